@@ -1,157 +1,708 @@
-"""Train NVIDIA's network to steer from recordings of the Udacity simulator.
+"""Train NVIDIA's network to steer, from recordings of the Udacity simulator.
 
-    python model.py                                 # every folder with a driving_log.csv under data/
-    python model.py data/lake-ccw data/lake-cw      # or these
+    python model.py                                     # every folder with a driving_log.csv under data/
+    python model.py data/lake-ccw data/lake-cw          # or these
+    python model.py --resume                            # go on where a run was stopped or killed
+    torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes, each with its share of every batch
+
+It reads top to bottom as the report does: recordings, observations, the generator, the network, training, pictures.
+Beside model.pt (the best epoch's) it leaves model-last.pt (what --resume goes on from), training_loss.png,
+training_log.csv, training_arguments.json and the pictures in diagnostic_images/.
 """
 
+import argparse
+import csv
+import functools
+import hashlib
 import io
+import json
 import os
-import struct
-import tempfile
+import signal
+import sys
+import time
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from torch import nn
+import torch.distributed as dist
+from torch.nn.parallel import DistributedDataParallel
+from tqdm import tqdm
 
-FRAME = (160, 320, 3)  # rows, columns, RGB: what the simulator records and sends
-FORMAT, VERSION = "behavioral-cloning", 1  # of model.pt
+from arithmetic import PIECE, SquaredErrors, choose_device, choose_precision, keep_freed_memory, one_thread, threads
+from network import (
+    CROP,
+    UNITS,
+    ModelError,
+    Network,
+    layer_table,
+    load_checkpoint,
+    load_model,
+    save_model,
+    versions,
+    write,
+)
+from pictures import loss_picture, panel, side_by_side
+from recordings import FRAME, LOG, Recording, RecordingError, check_images, decode, read_recording
 
+# The recipe's figures (report, "Data Pipeline") that are no options.
+STRAIGHT, KEEP_STRAIGHT = 0.02, 0.8  # |steering| below which an observation is kept with this probability
+TURN, JITTER = (0.2, 0.5), 0.01  # |steering| above, to: a copy is added, its angle perturbed by this share at most
+REPEATED, REPEATS = ("-repetitive", "-corrections"), 4  # ends of the names of problem areas' folders
+BLOCK_SECONDS, FOLDS = 2.0, 5  # validation takes every fifth stretch of two seconds
+FLIP, SHADOW = 0.9, 0.8  # probabilities; each observation's own image and a brightened copy are always there
+BRIGHTNESS, DARKNESS = (0.4, 1.2), (0.2, 0.5)  # factors of HSV value and HLS lightness
+PICTURE_EVERY = 6400  # observations
 
-class ModelError(Exception):
-    """A model file that cannot be used; the message names the file and the remedy."""
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Frames
-
-
-def jpeg_size(jpeg: bytes) -> tuple[int, int]:
-    """Rows and columns of a JPEG from its header, without decoding it.
-
-    Raises ValueError for what is no JPEG, or one that was cut short (no end marker after the scan's start).
-    """
-    if not jpeg:
-        raise ValueError("empty")
-    if jpeg[:2] != b"\xff\xd8":
-        raise ValueError("not a JPEG")
-    size, at = None, 2
-    while at + 9 < len(jpeg) and jpeg[at] == 0xFF:
-        marker, length = jpeg[at + 1], struct.unpack_from(">H", jpeg, at + 2)[0]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
-            size = struct.unpack_from(">HH", jpeg, at + 5)
-        if marker == 0xDA:  # start of scan: entropy-coded to the end marker, which cannot occur inside it
-            if size and jpeg.rfind(b"\xff\xd9", at) > 0:
-                return size
-            break
-        at += 2 + length
-    raise ValueError("cut short")
+SAVE_SECONDS = 30  # at most this much work is lost to a kill
 
 
-def decode(jpeg: bytes) -> np.ndarray:
-    """A recorded or received JPEG as the network sees it, in training and in driving alike: uint8 (160, 320, 3), RGB.
-
-    Raises ValueError, before decoding, for what is no whole JPEG of 160 rows and 320 columns.
-    """
-    rows, columns = jpeg_size(jpeg)
-    if (rows, columns) != FRAME[:2]:
-        raise ValueError(f"{columns}x{rows} pixels where {FRAME[1]}x{FRAME[0]} are expected")
-    frame = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
-    if frame is None:
-        raise ValueError("damaged")
-    return frame
+class Interrupted(Exception):
+    """The run was asked to stop and has saved its state; args[0] is the signal."""
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Network
+# --------------------------------------------------------------------------------------------------
+# Recordings -> observations
 
 
-class Network(nn.Module):
-    """NVIDIA's network (arXiv 1604.07316) as the report uses it: 559,419 parameters.
+@dataclass
+class Observations:
+    """What is trained on or validated with: one entry a row of a recording, or a copy of one.
 
-    forward: frames uint8 (N, 160, 320, 3), RGB, or already cropped (N, 75, 320, 3) -> steering float32 (N,),
-    where -1..1 is the simulator's -25°..25°, positive to the right.
+    recordings  the folders' Recordings
+    recording   int16 (n,): index into `recordings`
+    images      int32 (n, 3): centre, left, right, indices into the recording's names
+    steering    float32 (n,): -1..1, right positive
+    frame       uint64 (n,): digest of the centre image's file
+    time        float64 (n,): seconds
     """
 
-    def __init__(self, crop=(60, 25), scale=127.5, offset=1.0):
-        """crop: rows cut off the top and the bottom; a pixel value x enters as x / scale - offset."""
-        super().__init__()
-        self.crop, self.scale, self.offset = tuple(crop), scale, offset
-        self.convolutions = nn.ModuleList(
-            nn.Conv2d(into, out, kernel, stride)
-            for into, out, kernel, stride in
-            [(3, 24, 5, 2), (24, 36, 5, 2), (36, 48, 5, 2), (48, 64, 3, 1), (64, 64, 3, 1)]
-        )
-        self.dropout = nn.Dropout(0.5)
-        self.dense = nn.ModuleList(nn.Linear(into, out) for into, out in [(4224, 100), (100, 50), (50, 10), (10, 1)])
+    recordings: list[Recording]
+    recording: np.ndarray
+    images: np.ndarray
+    steering: np.ndarray
+    frame: np.ndarray
+    time: np.ndarray
 
-    def forward(self, frames):
-        top, bottom = self.crop
-        if frames.shape[1] == FRAME[0]:
-            frames = frames[:, top:FRAME[0] - bottom]
-        x = frames.permute(0, 3, 1, 2).float() / self.scale - self.offset
-        for convolution in self.convolutions:
-            x = nn.functional.elu(convolution(x))
-        x = self.dropout(x.flatten(1))
-        for layer in self.dense[:-1]:
-            x = nn.functional.elu(layer(x))
-        return self.dense[-1](x).squeeze(1)
+    def __len__(self):
+        return len(self.steering)
 
+    def take(self, rows: np.ndarray, steering=None) -> "Observations":
+        return Observations(self.recordings, self.recording[rows], self.images[rows],
+                            self.steering[rows] if steering is None else steering, self.frame[rows], self.time[rows])
 
-# ---------------------------------------------------------------------------------------------------------------------
-# model.pt
+    def path(self, at: int, camera: int) -> Path:
+        recording = self.recordings[self.recording[at]]
+        return recording.folder / "IMG" / os.fsdecode(recording.names[self.images[at, camera]])
+
+    def read(self, at: int, camera: int) -> np.ndarray:
+        """uint8 (160, 320, 3), RGB. Raises RecordingError if the file has changed since it was checked."""
+        path = self.path(at, camera)
+        try:
+            return decode(path.read_bytes())
+        except (OSError, ValueError) as error:
+            raise RecordingError(f"{path}: {error}; it was whole when the run began. Restore it and --resume") from None
 
 
-def write(path: Path, data: bytes) -> None:
-    """Write a file beside its place and rename it there, so that a kill leaves the old file or the new one, whole."""
-    handle, beside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    except BaseException:
-        os.unlink(beside)
-        raise
+def find_folders(given: list[str]) -> list[Path]:
+    """The folders with a driving_log.csv among and below those given, each once. Raises RecordingError."""
+    folders: dict[Path, Path] = {}
+    for name in given:
+        path = Path(name)
+        if not path.exists():
+            raise RecordingError(f"{path}: no such folder. {WHERE_TO_GET_RECORDINGS}")
+        logs = [path / LOG] if (path / LOG).is_file() else sorted(path.rglob(LOG)) if path.is_dir() else []
+        if not logs:
+            raise RecordingError(f"{path}: no {LOG} in or below it. {WHERE_TO_GET_RECORDINGS}")
+        for log in logs:
+            folders.setdefault(log.parent.resolve(), log.parent)
+    return list(folders.values())
 
 
-def save_model(path: Path, network: Network, **more) -> None:
-    """Write a model file: weights, what driving needs to use them, and `more` (plain values and tensors)."""
-    buffer = io.BytesIO()
-    torch.save({
-        "format": FORMAT, "version": VERSION, "network": network.state_dict(),
-        "recipe": {"frame": FRAME, "colour": "RGB", "crop": network.crop, "scale": network.scale,
-                   "offset": network.offset},
-        "versions": {"torch": torch.__version__, "opencv": cv2.__version__, "numpy": np.__version__}, **more,
-    }, buffer)
-    write(Path(path), buffer.getvalue())
+WHERE_TO_GET_RECORDINGS = ("Record some in the simulator (training mode, button R), or unpack the public sample data "
+                           "there: data/README.md says how. A recording is a folder with driving_log.csv and IMG/.")
 
 
-def load_checkpoint(path) -> dict:
-    """The contents of a model file, read with weights_only=True. Raises ModelError."""
-    try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise ModelError(f"{path}: no such file; `python model.py` trains one") from None
-    except Exception as error:
-        raise ModelError(f"{path}: not a model of this project, or damaged ({type(error).__name__})") from error
-    if not isinstance(saved, dict) or saved.get("format") != FORMAT:
-        raise ModelError(f"{path}: not a model of this project; `python model.py` trains one")
-    if saved.get("version") != VERSION:
-        raise ModelError(f"{path}: version {saved.get('version')} of the model file where this program reads "
-                         f"version {VERSION}; train it again with `python model.py`")
+def read_observations(folders: list[Path], throttle_threshold: float, strict: bool,
+                      rejected_file: Path) -> Observations:
+    """Steps 2 to 4 of the report: read each csv, drop rows off throttle, rewrite the images' paths; print the counts.
+
+    Raises RecordingError when nothing is left, and with `strict` for the first row that is unusable.
+    """
+    recordings, table, rejected = [], [], []
+    for folder in folders:
+        recording = read_recording(folder)
+        check_images(recording, threads())
+        usable = len(recording)
+        recording.keep(recording.numbers[:, 1] >= throttle_threshold)
+        recordings.append(recording)
+        table.append((str(folder), recording.read, recording.read - usable, usable - len(recording), len(recording)))
+        print_findings(recording)
+        rejected += [(folder / LOG, *row) for row in recording.rejected]
+    if rejected:
+        if strict:
+            path, line, _, detail = rejected[0]
+            raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {len(rejected)} unusable rows)")
+        text = io.StringIO()
+        csv.writer(text).writerows([("file", "line", "kind", "detail"), *rejected])
+        write(rejected_file, text.getvalue().encode(errors="surrogateescape"))
+        print(f"{len(rejected)} unusable rows are left out; all are listed in {rejected_file}")
+    width = max(len(row[0]) for row in table)
+    print(f"\n{'recording':{width}}  rows read  unusable  throttle < {throttle_threshold:g}  kept")
+    table.append(("total", *np.array([row[1:] for row in table]).sum(0)))
+    for name, read, unusable, off, kept in table:
+        print(f"{name:{width}}  {read:9,}  {unusable:8,}  {off:14,}  {kept:,}")
+    observations = Observations(
+        recordings, np.repeat(np.arange(len(recordings), dtype=np.int16), [len(r) for r in recordings]),
+        np.concatenate([r.images for r in recordings]), np.concatenate([r.numbers[:, 0] for r in recordings]),
+        np.concatenate([r.digests[r.images[:, 0]] for r in recordings]), np.concatenate([r.time for r in recordings]),
+    )
+    if len(observations) < FOLDS:
+        why = "--throttle-threshold drops most of them" if table[-1][3] > table[-1][2] else f"see {rejected_file}"
+        raise RecordingError(f"{len(observations)} rows are left of {table[-1][1]}, at least {FOLDS} are needed: {why}")
+    return observations
+
+
+def print_findings(recording: Recording) -> None:
+    """What was read otherwise than written, and what was left out: file, line, remedy; five a kind."""
+    path = recording.folder / LOG
+    for kind, (count, line) in recording.repairs.items():
+        print(f"{path}: line {line}: {kind} ({count} rows; read so, check that it is meant)")
+    kinds: dict[str, list] = {}
+    for line, kind, detail in recording.rejected:
+        kinds.setdefault(kind, []).append((line, detail))
+    for found in kinds.values():
+        for line, detail in found[:5]:
+            print(f"{path}: line {line}: left out: {detail}")
+        if len(found) > 5:
+            print(f"{path}: … and {len(found) - 5} more of this kind")
+
+
+def split(observations: Observations, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows for training (80 %) and validation (20 %), by stretches of two seconds spread over each recording.
+
+    Neighbouring frames are near copies, so a random split would validate on what was trained on; and a frame that
+    stands in several rows or folders goes, with all of them, where its first row goes.
+    """
+    n = len(observations)
+    starts = np.ones(n, bool)  # of stretches without a break
+    pause = np.diff(observations.time)
+    starts[1:] = (np.diff(observations.recording) != 0) | (pause < 0) | (pause > 1)
+    stretch = np.cumsum(starts) - 1
+    second = observations.time - observations.time[starts][stretch]
+    block = np.unique(np.stack([stretch, second // BLOCK_SECONDS]), axis=1, return_inverse=True)[1].ravel()
+    if block[-1] + 1 < FOLDS:  # a few seconds in all
+        block = np.arange(n) * FOLDS // n
+    validation = (block + np.random.default_rng([seed, 0]).integers(FOLDS)) % FOLDS == 0
+    _, first, which = np.unique(observations.frame, return_index=True, return_inverse=True)
+    validation = validation[first][which]
+    if validation.all() or not validation.any():
+        raise RecordingError(f"{len(first)} different frames are too few to train and to validate with; record more")
+    return np.flatnonzero(~validation), np.flatnonzero(validation)
+
+
+def resample(observations: Observations, seed: int) -> Observations:
+    """Steps 5 to 7 of the report: straight driving under-sampled, turns over-sampled, problem areas repeated."""
+    rng, steering = np.random.default_rng([seed, 1]), observations.steering
+    size = np.abs(steering)
+    kept = np.flatnonzero((size >= STRAIGHT) | (rng.random(len(steering)) < KEEP_STRAIGHT))
+    turns = np.flatnonzero((size > TURN[0]) & (size <= TURN[1]))
+    jittered = steering[turns] * (1 + JITTER * rng.uniform(-1, 1, len(turns)))
+    rows, angles = np.concatenate([kept, turns]), np.concatenate([steering[kept], jittered.astype(np.float32)])
+    repeats = np.array([REPEATS if r.folder.resolve().name.endswith(REPEATED) else 1 for r in observations.recordings])
+    times = repeats[observations.recording[rows]]
+    return observations.take(np.repeat(rows, times), np.repeat(angles, times))
+
+
+# --------------------------------------------------------------------------------------------------
+# The generator
+
+
+def brighten(image: np.ndarray, factor: float) -> np.ndarray:
+    """A copy of an RGB image, uint8 (rows, columns, 3), whose HSV value is multiplied, clipped and never wrapped."""
+    table = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 256, 3)
+    table[0, :, 2] = np.minimum(np.arange(256) * factor + 0.5, 255)
+    return cv2.cvtColor(cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGB2HSV), table), cv2.COLOR_HSV2RGB)
+
+
+def shade(image: np.ndarray, line: tuple[float, float], left: bool, factor: float, first_row: int = 0) -> np.ndarray:
+    """A copy of an RGB image, uint8 (rows, columns, 3), with the HLS lightness of one side of a line multiplied.
+
+    line: the columns where it meets the top and the bottom edge of the full frame of 160 rows; first_row: the frame's
+    row that is the image's first, for an image that is cropped.
+    """
+    rows = np.arange(first_row, first_row + len(image))[:, None]
+    edge = line[0] + (line[1] - line[0]) * rows / FRAME[0]
+    shadow = ((np.arange(image.shape[1]) < edge) == left).astype(np.uint8)
+    table = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 256, 3)
+    table[0, :, 1] = np.arange(256) * factor + 0.5
+    dark = cv2.cvtColor(cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGB2HLS), table), cv2.COLOR_HLS2RGB)
+    return cv2.copyTo(dark, shadow, image.copy())
+
+
+def rank() -> int:
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def world() -> int:
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+@dataclass
+class Batch:
+    """One rank's share of a batch.
+
+    images uint8 (n, 75, 320, 3) RGB, cropped; angles float32 (n,); keep bool (n, 4224): what dropout leaves of the
+    flattened layer; total: images in the whole batch, over all ranks.
+    """
+
+    images: np.ndarray
+    angles: np.ndarray
+    keep: np.ndarray
+    total: int
+
+
+class Generator:
+    """Endless batches of the training observations: shuffled, a random camera each, augmented (report, "Augmenting").
+
+    What a batch is made of depends on the seed and its number alone, so that a resumed run, or several processes,
+    draw the same ones. Images are made by the pool's threads, `ahead` batches before they are needed.
+    """
+
+    def __init__(self, observations: Observations, batch_size: int, side_correction: float, seed: int, pool,
+                 ahead: int):
+        self.observations, self.batch_size, self.seed = observations, batch_size, seed
+        self.corrections = np.array([0, side_correction, -side_correction], np.float32)  # centre, left, right
+        self.pool, self.ahead = pool, ahead
+        self.shuffled = functools.lru_cache(2)(
+            lambda turn: np.random.default_rng([seed, 2, turn]).permutation(len(observations)))
+
+    def draw(self, number: int) -> dict[str, np.ndarray]:
+        """All that chance decides in a batch; one entry an observation, but `keep` one an image."""
+        rng, n = np.random.default_rng([self.seed, 3, number]), self.batch_size
+        at = np.arange(number * n, (number + 1) * n)
+        turns = at // len(self.observations)
+        chosen = np.concatenate([self.shuffled(int(turn))[at[turns == turn] % len(self.observations)]
+                                 for turn in np.unique(turns)])
+        camera = rng.integers(3, size=n)
+        kinds = np.stack([np.ones(n, bool), rng.random(n) < FLIP, np.ones(n, bool), rng.random(n) < SHADOW], axis=1)
+        total = int(kinds.sum())
+        places = np.full(kinds.shape, -1)
+        places[kinds] = rng.permutation(total)  # the batch is shuffled
+        angle = self.observations.steering[chosen] + self.corrections[camera]
+        angles = np.stack([angle, -angle, angle, angle], axis=1)
+        bits = np.unpackbits(np.frombuffer(rng.bytes(total * UNITS // 8), np.uint8))
+        return {
+            "observation": chosen, "camera": camera, "places": places, "angles": angles,
+            "brightness": rng.uniform(*BRIGHTNESS, n), "darkness": rng.uniform(*DARKNESS, n),
+            "line": rng.uniform(0, FRAME[1], (n, 2)), "left": rng.random(n) < 0.5,
+            "keep": bits.view(bool).reshape(total, UNITS),
+        }
+
+    def images(self, drawn: dict, i: int, crop=CROP):
+        """The images of a batch's i-th observation: chosen, flipped, brightened, shadowed; None where it has none."""
+        frame = self.observations.read(drawn["observation"][i], drawn["camera"][i])
+        frame = np.ascontiguousarray(frame[crop[0]:FRAME[0] - crop[1]])
+        _, flipped, _, shadowed = drawn["places"][i] >= 0
+        return (frame, cv2.flip(frame, 1) if flipped else None, brighten(frame, drawn["brightness"][i]),
+                shade(frame, drawn["line"][i], drawn["left"][i], drawn["darkness"][i], crop[0]) if shadowed else None)
+
+    def begin(self, number: int):
+        """Start making this rank's share of a batch; the returned call waits for it."""
+        drawn = self.draw(number)
+        mine = np.arange(self.batch_size)[rank()::world()]
+        places = drawn["places"][mine]
+        order = np.sort(places[places >= 0])  # this rank's images among all, in the batch's order
+        images = np.empty((len(order), FRAME[0] - sum(CROP), *FRAME[1:]), np.uint8)
+        angles = np.empty(len(order), np.float32)
+
+        def make(part):
+            for i in part:
+                for kind, image in enumerate(self.images(drawn, i)):
+                    if image is not None:
+                        at = np.searchsorted(order, drawn["places"][i, kind])
+                        images[at], angles[at] = image, drawn["angles"][i, kind]
+
+        parts = [self.pool.submit(make, mine[start:start + PIECE]) for start in range(0, len(mine), PIECE)]
+
+        def wait() -> Batch:
+            for part in parts:
+                part.result()
+            return Batch(images, angles, drawn["keep"][order], len(drawn["keep"]))
+
+        return wait
+
+    def batches(self, number: int):
+        """Batches from this number on."""
+        begun = deque()
+        while True:
+            while len(begun) <= self.ahead:
+                begun.append(self.begin(number))
+                number += 1
+            yield begun.popleft()()
+
+
+def batch_pictures(generator: Generator, number: int) -> dict[str, bytes]:
+    """The report's two pictures of a batch's first observation: file name, with {} for the count, -> PNG."""
+    drawn, observations = generator.draw(number), generator.observations
+    at, camera = drawn["observation"][0], drawn["camera"][0]
+    frames = [observations.read(at, camera) for camera in range(3)]
+    angles = observations.steering[at] + generator.corrections
+    drawn["places"][0] = np.abs(drawn["places"][0])  # show every kind, also what chance left out of the batch
+    chosen, *augmented = generator.images(drawn, 0, crop=(0, 0))
+    angle = drawn["angles"][0]
+    titles = ("flipped", f"brightness x {drawn['brightness'][0]:.2f}", f"shadow x {drawn['darkness'][0]:.2f}")
+    left, center, right = (panel(frames[i], name, angles[i]) for i, name in ((1, "left"), (0, "center"), (2, "right")))
+    return {
+        "training_generator_LRC_{}.png": side_by_side([left, center, right]),
+        "training_generator_augmented-{}.png": side_by_side([
+            panel(chosen, f"{('center', 'left', 'right')[camera]} camera", angle[0]),
+            *(panel(image, title, a) for image, title, a in zip(augmented, titles, angle[1:], strict=True))]),
+    }
+
+
+# --------------------------------------------------------------------------------------------------
+# Training: the run
+
+
+class Run:
+    """A training run: its state, and the files that it leaves. rank 0 writes them."""
+
+    def __init__(self, arguments: argparse.Namespace, training: Observations, validation: Observations):
+        self.arguments, self.training, self.validation = arguments, training, validation
+        self.device = choose_device(arguments.device)
+        self.precision = choose_precision(self.device)
+        self.best_file = Path(arguments.output)
+        self.last_file = last_file(arguments.output)
+        self.folder = self.best_file.parent
+        torch.manual_seed(arguments.seed)
+        self.network = Network().to(self.device, memory_format=torch.channels_last)
+        self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
+        self.errors = SquaredErrors(self.network, self.precision, self.device, self.pool)
+        if dist.is_initialized():
+            self.errors = DistributedDataParallel(self.errors)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), arguments.learning_rate, fused=True)
+        self.generator = Generator(training, arguments.batch_size, arguments.side_correction, arguments.seed,
+                                   self.pool, ahead=1 if self.device.type == "cpu" else 4)
+        self.number = 0  # of the next batch, over all epochs
+        self.images, self.loss, self.seconds = 0, 0.0, 0.0  # so far in this epoch
+        self.history: list[dict] = []  # a finished epoch each
+        self.saved_at = time.monotonic()
+        self.signal = 0
+
+    def fingerprint(self) -> str:
+        """Of what is trained on and validated with: a resumed run must go on with the same."""
+        digest = hashlib.blake2b(digest_size=16)
+        for part in (self.training, self.validation):
+            digest.update(part.frame.tobytes() + part.steering.tobytes())
+        return digest.hexdigest()
+
+    def save(self, best: bool = False) -> None:
+        """Write model-last.pt, with all that --resume needs, and the best epoch's model.pt before it."""
+        if rank() == 0:
+            more = {"arguments": vars(self.arguments), "history": self.history}
+            if best:
+                save_model(self.best_file, self.network, **more)
+            save_model(self.last_file, self.network, **more, training={
+                "optimizer": self.optimizer.state_dict(), "number": self.number, "images": self.images,
+                "loss": self.loss, "seconds": self.seconds, "fingerprint": self.fingerprint()})
+        self.saved_at = time.monotonic()
+
+    def resume(self, saved: dict) -> None:
+        """Go on from a checkpoint. Raises ModelError if the recordings are not those that it was trained on."""
+        state = saved["training"]
+        if state["fingerprint"] != self.fingerprint():
+            raise ModelError(f"{self.last_file}: its recordings were others ({len(self.training):,} observations now). "
+                             "Restore them, or begin anew without --resume")
+        self.network.load_state_dict(saved["network"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.number, self.images, self.loss, self.seconds = (state[k] for k in ("number", "images", "loss", "seconds"))
+        self.history = saved["history"]
+
+    def train(self) -> None:
+        """Epochs as in the report's log. Raises Interrupted, with everything saved, after SIGINT or SIGTERM."""
+        batches = self.generator.batches(self.number)
+        while len(self.history) < self.arguments.epochs:
+            self.epoch(batches)
+            started = time.monotonic()
+            loss = self.validate()
+            self.seconds += time.monotonic() - started
+            best = loss < min((row["val_loss"] for row in self.history), default=float("inf"))
+            row = {"epoch": len(self.history) + 1, "images": self.images, "seconds": round(self.seconds, 3),
+                   "loss": self.loss / self.images, "val_loss": loss}
+            self.history.append(row)
+            self.images, self.loss, self.seconds = 0, 0.0, 0.0
+            self.save(best)
+            if rank() == 0:
+                self.write_log()
+                print("{images}/{0} [{1}] - {seconds:.0f}s - loss: {loss:.4f} - val_loss: {val_loss:.4f}".format(
+                    self.arguments.samples_per_epoch, "=" * 30, **row), flush=True)
+
+    def epoch(self, batches) -> None:
+        """Batches until `samples_per_epoch` images are reached (as Keras counted), from where the epoch stands."""
+        arguments, started = self.arguments, time.monotonic() - self.seconds
+        if rank() == 0:
+            print(f"Epoch {len(self.history) + 1}/{arguments.epochs}", flush=True)
+        with tqdm(total=arguments.samples_per_epoch, initial=self.images, unit="image", leave=False,
+                  disable=None if rank() == 0 else True) as bar:
+            while self.images < arguments.samples_per_epoch:
+                self.draw_pictures()
+                batch = next(batches)
+                # DistributedDataParallel takes the mean over the ranks, each of which has its share of the sum.
+                loss = self.errors(batch)
+                (loss * (world() / batch.total)).backward()
+                self.optimizer.step()
+                self.optimizer.zero_grad()
+                self.number += 1
+                self.images += batch.total
+                sums = torch.tensor([float(loss.detach()), float(self.signal)], dtype=torch.float64)
+                if dist.is_initialized():
+                    sums = sums.to(self.device)
+                    dist.all_reduce(sums)
+                self.loss += float(sums[0])
+                self.seconds = time.monotonic() - started
+                bar.update(batch.total)
+                bar.set_postfix(loss=f"{self.loss / self.images:.4f}")
+                if sums[1]:
+                    self.save()
+                    raise Interrupted(self.signal or signal.SIGTERM)
+                if time.monotonic() - self.saved_at > SAVE_SECONDS:
+                    self.save()
+
+    def validate(self) -> float:
+        """Mean squared error on centre images, unchanged; 0.2 x samples_per_epoch of them, or all if they are fewer."""
+        count = min(len(self.validation), self.arguments.samples_per_epoch // 5)
+        chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[:max(count, 1)]
+        mine = chosen[rank()::world()]
+        predicted = predict(self.network, self.validation, mine, self.device, self.precision, self.pool)
+        errors = torch.tensor(((predicted - self.validation.steering[mine]) ** 2).sum())
+        if dist.is_initialized():
+            errors = errors.to(self.device)
+            dist.all_reduce(errors)
+        return float(errors) / len(chosen)
+
+    def write_log(self) -> None:
+        """training_log.csv and training_loss.png, from the history."""
+        text = io.StringIO()
+        table = csv.DictWriter(text, list(self.history[0]))
+        table.writeheader()
+        table.writerows(self.history)
+        write(self.folder / "training_log.csv", text.getvalue().encode())
+        write(self.folder / "training_loss.png", loss_picture(self.history))
+
+    def draw_pictures(self) -> None:
+        """Every 6,400 observations: a batch's first one, by the three cameras and augmented."""
+        before, now = (n * self.arguments.batch_size for n in (self.number - 1, self.number))
+        if rank() or before // PICTURE_EVERY == now // PICTURE_EVERY:
+            return
+        for name, png in batch_pictures(self.generator, self.number).items():
+            write(self.folder / "diagnostic_images" / name.format(now // PICTURE_EVERY * PICTURE_EVERY), png)
+
+    def summary(self) -> str:
+        """The best epoch's error beside that of always steering 0 and of the mean, and by how hard is steered."""
+        network = load_model(self.best_file, self.device)
+        truth = self.validation.steering
+        predicted = predict(network, self.validation, np.arange(len(truth)), self.device, self.precision, self.pool)
+        mean = self.training.steering.mean()
+        lines = [f"\n{'validation, mean squared error':34} {'rows':>6} {'model':>8} {'steer 0':>8} {'steer mean':>10}"]
+        size = np.abs(truth)
+        ranges = [(0, STRAIGHT), (STRAIGHT, TURN[0]), TURN, (TURN[1], 1.001), (0, 1.001)]
+        for low, high in ranges:
+            rows = (size >= low) & (size < high)
+            if rows.any():
+                name = "all" if (low, high) == ranges[-1] else f"steering {low:g} to {min(high, 1):g}"
+                figures = [np.mean((guess - truth[rows]) ** 2) for guess in (predicted[rows], 0, mean)]
+                lines.append(f"{name:34} {rows.sum():6,} {figures[0]:8.4f} {figures[1]:8.4f} {figures[2]:10.4f}")
+        if figures[0] >= min(figures[1:]):  # of all rows, the last
+            lines.append("The model is no better than a constant: train longer, or record more turns.")
+        return "\n".join(lines)
+
+
+def predict(network, observations: Observations, rows: np.ndarray, device, precision, pool) -> np.ndarray:
+    """Steering for the centre images of these rows: float32 (len(rows),)."""
+    def part(chosen):
+        frames = np.stack([observations.read(at, 0)[CROP[0]:FRAME[0] - CROP[1]] for at in chosen])
+        with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16):
+            return network(torch.from_numpy(frames).to(device)).cpu().numpy()
+
+    return np.concatenate([np.empty(0, np.float32),
+                           *pool.map(part, [rows[i:i + PIECE] for i in range(0, len(rows), PIECE)])])
+
+
+# --------------------------------------------------------------------------------------------------
+# The command
+
+
+def parse(argv: list[str] | None) -> tuple[argparse.Namespace, dict]:
+    """The command line's arguments, and of them those that were given."""
+    parser = argparse.ArgumentParser(
+        description=__doc__.split("\n\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        epilog="The defaults are the report's. Interrupt with Ctrl-C at any time; --resume goes on.")
+    parser.add_argument("recordings", nargs="*", default=["data"],
+                        help="folders with a driving_log.csv, or folders of such folders")
+    add = parser.add_argument_group("training").add_argument
+    add("--epochs", type=at_least(1, int), default=10, help="epochs in all, also with --resume")
+    add("--batch-size", type=at_least(1, int), default=128, help="observations a batch; each gives 3.7 images")
+    add("--learning-rate", type=at_least(1e-9, float), default=1e-4, help="Adam's")
+    add("--samples-per-epoch", type=at_least(1, int), default=20224,
+        help="images an epoch, at least; a fifth as many observations validate")
+    add("--seed", type=at_least(0, int), default=0, help="the same seed gives the same run on a machine")
+    add("--device", choices=["auto", "cpu", "cuda", "mps"], default="auto",
+        help="auto: an NVIDIA GPU, else Apple's, else the CPU")
+    add = parser.add_argument_group("observations").add_argument
+    add("--throttle-threshold", type=float, default=0.25, help="rows with less throttle are dropped")
+    add("--side-correction", type=float, default=0.2,
+        help="added to the left camera's steering, taken off the right's")
+    add("--strict", action="store_true", help="stop at an unusable row, instead of leaving it out")
+    add = parser.add_argument_group("output").add_argument
+    add("--output", default="model.pt", help="the best epoch's model; all else is written beside it")
+    add("--resume", action="store_true",
+        help="go on from the output's -last.pt, with that run's arguments; --epochs may be raised")
+    arguments = parser.parse_args(argv)
+    absent = object()  # argparse sets a default only where a namespace has nothing yet
+    given = vars(parser.parse_args(argv, argparse.Namespace(**dict.fromkeys(vars(arguments), absent))))
+    return arguments, {name: value for name, value in given.items()
+                       if value is not absent and value is not parser.get_default(name)}
+
+
+def at_least(least, kind):
+    """A type for argparse: a number of this kind, not below the least."""
+    def number(text: str):
+        value = kind(text)
+        if not least <= value < float("inf"):
+            raise argparse.ArgumentTypeError(f"{text} is not a number from {least} up")
+        return value
+
+    number.__name__ = kind.__name__
+    return number
+
+
+def last_file(output: str) -> Path:
+    """model-last.pt for model.pt: the last epoch's model, and what --resume goes on from."""
+    return Path(output).with_stem(f"{Path(output).stem}-last")
+
+
+def load_resumed(arguments: argparse.Namespace, given: dict) -> dict | None:
+    """The checkpoint to go on from, its run's arguments taken over; None to begin. Raises ModelError."""
+    path = last_file(arguments.output)
+    if not arguments.resume:
+        return None
+    if not path.exists():
+        print(f"{path}: nothing to resume yet; the run begins")
+        return None
+    saved = load_checkpoint(path)
+    if "training" not in saved:
+        raise ModelError(f"{path}: holds no state of a run; name the run's --output")
+    free = ("recordings", "epochs", "device", "output", "strict", "resume")  # other recordings are found out later
+    for name, value in saved["arguments"].items():
+        if name in given and name not in free and given[name] != value:
+            raise ModelError(f"{path}: was begun with --{name.replace('_', '-')} {value}, not {given[name]}; "
+                             "leave it out, or begin anew without --resume")
+        if name not in given:
+            setattr(arguments, name, value)
     return saved
 
 
-def load_model(path, device="cpu") -> Network:
-    """The network of a model file, ready to drive (evaluation mode). Raises ModelError."""
-    saved = load_checkpoint(path)
-    recipe = saved["recipe"]
-    network = Network(recipe["crop"], recipe["scale"], recipe["offset"])
+def prepare(arguments: argparse.Namespace, given: dict) -> tuple[Observations, Observations, dict | None]:
+    """What is trained on, what is validated with, and the checkpoint to go on from."""
+    saved = load_resumed(arguments, given)
+    output = Path(arguments.output)
+    (output.parent / "diagnostic_images").mkdir(parents=True, exist_ok=True)
+    arguments.recordings = [str(folder.resolve()) for folder in find_folders(arguments.recordings)]
+    folders = find_folders(arguments.recordings)
+    observations = read_observations(folders, arguments.throttle_threshold, arguments.strict,
+                                     output.with_name("rejected_rows.csv"))
+    train, validation = split(observations, arguments.seed)
+    training = resample(observations.take(train), arguments.seed)
+    print(f"\ntraining: {len(train):,} rows, {len(training):,} observations after resampling; "
+          f"validation: {len(validation):,} rows\n")
+    return training, observations.take(validation), saved
+
+
+def run(arguments: argparse.Namespace, given: dict) -> None:
+    """All that the command does. Raises RecordingError, ModelError, OSError, Interrupted."""
+    data = [None]
+    if rank() == 0:
+        try:
+            data = [prepare(arguments, given)]
+        except (RecordingError, ModelError, OSError) as error:
+            data = [error]
+    if dist.is_initialized():
+        dist.broadcast_object_list(data)
+    if isinstance(data[0], Exception):
+        raise data[0]
+    training, validation, saved = data[0]
+    one = Run(arguments, training, validation)
+    if saved:
+        one.resume(saved)
+    if rank() == 0:
+        print(layer_table(one.network))
+        print(f"\n{one.device}, {str(one.precision).removeprefix('torch.')}, {threads()} threads"
+              + (f", {world()} processes" if world() > 1 else ""))
+        if saved:
+            print(f"resumed in epoch {len(one.history) + 1} at image {one.images:,}")
+        else:
+            set_aside(one.best_file, one.last_file)
+        write(one.folder / "training_arguments.json", json.dumps(
+            {**vars(arguments), "precision": str(one.precision), "versions": versions()}, indent=2).encode())
+    if not saved:
+        one.save()
+
+    def stop(number, _):
+        if one.signal:
+            raise KeyboardInterrupt  # asked twice
+        one.signal = number
+
+    handlers = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        network.load_state_dict(saved["network"])
-    except RuntimeError as error:
-        raise ModelError(f"{path}: its weights do not fit the network ({error})") from None
-    return network.to(device).eval()
+        one.train()
+        if rank() == 0:
+            print(f"{one.summary()}\n\n{one.best_file}: the best epoch; next: python drive.py {one.best_file}")
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        one.pool.shutdown(cancel_futures=True)
+
+
+def set_aside(*files: Path) -> None:
+    """Keep an earlier run's models under -previous."""
+    for path in files:
+        if path.exists():
+            previous = path.with_stem(f"{path.stem}-previous")
+            os.replace(path, previous)
+            print(f"{path} of an earlier run is now {previous}")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Exit status: 0 done, 1 a file could not be written or read, 2 unusable input, 128 + signal when interrupted."""
+    arguments, given = parse(argv)
+    keep_freed_memory()
+    status, message = 0, None
+    if "RANK" in os.environ:  # torchrun's
+        device = choose_device(arguments.device)
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    try:
+        run(arguments, given)
+    except (RecordingError, ModelError) as error:
+        status, message = 2, f"error: {error}"
+    except OSError as error:
+        status, message = 1, (f"error: {error.filename}: {error.strerror}. What was written before stays; mend this "
+                              "and go on with --resume")
+    except Interrupted as error:
+        status, message = 128 + error.args[0], "stopped and saved; go on with --resume"
+    except KeyboardInterrupt:
+        status, message = 128 + signal.SIGINT, "stopped at once; --resume goes on from what was saved last"
+    if message and rank() == 0:
+        print(message, file=sys.stderr)
+    if dist.is_initialized():
+        dist.destroy_process_group()
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
