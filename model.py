@@ -6,8 +6,8 @@
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes, each with its share of every batch
 
 It reads top to bottom as the report does: recordings, observations, the generator, the network, training, pictures.
-Beside model.pt (the best epoch's) it leaves model-last.pt (what --resume goes on from), training_loss.png,
-training_log.csv, training_arguments.json and the pictures in diagnostic_images/.
+It leaves model.pt (the last epoch's, as in the report), model-best.pt (the least validation loss), model-resume.pt,
+training_loss.png, training_log.csv, training_arguments.json and the pictures in diagnostic_images/.
 """
 
 import argparse
@@ -375,9 +375,8 @@ class Run:
         self.arguments, self.training, self.validation = arguments, training, validation
         self.device = choose_device(arguments.device)
         self.precision = choose_precision(self.device)
-        self.best_file = Path(arguments.output)
-        self.last_file = last_file(arguments.output)
-        self.folder = self.best_file.parent
+        self.last_file, self.best_file, self.resume_file = model_files(arguments.output)
+        self.folder = self.last_file.parent
         torch.manual_seed(arguments.seed)
         self.network = Network().to(self.device, memory_format=torch.channels_last)
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
@@ -393,6 +392,7 @@ class Run:
         self.saved_at = time.monotonic()
         self.signal = 0
 
+    @functools.cached_property
     def fingerprint(self) -> str:
         """Of what is trained on and validated with: a resumed run must go on with the same."""
         digest = hashlib.blake2b(digest_size=16)
@@ -400,23 +400,23 @@ class Run:
             digest.update(part.frame.tobytes() + part.steering.tobytes())
         return digest.hexdigest()
 
-    def save(self, best: bool = False) -> None:
-        """Write model-last.pt, with all that --resume needs, and the best epoch's model.pt before it."""
+    def save(self, *models: Path) -> None:
+        """Write these models, and then model-resume.pt with all that --resume needs."""
         if rank() == 0:
             more = {"arguments": vars(self.arguments), "history": self.history}
-            if best:
-                save_model(self.best_file, self.network, **more)
-            save_model(self.last_file, self.network, **more, training={
+            for path in models:
+                save_model(path, self.network, **more)
+            save_model(self.resume_file, self.network, **more, training={
                 "optimizer": self.optimizer.state_dict(), "number": self.number, "images": self.images,
-                "loss": self.loss, "seconds": self.seconds, "fingerprint": self.fingerprint()})
+                "loss": self.loss, "seconds": self.seconds, "fingerprint": self.fingerprint})
         self.saved_at = time.monotonic()
 
     def resume(self, saved: dict) -> None:
         """Go on from a checkpoint. Raises ModelError if the recordings are not those that it was trained on."""
         state = saved["training"]
-        if state["fingerprint"] != self.fingerprint():
-            raise ModelError(f"{self.last_file}: its recordings were others ({len(self.training):,} observations now). "
-                             "Restore them, or begin anew without --resume")
+        if state["fingerprint"] != self.fingerprint:
+            raise ModelError(f"{self.resume_file}: its recordings were others; restore them, or begin anew without "
+                             "--resume")
         self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.number, self.images, self.loss, self.seconds = (state[k] for k in ("number", "images", "loss", "seconds"))
@@ -430,12 +430,12 @@ class Run:
             started = time.monotonic()
             loss = self.validate()
             self.seconds += time.monotonic() - started
-            best = loss < min((row["val_loss"] for row in self.history), default=float("inf"))
+            is_best = loss < min((row["val_loss"] for row in self.history), default=float("inf"))
             row = {"epoch": len(self.history) + 1, "images": self.images, "seconds": round(self.seconds, 3),
                    "loss": self.loss / self.images, "val_loss": loss}
             self.history.append(row)
             self.images, self.loss, self.seconds = 0, 0.0, 0.0
-            self.save(best)
+            self.save(self.last_file, *[self.best_file] * is_best)
             if rank() == 0:
                 self.write_log()
                 print("{images}/{0} [{1}] - {seconds:.0f}s - loss: {loss:.4f} - val_loss: {val_loss:.4f}".format(
@@ -502,22 +502,24 @@ class Run:
             write(self.folder / "diagnostic_images" / name.format(now // PICTURE_EVERY * PICTURE_EVERY), png)
 
     def summary(self) -> str:
-        """The best epoch's error beside that of always steering 0 and of the mean, and by how hard is steered."""
-        network = load_model(self.best_file, self.device)
+        """The last and the best epoch's error, by how hard is steered, beside those of steering 0 and the mean."""
         truth = self.validation.steering
-        predicted = predict(network, self.validation, np.arange(len(truth)), self.device, self.precision, self.pool)
-        mean = self.training.steering.mean()
-        lines = [f"\n{'validation, mean squared error':34} {'rows':>6} {'model':>8} {'steer 0':>8} {'steer mean':>10}"]
+        guesses = {"steer 0": np.zeros_like(truth), "steer mean": np.full_like(truth, self.training.steering.mean())}
+        for path in (self.last_file, self.best_file):
+            guesses[path.name] = predict(load_model(path, self.device), self.validation, np.arange(len(truth)),
+                                         self.device, self.precision, self.pool)
+        lines = ["\n" + f"{'validation: mean squared error':32} {'rows':>6}" + "".join(f"{n:>15}" for n in guesses)]
         size = np.abs(truth)
-        ranges = [(0, STRAIGHT), (STRAIGHT, TURN[0]), TURN, (TURN[1], 1.001), (0, 1.001)]
-        for low, high in ranges:
+        for low, high in [(0, STRAIGHT), (STRAIGHT, TURN[0]), TURN, (TURN[1], 1.001), (0, 1.001)]:
             rows = (size >= low) & (size < high)
             if rows.any():
-                name = "all" if (low, high) == ranges[-1] else f"steering {low:g} to {min(high, 1):g}"
-                figures = [np.mean((guess - truth[rows]) ** 2) for guess in (predicted[rows], 0, mean)]
-                lines.append(f"{name:34} {rows.sum():6,} {figures[0]:8.4f} {figures[1]:8.4f} {figures[2]:10.4f}")
-        if figures[0] >= min(figures[1:]):  # of all rows, the last
-            lines.append("The model is no better than a constant: train longer, or record more turns.")
+                errors = "".join(f"{np.mean((guess - truth)[rows] ** 2):15.4f}" for guess in guesses.values())
+                lines.append(f"{f'steering of {low:g} to {min(high, 1):g}':32} {rows.sum():6,}{errors}")
+        with np.errstate(invalid="ignore"):  # a constant correlates with nothing
+            follows = [np.corrcoef(guess, truth)[0, 1] for guess in guesses.values()]
+        lines.append(f"{'correlation with the driver':39}" + "".join(f"{value:15.2f}" for value in follows))
+        if not follows[2] > 0.3:
+            lines.append(f"{self.last_file} hardly follows the driver: train longer, or record more turns.")
         return "\n".join(lines)
 
 
@@ -558,9 +560,9 @@ def parse(argv: list[str] | None) -> tuple[argparse.Namespace, dict]:
         help="added to the left camera's steering, taken off the right's")
     add("--strict", action="store_true", help="stop at an unusable row, instead of leaving it out")
     add = parser.add_argument_group("output").add_argument
-    add("--output", default="model.pt", help="the best epoch's model; all else is written beside it")
+    add("--output", default="model.pt", help="the model; all else is written beside it")
     add("--resume", action="store_true",
-        help="go on from the output's -last.pt, with that run's arguments; --epochs may be raised")
+        help="go on from the output's -resume.pt, with that run's arguments; --epochs may be raised")
     arguments = parser.parse_args(argv)
     absent = object()  # argparse sets a default only where a namespace has nothing yet
     given = vars(parser.parse_args(argv, argparse.Namespace(**dict.fromkeys(vars(arguments), absent))))
@@ -580,14 +582,15 @@ def at_least(least, kind):
     return number
 
 
-def last_file(output: str) -> Path:
-    """model-last.pt for model.pt: the last epoch's model, and what --resume goes on from."""
-    return Path(output).with_stem(f"{Path(output).stem}-last")
+def model_files(output: str) -> tuple[Path, Path, Path]:
+    """For model.pt: itself, the last epoch's; model-best.pt; and model-resume.pt, which --resume goes on from."""
+    path = Path(output)
+    return path, path.with_stem(f"{path.stem}-best"), path.with_stem(f"{path.stem}-resume")
 
 
 def load_resumed(arguments: argparse.Namespace, given: dict) -> dict | None:
     """The checkpoint to go on from, its run's arguments taken over; None to begin. Raises ModelError."""
-    path = last_file(arguments.output)
+    *_, path = model_files(arguments.output)
     if not arguments.resume:
         return None
     if not path.exists():
@@ -645,7 +648,7 @@ def run(arguments: argparse.Namespace, given: dict) -> None:
         if saved:
             print(f"resumed in epoch {len(one.history) + 1} at image {one.images:,}")
         else:
-            set_aside(one.best_file, one.last_file)
+            set_aside(one.last_file, one.best_file, one.resume_file)
         write(one.folder / "training_arguments.json", json.dumps(
             {**vars(arguments), "precision": str(one.precision), "versions": versions()}, indent=2).encode())
     if not saved:
@@ -660,7 +663,7 @@ def run(arguments: argparse.Namespace, given: dict) -> None:
     try:
         one.train()
         if rank() == 0:
-            print(f"{one.summary()}\n\n{one.best_file}: the best epoch; next: python drive.py {one.best_file}")
+            print(f"{one.summary()}\n\nnext: python drive.py {one.last_file}")
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
