@@ -22,7 +22,7 @@ import sys
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -46,7 +46,7 @@ from network import (
     write,
 )
 from pictures import loss_picture, panel, side_by_side
-from recordings import FRAME, LOG, Recording, RecordingError, check_images, decode, read_recording
+from recordings import CAMERAS, FRAME, LOG, Recording, RecordingError, check_images, decode, read_recording
 
 # The recipe's figures (report, "Data Pipeline") that are no options.
 STRAIGHT, KEEP_STRAIGHT = 0.02, 0.8  # |steering| below which an observation is kept with this probability
@@ -57,6 +57,7 @@ FLIP, SHADOW = 0.9, 0.8  # probabilities; each observation's own image and a bri
 BRIGHTNESS, DARKNESS = (0.4, 1.2), (0.2, 0.5)  # factors of HSV value and HLS lightness
 PICTURE_EVERY = 6400  # observations
 
+KEEP_CROPPED = 5_000  # decoded images that are kept in memory: 360 MB, and half the generator's work
 SAVE_SECONDS = 30  # at most this much work is lost to a kill
 
 
@@ -86,6 +87,7 @@ class Observations:
     steering: np.ndarray
     frame: np.ndarray
     time: np.ndarray
+    cropped: dict = field(default_factory=dict, repr=False)  # decoded images, by recording and image
 
     def __len__(self):
         return len(self.steering)
@@ -105,6 +107,16 @@ class Observations:
             return decode(path.read_bytes())
         except (OSError, ValueError) as error:
             raise RecordingError(f"{path}: {error}; it was whole when the run began. Restore it and --resume") from None
+
+    def read_cropped(self, at: int, camera: int) -> np.ndarray:
+        """uint8 (75, 320, 3), RGB, not to be changed. The first KEEP_CROPPED of them are read and decoded only once."""
+        key = self.recording[at], self.images[at, camera]
+        cropped = self.cropped.get(key)
+        if cropped is None:
+            cropped = np.ascontiguousarray(self.read(at, camera)[CROP[0]:FRAME[0] - CROP[1]])
+            if len(self.cropped) < KEEP_CROPPED:
+                self.cropped[key] = cropped
+        return cropped
 
 
 def find_folders(given: list[str]) -> list[Path]:
@@ -221,26 +233,37 @@ def resample(observations: Observations, seed: int) -> Observations:
 # The generator
 
 
-def brighten(image: np.ndarray, factor: float) -> np.ndarray:
-    """A copy of an RGB image, uint8 (rows, columns, 3), whose HSV value is multiplied, clipped and never wrapped."""
-    table = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 256, 3)
-    table[0, :, 2] = np.minimum(np.arange(256) * factor + 0.5, 255)
-    return cv2.cvtColor(cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGB2HSV), table), cv2.COLOR_HSV2RGB)
+def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, there: int, back: int) -> np.ndarray:
+    """One channel of another colour space multiplied, rounded and clipped at 255: uint8 (n, rows, columns, 3).
 
-
-def shade(image: np.ndarray, line: tuple[float, float], left: bool, factor: float, first_row: int = 0) -> np.ndarray:
-    """A copy of an RGB image, uint8 (rows, columns, 3), with the HLS lightness of one side of a line multiplied.
-
-    line: the columns where it meets the top and the bottom edge of the full frame of 160 rows; first_row: the frame's
-    row that is the image's first, for an image that is cropped.
+    factors: (n,); there, back: OpenCV's conversions. OpenCV takes all images as one tall one, as long calls let the
+    other threads go on.
     """
-    rows = np.arange(first_row, first_row + len(image))[:, None]
-    edge = line[0] + (line[1] - line[0]) * rows / FRAME[0]
-    shadow = ((np.arange(image.shape[1]) < edge) == left).astype(np.uint8)
-    table = np.arange(256, dtype=np.uint8).repeat(3).reshape(1, 256, 3)
-    table[0, :, 1] = np.arange(256) * factor + 0.5
-    dark = cv2.cvtColor(cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGB2HLS), table), cv2.COLOR_HLS2RGB)
-    return cv2.copyTo(dark, shadow, image.copy())
+    if not len(images):
+        return images
+    tall = cv2.cvtColor(images.reshape(-1, *images.shape[2:]), there)
+    values = cv2.extractChannel(tall, channel).reshape(len(images), -1)
+    values = np.minimum(np.multiply(values, factors[:, None], dtype=np.float32) + np.float32(0.5), 255).astype(np.uint8)
+    cv2.insertChannel(values.reshape(tall.shape[:2]), tall, channel)
+    return cv2.cvtColor(tall, back, dst=tall).reshape(images.shape)
+
+
+def brighten(images: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """RGB images, uint8 (n, rows, columns, 3), with their HSV value multiplied, clipped and never wrapped."""
+    return multiply_channel(images, 2, factors, cv2.COLOR_RGB2HSV, cv2.COLOR_HSV2RGB)
+
+
+def shade(images: np.ndarray, lines: np.ndarray, left: np.ndarray, factors: np.ndarray, first_row: int) -> np.ndarray:
+    """RGB images, uint8 (n, rows, columns, 3), with the HLS lightness on one side of a line multiplied.
+
+    lines: (n, 2), the columns where it meets the top and the bottom edge of the full frame of 160 rows; left: bool
+    (n,), the side; factors: (n,); first_row: the full frame's row that is the images' first.
+    """
+    rows = np.arange(first_row, first_row + images.shape[1])
+    edges = (lines[:, :1] + (lines[:, 1:] - lines[:, :1]) * rows / FRAME[0]).astype(np.float32)
+    shadow = (np.arange(images.shape[2], dtype=np.float32) < edges[:, :, None]) == left[:, None, None]
+    dark = multiply_channel(images, 1, factors, cv2.COLOR_RGB2HLS, cv2.COLOR_HLS2RGB)
+    return np.where(shadow[..., None], dark, images)
 
 
 def rank() -> int:
@@ -302,13 +325,18 @@ class Generator:
             "keep": bits.view(bool).reshape(total, UNITS),
         }
 
-    def images(self, drawn: dict, i: int, crop=CROP):
-        """The images of a batch's i-th observation: chosen, flipped, brightened, shadowed; None where it has none."""
-        frame = self.observations.read(drawn["observation"][i], drawn["camera"][i])
-        frame = np.ascontiguousarray(frame[crop[0]:FRAME[0] - crop[1]])
-        _, flipped, _, shadowed = drawn["places"][i] >= 0
-        return (frame, cv2.flip(frame, 1) if flipped else None, brighten(frame, drawn["brightness"][i]),
-                shade(frame, drawn["line"][i], drawn["left"][i], drawn["darkness"][i], crop[0]) if shadowed else None)
+    def augment(self, drawn: dict, part: np.ndarray, images: np.ndarray, first_row: int):
+        """Of each kind (as it is, flipped, brightened, shadowed): which observations have it, and their images.
+
+        part: indices into the batch's observations; images: theirs, uint8 (len(part), rows, 320, 3); first_row: the
+        full frame's row that is the images' first.
+        """
+        flipped, shadowed = (np.flatnonzero(drawn["places"][part, kind] >= 0) for kind in (1, 3))
+        dark = part[shadowed]
+        shadow = drawn["line"][dark], drawn["left"][dark], drawn["darkness"][dark]
+        return ((part, images), (part[flipped], images[flipped, :, ::-1]),
+                (part, brighten(images, drawn["brightness"][part])),
+                (dark, shade(images[shadowed], *shadow, first_row)))
 
     def begin(self, number: int):
         """Start making this rank's share of a batch; the returned call waits for it."""
@@ -320,11 +348,11 @@ class Generator:
         angles = np.empty(len(order), np.float32)
 
         def make(part):
-            for i in part:
-                for kind, image in enumerate(self.images(drawn, i)):
-                    if image is not None:
-                        at = np.searchsorted(order, drawn["places"][i, kind])
-                        images[at], angles[at] = image, drawn["angles"][i, kind]
+            cropped = np.stack([self.observations.read_cropped(at, camera) for at, camera in
+                                zip(drawn["observation"][part], drawn["camera"][part], strict=True)])
+            for kind, (which, made) in enumerate(self.augment(drawn, part, cropped, CROP[0])):
+                at = np.searchsorted(order, drawn["places"][which, kind])
+                images[at], angles[at] = made, drawn["angles"][which, kind]
 
         parts = [self.pool.submit(make, mine[start:start + PIECE]) for start in range(0, len(mine), PIECE)]
 
@@ -349,18 +377,18 @@ def batch_pictures(generator: Generator, number: int) -> dict[str, bytes]:
     """The report's two pictures of a batch's first observation: file name, with {} for the count, -> PNG."""
     drawn, observations = generator.draw(number), generator.observations
     at, camera = drawn["observation"][0], drawn["camera"][0]
-    frames = [observations.read(at, camera) for camera in range(3)]
+    frames = [observations.read(at, i) for i in range(3)]
     angles = observations.steering[at] + generator.corrections
-    drawn["places"][0] = np.abs(drawn["places"][0])  # show every kind, also what chance left out of the batch
-    chosen, *augmented = generator.images(drawn, 0, crop=(0, 0))
+    drawn["places"][0] = 0  # show every kind, also what chance left out of the batch
+    augmented = [made[0] for _, made in generator.augment(drawn, np.array([0]), frames[camera][None], first_row=0)]
     angle = drawn["angles"][0]
-    titles = ("flipped", f"brightness x {drawn['brightness'][0]:.2f}", f"shadow x {drawn['darkness'][0]:.2f}")
-    left, center, right = (panel(frames[i], name, angles[i]) for i, name in ((1, "left"), (0, "center"), (2, "right")))
+    titles = (f"{CAMERAS[camera]} camera", "flipped", f"brightness x {drawn['brightness'][0]:.2f}",
+              f"shadow x {drawn['darkness'][0]:.2f}")
+    center, left, right = (panel(*one) for one in zip(frames, CAMERAS, angles, strict=True))
     return {
         "training_generator_LRC_{}.png": side_by_side([left, center, right]),
-        "training_generator_augmented-{}.png": side_by_side([
-            panel(chosen, f"{('center', 'left', 'right')[camera]} camera", angle[0]),
-            *(panel(image, title, a) for image, title, a in zip(augmented, titles, angle[1:], strict=True))]),
+        "training_generator_augmented-{}.png": side_by_side(
+            [panel(*one) for one in zip(augmented, titles, angle, strict=True)]),
     }
 
 
@@ -526,7 +554,7 @@ class Run:
 def predict(network, observations: Observations, rows: np.ndarray, device, precision, pool) -> np.ndarray:
     """Steering for the centre images of these rows: float32 (len(rows),)."""
     def part(chosen):
-        frames = np.stack([observations.read(at, 0)[CROP[0]:FRAME[0] - CROP[1]] for at in chosen])
+        frames = np.stack([observations.read_cropped(at, 0) for at in chosen])
         with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16):
             return network(torch.from_numpy(frames).to(device)).cpu().numpy()
 

@@ -11,7 +11,8 @@ def panel(frame: np.ndarray, title: str, angle: float) -> Image.Image:
     """A frame at twice its size under a title, with the angle as a number and as the way that the wheels point."""
     height, width = frame.shape[0] * 2, frame.shape[1] * 2
     picture = Image.new("RGB", (width, height + 40), "white")
-    picture.paste(Image.fromarray(frame).resize((width, height), Image.Resampling.BICUBIC), (0, 40))
+    image = Image.fromarray(np.ascontiguousarray(frame))
+    picture.paste(image.resize((width, height), Image.Resampling.BICUBIC), (0, 40))
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(26)
     draw.text((10, 4), title, "black", font)

@@ -86,17 +86,23 @@ def test_brightness_is_opencvs_hsv_value_clipped_and_never_wrapped(factor):
     image = np.random.default_rng(0).integers(0, 256, (75, 320, 3), np.uint8)
     image[:20] = 250  # would wrap
     value = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)[..., 2].astype(float)
-    got = cv2.cvtColor(brighten(image, factor), cv2.COLOR_RGB2HSV)[..., 2]
+    changed, one = brighten(np.stack([image, image]), np.array([factor, 1]))
+    got = cv2.cvtColor(changed, cv2.COLOR_RGB2HSV)[..., 2]
     assert np.abs(got - np.minimum(value * factor, 255)).max() <= 1
     exact = image * np.minimum(factor, 255 / np.maximum(image.max(-1, keepdims=True), 1))  # same hue and saturation
-    assert np.abs(brighten(image, factor) - exact).mean() < 1.5
+    assert np.abs(changed - exact).mean() < 1.5
+    assert np.abs(one.astype(int) - image).mean() < 1.5  # each image by its own factor
+
+
+def one_shaded(image, line, left, factor, first_row=0):
+    return shade(image[None], np.array([line]), np.array([left]), np.array([factor]), first_row)[0]
 
 
 @pytest.mark.parametrize("left", [True, False])
 def test_shadow_is_opencvs_hls_lightness_on_one_side_of_the_line(left):
     image = np.random.default_rng(0).integers(0, 256, (160, 320, 3), np.uint8)
     top, bottom, factor = 250.0, 40.0, 0.3
-    got = shade(image, (top, bottom), left, factor)
+    got = one_shaded(image, (top, bottom), left, factor)
     polygon = np.array([[0, 0], [top, 0], [bottom, 160], [0, 160]], np.int32)  # OpenCV's own drawing as the oracle
     inside = cv2.fillPoly(np.zeros((160, 320), np.uint8), [polygon], 1) == (1 if left else 0)
     edge = cv2.dilate(cv2.Canny(inside.astype(np.uint8) * 255, 1, 2), np.ones((5, 5))) > 0
@@ -108,8 +114,8 @@ def test_shadow_is_opencvs_hls_lightness_on_one_side_of_the_line(left):
 
 def test_shadow_of_a_cropped_image_is_the_crop_of_the_shadowed_frame():
     image = np.random.default_rng(0).integers(0, 256, (160, 320, 3), np.uint8)
-    whole = shade(image, (30.5, 300.2), True, 0.4)
-    np.testing.assert_array_equal(shade(image[60:135].copy(), (30.5, 300.2), True, 0.4, first_row=60), whole[60:135])
+    whole = one_shaded(image, (30.5, 300.2), True, 0.4)
+    np.testing.assert_array_equal(one_shaded(image[60:135], (30.5, 300.2), True, 0.4, 60), whole[60:135])
 
 
 def test_chances_and_ranges_over_many_draws(generator):
@@ -152,8 +158,7 @@ def test_images_and_angles_of_an_observation(generator):
                                    np.array([angle, -angle, angle, angle])[places >= 0], rtol=1e-6)
         if places[1] >= 0:
             np.testing.assert_array_equal(cv2.flip(batch.images[places[1]], 1), jpeg)  # twice is the identity
-        np.testing.assert_array_equal(batch.images[places[2]], brighten(np.ascontiguousarray(jpeg),
-                                                                        drawn["brightness"][i]))
+        np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], drawn["brightness"][i:i + 1])[0])
 
 
 def test_a_batch_depends_on_seed_and_number_alone(generator):
