@@ -33,6 +33,7 @@ from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from arithmetic import PIECE, SquaredErrors, choose_device, choose_precision, keep_freed_memory, one_thread, threads
+from images import FRAME, check_images, decode
 from network import (
     CROP,
     UNITS,
@@ -46,7 +47,7 @@ from network import (
     write,
 )
 from pictures import loss_picture, panel, side_by_side
-from recordings import CAMERAS, FRAME, LOG, Recording, RecordingError, check_images, decode, read_recording
+from recordings import CAMERAS, LOG, Recording, RecordingError, find_folders, print_findings, read_recording
 
 # The recipe's figures (report, "Data Pipeline") that are no options.
 STRAIGHT, KEEP_STRAIGHT = 0.02, 0.8  # |steering| below which an observation is kept with this probability
@@ -119,25 +120,6 @@ class Observations:
         return cropped
 
 
-def find_folders(given: list[str]) -> list[Path]:
-    """The folders with a driving_log.csv among and below those given, each once. Raises RecordingError."""
-    folders: dict[Path, Path] = {}
-    for name in given:
-        path = Path(name)
-        if not path.exists():
-            raise RecordingError(f"{path}: no such folder. {WHERE_TO_GET_RECORDINGS}")
-        logs = [path / LOG] if (path / LOG).is_file() else sorted(path.rglob(LOG)) if path.is_dir() else []
-        if not logs:
-            raise RecordingError(f"{path}: no {LOG} in or below it. {WHERE_TO_GET_RECORDINGS}")
-        for log in logs:
-            folders.setdefault(log.parent.resolve(), log.parent)
-    return list(folders.values())
-
-
-WHERE_TO_GET_RECORDINGS = ("Record some in the simulator (training mode, button R), or unpack the public sample data "
-                           "there: data/README.md says how. A recording is a folder with driving_log.csv and IMG/.")
-
-
 def read_observations(folders: list[Path], throttle_threshold: float, strict: bool,
                       rejected_file: Path) -> Observations:
     """Steps 2 to 4 of the report: read each csv, drop rows off throttle, rewrite the images' paths; print the counts.
@@ -176,21 +158,6 @@ def read_observations(folders: list[Path], throttle_threshold: float, strict: bo
         why = "--throttle-threshold drops most of them" if table[-1][3] > table[-1][2] else f"see {rejected_file}"
         raise RecordingError(f"{len(observations)} rows are left of {table[-1][1]}, at least {FOLDS} are needed: {why}")
     return observations
-
-
-def print_findings(recording: Recording) -> None:
-    """What was read otherwise than written, and what was left out: file, line, remedy; five a kind."""
-    path = recording.folder / LOG
-    for kind, (count, line) in recording.repairs.items():
-        print(f"{path}: line {line}: {kind} ({count} rows; read so, check that it is meant)")
-    kinds: dict[str, list] = {}
-    for line, kind, detail in recording.rejected:
-        kinds.setdefault(kind, []).append((line, detail))
-    for found in kinds.values():
-        for line, detail in found[:5]:
-            print(f"{path}: line {line}: left out: {detail}")
-        if len(found) > 5:
-            print(f"{path}: … and {len(found) - 5} more of this kind")
 
 
 def split(observations: Observations, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from recordings import FRAME
+from images import FRAME
 
 FORMAT, VERSION = "behavioral-cloning", 1  # of model.pt
 CROP = (60, 25)  # rows cut off the top and the bottom

@@ -9,8 +9,9 @@ import pytest
 from conftest import draw_recording
 
 import model
+from images import check_images
 from model import Generator, Observations, brighten, resample, shade, split
-from recordings import Recording, check_images, read_recording
+from recordings import Recording, read_recording
 
 
 def recording(n, name="lake", seconds=0.0714, first=0):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from conftest import draw_recording
 
-from recordings import RecordingError, check_images, decode, jpeg_size, read_recording
+from images import check_images, decode, jpeg_size
+from recordings import RecordingError, read_recording
 
 STAMPS = ["2018_07_16_17_11_43_382", "2018_07_16_17_11_43_453", "2018_07_16_17_11_43_524"]
 
@@ -143,7 +144,7 @@ def test_unchanged_images_are_not_looked_at_again(copied, monkeypatch):
     first = read_recording(copied)
     check_images(first)
     looked_at = []
-    monkeypatch.setattr("recordings.decode", lambda jpeg: looked_at.append(jpeg) or decode(jpeg))
+    monkeypatch.setattr("images.decode", lambda jpeg: looked_at.append(jpeg) or decode(jpeg))
     changed = copied / "IMG" / os.fsdecode(first.names[7])
     changed.write_bytes(changed.read_bytes()[:100])
     again = read_recording(copied)
