@@ -15,6 +15,7 @@ import csv
 import functools
 import hashlib
 import io
+import itertools
 import json
 import os
 import signal
@@ -22,7 +23,7 @@ import sys
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -88,7 +89,11 @@ class Observations:
     steering: np.ndarray
     frame: np.ndarray
     time: np.ndarray
-    cropped: dict = field(default_factory=dict, repr=False)  # decoded images, by recording and image
+
+    def __post_init__(self):
+        # Decoded images, by recording and image; memory is only taken as it is filled, all in one piece.
+        self.cropped = np.empty((KEEP_CROPPED, FRAME[0] - sum(CROP), *FRAME[1:]), np.uint8)
+        self.places, self.free = {}, itertools.count()
 
     def __len__(self):
         return len(self.steering)
@@ -112,11 +117,12 @@ class Observations:
     def read_cropped(self, at: int, camera: int) -> np.ndarray:
         """uint8 (75, 320, 3), RGB, not to be changed. The first KEEP_CROPPED of them are read and decoded only once."""
         key = self.recording[at], self.images[at, camera]
-        cropped = self.cropped.get(key)
-        if cropped is None:
-            cropped = np.ascontiguousarray(self.read(at, camera)[CROP[0]:FRAME[0] - CROP[1]])
-            if len(self.cropped) < KEEP_CROPPED:
-                self.cropped[key] = cropped
+        if key in self.places:
+            return self.cropped[self.places[key]]
+        cropped = self.read(at, camera)[CROP[0]:FRAME[0] - CROP[1]]
+        if (place := next(self.free)) < KEEP_CROPPED:
+            self.cropped[place] = cropped
+            self.places[key] = place
         return cropped
 
 
