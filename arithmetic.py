@@ -34,6 +34,20 @@ def choose_precision(device: torch.device) -> torch.dtype:
     return torch.bfloat16 if fast else torch.float32
 
 
+def in_precision(precision: torch.dtype, device: torch.device):
+    """The context in which the network multiplies in this precision; weights and their updates stay float32."""
+    # No weight is used twice in a pass, so that keeping their casts would only tie the pool's threads together.
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16, cache_enabled=False)
+
+
+def repeatable(device: torch.device) -> None:
+    """Have a GPU, too, give the same numbers for the same seed, as a CPU does."""
+    if device.type == "cuda":
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        torch.utils.deterministic.fill_uninitialized_memory = False  # a check that costs time, not a need
+
+
 def keep_freed_memory() -> None:
     """Have glibc keep freed blocks instead of returning them and faulting them in again: a step is 8 to 20 % faster."""
     if sys.platform == "linux":
@@ -44,14 +58,14 @@ def keep_freed_memory() -> None:
 
 
 def one_thread() -> None:
-    """For the pool's threads: each computes on its own core, without waiting for the others within an operation."""
+    """Have this thread compute by itself: the pool's threads, one to a core, leave no core that could help it."""
     torch.set_num_threads(1)
 
 
 def squared_errors(network, precision, device, images, angles, keep=None) -> torch.Tensor:
     """The sum over the images of (predicted - recorded steering)²."""
     images, angles = torch.from_numpy(images).to(device), torch.from_numpy(angles).to(device)
-    with torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16):
+    with in_precision(precision, device):
         predicted = network(images, None if keep is None else torch.from_numpy(keep).to(device))
     return ((predicted - angles) ** 2).sum()
 

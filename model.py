@@ -33,7 +33,17 @@ import torch.distributed as dist
 from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
-from arithmetic import PIECE, SquaredErrors, choose_device, choose_precision, keep_freed_memory, one_thread, threads
+from arithmetic import (
+    PIECE,
+    SquaredErrors,
+    choose_device,
+    choose_precision,
+    in_precision,
+    keep_freed_memory,
+    one_thread,
+    repeatable,
+    threads,
+)
 from images import FRAME, check_images, decode
 from network import (
     CROP,
@@ -380,6 +390,8 @@ class Run:
         self.folder = self.last_file.parent
         torch.manual_seed(arguments.seed)
         self.network = Network().to(self.device, memory_format=torch.channels_last)
+        repeatable(self.device)
+        one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
         self.errors = SquaredErrors(self.network, self.precision, self.device, self.pool)
         if dist.is_initialized():
@@ -528,7 +540,7 @@ def predict(network, observations: Observations, rows: np.ndarray, device, preci
     """Steering for the centre images of these rows: float32 (len(rows),)."""
     def part(chosen):
         frames = np.stack([observations.read_cropped(at, 0) for at in chosen])
-        with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16):
+        with torch.inference_mode(), in_precision(precision, device):
             return network(torch.from_numpy(frames).to(device)).cpu().numpy()
 
     return np.concatenate([np.empty(0, np.float32),
