@@ -16,7 +16,7 @@ def panel(frame: np.ndarray, title: str, angle: float) -> Image.Image:
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(26)
     draw.text((10, 4), title, "black", font)
-    draw.text((width - 10, 4), f"steering {angle:+.3f}", "black", font, anchor="ra")
+    draw.text((width - 10, 4), f"steering {angle + 0:+.3f}", "black", font, anchor="ra")
     heading = np.radians(25 * angle)  # steering -1..1 is -25°..25° at the front wheels
     start, end = (width / 2, height + 10), (width / 2 + 150 * np.sin(heading), height + 10 - 150 * np.cos(heading))
     draw.line([start, end], "black", 9)
