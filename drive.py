@@ -280,8 +280,9 @@ def main() -> None:
     except OSError as error:
         sys.exit(f"drive.py: can't listen on {args.host}:{args.port} ({error.strerror}); is another server running? "
                  "Stop it, or choose another --port")
-    print(f"Listening on {args.host}:{args.port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
-          f"Watch at http://127.0.0.1:{args.port}/ . Ctrl-C ends.", file=sys.stderr, flush=True)
+    port = listener.getsockname()[1]
+    print(f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
+          f"Watch at http://127.0.0.1:{port}/ . Ctrl-C ends.", file=sys.stderr, flush=True)
     try:
         run(server, listener)
     finally:

@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from datetime import datetime
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -54,9 +55,9 @@ def rate(times: list[datetime]) -> Fraction:
 
     The mean, for frames arrive two or three at once: the median gap would be that within such a bunch.
     """
-    gaps = [(after - before).total_seconds() for before, after in zip(times, times[1:], strict=False)]
+    gaps = [(after - before).total_seconds() for before, after in pairwise(times)]
     gaps = [gap for gap in gaps if gap < PAUSE]
-    return Fraction(min(240.0, max(1.0, len(gaps) / sum(gaps))) if gaps else 15).limit_denominator(1000)
+    return Fraction(min(240.0, max(1.0, len(gaps) / sum(gaps))) if sum(gaps) else 15).limit_denominator(1000)
 
 
 def read(path: Path) -> np.ndarray | None:

@@ -17,6 +17,7 @@ import socketio
 from engineio.async_drivers import eventlet as driver
 
 MAX_MESSAGE = 1 << 20  # bytes; a telemetry message has about 16,000
+PACKETS = {str: "0123456", bytes: b"\0\1\2\3\4\5\6"}  # Engine.IO's types, with which a message begins
 MESSAGE = re.compile(r'2\d{0,9}\["|5[1-9]-\d{0,9}\["|[0134].{0,200}$')  # Socket.IO: event, with attachments, the rest
 QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux alone delays ACKs so that the simulator waits for them
 
@@ -63,9 +64,12 @@ class WebSocket(eventlet.websocket.RFC6455WebSocket):
         self.max_frame_length = float("inf")  # Message bounds it
 
     def wait(self):
-        # The last answer leaves and the other clients have their turn, although more may be buffered here.
-        eventlet.sleep(0)
-        return super().wait()
+        while True:
+            # The last answer leaves and the other clients have their turn, although more may be buffered here.
+            eventlet.sleep(0)
+            message = super().wait()
+            if message is None or message[:1] in PACKETS[type(message)]:  # python-engineio breaks on some others
+                return message
 
     def _recv_frame(self, message=None):
         frame = super()._recv_frame(message)
