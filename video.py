@@ -19,6 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 import frames
+from recordings import FRAME, jpeg_size
 
 PAUSE = 1.0  # seconds between two frames from which it is a pause, which says nothing about the rate
 
@@ -61,13 +62,19 @@ def rate(times: list[datetime]) -> Fraction:
 
 
 def read(path: Path) -> np.ndarray | None:
-    """A frame of any size, uint8 (rows, columns, 3), RGB; None if it is unreadable."""
-    data = np.fromfile(path, np.uint8)
-    return cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+    """A frame of any size, uint8 (rows, columns, 3), RGB; None if it is unreadable or cut short."""
+    try:
+        jpeg = path.read_bytes()
+        jpeg_size(jpeg)
+    except (OSError, ValueError):
+        return None
+    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
 
 
 def film(folder: Path, fps: Fraction | None = None, overlay=None) -> Path:
     """Write `folder`.mp4 beside the folder: H.264 in yuv420p, which browsers and desktop players play.
+
+    PyAV's wheel brings FFmpeg's libraries with x264: no program to install, and the film is finished or an error.
 
     overlay: a function from a frame to its picture. Raises FilmError.
     """
@@ -112,26 +119,42 @@ def film(folder: Path, fps: Fraction | None = None, overlay=None) -> Path:
 
 
 def overlay_of(model_file: str):
-    """The overlay with the network's own steering and what it looks at."""
-    import attention
-    from network import load_model
-    network = load_model(model_file)
+    """The overlay with the network's own steering and what it looks at. Raises FilmError."""
+    import attention  # which loads torch, and that takes longer than a short film
+    from network import ModelError, load_model
+    try:
+        network = load_model(model_file)
+    except ModelError as error:
+        raise FilmError(error) from None
 
     def overlay(frame: np.ndarray) -> np.ndarray:
+        if frame.shape != FRAME:
+            raise FilmError(f"the frames are {frame.shape[1]}x{frame.shape[0]} where a model sees "
+                            f"{FRAME[1]}x{FRAME[0]}; leave out --overlay")
         return attention.draw(frame, *attention.look(network, frame))
     return overlay
+
+
+def frame_rate(text: str) -> Fraction:
+    rate = Fraction(text)
+    if not 0 < rate <= 1000:
+        raise ValueError
+    return rate
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the frames; its film is FOLDER.mp4")
-    parser.add_argument("--fps", type=Fraction, help="frames per second (default: by the frames' times)")
+    parser.add_argument("--fps", type=frame_rate, help="frames per second, up to 1000 (default: by the frames' times)")
     parser.add_argument("--overlay", metavar="MODEL", help="draw this model's steering and what it looks at")
     args = parser.parse_args()
+    folder = args.folder if args.folder.name not in ("", "..") else args.folder.resolve()  # "." has a name, too
     try:
-        film(args.folder.resolve(), args.fps, overlay_of(args.overlay) if args.overlay else None)
-    except FilmError as error:
+        film(folder, args.fps, overlay_of(args.overlay) if args.overlay else None)
+    except (FilmError, OSError) as error:
         sys.exit(f"video.py: {error}")
+    except KeyboardInterrupt:
+        sys.exit("video.py: stopped; no film was written")
 
 
 if __name__ == "__main__":
