@@ -24,6 +24,7 @@ import wire
 from network import ModelError, Network, load_model
 from recordings import FRAME, decode
 
+NUMBERS = ("steering_angle", "throttle", "speed")  # of a telemetry: degrees, -1..1, mph
 log = logging.getLogger("drive")
 
 
@@ -46,16 +47,21 @@ def number(telemetry: dict, key: str) -> float:
     return value
 
 
+def writes_commas(telemetry, before: bool) -> bool:
+    """Whether the simulator writes decimal commas; what it was before, if it writes no decimals now."""
+    numbers = [telemetry.get(key) for key in NUMBERS] if isinstance(telemetry, dict) else []
+    marks = [mark for number in numbers for mark in re.findall(r"\d([.,])\d", str(number))]
+    return "," in marks if marks else before
+
+
 def read(telemetry) -> tuple[bytes, np.ndarray, float]:
     """The image as received (JPEG), decoded (uint8 (160, 320, 3), RGB), and the speed (mph). Raises Unusable."""
     if not isinstance(telemetry, dict):
         raise Unusable("it is no object")
-    for key in ("steering_angle", "throttle", "speed", "image"):
+    for key in (*NUMBERS, "image"):
         if key not in telemetry:
             raise Unusable(f"{key} is missing")
-    number(telemetry, "steering_angle")
-    number(telemetry, "throttle")
-    speed = number(telemetry, "speed")
+    *_, speed = (number(telemetry, key) for key in NUMBERS)
     try:
         jpeg = base64.b64decode(telemetry["image"], validate=True)
     except (TypeError, ValueError) as error:
@@ -114,12 +120,9 @@ class Session:
         arrived = self.arrived()
         if self._sent:
             self.round_trip = arrived - self._sent.popleft()
-        if isinstance(telemetry, dict):
-            numbers = [str(telemetry.get(key)) for key in ("steering_angle", "throttle", "speed")]
-            if any(re.search(r"\d[.,]\d", text) for text in numbers):
-                self.comma = any("," in text for text in numbers)
         throttle = "0"
         try:
+            self.comma = writes_commas(telemetry, self.comma)
             jpeg, frame, speed = read(telemetry)
             steering = self.server.steer(frame)
             throttle = text(self.controller.throttle(speed))
@@ -254,12 +257,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", help="a model file that model.py wrote")
     parser.add_argument("folder", nargs="?", type=Path, help="where to save the frames; emptied first")
-    parser.add_argument("--speed", type=float, default=9, help="set speed in mph (default %(default)s)")
+    parser.add_argument("--speed", type=float, default=9, help="set speed in mph, the car does 30 (default %(default)s)")
     parser.add_argument("--host", default="127.0.0.1",
                         help="address to listen on (default %(default)s: this machine alone; 0.0.0.0: everyone)")
     parser.add_argument("--port", type=int, default=4567, help="the simulator's is %(default)s")
-    parser.add_argument("--device", default="cpu", help="where the network runs: cpu (default) or cuda")
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"],
+                        help="where the network runs (default %(default)s, which is fast enough)")
     args = parser.parse_args()
+    if args.device == "cuda" and not torch.cuda.is_available():
+        parser.error("--device cuda: torch finds no GPU here; leave it out")
+    if not 0 < args.speed < math.inf:
+        parser.error("--speed: a number of mph above 0, please")
 
     handler = logging.StreamHandler()
     handler.addFilter(OncePerKind())
@@ -277,9 +285,9 @@ def main() -> None:
             server.saver = saver = frames.Saver(args.folder)
     except (ModelError, frames.FolderError) as error:
         sys.exit(f"drive.py: {error}")
-    except OSError as error:
-        sys.exit(f"drive.py: can't listen on {args.host}:{args.port} ({error.strerror}); is another server running? "
-                 "Stop it, or choose another --port")
+    except (OSError, OverflowError) as error:
+        sys.exit(f"drive.py: can't listen on {args.host}:{args.port} ({getattr(error, 'strerror', None) or error}); "
+                 "is another server running? Stop it, or choose another --port")
     port = listener.getsockname()[1]
     print(f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
           f"Watch at http://127.0.0.1:{port}/ . Ctrl-C ends.", file=sys.stderr, flush=True)

@@ -30,9 +30,11 @@ def taken_at(name: str) -> datetime | None:
 
 def check(folder: Path) -> None:
     """Raises FolderError if emptying the folder would delete anything but frames."""
-    if folder.exists() and not folder.is_dir():
+    if not folder.exists():
+        return
+    if not folder.is_dir():
         raise FolderError(f"{folder}: not a folder; name another one for the frames")
-    for entry in folder.iterdir() if folder.exists() else ():
+    for entry in folder.iterdir():
         if not entry.is_file() or not (taken_at(entry.name) or entry.name == BESIDE):
             raise FolderError(f"{folder}: holds {entry.name}, which is no frame, so it is not emptied; "
                               "name another folder or move that away")
@@ -41,9 +43,12 @@ def check(folder: Path) -> None:
 def empty(folder: Path) -> None:
     """Make the folder, or empty it of its frames. Raises FolderError."""
     check(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    for entry in folder.iterdir():
-        entry.unlink()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for entry in folder.iterdir():
+            entry.unlink()
+    except OSError as error:
+        raise FolderError(f"{folder}: can't be made or emptied ({error.strerror}); name another one") from error
 
 
 class Saver:
@@ -63,7 +68,6 @@ class Saver:
         path, self._first = self._first, None
         if path is None:
             path = next(path for path in self._free if not path.exists())
-            path.mkdir()
         log.info(f"saving frames in {path}")
         return Folder(path, self._queue)
 
@@ -76,6 +80,7 @@ class Saver:
         while (item := self._queue.get()) is not None:
             path, jpeg = item
             try:
+                path.parent.mkdir(exist_ok=True)
                 beside = path.with_name(BESIDE)  # renamed when whole, so a kill leaves no half of a frame
                 beside.write_bytes(jpeg)
                 os.replace(beside, path)
