@@ -56,6 +56,8 @@ def writes_commas(telemetry, before: bool) -> bool:
 
 def read(telemetry) -> tuple[bytes, np.ndarray, float]:
     """The image as received (JPEG), decoded (uint8 (160, 320, 3), RGB), and the speed (mph). Raises Unusable."""
+    if telemetry is wire.UNREADABLE:
+        raise Unusable(f"its JSON breaks off, or it is longer than {wire.MAX_MESSAGE} bytes")
     if not isinstance(telemetry, dict):
         raise Unusable("it is no object")
     for key in (*NUMBERS, "image"):
@@ -142,7 +144,7 @@ class Session:
         return {key: value.replace(".", ",") for key, value in answer.items()} if self.comma else answer
 
     def arrived(self) -> float:
-        """time.perf_counter() of the first bytes of the message that is being answered."""
+        """time.perf_counter() at the first fragment of the message that is being answered."""
         websocket = self.environ.get("drive.websocket")  # none while a client still polls
         return websocket.arrived if websocket else time.perf_counter()
 
@@ -257,7 +259,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", help="a model file that model.py wrote")
     parser.add_argument("folder", nargs="?", type=Path, help="where to save the frames; emptied first")
-    parser.add_argument("--speed", type=float, default=9, help="set speed in mph, the car does 30 (default %(default)s)")
+    parser.add_argument("--speed", type=float, default=9, help="set speed in mph, at most 30 (default %(default)s)")
     parser.add_argument("--host", default="127.0.0.1",
                         help="address to listen on (default %(default)s: this machine alone; 0.0.0.0: everyone)")
     parser.add_argument("--port", type=int, default=4567, help="the simulator's is %(default)s")
@@ -280,14 +282,15 @@ def main() -> None:
         if args.folder:
             frames.check(args.folder)
         server = DriveServer(network, args.speed)
-        listener = wire.listen(args.host, args.port)
+        try:
+            listener = wire.listen(args.host, args.port)
+        except (OSError, OverflowError) as error:
+            sys.exit(f"drive.py: can't listen on {args.host}:{args.port} ({getattr(error, 'strerror', error)}); "
+                     "is another server running? Stop it, or choose another --port")
         if args.folder:
-            server.saver = saver = frames.Saver(args.folder)
-    except (ModelError, frames.FolderError) as error:
+            server.saver = saver = frames.Saver(args.folder)  # empties the folder, so it comes last
+    except (ModelError, frames.FolderError, OSError) as error:
         sys.exit(f"drive.py: {error}")
-    except (OSError, OverflowError) as error:
-        sys.exit(f"drive.py: can't listen on {args.host}:{args.port} ({getattr(error, 'strerror', None) or error}); "
-                 "is another server running? Stop it, or choose another --port")
     port = listener.getsockname()[1]
     print(f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
           f"Watch at http://127.0.0.1:{port}/ . Ctrl-C ends.", file=sys.stderr, flush=True)

@@ -35,7 +35,8 @@ def check(folder: Path) -> None:
     if not folder.is_dir():
         raise FolderError(f"{folder}: not a folder; name another one for the frames")
     for entry in folder.iterdir():
-        if not entry.is_file() or not (taken_at(entry.name) or entry.name == BESIDE):
+        saved = taken_at(entry.name) and not entry.name.startswith("center_")  # which is a recording's
+        if not entry.is_file() or not (saved or entry.name == BESIDE):
             raise FolderError(f"{folder}: holds {entry.name}, which is no frame, so it is not emptied; "
                               "name another folder or move that away")
 
@@ -57,7 +58,8 @@ class Saver:
 
     def __init__(self, path: Path):
         empty(path)
-        self._free = (path.with_name(f"{path.name}-{number}") for number in itertools.count(2))
+        beside = path.resolve()  # "." has a name, too
+        self._free = (beside.with_name(f"{beside.name}-{number}") for number in itertools.count(2))
         self._first = path
         self._queue = queue.Queue(WAITING)
         self._thread = threading.Thread(target=self._write)

@@ -23,7 +23,7 @@ class Row(NamedTuple):
     steering: float  # -1..1
     speed: float  # mph
     throttle: float  # -1..1
-    latency: float  # ms from the telemetry's first bytes to its answer
+    latency: float  # ms from the telemetry's first fragment to its answer
 
 
 def create_app(server) -> flask.Flask:

@@ -19,6 +19,7 @@ from engineio.async_drivers import eventlet as driver
 MAX_MESSAGE = 1 << 20  # bytes; a telemetry message has about 16,000
 PACKETS = {str: "0123456", bytes: b"\0\1\2\3\4\5\6"}  # Engine.IO's types, with which a message begins
 MESSAGE = re.compile(r'2\d{0,9}\["|5[1-9]-\d{0,9}\["|[0134].{0,200}$')  # Socket.IO: event, with attachments, the rest
+UNREADABLE = object()  # what a handler gets in place of a telemetry that is no JSON, or too long to be read
 QUICKACK = getattr(socket, "TCP_QUICKACK", None)  # Linux alone delays ACKs so that the simulator waits for them
 
 
@@ -47,7 +48,7 @@ class QuickSocket:
 class WebSocket(eventlet.websocket.RFC6455WebSocket):
     """eventlet's websocket with a fast mask, and messages bounded as a whole rather than by the fragment."""
 
-    arrived = 0.0  # time.perf_counter() of the first bytes of the message that is being read or was read last
+    arrived = 0.0  # time.perf_counter() at the first fragment of the last message
 
     class Message(eventlet.websocket.RFC6455WebSocket.Message):
         length = 0
@@ -98,7 +99,7 @@ class WebSocketWSGI(driver.WebSocketWSGI):
 
 
 class Json:
-    """The `json` of python-socketio: a telemetry message that breaks off still arrives, as one without its keys."""
+    """The `json` of python-socketio: a telemetry that can't be read still arrives, as UNREADABLE."""
 
     dumps = staticmethod(json.dumps)
 
@@ -108,7 +109,7 @@ class Json:
             return json.loads(text)
         except (ValueError, RecursionError) as error:
             if text.startswith('["telemetry"'):
-                return ["telemetry", {}]
+                return ["telemetry", UNREADABLE]
             raise ValueError(f"not JSON: {type(error).__name__}") from None
 
 
@@ -124,7 +125,7 @@ class Server(socketio.Server):
 
     def _handle_eio_message(self, sid, data):
         # What is no message is dropped here: python-socketio takes quadratic time over the digits of a long header.
-        if isinstance(data, bytes) or MESSAGE.match(data or ""):
+        if isinstance(data, bytes) or (isinstance(data, str) and MESSAGE.match(data)):
             super()._handle_eio_message(sid, data)
 
 

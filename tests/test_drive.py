@@ -197,7 +197,7 @@ def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
     (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
     frames.empty(folder)
     assert list(folder.iterdir()) == []
-    for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "left_2018_07_16_17_11_43_382.jpg"):
+    for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "center_2018_07_16_17_11_43_382.jpg"):
         (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
         (folder / foreign).write_bytes(b"mine")
         with pytest.raises(frames.FolderError, match=foreign):
