@@ -5,8 +5,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from images import FRAME
 from network import Network
-from recordings import FRAME
 
 # The centre camera, for drawing on the road: focal length (px), horizon (row), height (m); and the car's wheelbase (m).
 FOCAL, HORIZON, HEIGHT, WHEELBASE = 138.6, 61, 1.2, 2.87

@@ -21,8 +21,8 @@ import torch
 import frames
 import page
 import wire
+from images import FRAME, decode
 from network import ModelError, Network, load_model
-from recordings import FRAME, decode
 
 NUMBERS = ("steering_angle", "throttle", "speed")  # of a telemetry: degrees, -1..1, mph
 log = logging.getLogger("drive")

@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 import frames
-from recordings import FRAME, jpeg_size
+from images import FRAME, jpeg_size
 
 PAUSE = 1.0  # seconds between two frames from which it is a pause, which says nothing about the rate
 

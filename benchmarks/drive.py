@@ -26,8 +26,8 @@ from client import Simulator, fragments, telemetry
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
+from images import decode  # noqa: E402
 from network import load_model  # noqa: E402
-from recordings import decode  # noqa: E402
 
 TICKS = 100  # a second, in /proc/PID/stat
 

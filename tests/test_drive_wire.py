@@ -22,8 +22,8 @@ import torch
 from conftest import ROOT, draw_frame
 
 from benchmarks.client import Simulator, fragments, telemetry
+from images import decode
 from network import Network, load_model, save_model
-from recordings import decode
 
 
 class Process:
