@@ -85,8 +85,10 @@ class PieceByPiece(torch.autograd.Function):
                                       batch.keep[part])
             return loss.detach(), torch.autograd.grad(loss, parameters)
 
+        pieces = pool.map(piece, range(0, len(batch.angles), PIECE))
+        batch.begin_next()
         loss, gradients = torch.zeros(()), None
-        for part, found in pool.map(piece, range(0, len(batch.angles), PIECE)):
+        for part, found in pieces:
             loss += part
             if gradients is None:
                 gradients = [gradient.clone() for gradient in found]
@@ -110,4 +112,5 @@ class SquaredErrors(nn.Module):
     def forward(self, batch) -> torch.Tensor:
         if self.device.type == "cpu":
             return PieceByPiece.apply(self.network, self.precision, self.pool, batch, *self.network.parameters())
+        batch.begin_next()
         return squared_errors(self.network, self.precision, self.device, batch.images, batch.angles, batch.keep)

@@ -22,6 +22,7 @@ import signal
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -262,13 +263,15 @@ class Batch:
     """One rank's share of a batch.
 
     images uint8 (n, 75, 320, 3) RGB, cropped; angles float32 (n,); keep bool (n, 4224): what dropout leaves of the
-    flattened layer; total: images in the whole batch, over all ranks.
+    flattened layer; total: images in the whole batch, over all ranks; begin_next: to be called once this batch's
+    work is handed to the pool, so that the next one's images are made where cores fall idle.
     """
 
     images: np.ndarray
     angles: np.ndarray
     keep: np.ndarray
     total: int
+    begin_next: Callable[[], None] = lambda: None
 
 
 class Generator:
@@ -348,12 +351,17 @@ class Generator:
 
     def batches(self, number: int):
         """Batches from this number on."""
-        begun = deque()
+        begun, numbers = deque(), itertools.count(number)
+
+        def begin_next():
+            begun.append(self.begin(next(numbers)))
+
         while True:
-            while len(begun) <= self.ahead:
-                begun.append(self.begin(number))
-                number += 1
-            yield begun.popleft()()
+            while len(begun) < self.ahead:
+                begin_next()
+            batch = begun.popleft()()
+            batch.begin_next = begin_next
+            yield batch
 
 
 def batch_pictures(generator: Generator, number: int) -> dict[str, bytes]:
@@ -398,7 +406,7 @@ class Run:
             self.errors = DistributedDataParallel(self.errors)
         self.optimizer = torch.optim.Adam(self.network.parameters(), arguments.learning_rate, fused=True)
         self.generator = Generator(training, arguments.batch_size, arguments.side_correction, arguments.seed,
-                                   self.pool, ahead=1 if self.device.type == "cpu" else 4)
+                                   self.pool, ahead=2 if self.device.type == "cpu" else 4)
         self.number = 0  # of the next batch, over all epochs
         self.images, self.loss, self.seconds = 0, 0.0, 0.0  # so far in this epoch
         self.history: list[dict] = []  # a finished epoch each

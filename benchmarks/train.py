@@ -63,8 +63,7 @@ def part_a(run, _):
 
 
 def part_b(run, steps):
-    batch = next(run.generator.batches(0))
-    run.generator.pool.submit(int).result()
+    batch = run.generator.begin(0)()
 
     def step():
         (run.errors(batch) / batch.total).backward()
@@ -74,32 +73,40 @@ def part_b(run, steps):
     return rate(step, len(batch.angles), steps, run.device)
 
 
-def part_c(run, steps):
+def one_by_one(generator, number: int):
+    """A batch as a classic generator makes it, from its files, an image at a time: images and angles."""
     import numpy as np
+
+    from images import FRAME
+    from model import CROP
+
+    drawn, images, angles = generator.draw(number), [], []
+    for i, (at, camera) in enumerate(zip(drawn["observation"], drawn["camera"], strict=True)):
+        cropped = generator.observations.read(at, camera)[CROP[0]:FRAME[0] - CROP[1]]
+        for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), cropped[None], CROP[0])):
+            images += list(made)
+            angles += [drawn["angles"][i, kind]] * len(which)
+    return np.stack(images), np.array(angles)
+
+
+def part_c(run, steps):
     import torch
 
     network = run.network.to(memory_format=torch.contiguous_format)
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     optimizer = torch.optim.Adam(network.parameters(), 1e-4)
     numbers = iter(range(1000))
-    images = []
 
     def step():
-        drawn, made, angles = run.generator.draw(next(numbers)), [], []
-        for i in range(run.arguments.batch_size):
-            for image, angle in zip(run.generator.images(drawn, i), drawn["angles"][i], strict=True):
-                if image is not None:
-                    made.append(image)
-                    angles.append(angle)
-        images.append(len(made))
-        frames = torch.from_numpy(np.stack(made)).to(run.device)
+        made, angles = one_by_one(run.generator, next(numbers))
+        frames = torch.from_numpy(made).to(run.device)
         x = (frames.permute(0, 3, 1, 2).float() / 127.5 - 1).contiguous()
         for convolution in network.convolutions:
             x = torch.nn.functional.elu(convolution(x))
         x = torch.nn.functional.dropout(x.flatten(1), 0.5)
         for layer in network.dense[:-1]:
             x = torch.nn.functional.elu(layer(x))
-        loss = ((network.dense[-1](x)[:, 0] - torch.from_numpy(np.array(angles)).to(run.device)) ** 2).mean()
+        loss = ((network.dense[-1](x)[:, 0] - torch.from_numpy(angles).to(run.device)) ** 2).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -109,7 +116,6 @@ def part_c(run, steps):
 
 def part_k(run, steps):
     import keras
-    import numpy as np
 
     layers = keras.layers
     network = keras.Sequential([
@@ -121,16 +127,7 @@ def part_k(run, steps):
     network.compile(optimizer=keras.optimizers.Adam(1e-4), loss="mse")
     numbers = iter(range(1000))
 
-    def step():
-        drawn, made, angles = run.generator.draw(next(numbers)), [], []
-        for i in range(run.arguments.batch_size):
-            for image, angle in zip(run.generator.images(drawn, i), drawn["angles"][i], strict=True):
-                if image is not None:
-                    made.append(image)
-                    angles.append(angle)
-        network.train_on_batch(np.stack(made), np.array(angles))
-
-    return rate(step, 474, steps, run.device)
+    return rate(lambda: network.train_on_batch(*one_by_one(run.generator, next(numbers))), 474, steps, run.device)
 
 
 def part_bound(run, _):
