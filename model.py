@@ -406,7 +406,7 @@ class Run:
             self.errors = DistributedDataParallel(self.errors)
         self.optimizer = torch.optim.Adam(self.network.parameters(), arguments.learning_rate, fused=True)
         self.generator = Generator(training, arguments.batch_size, arguments.side_correction, arguments.seed,
-                                   self.pool, ahead=2 if self.device.type == "cpu" else 4)
+                                   self.pool, ahead=1 if self.device.type == "cpu" else 4)
         self.number = 0  # of the next batch, over all epochs
         self.images, self.loss, self.seconds = 0, 0.0, 0.0  # so far in this epoch
         self.history: list[dict] = []  # a finished epoch each
