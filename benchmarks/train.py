@@ -14,6 +14,7 @@ turns, so that a machine that slows down slows them all. Rates are training imag
 
 import argparse
 import importlib.util
+import itertools
 import json
 import os
 import subprocess
@@ -24,7 +25,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
-PARTS = {"bound": "bound by the matrix product", "a": "(a) model.py's epoch", "b": "(b) bare step",
+from arithmetic import keep_freed_memory  # noqa: E402
+
+PARTS = ("bound", "ab", "c", "k")
+NAMES = {"bound": "bound by the matrix product", "a": "(a) model.py's epoch", "b": "(b) bare step",
          "c": "(c) what people write today", "k": "(k) Keras, classic generator"}
 
 
@@ -33,7 +37,6 @@ def begin(folders: list[str], samples: int, output: Path):
     import model
 
     arguments, given = model.parse([*folders, "--samples-per-epoch", str(samples), "--output", str(output)])
-    model.keep_freed_memory()
     training, validation, _ = model.prepare(arguments, given)
     return model.Run(arguments, training, validation)
 
@@ -55,22 +58,28 @@ def flops(network) -> int:
     return sum(total)
 
 
-def part_a(run, _):
+def part_ab(run, _):
+    """Both in one process, a bare step after every fourth batch, so that what else the machine does falls on both."""
+    bare, draw_pictures, turns = run.generator.begin(0)(), run.draw_pictures, itertools.count(1)
+    spent, steps = 0.0, 0
+
+    def between_batches():
+        nonlocal spent, steps
+        draw_pictures()
+        if next(turns) % 4 == 0:
+            run.pool.submit(int).result()  # behind the images of the next batch, which are (a)'s
+            started = time.perf_counter()
+            (run.errors(bare) / bare.total).backward()
+            run.optimizer.step()
+            run.optimizer.zero_grad()
+            synchronize(run.device)
+            spent, steps = spent + time.perf_counter() - started, steps + 1
+
+    run.draw_pictures, run.arguments.epochs = between_batches, 1
     started = time.perf_counter()
-    run.arguments.epochs = 1
     run.train()
-    return run.history[0]["images"] / (time.perf_counter() - started)
-
-
-def part_b(run, steps):
-    batch = run.generator.begin(0)()
-
-    def step():
-        (run.errors(batch) / batch.total).backward()
-        run.optimizer.step()
-        run.optimizer.zero_grad()
-
-    return rate(step, len(batch.angles), steps, run.device)
+    whole = time.perf_counter() - started - spent
+    return {"a": run.history[0]["images"] / whole, "b": steps * bare.total / spent}
 
 
 def one_by_one(generator, number: int):
@@ -111,7 +120,7 @@ def part_c(run, steps):
         loss.backward()
         optimizer.step()
 
-    return rate(step, 474, steps, run.device)
+    return {"c": rate(step, 474, steps, run.device)}
 
 
 def part_k(run, steps):
@@ -127,7 +136,11 @@ def part_k(run, steps):
     network.compile(optimizer=keras.optimizers.Adam(1e-4), loss="mse")
     numbers = iter(range(1000))
 
-    return rate(lambda: network.train_on_batch(*one_by_one(run.generator, next(numbers))), 474, steps, run.device)
+
+    def step():
+        network.train_on_batch(*one_by_one(run.generator, next(numbers)))
+
+    return {"k": rate(step, 474, steps, run.device)}
 
 
 def part_bound(run, _):
@@ -137,21 +150,26 @@ def part_bound(run, _):
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     size = 2048 if run.device.type == "cpu" else 8192
     a, b = (torch.randn(size, size, device=run.device).to(run.precision) for _ in "ab")
-    return max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size ** 3 / flops(run.network)
+    return {"bound": max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size ** 3 / flops(run.network)}
 
 
 def rate(step, images: int, steps: int, device) -> float:
     """Images a second over these steps, after one that does not count."""
-    import torch
-
-    wait = torch.cuda.synchronize if device.type == "cuda" else (lambda: None)
     step()
-    wait()
+    synchronize(device)
     started = time.perf_counter()
     for _ in range(steps):
         step()
-    wait()
+    synchronize(device)
     return images * steps / (time.perf_counter() - started)
+
+
+def synchronize(device) -> None:
+    """Wait for a GPU's work to be done."""
+    if device.type == "cuda":
+        import torch
+
+        torch.cuda.synchronize(device)
 
 
 def main():
@@ -164,9 +182,11 @@ def main():
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if arguments.part:
+            if arguments.part == "ab":
+                keep_freed_memory()  # as model.py's main does
             run = begin(arguments.recordings, arguments.samples, Path(folder) / "model.pt")
-            figure = globals()[f"part_{arguments.part}"](run, arguments.steps)
-            print("\n" + json.dumps({"rate": figure, "gb": peak_memory(), "device": str(run.device),
+            rates = globals()[f"part_{arguments.part}"](run, arguments.steps)
+            print("\n" + json.dumps({"rates": rates, "gb": peak_memory(), "device": str(run.device),
                                      "precision": str(run.precision), "flops": flops(run.network)}))
             return
         if not arguments.recordings:
@@ -185,25 +205,27 @@ def peak_memory() -> float:
 
 def report(arguments) -> None:
     parts = [part for part in PARTS if part != "k" or importlib.util.find_spec("tensorflow")]
-    found: dict[str, list[dict]] = {part: [] for part in parts}
+    rates: dict[str, list[float]] = {}
+    memory: dict[str, float] = {}
     for number in range(arguments.rounds):
         for part in parts:
             command = [sys.executable, __file__, *arguments.recordings, "--part", part, "--samples",
                        str(arguments.samples), "--steps", str(arguments.steps)]
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-            found[part].append(json.loads(done.stdout.splitlines()[-1]))
-            print(f"round {number + 1}: {PARTS[part]}: {found[part][-1]['rate']:.0f}", file=sys.stderr, flush=True)
-    one = found["b"][0]
-    print(f"\n{one['device']}, {one['precision'].removeprefix('torch.')}, {arguments.rounds} rounds, "
-          f"{one['flops'] / 1e6:.0f} MFLOP an image\n")
+            found = json.loads(done.stdout.splitlines()[-1])
+            for name, value in found["rates"].items():
+                rates.setdefault(name, []).append(value)
+                memory[name] = max(memory.get(name, 0), found["gb"])
+                print(f"round {number + 1}: {NAMES[name]}: {value:.0f}", file=sys.stderr, flush=True)
+    print(f"\n{found['device']}, {found['precision'].removeprefix('torch.')}, {arguments.rounds} rounds, "
+          f"{found['flops'] / 1e6:.0f} MFLOP an image\n")
     print("| training images/s | median | least | most | peak memory GB |\n|---|---|---|---|---|")
-    for part in parts:
-        rates = sorted(one["rate"] for one in found[part])
-        memory = max(one["gb"] for one in found[part])
-        print(f"| {PARTS[part]} | {median(rates):.0f} | {rates[0]:.0f} | {rates[-1]:.0f} | {memory:.2f} |")
+    for name, values in rates.items():
+        values = sorted(values)
+        print(f"| {NAMES[name]} | {median(values):.0f} | {values[0]:.0f} | {values[-1]:.0f} | {memory[name]:.2f} |")
     print("\n| ratio, round by round | median | least | most |\n|---|---|---|---|")
     for above, below in (("b", "bound"), ("a", "b"), ("a", "c"), *((("a", "k"),) if "k" in parts else ())):
-        ratios = sorted(x["rate"] / y["rate"] for x, y in zip(found[above], found[below], strict=True))
+        ratios = sorted(x / y for x, y in zip(rates[above], rates[below], strict=True))
         print(f"| {above} / {below} | {median(ratios):.2f} | {ratios[0]:.2f} | {ratios[-1]:.2f} |")
 
 
