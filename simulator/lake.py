@@ -1,0 +1,425 @@
+"""The lake's scenery, from its centre line: distances along it and features were read off the real
+simulator's frames."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from . import textures
+from .scenery import Haze, Scenery, bonnet, dome
+from .shapes import Light, Mesh, around, boulder, grid, lit, plants, ribbon, stretch, together
+from .track import Track
+
+ASPHALT, EDGE = 4.95, 7.6  # m from the centre line: where the asphalt ends, and the concrete beside it
+BRIDGE = (674, 783)
+WATER = -1.2  # m
+CELL = 7.0  # m between the ground's points
+# (side, from, to): +1 is left of the listed direction
+KERBS = (
+    (1, -45, 50),
+    (-1, -45, 55),
+    (1, 465, 545),
+    (-1, 478, 545),
+    (1, 815, 892),
+    (-1, 825, 845),
+    (-1, 860, 885),
+    (1, 965, 1022),
+    (-1, 958, 1022),
+)
+VERGES = ((-1, 62, 106), (-1, 845, 860))  # no concrete here: red earth up to the asphalt
+# Height in metres of the land 25 m beside the road, by distance along it
+RIGHT = (
+    (-60, 7),
+    (-40, 9),
+    (40, 9),
+    (62, 5),
+    (75, 2),
+    (110, 3),
+    (150, 7),
+    (200, 11),
+    (300, 14),
+    (420, 15),
+    (500, 13),
+    (535, 5),
+    (560, 0),
+    (585, -3),
+    (790, -3),
+    (805, 1),
+    (850, 1.5),
+    (880, 4),
+    (930, 6),
+    (958, 1.5),
+    (1000, 1.5),
+    (1024, 4),
+    (1075, 3.5),
+)
+LEFT = (
+    (-20, 2),
+    (25, 3),
+    (60, 1.5),
+    (110, 2.5),
+    (135, -1),
+    (160, -3),
+    (215, -3),
+    (245, 2.5),
+    (300, 2.5),
+    (350, 1.5),
+    (420, 1),
+    (470, 0.5),
+    (500, -3),
+    (790, -3),
+    (805, 0.5),
+    (865, 2),
+    (905, 3),
+    (940, 2),
+    (960, -3),
+    (1018, -3),
+    (1032, 1.5),
+    (1085, 2),
+)
+EARTH = (
+    (-1, -45, 110),
+    (-1, 215, 440),
+    (1, 220, 420),
+    (-1, 560, 640),
+    (-1, 843, 864),
+    (1, 150, 240),
+)  # red earth beside
+BOULDERS = (
+    (1, 330, 32, 20, 7),
+    (-1, 170, 40, 12, 8),
+    (-1, 195, 34, 9, 7),
+    (-1, 155, 60, 14, 8),
+    (1, 30, 70, 10, 4),
+    (-1, 868, 60, 16, 7),
+    (-1, 905, 60, 18, 8),
+    (1, 960, 45, 12, 5),
+    (1, 975, 90, 16, 6),
+    (1, 750, 60, 16, 4),
+    (1, 720, 120, 22, 6),
+    (-1, 60, 45, 14, 5),
+    (1, 600, 150, 25, 8),
+    (-1, 700, 160, 40, 9),
+    (-1, 1060, 60, 18, 6),
+)
+SHADOWS = (
+    (22, 0, 0.5, 9),
+    (29, -1.5, 0.6, 6),
+    (62, 3, 0.4, 8),
+    (628, 4, 5, 3.5),
+    (632, 2.5, 3, 2),
+    (884, 0, 4, 5),
+    (915, -1, 6, 4),
+    (1070, 0, 0.4, 9),
+    (1104, 0, 0.5, 9),
+    (1111, -2, 0.7, 8),
+)  # along, left, half length, half width
+
+
+def around_lap(table, s: np.ndarray, length: float) -> np.ndarray:
+    """The table's values at the distances, going round."""
+    at, value = np.array(table, float).T
+    return np.interp(s, np.r_[at - length, at, at + length], np.tile(value, 3))
+
+
+def within(stretches, s: np.ndarray, side: np.ndarray, length: float) -> np.ndarray:
+    """Whether each place (s, side) lies in one of the stretches (side, from, to)."""
+    inside = np.zeros(np.shape(s), bool)
+    for which, start, end in stretches:
+        inside |= (side == which) & ((s - start) % length <= end - start)
+    return inside
+
+
+class Land:
+    """The ground's height and nearest road, as functions of the place."""
+
+    def __init__(self, track: Track, random):
+        self.track = track
+        self.tree = cKDTree(track.points[:, :2])
+        self.rolling = textures.clouds(random, 256, 24, 5)  # one metre of height a unit, 4 m a pixel
+
+    def beside(self, places: np.ndarray):
+        """Distance to the centre line, s, and side (+1 left) of places (n, 2)."""
+        away, nearest = self.tree.query(places)
+        across = np.einsum("ij,ij->i", places - self.track.points[nearest, :2], self.track.normal[nearest])
+        return away, nearest * self.track.step, np.where(across > 0, 1, -1)
+
+    def height(self, places: np.ndarray) -> np.ndarray:
+        """Metres above the road's level, which is the lake's zero; the water stands at -1.2."""
+        away, s, side = self.beside(places)
+        length = self.track.length
+        near = np.where(side > 0, around_lap(LEFT, s, length), around_lap(RIGHT, s, length))
+        cliff = (side < 0) & ((s + 45) % length < 100)
+        rise = np.clip((away - np.where(cliff, 15, 9)) / np.where(cliff, 6, 22), 0, 1)
+        rise = rise * rise * (3 - 2 * rise)
+        row, column = (np.floor(places / 4).astype(int) % 256).T
+        roll = self.rolling[row, column]
+        far = np.clip((away - 35) / 90, 0, 1)
+        beyond = np.where(near > 2.5, 14 + 9 * roll, 1.5 + 4 * roll) if len(places) else roll
+        lake = (side > 0) & (away > 40)
+        beyond = np.where(lake, -3 + 2.2 * roll, beyond)
+        z = near * rise * (1 + 0.15 * roll) + np.where(
+            lake, (beyond - near) * far, np.maximum(beyond, 0) * far * 0.8
+        )
+        z = np.where(near < 0, np.where(away > 60, z + 2.2 * far * (side < 0), z), z)
+        return np.where(away < 8.5, -0.15, z + 0.02)
+
+
+def ground(land: Land, random, light: Light, palette: dict, soil) -> Mesh:
+    low, high = land.track.points[:, :2].min(axis=0) - 230, land.track.points[:, :2].max(axis=0) + 230
+    xs, ys = (np.arange(a, b, CELL) for a, b in zip(low, high, strict=True))
+    places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    points = np.c_[places, land.height(places)]
+    faces = grid(len(ys), len(xs))
+    away, s, side = land.beside(places)
+    mesh = Mesh(points, np.ones_like(points), places / 14.0, faces, soil)
+    facing = (lit(mesh, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), faced_up=True)).colours[:, :1]
+    steep = np.clip((0.93 - facing) * 6, 0, 1)
+    earth = within(EARTH, s, side, land.track.length) & (away < 30)
+    tone = textures.clouds(random, 256, 12, 4)[tuple((np.floor(places / 5).astype(int) % 256).T)][:, None]
+    green = np.clip(0.5 + 0.35 * tone, 0, 1)
+    colour = np.array(palette["grass"]) * (1 - 0.35 * green) + np.array(palette["green"]) * 0.35 * green
+    colour = np.where(earth[:, None], np.array(palette["earth"]), colour)
+    sandy = np.array(palette["sand"]) * (1 + 0.10 * tone)
+    colour = colour * (1 - steep) + sandy * steep
+    cliff = ((side < 0) & ((s + 45) % land.track.length < 100) & (away > 14) & (away < 32))[:, None]
+    colour = np.where(cliff, np.array(palette["cliff"]), colour)
+    return lit(Mesh(points, colour, places / 14.0, faces, mesh.texture), light, faced_up=True)
+
+
+def road(track: Track, random, light: Light, palette: dict, soil) -> list[Mesh]:
+    """Asphalt with its double lines, kerbs, concrete edges, verges, and the bridge."""
+    s, line = around(track, 2.0), textures.line()
+    shade = np.ones((len(s), 9, 3))
+    across = np.linspace(ASPHALT, -ASPHALT, 9)
+    for at, left, half_length, half_width in SHADOWS:
+        along = ((s - at + track.length / 2) % track.length - track.length / 2)[:, None] / half_length
+        inside = np.clip(1.6 - np.hypot(along, (across - left) / half_width) * 1.2, 0, 1)[..., None]
+        shade *= 1 - 0.5 * inside
+    asphalt = np.array(palette["asphalt"]) * shade
+    meshes = [ribbon(track, s, across, 0.0, asphalt, textures.asphalt(random), 6.0)]
+    yellow, dark = palette["line"], palette["seam"]
+    for side in (1, -1):
+        for offset, half, colour in (
+            (3.5, 0.06, yellow),
+            (3.72, 0.16, dark),
+            (3.95, 0.05, palette["outer line"]),
+        ):
+            edges = sorted((side * (offset - half), side * (offset + half)), reverse=True)
+            meshes.append(ribbon(track, s, edges, 0.012, colour, line, 4.0, across=(0, 1)))
+    slab = textures.concrete(random)
+    ends = {1: [], -1: []}
+    for side, start, end in VERGES:
+        ends[side].append((start, end))
+    for side in (1, -1):
+        edges, cut = [], sorted(ends[side] + [BRIDGE])
+        begin = 0.0
+        for start, end in [*cut, (track.length, None)]:
+            edges.append((begin, start))
+            begin = end
+        for start, end in edges:
+            offsets, heights = (ASPHALT, 5.6, EDGE, EDGE + 0.3), (0.01, 0.10, 0.42, -0.5)
+            if side < 0:
+                offsets, heights = tuple(-x for x in offsets[::-1]), heights[::-1]
+            strip = ribbon(
+                track,
+                stretch(start, end, 2.0),
+                offsets,
+                heights,
+                palette["slab"],
+                slab,
+                3.0,
+                across=(0, 0.4, 0.8, 1),
+            )
+            meshes.append(lit(strip, light, faced_up=True))
+        for start, end in ends[side]:
+            offsets, heights = (ASPHALT - 1.3, 6.0, 12.0), (0.015, 0.02, 0.1)
+            if side < 0:
+                offsets, heights = tuple(-x for x in offsets[::-1]), heights[::-1]
+            strip = ribbon(track, stretch(start, end), offsets, heights, palette["earth"], soil, 9.0)
+            meshes.append(lit(strip, light, faced_up=True))
+    stripes = textures.kerb()
+    for side, start, end in KERBS:
+        offsets = sorted((side * 3.86, side * 4.93), reverse=True)
+        kerb = ribbon(track, stretch(start, end), offsets, 0.05, palette["kerb"], stripes, 1.0, across=(0, 1))
+        meshes.append(kerb)
+    deck = stretch(*BRIDGE)
+    meshes.append(
+        ribbon(
+            track,
+            deck,
+            np.linspace(ASPHALT, -ASPHALT, 7),
+            0.02,
+            palette["cobbles"],
+            textures.cobbles(random),
+            4.5,
+        )
+    )
+    for side in (1, -1):
+        for offsets, heights in (
+            ((side * 4.9, side * 4.9), (0.0, 0.75)),
+            ((side * 4.9, side * 5.5), (0.75, 0.75)),
+            ((side * 5.5, side * 5.5), (0.75, -2.0)),
+        ):
+            meshes.append(ribbon(track, deck, offsets, heights, (0.02, 0.02, 0.02), line, 4.0, across=(0, 1)))
+    return meshes
+
+
+def pines(land: Land, random, palette: dict) -> list[Mesh]:
+    """Forest on the hills to the right, single trees and bushes elsewhere, reeds at the water."""
+    track, length = land.track, land.track.length
+    low, high = track.points[:, :2].min(axis=0) - 210, track.points[:, :2].max(axis=0) + 210
+    places = random.uniform(low, high, (5200, 2))
+    away, s, side = land.beside(places)
+    z = land.height(places)
+    forest = (side < 0) & ((s > 120) & (s < 545))
+    chance = np.where(forest, 0.9, 0.22) * np.clip((away - 11) / 20, 0, 1) * np.clip((z + 0.6) * 2, 0, 1)
+    chance = np.where(away > 150, chance * 0.5, chance)
+    keep = (random.uniform(size=len(places)) < chance) & (away > 13) & (away < 210)
+    places = np.c_[places, z - 0.3][keep]
+    tall = random.uniform(8, 15, len(places))
+    tone = random.uniform(0.75, 1.2, (len(places), 1))
+    colours = np.clip(np.array(palette["pine"]) * tone, 0, 1)
+    meshes = []
+    for kind in range(3):
+        mine = np.arange(len(places)) % 3 == kind
+        meshes.append(
+            plants(
+                places[mine],
+                tall[mine],
+                0.52 * tall[mine],
+                colours[mine],
+                textures.pine(random, low=(0.62, 0.5, 0.75)[kind]),
+                random,
+            )
+        )
+    for texture, colour, count, near, far, tallest in (
+        (textures.bush(random), palette["bush"], 900, 9.5, 28, 1.4),
+        (textures.reeds(random), palette["reeds"], 260, 9.5, 16, 2.6),
+    ):
+        along = random.uniform(0, length, count)
+        along = (along // 22) * 22 + random.normal(0, 4, count)  # in clumps
+        left = random.choice((-1, 1), count) * random.uniform(near, far, count)
+        index = np.floor(along / track.step).astype(int) % len(track.points)
+        spot = track.points[index, :2] + track.normal[index] * left[:, None]
+        z = land.height(spot)
+        clear = (land.beside(spot)[0] > near - 0.5) & (z > WATER)
+        spot, z = spot[clear], z[clear]
+        size = random.uniform(0.5, 1.0, len(spot)) * tallest
+        colours = np.clip(np.array(colour) * random.uniform(0.7, 1.15, (len(spot), 1)), 0, 1)
+        meshes.append(plants(np.c_[spot, z - 0.1], size, 1.9 * size, colours, texture, random))
+    return meshes
+
+
+def pylons(land: Land, light: Light) -> list[Mesh]:
+    """The line of pylons behind the bridge, and its wires."""
+    feet = np.array([[-150.0, -230.0], [-60, -205], [30, -190], [125, -175], [205, -95], [150, 5], [90, 75]])
+    feet = np.c_[feet, np.full(len(feet), 0.0)]
+    blue, line = (0.22, 0.30, 0.42), textures.line()
+    beams = []
+    for foot in feet:
+        for lean in ((-2.2, -2.2), (2.2, -2.2), (2.2, 2.2), (-2.2, 2.2)):
+            for start, end in ((0.0, 0.5), (0.5, 1.0)):
+                a = foot + np.array([*(np.array(lean) * (1 - 0.8 * start)), 26 * start])
+                b = foot + np.array([*(np.array(lean) * (1 - 0.8 * end)), 26 * end])
+                beams.append(beam(a, b, 0.13, blue, line))
+        for height in (5, 10, 15, 20):
+            reach = 2.2 * (1 - 0.8 * height / 26)
+            for side in (reach, -reach):
+                start, end = np.array([[side, -reach, height], [-side, reach, height + 4]])
+                beams.append(beam(foot + start, foot + end, 0.09, blue, line))
+        for height in (19, 23):
+            start, end = np.array([[-4.5, 0, height], [4.5, 0, height]])
+            beams.append(beam(foot + start, foot + end, 0.12, blue, line))
+    return [together(beams)]
+
+
+def beam(a, b, half, colour, texture) -> Mesh:
+    """A thin upright strip from a to b, crossed with another."""
+    quads = []
+    for aside in ((half, 0, 0), (0, half, 0)):
+        quads += [a - np.array(aside), a + np.array(aside), b + np.array(aside), b - np.array(aside)]
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    return Mesh(np.array(quads), np.tile(np.array(colour), (8, 1)), np.zeros((8, 2)), faces, texture)
+
+
+def rocks(land: Land, random, light: Light, palette: dict) -> Mesh:
+    track, texture = land.track, textures.rock(random)
+    made = []
+    for side, s, away, wide, tall in BOULDERS:
+        place = track.at(s, side * away)
+        z = float(land.height(np.array([[place.x, place.y]]))[0])
+        made.append(
+            boulder(
+                (place.x, place.y, max(z, WATER)), (wide, 0.7 * wide, tall), random, palette["rock"], texture
+            )
+        )
+    return lit(together(made), light)
+
+
+def mountains(random, light: Light, palette: dict, soil) -> Mesh:
+    """A ring of far hills, which the haze turns blue."""
+    turn = np.linspace(0, 2 * np.pi, 121)
+    crest = 14 + 16 * np.abs(textures.clouds(random, 256, 24, 4)[0, :120] + 0.5)
+    crest = np.r_[crest, crest[:1]]
+    radius = np.array([430.0, 520.0, 640.0])[:, None]
+    points = np.stack(
+        [
+            radius * np.cos(turn),
+            radius * np.sin(turn),
+            np.stack([np.full(121, -2.0), 0.6 * crest, 0.0 * crest + crest]),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    uv = np.stack(np.broadcast_arrays(turn * 8, np.array([0, 1, 2.0])[:, None]), axis=-1).reshape(-1, 2)
+    colours = np.tile(np.array(palette["grass"]), (len(points), 1))
+    return lit(Mesh(points, colours, uv, grid(3, 121), soil), light, faced_up=True)
+
+
+PALETTE = {
+    "asphalt": (0.715, 0.73, 0.665),
+    "line": (0.88, 0.76, 0.26),
+    "outer line": (0.72, 0.63, 0.28),
+    "seam": (0.36, 0.35, 0.32),
+    "slab": (0.88, 0.85, 0.78),
+    "kerb": (1.0, 0.98, 0.95),
+    "cobbles": (0.80, 0.68, 0.60),
+    "grass": (1.0, 0.84, 0.38),
+    "green": (0.50, 0.50, 0.18),
+    "earth": (0.94, 0.60, 0.31),
+    "sand": (0.96, 0.84, 0.62),
+    "cliff": (0.46, 0.54, 0.48),
+    "rock": (0.96, 0.94, 0.86),
+    "pine": (0.40, 0.42, 0.21),
+    "bush": (0.24, 0.28, 0.10),
+    "reeds": (0.26, 0.36, 0.12),
+    "water": (0.60, 0.72, 0.87),
+    "bonnet": (0.62, 0.61, 0.56),
+}
+LIGHT = Light(sun=(0.78, -0.10, 0.62), sunlight=(0.74, 0.68, 0.50), fill=(0.56, 0.61, 0.68))
+
+
+def scenery(look: int) -> Scenery:
+    random = np.random.default_rng(look)
+    track, light, palette = Track("lake"), LIGHT, PALETTE
+    land = Land(track, random)
+    side = np.linspace(-760, 760, 27)
+    flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    water = Mesh(
+        np.c_[flat, np.full(len(flat), WATER)],
+        np.tile(np.array(palette["water"]), (len(flat), 1)),
+        flat / 40,
+        grid(27, 27),
+        textures.grey(0.97, 0.02 * textures.noise(random, (64, 64), 3)),
+    )
+    soil = textures.soil(random)
+    meshes = [
+        ground(land, random, light, palette, soil),
+        *road(track, random, light, palette, soil),
+        water,
+        mountains(random, light, palette, soil),
+        rocks(land, random, light, palette),
+        *pines(land, random, palette),
+        *pylons(land, light),
+    ]
+    sky = dome(textures.sky((62, 92, 152), (176, 200, 232)))
+    return Scenery(meshes, sky, bonnet(palette["bonnet"], light), Haze((0.41, 0.60, 0.85), (100, 600), 0.8))

@@ -1,0 +1,35 @@
+"""An expert drives and is recorded, faster than real time."""
+
+from . import scenery
+from .cameras import Cameras
+from .expert import Expert
+from .progress import Progress
+from .recording import Clock, Recording
+from .run import Run
+from .track import MPH, Track
+from .world import Scene
+
+
+def record(folder: str, track: Track, laps: float, speed: float = 30.0, seed: int = 0, look: int = 0) -> Run:
+    """Record the expert's laps at a set speed in mph into a new folder. Raises SimulatorError."""
+    with Recording(folder, seed) as recording:
+        run = Run(track)
+        run.car.speed_limit = speed * MPH
+        expert = Expert(track, seed, speed * MPH)
+        cameras = Cameras(Scene(scenery.build(track.name, look)))
+        clock, progress = Clock(), Progress(laps, "laps")
+        while run.travelled < laps * track.length:
+            steering, throttle = expert.drive(run)
+            run.step(steering, throttle)
+            if clock.due(run.time):
+                recording.add(
+                    run.time,
+                    cameras.frames(run.car.node.get_transform()),
+                    run.steering,
+                    max(0.0, run.throttle),
+                    max(0.0, -run.throttle),
+                    run.speed_mph,
+                )
+                progress.show(max(0.0, run.travelled) / track.length, run.time)
+        progress.finish(laps, run.time)
+    return run

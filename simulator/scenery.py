@@ -1,0 +1,80 @@
+"""All that is to be seen on a track: its meshes, sky and haze, the car's own bonnet, and other looks of
+them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .shapes import Light, Mesh, grid, lit
+
+
+@dataclass(frozen=True)
+class Haze:
+    """colour: 0..1; range: metres from where to where it grows from nothing to all; most: its largest
+    share."""
+
+    colour: tuple[float, float, float]
+    range: tuple[float, float]
+    most: float = 1.0
+
+
+@dataclass(frozen=True)
+class Scenery:
+    meshes: list[Mesh]
+    sky: Mesh
+    bonnet: Mesh
+    haze: Haze | None
+
+
+def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
+    """A sky around the viewer, its texture's bottom row at the horizon."""
+    turn, rise = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.radians([-8, 0, 5, 10, 20, 40, 88]))
+    points = radius * np.stack(
+        [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1
+    )
+    height = np.clip(rise / np.radians(40), 0.01, 0.99)
+    uv = np.stack([turn, height], axis=-1).reshape(-1, 2)
+    return Mesh(points.reshape(-1, 3), np.ones((turn.size, 3)), uv, grid(*turn.shape), texture, hazy=False)
+
+
+def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
+    """The car's bonnet in the car's coordinates (x right, y forward, z up, in metres), shaped to fit the real
+    frames.
+
+    Its front edge hides what the real one hides from the centre camera: image row at each sideways x.
+    """
+    aside = np.linspace(-0.66, 0.60, 43)
+    front = 2.10 - 0.30 * (aside / 0.64) ** 2
+    rows = np.interp(
+        aside,
+        [-0.66, -0.60, -0.48, -0.34, -0.20, -0.09, 0.02, 0.16, 0.30, 0.42, 0.52, 0.58, 0.60],
+        [175, 160, 153, 148, 143, 138, 137, 137.5, 141, 147, 153, 160, 172],
+    )
+    below = np.radians(7.8) + np.arctan((rows - 80) / 138.6)
+    edge = 1.2 - (front - 1.0) * np.tan(below)
+    bands = np.array([0.0, 0.015, 0.03, 0.12, 0.2, 0.24, 0.28, 0.6, 1.0])  # of the way back from the edge
+    shade = np.array([0.55, 0.85, 1.0, 0.95, 0.80, 0.45, 0.95, 1.15, 1.2])
+    y = front + (1.45 - front) * bands[:, None]
+    z = edge + (0.62 - edge) * bands[:, None] ** 0.8 - 0.25 * (aside / 0.64) ** 4 * bands[:, None]
+    points = np.stack([np.broadcast_to(aside, y.shape), y, z], axis=-1)
+    colours = np.clip(shade[:, None, None] * np.array(colour), 0, 1)
+    colours = np.broadcast_to(colours, points.shape).copy()
+    lamps = np.abs(np.abs(aside + 0.03) - 0.52) < 0.05
+    colours[1:4, lamps] = 0.95
+    mesh = Mesh(
+        points.reshape(-1, 3),
+        colours.reshape(-1, 3),
+        np.zeros((points[..., 0].size, 2)),
+        grid(*y.shape)[:, ::-1],
+        np.full((4, 4, 3), 255, np.uint8),
+        hazy=False,
+    )
+    return lit(mesh, light, faced_up=True)
+
+
+def build(track: str, look: int = 0) -> Scenery:
+    """The scenery of a track; look 0 is the real simulator's, any other number another light, texture and
+    planting."""
+    from . import lake  # each knows one track, and is large
+
+    return {"lake": lake}[track].scenery(look)
