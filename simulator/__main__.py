@@ -1,4 +1,4 @@
-"""python -m simulator: record."""
+"""What a user gets: python -m simulator record, drive."""
 
 import argparse
 import sys
@@ -39,7 +39,28 @@ def arguments(argv=None) -> argparse.Namespace:
     record.add_argument("--laps", type=positive, default=1, help="default 1")
     record.add_argument("--speed", type=mph, default=30.0, help="set speed in mph, 1 to 30 (default)")
 
-    for command in (record,):
+    drive = commands.add_parser(
+        "drive", help="the client of drive.py; exit status 1 if the car left the road"
+    )
+    drive.add_argument("--laps", type=positive, default=1, help="default 1")
+    drive.add_argument("--host", default="127.0.0.1", help="where drive.py runs (default 127.0.0.1)")
+    drive.add_argument("--port", type=int, default=4567, help="default 4567")
+    drive.add_argument(
+        "--wait", type=positive, default=60.0, help="seconds to wait for a server or an answer (default 60)"
+    )
+    pace = drive.add_mutually_exclusive_group()
+    pace.add_argument(
+        "--lockstep",
+        action="store_true",
+        help="simulated time waits for each answer, so that a run can be repeated (default)",
+    )
+    pace.add_argument("--realtime", action="store_true", help="the wall clock's time, and the wire's latency")
+    drive.add_argument("--report", metavar="FILE", help="write the lap report as JSON")
+    drive.add_argument(
+        "--picture", metavar="FILE.png", help="write a picture of the track from above with the way driven"
+    )
+
+    for command in (record, drive):
         command.add_argument("--track", choices=sorted(ROADS), default="lake", help="default lake")
         command.add_argument(
             "--direction",
@@ -58,21 +79,49 @@ def arguments(argv=None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def record(args, track: Track) -> int:
+    from .record import record  # panda3d loads only when it is needed, and says why if it cannot
+
+    run = record(args.folder, track, args.laps, args.speed, args.seed, args.look)
+    for departure in run.departures:
+        print(f"left the road at {departure.s:.0f} m after {departure.time:.1f} s")
+    return 0
+
+
+def drive(args, track: Track) -> int:
+    from . import report, scenery
+    from .cameras import Cameras
+    from .client import Client
+    from .progress import Progress
+    from .run import Run
+    from .world import Scene
+
+    run = Run(track, "autonomous")
+    cameras = Cameras(Scene(scenery.build(track.name, args.look)), ("center",))
+    client = Client(run, cameras, args.host, args.port, args.wait, args.realtime)
+    progress = Progress(args.laps, "laps")
+    try:
+        client.drive(args.laps, progress)
+    finally:
+        summary = report.figures(run, client)
+        if run.time:
+            print(report.text(summary))
+        if args.report:
+            report.write_json(args.report, summary)
+        if args.picture:
+            report.write_picture(args.picture, run)
+    return 1 if run.departures else 0
+
+
 def main(argv=None) -> int:
     args = arguments(argv)
-    track = Track(args.track, args.direction)
     try:
-        from .record import record  # panda3d loads only when it is needed, and says why if it cannot
-
-        run = record(args.folder, track, args.laps, args.speed, args.seed, args.look)
-        for departure in run.departures:
-            print(f"left the road at {departure.s:.0f} m after {departure.time:.1f} s")
-        return 0
+        return {"record": record, "drive": drive}[args.command](args, Track(args.track, args.direction))
     except SimulatorError as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\nstopped; what was recorded is whole", file=sys.stderr)
+        print("\nstopped; what was written is whole", file=sys.stderr)
         return 130
 
 
