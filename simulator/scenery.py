@@ -75,6 +75,6 @@ def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
 def build(track: str, look: int = 0) -> Scenery:
     """The scenery of a track; look 0 is the real simulator's, any other number another light, texture and
     planting."""
-    from . import lake  # each knows one track, and is large
+    from . import jungle, lake  # which are made of what this module offers
 
-    return {"lake": lake}[track].scenery(look)
+    return {"lake": lake, "jungle": jungle}[track].scenery(look)

@@ -26,14 +26,14 @@ def grey(mean: float, *layers: np.ndarray) -> np.ndarray:
     return np.repeat(level[..., None], 3, axis=2)
 
 
-def asphalt(random, size: int = 512, grain: float = 0.12) -> np.ndarray:
+def asphalt(random, size: int = 512, grain: float = 0.12, spots: float = 1.0) -> np.ndarray:
     stones = noise(random, (size, size), 1.0)
     return grey(
         0.72,
         grain * stones,
-        0.08 * np.maximum(noise(random, (size, size), 1.2) - 1, 0),
-        0.06 * noise(random, (size, size), 6),
-        0.03 * noise(random, (size, size), 40),
+        spots * 0.08 * np.maximum(noise(random, (size, size), 1.2) - 1, 0),
+        spots * 0.06 * noise(random, (size, size), 6),
+        spots * 0.03 * noise(random, (size, size), 40),
     )
 
 
@@ -57,11 +57,11 @@ def soil(random, size: int = 256) -> np.ndarray:
     return grey(0.80, 0.07 * clouds(random, size, 24), 0.05 * noise(random, (size, size), 0.8))
 
 
-def rock(random, size: int = 256) -> np.ndarray:
-    """Streaked downwards, as the cliffs' stretched textures are."""
-    streaks = cv2.GaussianBlur(
-        np.pad(random.standard_normal((size, size)).astype(np.float32), 40, mode="wrap"), (0, 0), 2, sigmaY=12
-    )[40:-40, 40:-40]
+def rock(random, size: int = 256, streak: float = 6.0) -> np.ndarray:
+    """Streaked downwards, as the cliffs' stretched textures are; streak: how many times longer than wide."""
+    pad = 40
+    grain = np.pad(random.standard_normal((size, size)).astype(np.float32), pad, mode="wrap")
+    streaks = cv2.GaussianBlur(grain, (0, 0), 2, sigmaY=2 * streak)[pad:-pad, pad:-pad]
     return grey(0.74, 0.13 * streaks / streaks.std(), 0.06 * clouds(random, size, 24))
 
 
