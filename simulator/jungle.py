@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from . import textures
 from .scenery import Scenery, bonnet, dome
-from .shapes import Light, Mesh, around, box, grid, lit, plants, ribbon, stretch, together
+from .shapes import Light, Mesh, around, beside, box, grid, lit, plants, ribbon, stretch, together
 from .track import Track
 
 LINE, ROAD = 4.1, 4.45  # m from the centre line: the white edge line, the asphalt's end
@@ -109,59 +109,38 @@ def ground(land: Land, random, light: Light, palette: dict) -> Mesh:
     return shadowed(lit(white, light, faced_up=True), land, light, 0.55)
 
 
+def tarmac(random, palette: dict) -> np.ndarray:
+    """Asphalt as wide as the road, a dash and a gap long, divided by its own colour, which the vertices
+    carry."""
+    texture = textures.asphalt(random, grain=0.03, spots=0.35).astype(float)
+    rows, columns = texture.shape[:2]
+    left = ROAD - (np.arange(columns) + 0.5) / columns * 2 * ROAD
+    white = np.array(palette["line"]) / palette["asphalt"] * 255
+    texture[:, np.abs(np.abs(left) - LINE) < 0.10] = white
+    texture[: round(rows * DASH / (DASH + GAP)), np.abs(left) < 0.11] = white
+    return np.clip(texture, 0, 255).astype(np.uint8)
+
+
 def road(land: Land, random, light: Light, palette: dict) -> list[Mesh]:
-    """Asphalt, edge lines, the dashed centre line, grassy verges, and the bridge's sides."""
-    track, white = land.track, textures.line()
-    s = around(track)
-    meshes = [
-        ribbon(
-            track,
-            s,
-            np.linspace(ROAD, -ROAD, 9),
-            0.0,
-            palette["asphalt"],
-            textures.asphalt(random, grain=0.03, spots=0.35),
-            9.0,
-        )
-    ]
-    for offset in (LINE, -LINE):
-        meshes.append(
-            ribbon(
-                track, s, (offset + 0.09, offset - 0.09), 0.015, palette["line"], white, 4.0, across=(0, 1)
-            )
-        )
-    dashes = [
-        ribbon(
-            track,
-            stretch(start, start + DASH),
-            (0.09, -0.09),
-            0.015,
-            palette["line"],
-            white,
-            4.0,
-            across=(0, 1),
-        )
-        for start in np.arange(0, track.length - DASH, DASH + GAP)
-    ]
-    meshes.append(together(dashes))
-    soil = textures.soil(random)
-    ends = [(0.0, BRIDGE[0]), (BRIDGE[1], track.length)]
-    for start, end in ends:
+    """Asphalt with its lines, grassy verges, and the bridge's sides."""
+    track, plain, soil = land.track, textures.line(), textures.soil(random)
+    across = np.linspace(ROAD, -ROAD, 7)
+    painted = 0.5 - across / (2 * ROAD)
+    surface = (palette["asphalt"], tarmac(random, palette), DASH + GAP)
+    meshes = [ribbon(track, around(track, 1.5), across, 0.0, *surface, painted)]
+    for start, end in ((0.0, BRIDGE[0]), (BRIDGE[1], track.length)):
         for side in (1, -1):
-            offsets, heights = (ROAD, 6.2, 9.8), (-0.01, -0.08, -0.75)
-            if side < 0:
-                offsets, heights = tuple(-x for x in offsets[::-1]), heights[::-1]
-            verge = ribbon(track, stretch(start, end, 2.0), offsets, heights, palette["grass"], soil, 9.0)
-            meshes.append(lit(verge, light, faced_up=True))
-    deck = stretch(*BRIDGE)
+            shape = (track, stretch(start, end, 2.5), side, (ROAD, 6.2, 9.8), (-0.01, -0.08, -0.75))
+            meshes.append(lit(beside(*shape, palette["grass"], soil, 9.0), light, faced_up=True))
+    out = ROAD + 0.25
     for side in (1, -1):
-        edge = side * (ROAD + 0.25)
         for offsets, heights in (
-            ((edge, edge), (0.15, -1.3)),
-            ((side * ROAD, edge), (0.15, 0.15)),
-            ((edge, 0.0), (-1.3, -1.3)),
+            ((out, out), (0.15, -1.3)),
+            ((ROAD, out), (0.15, 0.15)),
+            ((0, out), (-1.3, -1.3)),
         ):
-            meshes.append(ribbon(track, deck, offsets, heights, palette["deck"], white, 4.0, across=(0, 1)))
+            shape = (track, stretch(*BRIDGE), side, offsets, heights)
+            meshes.append(beside(*shape, palette["deck"], plain, 4.0, (0, 1)))
     return [shadowed(mesh, land, light, 0.68) for mesh in meshes]
 
 

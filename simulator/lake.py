@@ -1,15 +1,17 @@
 """The lake's scenery, from its centre line: distances along it and features were read off the real
 simulator's frames."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from . import textures
 from .scenery import Haze, Scenery, bonnet, dome
-from .shapes import Light, Mesh, around, boulder, grid, lit, plants, ribbon, stretch, together
+from .shapes import Light, Mesh, around, beside, boulder, grid, lit, plants, ribbon, stretch, together
 from .track import Track
 
-ASPHALT, EDGE = 4.95, 7.6  # m from the centre line: where the asphalt ends, and the concrete beside it
+ASPHALT, EDGE = 4.95, 7.0  # m from the centre line: where the asphalt ends, and the concrete beside it
 BRIDGE = (674, 783)
 WATER = -1.2  # m
 CELL = 7.0  # m between the ground's points
@@ -25,6 +27,7 @@ KERBS = (
     (1, 965, 1022),
     (-1, 958, 1022),
 )
+CLIFF = (-1, -45, 55)  # dark rock close to the road
 VERGES = ((-1, 62, 106), (-1, 845, 860))  # no concrete here: red earth up to the asphalt
 # Height in metres of the land 25 m beside the road, by distance along it
 RIGHT = (
@@ -148,7 +151,7 @@ class Land:
         away, s, side = self.beside(places)
         length = self.track.length
         near = np.where(side > 0, around_lap(LEFT, s, length), around_lap(RIGHT, s, length))
-        cliff = (side < 0) & ((s + 45) % length < 100)
+        cliff = within((CLIFF,), s, side, length)
         rise = np.clip((away - np.where(cliff, 15, 9)) / np.where(cliff, 6, 22), 0, 1)
         rise = rise * rise * (3 - 2 * rise)
         row, column = (np.floor(places / 4).astype(int) % 256).T
@@ -164,103 +167,93 @@ class Land:
         return np.where(away < 8.5, -0.15, z + 0.02)
 
 
-def ground(land: Land, random, light: Light, palette: dict, soil) -> Mesh:
+def ground(land: Land, random, light: Light, palette: dict, soil) -> list[Mesh]:
+    """A fine sheet near the road and a coarse one, a little lower, beyond."""
+    tone = textures.clouds(random, 256, 12, 4)
     low, high = land.track.points[:, :2].min(axis=0) - 230, land.track.points[:, :2].max(axis=0) + 230
-    xs, ys = (np.arange(a, b, CELL) for a, b in zip(low, high, strict=True))
-    places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
-    points = np.c_[places, land.height(places)]
-    faces = grid(len(ys), len(xs))
-    away, s, side = land.beside(places)
-    mesh = Mesh(points, np.ones_like(points), places / 14.0, faces, soil)
-    facing = (lit(mesh, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), faced_up=True)).colours[:, :1]
-    steep = np.clip((0.93 - facing) * 6, 0, 1)
-    earth = within(EARTH, s, side, land.track.length) & (away < 30)
-    tone = textures.clouds(random, 256, 12, 4)[tuple((np.floor(places / 5).astype(int) % 256).T)][:, None]
-    green = np.clip(0.5 + 0.35 * tone, 0, 1)
-    colour = np.array(palette["grass"]) * (1 - 0.35 * green) + np.array(palette["green"]) * 0.35 * green
-    colour = np.where(earth[:, None], np.array(palette["earth"]), colour)
-    sandy = np.array(palette["sand"]) * (1 + 0.10 * tone)
-    colour = colour * (1 - steep) + sandy * steep
-    cliff = ((side < 0) & ((s + 45) % land.track.length < 100) & (away > 14) & (away < 32))[:, None]
-    colour = np.where(cliff, np.array(palette["cliff"]), colour)
-    return lit(Mesh(points, colour, places / 14.0, faces, mesh.texture), light, faced_up=True)
+    sheets = []
+    for cell, nearest, farthest, lower in ((CELL, 0, 66, 0.0), (2.5 * CELL, 48, 400, 0.4)):
+        xs, ys = (np.arange(a, b, cell) for a, b in zip(low, high, strict=True))
+        places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+        away, s, side = land.beside(places)
+        points = np.c_[places, land.height(places) - lower]
+        sheet = Mesh(points, np.ones_like(points), places / 14.0, grid(len(ys), len(xs)), soil)
+        facing = lit(sheet, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), faced_up=True).colours[:, :1]
+        steep = np.clip((0.93 - facing) * 6, 0, 1)
+        patch = tone[tuple((np.floor(places / 5).astype(int) % 256).T)][:, None]
+        green = 0.35 * np.clip(0.5 + 0.35 * patch, 0, 1)
+        colour = np.array(palette["grass"]) * (1 - green) + np.array(palette["green"]) * green
+        earth = within(EARTH, s, side, land.track.length) & (away < 30)
+        colour = np.where(earth[:, None], np.array(palette["earth"]), colour)
+        colour = colour * (1 - steep) + np.array(palette["sand"]) * (1 + 0.10 * patch) * steep
+        cliff = within((CLIFF,), s, side, land.track.length) & (away > 14) & (away < 32)
+        sheet.colours[:] = np.where(cliff[:, None], np.array(palette["cliff"]), colour)
+        corners = away[sheet.faces]
+        seen = (points[sheet.faces, 2].max(axis=1) > WATER - 0.4) & (corners.max(axis=1) > nearest)
+        seen &= corners.min(axis=1) < farthest
+        sheets.append(replace(lit(sheet, light, faced_up=True), faces=sheet.faces[seen]))
+    return sheets
+
+
+def tarmac(random, palette: dict) -> np.ndarray:
+    """Asphalt as wide as the road, with its double lines; divided by the asphalt's own colour, which the
+    vertices carry."""
+    texture = textures.asphalt(random).astype(float)
+    columns = texture.shape[1]
+    left = ASPHALT - (np.arange(columns) + 0.5) / columns * 2 * ASPHALT
+    for offset, half, name in ((3.72, 0.17, "seam"), (3.5, 0.07, "line"), (3.95, 0.06, "outer line")):
+        texture[:, np.abs(np.abs(left) - offset) < half] = np.array(palette[name]) / palette["asphalt"] * 255
+    return np.clip(texture, 0, 255).astype(np.uint8)
 
 
 def road(track: Track, random, light: Light, palette: dict, soil) -> list[Mesh]:
     """Asphalt with its double lines, kerbs, concrete edges, verges, and the bridge."""
-    s, line = around(track, 2.0), textures.line()
-    shade = np.ones((len(s), 9, 3))
-    across = np.linspace(ASPHALT, -ASPHALT, 9)
+    s, black = around(track, 2.0), textures.line()
+    across = np.linspace(ASPHALT, -ASPHALT, 7)
+    shade = np.ones((len(s), len(across), 3))
     for at, left, half_length, half_width in SHADOWS:
         along = ((s - at + track.length / 2) % track.length - track.length / 2)[:, None] / half_length
         inside = np.clip(1.6 - np.hypot(along, (across - left) / half_width) * 1.2, 0, 1)[..., None]
         shade *= 1 - 0.5 * inside
+    painted = 0.5 - across / (2 * ASPHALT)
     asphalt = np.array(palette["asphalt"]) * shade
-    meshes = [ribbon(track, s, across, 0.0, asphalt, textures.asphalt(random), 6.0)]
-    yellow, dark = palette["line"], palette["seam"]
+    meshes = [ribbon(track, s, across, 0.0, asphalt, tarmac(random, palette), 2 * ASPHALT, painted)]
+    slab, stripes = textures.concrete(random), textures.kerb()
     for side in (1, -1):
-        for offset, half, colour in (
-            (3.5, 0.06, yellow),
-            (3.72, 0.16, dark),
-            (3.95, 0.05, palette["outer line"]),
-        ):
-            edges = sorted((side * (offset - half), side * (offset + half)), reverse=True)
-            meshes.append(ribbon(track, s, edges, 0.012, colour, line, 4.0, across=(0, 1)))
-    slab = textures.concrete(random)
-    ends = {1: [], -1: []}
-    for side, start, end in VERGES:
-        ends[side].append((start, end))
-    for side in (1, -1):
-        edges, cut = [], sorted(ends[side] + [BRIDGE])
+        verges = [(start, end) for which, start, end in VERGES if which == side]
         begin = 0.0
-        for start, end in [*cut, (track.length, None)]:
-            edges.append((begin, start))
+        for start, end in [*sorted([*verges, BRIDGE]), (track.length, None)]:
+            shape = (track, stretch(begin, start, 3.0), side, (ASPHALT, 5.9, EDGE, EDGE + 0.2))
+            paint = (palette["slab"], slab, 3.0, (0, 0.5, 0.9, 1))
+            # lit as if it rose steeply, which is how the real ones look, though their edges lie low
+            bright = lit(beside(*shape, (0, 0.5, 1.0, 1.1), *paint), light, faced_up=True)
+            meshes.append(replace(bright, points=beside(*shape, (0.01, 0.05, 0.08, -0.5), *paint).points))
             begin = end
-        for start, end in edges:
-            offsets, heights = (ASPHALT, 5.6, EDGE, EDGE + 0.3), (0.01, 0.10, 0.42, -0.5)
-            if side < 0:
-                offsets, heights = tuple(-x for x in offsets[::-1]), heights[::-1]
-            strip = ribbon(
-                track,
-                stretch(start, end, 2.0),
-                offsets,
-                heights,
-                palette["slab"],
-                slab,
-                3.0,
-                across=(0, 0.4, 0.8, 1),
-            )
-            meshes.append(lit(strip, light, faced_up=True))
-        for start, end in ends[side]:
-            offsets, heights = (ASPHALT - 1.3, 6.0, 12.0), (0.015, 0.02, 0.1)
-            if side < 0:
-                offsets, heights = tuple(-x for x in offsets[::-1]), heights[::-1]
-            strip = ribbon(track, stretch(start, end), offsets, heights, palette["earth"], soil, 9.0)
-            meshes.append(lit(strip, light, faced_up=True))
-    stripes = textures.kerb()
+        for start, end in verges:
+            shape = (track, stretch(start, end, 2.0), side, (3.65, 6.0, 12.0), (0.015, 0.02, 0.1))
+            meshes.append(lit(beside(*shape, palette["earth"], soil, 9.0), light, faced_up=True))
     for side, start, end in KERBS:
-        offsets = sorted((side * 3.86, side * 4.93), reverse=True)
-        kerb = ribbon(track, stretch(start, end), offsets, 0.05, palette["kerb"], stripes, 1.0, across=(0, 1))
-        meshes.append(kerb)
-    deck = stretch(*BRIDGE)
-    meshes.append(
-        ribbon(
+        kerb = (
             track,
-            deck,
-            np.linspace(ASPHALT, -ASPHALT, 7),
-            0.02,
-            palette["cobbles"],
-            textures.cobbles(random),
-            4.5,
+            stretch(start, end),
+            side,
+            (3.86, 4.93),
+            (0.03, 0.06),
+            palette["kerb"],
+            stripes,
+            1.6,
+            (0, 1),
         )
-    )
+        meshes.append(beside(*kerb))
+    deck = stretch(*BRIDGE)
+    meshes.append(ribbon(track, deck, across, 0.02, palette["cobbles"], textures.cobbles(random), 4.5))
     for side in (1, -1):
         for offsets, heights in (
-            ((side * 4.9, side * 4.9), (0.0, 0.75)),
-            ((side * 4.9, side * 5.5), (0.75, 0.75)),
-            ((side * 5.5, side * 5.5), (0.75, -2.0)),
+            ((4.9, 4.9), (0, 0.75)),
+            ((4.9, 5.5), (0.75, 0.75)),
+            ((5.5, 5.5), (0.75, -2)),
         ):
-            meshes.append(ribbon(track, deck, offsets, heights, (0.02, 0.02, 0.02), line, 4.0, across=(0, 1)))
+            meshes.append(beside(track, deck, side, offsets, heights, (0.02, 0.02, 0.02), black, 4.0, (0, 1)))
     return meshes
 
 
@@ -382,7 +375,7 @@ PALETTE = {
     "seam": (0.36, 0.35, 0.32),
     "slab": (0.88, 0.85, 0.78),
     "kerb": (1.0, 0.98, 0.95),
-    "cobbles": (0.80, 0.68, 0.60),
+    "cobbles": (0.80, 0.72, 0.66),
     "grass": (1.0, 0.84, 0.38),
     "green": (0.50, 0.50, 0.18),
     "earth": (0.94, 0.60, 0.31),
@@ -413,7 +406,7 @@ def scenery(look: int) -> Scenery:
     )
     soil = textures.soil(random)
     meshes = [
-        ground(land, random, light, palette, soil),
+        *ground(land, random, light, palette, soil),
         *road(track, random, light, palette, soil),
         water,
         mountains(random, light, palette, soil),

@@ -84,6 +84,16 @@ def ribbon(track: Track, s, offsets, heights, colour, texture, metres: float, ac
     return Mesh(points.reshape(-1, 3), colours.reshape(-1, 3).copy(), uv.reshape(-1, 2), grid(n, k), texture)
 
 
+def beside(track: Track, s, side: int, offsets, heights, colour, texture, metres: float, across=None) -> Mesh:
+    """A ribbon beside the road, on its left (side 1) or mirrored to its right (-1); offsets from the road
+    outwards."""
+    offsets, heights = side * np.array(offsets, float), np.array(heights, float)
+    across = -offsets / metres if across is None else np.array(across, float)
+    if side > 0:  # ribbons run from left to right
+        offsets, heights, across = offsets[::-1], heights[::-1], across[::-1]
+    return ribbon(track, s, offsets, heights, colour, texture, metres, across)
+
+
 def around(track: Track, every: float = 1.0) -> np.ndarray:
     """Distances once round the whole track, the first point again at the end."""
     return np.linspace(0, track.length, round(track.length / every) + 1)
@@ -113,7 +123,7 @@ def plants(
     return Mesh(corners.reshape(-1, 3), np.repeat(colours, 8, axis=0), uv, faces.reshape(-1, 3), texture)
 
 
-def boulder(centre, size, random, colour, texture, lumps: float = 0.15, detail: int = 12) -> Mesh:
+def boulder(centre, size, random, colour, texture, lumps: float = 0.15, detail: int = 9) -> Mesh:
     """A lumpy ellipsoid; size: its half axes in metres."""
     polar, turn = np.meshgrid(
         np.linspace(0, np.pi, detail), np.linspace(0, 2 * np.pi, 2 * detail), indexing="ij"

@@ -65,7 +65,7 @@ def rock(random, size: int = 256, streak: float = 6.0) -> np.ndarray:
     return grey(0.74, 0.13 * streaks / streaks.std(), 0.06 * clouds(random, size, 24))
 
 
-def cobbles(random, size: int = 512, stones: int = 9) -> np.ndarray:
+def cobbles(random, size: int = 512, stones: int = 12) -> np.ndarray:
     """Irregular setts, longer along the road (rows) than across it, with pale joints."""
     rows, columns = np.mgrid[0:size, 0:size].astype(np.float32)
     rows += 7 * noise(random, (size, size), 18)
@@ -74,9 +74,9 @@ def cobbles(random, size: int = 512, stones: int = 9) -> np.ndarray:
     course = np.floor(across)
     along = rows / size * stones * 0.6 + 0.37 * course
     edge = np.minimum(np.minimum(across % 1, 1 - across % 1), np.minimum(along % 1, 1 - along % 1) / 0.6)
-    tint = random.uniform(-0.10, 0.10, (64, 64))[course.astype(int) % 64, np.floor(along).astype(int) % 64]
-    level = 0.70 + tint + 0.07 * noise(random, (size, size), 2)
-    level = np.where(edge < 0.09, 0.95, level)
+    tint = random.uniform(-0.13, 0.10, (64, 64))[course.astype(int) % 64, np.floor(along).astype(int) % 64]
+    level = 0.76 + tint + 0.09 * noise(random, (size, size), 1.5)
+    level = np.where(edge < 0.08, 0.95, level)
     return grey(0.0, level)
 
 
