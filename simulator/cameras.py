@@ -9,6 +9,7 @@ from panda3d.core import (
     GraphicsOutput,
     GraphicsPipe,
     GraphicsPipeSelection,
+    NodePath,
     PerspectiveLens,
     Texture,
     WindowProperties,
@@ -16,7 +17,7 @@ from panda3d.core import (
 )
 
 from . import SimulatorError
-from .world import Scene
+from .world import INSIDE, Scene
 
 ROWS, COLUMNS = 160, 320
 QUALITY = 75
@@ -64,13 +65,11 @@ def jpeg(frame: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-class Cameras:
-    """The car's cameras on a scene, without a screen: one buffer, a region a camera, one below the other."""
+class Buffer:
+    """Regions below one another in one picture that is drawn without a screen."""
 
-    def __init__(self, scene: Scene, names: tuple[str, ...] = ("center", "left", "right")):
-        self.scene, self.names = scene, names
-        self.car = scene.root.attach_new_node("cameras")
-        scene.bonnet.reparent_to(self.car)
+    def __init__(self, rows: int, columns: int, cameras: list[NodePath]):
+        """rows: of each region. Raises SimulatorError."""
         pipe = GraphicsPipeSelection.get_global_ptr().make_pipe("TinyOffscreenGraphicsPipe", "p3tinydisplay")
         if not pipe:
             raise SimulatorError(
@@ -79,32 +78,40 @@ class Cameras:
         properties = FrameBufferProperties()
         properties.set_rgba_bits(8, 8, 8, 0)
         properties.set_depth_bits(24)
+        self.shape = (len(cameras), rows, columns, 3)
         self.engine = GraphicsEngine(pipe)
-        self.buffer = self.engine.make_output(
-            pipe,
-            "cameras",
-            0,
-            properties,
-            WindowProperties.size(COLUMNS, ROWS * len(names)),
-            GraphicsPipe.BF_refuse_window,
-        )
+        size = WindowProperties.size(columns, rows * len(cameras))
+        buffer = self.engine.make_output(pipe, "buffer", 0, properties, size, GraphicsPipe.BF_refuse_window)
         self.image = Texture()
-        self.buffer.add_render_texture(self.image, GraphicsOutput.RTM_copy_ram, GraphicsOutput.RTP_color)
-        for i, name in enumerate(names):
-            region = self.buffer.make_display_region(0, 1, 1 - (i + 1) / len(names), 1 - i / len(names))
-            camera = self.car.attach_new_node(Camera(name, lens()))
-            camera.set_pos(*MOUNTS[name])
-            camera.set_hpr(-YAW, -PITCH, -ROLL)
+        buffer.add_render_texture(self.image, GraphicsOutput.RTM_copy_ram, GraphicsOutput.RTP_color)
+        for i, camera in enumerate(cameras):
+            region = buffer.make_display_region(0, 1, 1 - (i + 1) / len(cameras), 1 - i / len(cameras))
             region.set_camera(camera)
 
-    def frames(self, transform) -> np.ndarray:
-        """uint8 (cameras, 160, 320, 3), RGB, in the order of `names`, with the car's node at the
-        transform."""
-        self.car.set_transform(transform)
-        at = transform.get_pos()
-        self.scene.look_from(at.x, at.y, at.z)
+    def draw(self) -> np.ndarray:
+        """uint8 (regions, rows, columns, 3), RGB."""
         self.engine.render_frame()
         pixels = np.frombuffer(self.image.get_ram_image_as("RGB"), np.uint8)
-        return np.ascontiguousarray(pixels.reshape(-1, COLUMNS, 3)[::-1]).reshape(
-            len(self.names), ROWS, COLUMNS, 3
-        )
+        return np.ascontiguousarray(pixels.reshape(-1, self.shape[2], 3)[::-1]).reshape(self.shape)
+
+
+class Cameras:
+    """The car's cameras on a scene."""
+
+    def __init__(self, scene: Scene, names: tuple[str, ...] = ("center", "left", "right")):
+        self.scene = scene
+        mounted = []
+        for name in names:
+            camera = scene.car.attach_new_node(Camera(name, lens()))
+            camera.node().set_camera_mask(INSIDE)
+            camera.set_pos(*MOUNTS[name])
+            camera.set_hpr(-YAW, -PITCH, -ROLL)
+            mounted.append(camera)
+        self.buffer = Buffer(ROWS, COLUMNS, mounted)
+
+    def frames(self, transform) -> np.ndarray:
+        """uint8 (cameras, 160, 320, 3), RGB, in the order of the names, with the car's node at the
+        transform."""
+        self.scene.car.set_transform(transform)
+        self.scene.look_from(*transform.get_pos())
+        return self.buffer.draw()

@@ -65,3 +65,35 @@ class Expert:
         return self.steering, max(
             -1.0, min(1.0, 0.6 * (limit - speed) + 0.3 * run.track.at(run.s).grade * 9.81 / 4)
         )
+
+
+class Recovery(Expert):
+    """Drives out to the road's sides and back; `recording` tells whether it is on its way back."""
+
+    OUT, BACK = 1.2, 2.2  # m/s sideways
+    PAUSE = (1.0, 3.0)  # s on the lane's centre between two returns
+    SHARE = (0.55, 0.95)  # of the way from the lane's centre to where a wheel would leave the road
+    MARGIN = 1.5  # m from the car's middle to the road's end at which it turns back at the latest
+
+    def __init__(self, track: Track, seed: int = 0, top_speed: float = TOP_SPEED):
+        super().__init__(track, seed, top_speed, wander=0.0)
+        self.random = np.random.default_rng([seed, 2])
+        self.goal, self.until, self.recording = 0.0, self.random.uniform(*self.PAUSE), False
+
+    def drive(self, run: Run) -> tuple[float, float]:
+        if self.recording:
+            if abs(run.offset) < 0.25 and self.aim == 0:
+                self.recording, self.until = False, run.time + self.random.uniform(*self.PAUSE)
+        elif self.goal:
+            if abs(run.offset - self.goal) < 0.2 or run.time > self.until:
+                self.goal, self.recording = 0.0, True
+        elif run.time > self.until:
+            side = self.random.choice((1, -1))
+            room = self.track.edges[
+                int(run.s / self.track.step) % len(self.track.edges), 0 if side > 0 else 1
+            ]
+            self.goal = side * self.random.uniform(*self.SHARE) * (room - self.MARGIN)
+            self.until = run.time + 6.0
+        pace = (self.BACK if self.recording else self.OUT) * 0.02
+        self.aim += max(-pace, min(pace, self.goal - self.aim))
+        return super().drive(run)

@@ -5,7 +5,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from . import textures
-from .scenery import Scenery, bonnet, dome
+from .scenery import Scenery, body, bonnet, dome, varied
 from .shapes import Light, Mesh, around, beside, box, grid, lit, plants, ribbon, stretch, together
 from .track import Track
 
@@ -19,6 +19,8 @@ REACH = 75.0  # m of ground around the track
 CLIFFS = (12.0, 4.0)  # m from the road where cliffs begin, and over which they rise
 
 PALETTE = {
+    "zenith": (0.22, 0.35, 0.59),
+    "horizon": (0.59, 0.71, 0.88),
     "asphalt": (0.90, 0.89, 0.86),
     "line": (0.98, 0.98, 0.97),
     "grass": (0.44, 0.49, 0.25),
@@ -223,7 +225,7 @@ def palms(land: Land, random, light: Light, palette: dict) -> list[Mesh]:
 
 def scenery(look: int) -> Scenery:
     random = np.random.default_rng(look)
-    light, palette = LIGHT, PALETTE
+    light, palette = varied(look, LIGHT, PALETTE)
     land = Land(Track("jungle"), random)
     meshes = [
         ground(land, random, light, palette),
@@ -231,5 +233,5 @@ def scenery(look: int) -> Scenery:
         *furniture(land.track, light, palette),
         *palms(land, random, light, palette),
     ]
-    sky = dome(textures.sky((56, 88, 150), (150, 180, 224)))
-    return Scenery(meshes, sky, bonnet(palette["bonnet"], light), None)
+    sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
+    return Scenery(meshes, sky, bonnet(palette["bonnet"], light), body(palette["bonnet"], light), None)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from . import textures
-from .scenery import Haze, Scenery, bonnet, dome
+from .scenery import Haze, Scenery, body, bonnet, dome, varied
 from .shapes import Light, Mesh, around, beside, boulder, grid, lit, plants, ribbon, stretch, together
 from .track import Track
 
@@ -201,17 +201,17 @@ def tarmac(random, palette: dict) -> np.ndarray:
     texture = textures.asphalt(random).astype(float)
     columns = texture.shape[1]
     left = ASPHALT - (np.arange(columns) + 0.5) / columns * 2 * ASPHALT
-    for offset, half, name in ((3.72, 0.17, "seam"), (3.5, 0.07, "line"), (3.95, 0.06, "outer line")):
+    for offset, half, name in ((3.72, 0.17, "seam"), (3.5, 0.05, "line"), (3.95, 0.04, "outer line")):
         texture[:, np.abs(np.abs(left) - offset) < half] = np.array(palette[name]) / palette["asphalt"] * 255
     return np.clip(texture, 0, 255).astype(np.uint8)
 
 
-def road(track: Track, random, light: Light, palette: dict, soil) -> list[Mesh]:
+def road(track: Track, random, light: Light, palette: dict, soil, shadows) -> list[Mesh]:
     """Asphalt with its double lines, kerbs, concrete edges, verges, and the bridge."""
     s, black = around(track, 2.0), textures.line()
     across = np.linspace(ASPHALT, -ASPHALT, 7)
     shade = np.ones((len(s), len(across), 3))
-    for at, left, half_length, half_width in SHADOWS:
+    for at, left, half_length, half_width in shadows:
         along = ((s - at + track.length / 2) % track.length - track.length / 2)[:, None] / half_length
         inside = np.clip(1.6 - np.hypot(along, (across - left) / half_width) * 1.2, 0, 1)[..., None]
         shade *= 1 - 0.5 * inside
@@ -369,6 +369,8 @@ def mountains(random, light: Light, palette: dict, soil) -> Mesh:
 
 
 PALETTE = {
+    "zenith": (0.24, 0.36, 0.60),
+    "horizon": (0.69, 0.78, 0.91),
     "asphalt": (0.715, 0.73, 0.665),
     "line": (0.88, 0.76, 0.26),
     "outer line": (0.72, 0.63, 0.28),
@@ -391,9 +393,22 @@ PALETTE = {
 LIGHT = Light(sun=(0.78, -0.10, 0.62), sunlight=(0.74, 0.68, 0.50), fill=(0.56, 0.61, 0.68))
 
 
+def cast(random, length: float) -> list[tuple]:
+    """Shadows of trees and posts at other places than the real simulator's."""
+    return [
+        (
+            random.uniform(0, length),
+            random.uniform(-4, 4),
+            random.choice((0.5, 3.0, 5.0)),
+            random.uniform(2, 9),
+        )
+        for _ in range(random.integers(5, 40))
+    ]
+
+
 def scenery(look: int) -> Scenery:
     random = np.random.default_rng(look)
-    track, light, palette = Track("lake"), LIGHT, PALETTE
+    track, (light, palette) = Track("lake"), varied(look, LIGHT, PALETTE)
     land = Land(track, random)
     side = np.linspace(-760, 760, 27)
     flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
@@ -405,14 +420,21 @@ def scenery(look: int) -> Scenery:
         textures.grey(0.97, 0.02 * textures.noise(random, (64, 64), 3)),
     )
     soil = textures.soil(random)
+    shadows = cast(random, track.length) if look else SHADOWS
     meshes = [
         *ground(land, random, light, palette, soil),
-        *road(track, random, light, palette, soil),
+        *road(track, random, light, palette, soil, shadows),
         water,
         mountains(random, light, palette, soil),
         rocks(land, random, light, palette),
         *pines(land, random, palette),
         *pylons(land, light),
     ]
-    sky = dome(textures.sky((62, 92, 152), (176, 200, 232)))
-    return Scenery(meshes, sky, bonnet(palette["bonnet"], light), Haze((0.41, 0.60, 0.85), (100, 600), 0.8))
+    sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
+    return Scenery(
+        meshes,
+        sky,
+        bonnet(palette["bonnet"], light),
+        body(palette["bonnet"], light),
+        Haze((0.41, 0.60, 0.85), (100, 600), 0.8),
+    )

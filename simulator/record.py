@@ -2,7 +2,7 @@
 
 from . import scenery
 from .cameras import Cameras
-from .expert import Expert
+from .expert import Expert, Recovery
 from .progress import Progress
 from .recording import Clock, Recording
 from .run import Run
@@ -10,18 +10,29 @@ from .track import MPH, Track
 from .world import Scene
 
 
-def record(folder: str, track: Track, laps: float, speed: float = 30.0, seed: int = 0, look: int = 0) -> Run:
-    """Record the expert's laps at a set speed in mph into a new folder. Raises SimulatorError."""
+def record(
+    folder: str,
+    track: Track,
+    laps: float,
+    speed: float = 30.0,
+    seed: int = 0,
+    look: int = 0,
+    recovery: bool = False,
+) -> Run:
+    """Record the expert's laps at a set speed in mph into a new folder. Raises SimulatorError.
+
+    recovery: only its returns from the road's sides.
+    """
     with Recording(folder, seed) as recording:
         run = Run(track)
         run.car.speed_limit = speed * MPH
-        expert = Expert(track, seed, speed * MPH)
+        expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
         cameras = Cameras(Scene(scenery.build(track.name, look)))
         clock, progress = Clock(), Progress(laps, "laps")
         while run.travelled < laps * track.length:
             steering, throttle = expert.drive(run)
             run.step(steering, throttle)
-            if clock.due(run.time):
+            if clock.due(run.time) and (not recovery or expert.recording):
                 recording.add(
                     run.time,
                     cameras.frames(run.car.node.get_transform()),

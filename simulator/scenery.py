@@ -1,11 +1,11 @@
 """All that is to be seen on a track: its meshes, sky and haze, the car's own bonnet, and other looks of
 them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .shapes import Light, Mesh, grid, lit
+from .shapes import Light, Mesh, box, grid, lit, together
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class Scenery:
     meshes: list[Mesh]
     sky: Mesh
     bonnet: Mesh
+    body: Mesh
     haze: Haze | None
 
 
@@ -70,6 +71,40 @@ def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
         hazy=False,
     )
     return lit(mesh, light, faced_up=True)
+
+
+def body(colour: tuple[float, float, float], light: Light) -> Mesh:
+    """The car as seen from outside, in the car's coordinates as the bonnet is."""
+    plain, dark = np.full((4, 4, 3), 255, np.uint8), (0.08, 0.08, 0.09)
+    boxes = [
+        box((0, -0.15, 0.35), (1.75, 4.3, 0.45), 0.0, colour, plain),
+        box((0, -0.45, 0.80), (1.45, 2.1, 0.50), 0.0, dark, plain),
+        box((0, -0.45, 1.26), (1.30, 1.8, 0.06), 0.0, colour, plain),
+        box((0, -2.35, 0.65), (1.5, 0.08, 0.12), 0.0, (0.75, 0.10, 0.08), plain),
+    ]
+    boxes += [
+        box((x, y, 0.0), (0.25, 0.68, 0.68), 0.0, dark, plain) for x in (-0.88, 0.88) for y in (1.27, -1.60)
+    ]
+    return replace(lit(together(boxes), light), hazy=False)
+
+
+def varied(look: int, light: Light, palette: dict) -> tuple[Light, dict]:
+    """Another look's light and colours: another hour and weather, other soils and plants. Look 0 changes
+    nothing."""
+    if not look:
+        return light, palette
+    random = np.random.default_rng([look, 7])
+    turn, rise = random.uniform(0, 2 * np.pi), np.radians(random.uniform(25, 70))
+    sun = (np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise))
+    overcast = random.uniform(0, 0.6)  # how much of the sun's light comes from the whole sky instead
+    strength = random.uniform(0.65, 1.1) * np.array(random.uniform(0.92, 1.08, 3))
+    sunlight = np.array(light.sunlight) * strength * (1 - overcast)
+    fill = (np.array(light.fill) + 0.5 * overcast * np.array(light.sunlight)) * strength
+    colours = {
+        name: tuple(np.clip(np.array(colour) * random.uniform(0.75, 1.2) * random.uniform(0.9, 1.1, 3), 0, 1))
+        for name, colour in palette.items()
+    }
+    return Light(sun, tuple(sunlight), tuple(fill)), colours
 
 
 def build(track: str, look: int = 0) -> Scenery:

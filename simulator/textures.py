@@ -171,6 +171,7 @@ def palm(random, size: int = 128) -> np.ndarray:
 
 
 def sky(zenith, horizon, rows: int = 128) -> np.ndarray:
-    """Colours 0..255 at the top and at the bottom row."""
+    """Colours 0..1 at the top and at the bottom row."""
     part = np.linspace(0, 1, rows)[:, None, None]
-    return np.repeat((1 - part) * np.array(zenith) + part * np.array(horizon), 8, axis=1).astype(np.uint8)
+    level = (1 - part) * np.array(zenith) + part * np.array(horizon)
+    return np.repeat(level * 255, 8, axis=1).astype(np.uint8)

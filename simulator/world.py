@@ -9,6 +9,7 @@ from panda3d.bullet import (
     BulletWorld,
 )
 from panda3d.core import (
+    BitMask32,
     Geom,
     GeomNode,
     GeomTriangles,
@@ -32,6 +33,7 @@ GROUND_HALF_WIDTH = (
     8.0  # m of ground to each side of a climbing road; the car is set back before it gets there
 )
 CELL = 120.0  # m: meshes are cut into cells so that the engine can leave out what is out of sight
+INSIDE, OUTSIDE = BitMask32.bit(0), BitMask32.bit(1)  # what the car's own cameras see, and what others do
 HAZE_STEP = 25.0  # m: the haze is drawn anew when the camera has moved so far
 
 
@@ -167,11 +169,18 @@ class Scene:
         for mesh in scenery.meshes:
             textures.setdefault(id(mesh.texture), []).append(mesh)
         self.batches = [Batch(together(meshes), self.root) for meshes in textures.values()]
+        for i, batch in enumerate(self.batches):
+            batch.root.set_bin(
+                "fixed", i
+            )  # else the engine sorts by memory addresses, which differ from run to run
         self.sky = Batch(scenery.sky, self.root).root
         self.sky.set_bin("background", 0)
         self.sky.set_depth_write(False)
         self.sky.set_depth_test(False)
-        self.bonnet = Batch(scenery.bonnet, NodePath("car")).root
+        self.car = self.root.attach_new_node("car")
+        self.car.set_bin("fixed", len(self.batches))
+        Batch(scenery.bonnet, self.car).root.hide(OUTSIDE)
+        Batch(scenery.body, self.car).root.hide(INSIDE)
         self.haze_at = None
 
     def look_from(self, x: float, y: float, z: float) -> None:
