@@ -1,4 +1,4 @@
-"""What a user gets: python -m simulator record, drive."""
+"""What a user gets: python -m simulator record, drive, window."""
 
 import argparse
 import sys
@@ -45,8 +45,7 @@ def add_drive(commands) -> argparse.ArgumentParser:
     )
     parser.set_defaults(run=drive)
     parser.add_argument("--laps", type=positive, default=1, help="default 1")
-    parser.add_argument("--host", default="127.0.0.1", help="where drive.py runs (default 127.0.0.1)")
-    parser.add_argument("--port", type=int, default=4567, help="default 4567")
+    add_server(parser)
     parser.add_argument(
         "--wait", type=positive, default=60.0, help="seconds to wait for a server or an answer (default 60)"
     )
@@ -63,12 +62,26 @@ def add_drive(commands) -> argparse.ArgumentParser:
     return parser
 
 
+def add_window(commands) -> argparse.ArgumentParser:
+    parser = commands.add_parser("window", help="a person drives and records, or watches drive.py drive")
+    parser.set_defaults(run=window)
+    parser.add_argument("--folder", help="of the recording (default data/window-DATE-TIME)")
+    parser.add_argument("--autonomous", action="store_true", help="drive.py drives; W or S takes over")
+    add_server(parser)
+    return parser
+
+
+def add_server(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--host", default="127.0.0.1", help="where drive.py runs (default 127.0.0.1)")
+    parser.add_argument("--port", type=int, default=4567, help="default 4567")
+
+
 def arguments(argv=None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m simulator", description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
-    for command in (add_record(commands), add_drive(commands)):
+    for command in (add_record(commands), add_drive(commands), add_window(commands)):
         command.add_argument("--track", choices=sorted(ROADS), default="lake", help="default lake")
         command.add_argument(
             "--direction",
@@ -125,6 +138,21 @@ def drive(args) -> int:
         if args.picture:
             report.write_picture(args.picture, run)
     return 1 if run.departures else 0
+
+
+def window(args) -> int:
+    from datetime import datetime
+
+    from .window import Window
+
+    folder = args.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}"
+    server = (args.host, args.port) if args.autonomous else None
+    shown = Window(Track(args.track, args.direction), folder, args.look, server)
+    try:
+        shown.run()
+    finally:
+        shown.finish()
+    return 0
 
 
 def main(argv=None) -> int:

@@ -7,9 +7,9 @@ from . import SimulatorError
 from .cameras import Cameras, jpeg
 from .car import STEP
 from .progress import Progress
-from .recording import Clock
+from .recording import RATE, Clock
 from .run import Run
-from .wire import RETRY, Answer, Gone, Wire, read, telemetry
+from .wire import MANUAL, RETRY, Answer, Gone, Wire, read, telemetry
 
 STANDS_STILL = 60.0  # simulated seconds in which the car has to get on by a metre
 OPENS = 2  # telemetry is sent twice at the start, since the real client's "open" fires twice
@@ -19,24 +19,20 @@ class Standstill(SimulatorError):
     """The server answers, but the car does not move."""
 
 
+def picture(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
+    """The telemetry packet of this moment; steering and throttle as last commanded, -1..1."""
+    frame = cameras.frames(run.car.node.get_transform())[0]
+    return telemetry(steering, throttle, run.speed_mph, jpeg(frame))
+
+
 class Client:
     """Drives a run by a server's answers, connecting again when it goes away."""
 
-    def __init__(
-        self, run: Run, cameras: Cameras, host: str, port: int, wait: float, realtime: bool, watch=None
-    ):
-        """wait: seconds of patience with a server that is not there or does not answer usably.
-
-        watch: called after each physics step; raises to stop.
-        """
-        self.run, self.cameras, self.address, self.wait, self.realtime = (
-            run,
-            cameras,
-            (host, port),
-            wait,
-            realtime,
-        )
-        self.watch = watch
+    def __init__(self, run: Run, cameras: Cameras, host: str, port: int, wait: float, realtime: bool):
+        """wait: seconds of patience with a server that is not there or does not answer usably."""
+        self.run, self.cameras, self.address = run, cameras, (host, port)
+        self.wait, self.realtime = wait, realtime
+        self.watch = None  # called after each physics step, if set
         self.steering = self.throttle = 0.0
         self.round_trips: list[float] = []  # s
         self.frames = self.dropped = self.reconnections = 0
@@ -61,9 +57,8 @@ class Client:
 
     def picture(self) -> str:
         """The telemetry packet of this moment."""
-        frame = self.cameras.frames(self.run.car.node.get_transform())[0]
         self.frames += 1
-        return telemetry(self.steering, self.throttle, self.run.speed_mph, jpeg(frame))
+        return picture(self.run, self.cameras, self.steering, self.throttle)
 
     def obey(self, answer: Answer) -> None:
         if answer.steering is not None:
@@ -132,8 +127,7 @@ class Client:
                 tokens += 1
             if packet.startswith("40"):
                 break
-        clock = Clock()
-        clock.taken = int(self.run.time * 15) + 1
+        clock = Clock(self.run.time + 1 / RATE)
         while self.run.travelled < goal:
             while (early := self.wire.receive(0)) is not None:
                 self.obey(self._usable(early) or Answer())
@@ -182,3 +176,43 @@ class Client:
             self.obey(answer)
             self.wire.send(self.picture())
             sent.append(time.perf_counter())
+
+
+class Remote:
+    """drive.py as the window sees it: never waited for, looked for each second while it is away."""
+
+    def __init__(self, host: str, port: int, cameras: Cameras):
+        self.address, self.cameras = (host, port), cameras
+        self.steering = self.throttle = 0.0
+        self.wire: Wire | None = None
+        self.state, self.next_try = "not connected", 0.0
+
+    def answer(self, by_hand: bool, run: Run) -> None:
+        """Obey what has arrived, and send a frame for each, or null while a person steers."""
+        try:
+            if self.wire is None:
+                self._connect(run)
+            while self.wire and (packet := self.wire.receive(0)) is not None:
+                if (answer := read(packet)) is None:
+                    continue
+                if answer.steering is not None:
+                    self.steering, self.throttle = answer.steering, answer.throttle
+                self.wire.send(
+                    MANUAL if by_hand else picture(run, self.cameras, self.steering, self.throttle)
+                )
+        except Gone as error:
+            self.wire, self.state = None, str(error)
+            self.steering = self.throttle = 0.0
+
+    def _connect(self, run: Run) -> None:
+        if time.monotonic() < self.next_try:
+            return
+        self.next_try = time.monotonic() + 1
+        self.wire = Wire(*self.address, patient=True)
+        self.state = "drives"
+        for _ in range(OPENS):
+            self.wire.send(picture(run, self.cameras, 0.0, 0.0))
+
+    def close(self) -> None:
+        if self.wire:
+            self.wire.close()

@@ -1,10 +1,12 @@
 """An expert drives and is recorded, faster than real time."""
 
+from datetime import timedelta
+
 from . import scenery
 from .cameras import Cameras
 from .expert import Expert, Recovery
 from .progress import Progress
-from .recording import Clock, Recording
+from .recording import EPOCH, Clock, Recording
 from .run import Run
 from .track import MPH, Track
 from .world import Scene
@@ -21,9 +23,11 @@ def record(
 ) -> Run:
     """Record the expert's laps at a set speed in mph into a new folder. Raises SimulatorError.
 
-    recovery: only its returns from the road's sides.
+    recovery: only its returns from the road's sides. The images' names tell the seed's day, not today: the
+    same
+    seed and arguments make the same files.
     """
-    with Recording(folder, seed) as recording:
+    with Recording(folder, EPOCH + timedelta(days=seed % 10_000)) as recording:
         run = Run(track)
         run.car.speed_limit = speed * MPH
         expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)

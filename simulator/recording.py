@@ -1,5 +1,6 @@
 """Recordings as the simulator writes them: IMG/ with three cameras' JPEGs, and driving_log.csv."""
 
+import math
 import os
 import re
 from datetime import datetime, timedelta
@@ -28,8 +29,11 @@ class Recording:
     """Writes samples into a folder. A row follows its three whole images, so a kill at any time leaves a
     readable folder."""
 
-    def __init__(self, folder: str | Path, seed: int = 0):
-        """Raises SimulatorError if the folder holds a recording already, or cannot be made."""
+    def __init__(self, folder: str | Path, begin: datetime = EPOCH):
+        """begin: the moment of simulated second 0, for the images' names.
+
+        Raises SimulatorError if the folder holds a recording already, or cannot be made.
+        """
         self.folder = Path(folder).absolute()
         self.images = self.folder / "IMG"
         log = self.folder / "driving_log.csv"
@@ -42,7 +46,7 @@ class Recording:
             raise SimulatorError(
                 f"{self.folder}: {error.strerror}; give a folder that can be written"
             ) from error
-        self.begin = EPOCH + timedelta(days=seed % 10_000)
+        self.begin = begin
         self.rows = 0
 
     def add(
@@ -83,8 +87,9 @@ class Recording:
 class Clock:
     """Tells the steps, 0.02 s each, after which a sample is due: 15 a second."""
 
-    def __init__(self):
-        self.taken = 0
+    def __init__(self, start: float = 0.0):
+        """start: simulated seconds; the first sample is due at once."""
+        self.taken = math.ceil(start * RATE - 1e-9)
 
     def due(self, time: float) -> bool:
         if time * RATE < self.taken - 1e-9:
