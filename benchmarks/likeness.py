@@ -69,35 +69,33 @@ def along(track: Track, steering, speed, moments) -> np.ndarray:
 def lines(frame: np.ndarray) -> tuple[float, float, float, float] | None:
     """Columns at row 100 of the left and right inner yellow line, and the column and row where they meet.
 
+    Of all pairs of lines that meet near the horizon, the pair that is most yellow against its surroundings.
     frame: uint8 (160, 320, 3) RGB. None if the lines cannot be made out.
     """
     colours = frame.astype(np.float32)
     yellow = colours[..., 0] + colours[..., 1] - 2 * colours[..., 2]
-    yellow -= cv2.blur(yellow, (25, 1))
-    fits = []
-    for side in (-1, 1):
-        found = []
-        for row in range(84, 122):
-            columns = np.arange(2, 158) if side < 0 else np.arange(162, 318)
-            best = columns[np.argmax(yellow[row, columns])]
-            if yellow[row, best] > 18:
-                found.append((row, best))
-        if len(found) < 12:
-            return None
-        rows, columns = np.array(found, float).T
-        for _ in range(6):
-            fit = np.polyfit(rows, columns, 1)
-            off = np.abs(np.polyval(fit, rows) - columns)
-            keep = off <= max(2.5, np.median(off))
-            rows, columns = rows[keep], columns[keep]
-        if len(rows) < 12 or np.abs(np.polyval(fit, rows) - columns).max() > 3:
-            return None
-        fits.append(fit)
-    (a, b), (c, d) = fits
-    if abs(a - c) < 0.5:
-        return None
-    row = (d - b) / (a - c)
-    return (float(np.polyval(fits[0], 100)), float(np.polyval(fits[1], 100)), float(a * row + b), float(row))
+    yellow = np.clip(yellow - cv2.blur(yellow, (15, 1)), -20, 60)
+    rows = np.arange(78, 132)
+    steep = np.arange(0.6, 5.0, 0.06)  # columns a row
+    best = (9.0, None)
+    for row in np.arange(56, 66):
+        for column in range(146, 174, 2):
+            found = []
+            for side in (-1, 1):
+                at = column + side * steep[:, None] * (rows - row)
+                inside = (at >= 0) & (at < 319.5)
+                value = yellow[rows, np.clip(np.round(at), 0, 319).astype(int)] * inside
+                score = value.sum(axis=1) / np.maximum(inside.sum(axis=1), 1)
+                score[inside.sum(axis=1) < 14] = -np.inf
+                k = int(np.argmax(score))
+                found.append((score[k], steep[k]))
+            total = min(found[0][0], found[1][0])
+            if total > best[0]:
+                best = (
+                    total,
+                    (column - found[0][1] * (100 - row), column + found[1][1] * (100 - row), column, row),
+                )
+    return best[1]
 
 
 def load(path: Path) -> np.ndarray:
@@ -144,7 +142,7 @@ def main():
         f"   mean difference {np.abs(profile[0] - profile[1]).mean():.1f}"
     )
     if args.track == "lake":
-        straight = np.abs(steering[chosen]) < 0.03
+        straight = np.flatnonzero(np.abs(steering[chosen]) < 0.03)[::2]
         for c, camera in enumerate(CAMERAS):
             found = [
                 [line for frame in frames[straight, c] if (line := lines(frame))] for frames in (real, drawn)
