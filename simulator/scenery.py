@@ -44,24 +44,24 @@ def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
 
     Its front edge hides what the real one hides from the centre camera: image row at each sideways x.
     """
-    aside = np.linspace(-0.66, 0.60, 43)
-    front = 2.10 - 0.30 * (aside / 0.64) ** 2
+    aside = np.linspace(-0.70, 0.63, 43)
+    front = 2.10 - 0.40 * (aside / 0.64) ** 2
     rows = np.interp(
         aside,
-        [-0.66, -0.60, -0.48, -0.34, -0.20, -0.09, 0.02, 0.16, 0.30, 0.42, 0.52, 0.58, 0.60],
-        [175, 160, 153, 148, 143, 138, 137, 137.5, 141, 147, 153, 160, 172],
+        [-0.70, -0.67, -0.60, -0.53, -0.36, -0.22, 0.11, 0.32, 0.49, 0.605, 0.63],
+        [175, 159, 154, 147, 142.7, 137.7, 137, 141.7, 150, 158, 172],
     )
     below = np.radians(7.8) + np.arctan((rows - 80) / 138.6)
     edge = 1.2 - (front - 1.0) * np.tan(below)
     bands = np.array([0.0, 0.015, 0.03, 0.12, 0.2, 0.24, 0.28, 0.6, 1.0])  # of the way back from the edge
     shade = np.array([0.55, 0.85, 1.0, 0.95, 0.80, 0.45, 0.95, 1.15, 1.2])
-    y = front + (1.45 - front) * bands[:, None]
+    y = front + (1.40 - front) * bands[:, None]
     z = edge + (0.62 - edge) * bands[:, None] ** 0.8 - 0.25 * (aside / 0.64) ** 4 * bands[:, None]
     points = np.stack([np.broadcast_to(aside, y.shape), y, z], axis=-1)
     colours = np.clip(shade[:, None, None] * np.array(colour), 0, 1)
     colours = np.broadcast_to(colours, points.shape).copy()
-    lamps = np.abs(np.abs(aside + 0.03) - 0.52) < 0.05
-    colours[1:4, lamps] = 0.95
+    lamps = np.abs(np.abs(aside + 0.03) - 0.50) < 0.035
+    colours[2:4, lamps] = 0.85
     mesh = Mesh(
         points.reshape(-1, 3),
         colours.reshape(-1, 3),

@@ -26,12 +26,12 @@ def grey(mean: float, *layers: np.ndarray) -> np.ndarray:
     return np.repeat(level[..., None], 3, axis=2)
 
 
-def asphalt(random, size: int = 512, grain: float = 0.12, spots: float = 1.0) -> np.ndarray:
-    stones = noise(random, (size, size), 1.0)
+def asphalt(random, size: int = 512, grain: float = 0.15, spots: float = 1.0) -> np.ndarray:
+    stones = noise(random, (size, size), 0.8)
     return grey(
         0.72,
         grain * stones,
-        spots * 0.08 * np.maximum(noise(random, (size, size), 1.2) - 1, 0),
+        spots * 0.12 * np.maximum(noise(random, (size, size), 0.9) - 1, 0),
         spots * 0.06 * noise(random, (size, size), 6),
         spots * 0.03 * noise(random, (size, size), 40),
     )
