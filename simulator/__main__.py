@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from pathlib import Path
 
 from . import SimulatorError
 from .track import ROADS, Track
@@ -119,6 +120,9 @@ def drive(args) -> int:
     from .run import Run
     from .world import Scene
 
+    for path in filter(None, (args.report, args.picture, args.film)):
+        if not Path(path).absolute().parent.is_dir():
+            raise SimulatorError(f"{path}: there is no such folder; make it first")
     run = Run(Track(args.track, args.direction), "autonomous")
     scene = Scene(scenery.build(args.track, args.look))
     film = Film(args.film, scene) if args.film else None

@@ -216,3 +216,4 @@ class Remote:
     def close(self) -> None:
         if self.wire:
             self.wire.close()
+            self.wire = None

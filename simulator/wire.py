@@ -156,16 +156,19 @@ class Wire:
     def send(self, packet: str) -> None:
         """Raises Gone."""
         data = packet.encode()
-        pieces = [data[i : i + FRAGMENT] for i in range(0, len(data), FRAGMENT)]
-        frames = [
-            self.protocol.send(TextMessage(piece.decode(), message_finished=piece is pieces[-1]))
-            for piece in pieces
-        ]
+        pieces = [data[i : i + FRAGMENT].decode() for i in range(0, len(data), FRAGMENT)]
+        last = len(pieces) - 1
         try:
+            frames = [
+                self.protocol.send(TextMessage(piece, message_finished=i == last))
+                for i, piece in enumerate(pieces)
+            ]
             for frame in frames if self.patient else [b"".join(frames)]:
                 self.socket.sendall(frame)
         except OSError as error:
             raise Gone(f"the connection broke ({error.strerror or error})") from error
+        except ProtocolError as error:
+            raise Gone("the server closed the connection") from error
 
     def receive(self, timeout: float) -> str | None:
         """The next packet, or None after `timeout` seconds without one; pings meanwhile. Raises Gone."""
@@ -211,7 +214,7 @@ class Wire:
             self.socket.settimeout(LEAVE_WITHIN)
             while self.socket.recv(65536):
                 pass
-        except (Gone, OSError):
+        except (Gone, OSError, ProtocolError):
             return  # it is gone already
         finally:
             self.socket.close()

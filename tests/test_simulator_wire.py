@@ -9,6 +9,8 @@ import re
 import select
 import socket
 import struct
+import subprocess
+import sys
 import threading
 
 import cv2
@@ -112,6 +114,9 @@ class Server:
                     replies = self.reply(text, answered)
                     answered += 1
                     if replies is None:
+                        return
+                    if replies == "close":
+                        client.sendall(b"\x88\x02\x03\xe8")
                         return
                     for packet in replies:
                         self.send(client, packet)
@@ -246,6 +251,16 @@ def test_a_lost_reply_is_said_with_what_came_instead():
         drive(server, wait=0.5)
 
 
+def test_a_report_that_cannot_be_written_is_said_before_the_drive(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "simulator", "drive", "--report", str(tmp_path / "no" / "report.json")],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert "no such folder" in done.stderr
+
+
 def test_a_missing_server_is_waited_for_then_said():
     closed = socket.create_server(("127.0.0.1", 0))
     port = closed.getsockname()[1]
@@ -275,11 +290,12 @@ def test_a_server_that_is_no_websocket_is_said():
 
 
 @pytest.mark.parametrize("realtime", [False, True])
-def test_reconnects_and_drives_on(realtime):
+@pytest.mark.parametrize("death", [None, "close", ["41"], ["1"]])
+def test_reconnects_and_drives_on(realtime, death):
     deaths = iter([True])
 
     def dies_once(packet, n):
-        return None if n == 20 and next(deaths, False) else ahead(packet, n)
+        return death if n == 20 and next(deaths, False) else ahead(packet, n)
 
     with Server(dies_once, sessions=2) as server:
         client = drive(server, realtime=realtime)
@@ -306,7 +322,8 @@ def test_pings_and_leaves_a_server_that_does_not_answer_them(monkeypatch):
     assert server.messages.count("2") > 3
 
 
-def test_a_car_that_is_never_driven_is_said():
+def test_a_car_that_is_never_driven_is_said(monkeypatch):
+    monkeypatch.setattr("simulator.client.STANDS_STILL", 5.0)
     with (
         Server(lambda packet, n: [STEER % ("0", "0")]) as server,
         pytest.raises(Standstill, match="stood still"),
@@ -324,8 +341,8 @@ def test_lockstep_repeats_to_the_last_digit():
 
 
 def test_report_says_what_happened(tmp_path):
-    with Server(lambda packet, n: [STEER % ("0.3" if n == 100 else "0", "1")]) as server:
-        client = drive(server, laps=0.1)
+    with Server(lambda packet, n: [STEER % ("0.3" if n > 30 else "0", "1")]) as server:
+        client = drive(server, laps=0.05)
     figures = report.figures(client.run, client)
     assert figures["departures"]
     assert figures["autonomy"] == pytest.approx(
