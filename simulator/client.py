@@ -192,8 +192,10 @@ class Remote:
         try:
             if self.wire is None:
                 self._connect(run)
-            while self.wire and (packet := self.wire.receive(0)) is not None:
-                if (answer := read(packet)) is None:
+            for _ in range(OPENS + 1):  # not for as long as answers come: the window has to be drawn as well
+                packet = self.wire.receive(0) if self.wire else None
+                answer = read(packet) if packet else None
+                if answer is None:
                     continue
                 if answer.steering is not None:
                     self.steering, self.throttle = answer.steering, answer.throttle

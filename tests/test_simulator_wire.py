@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from simulator import SimulatorError, report
-from simulator.client import Client, Standstill
+from simulator.client import Client, Remote, Standstill
 from simulator.progress import Progress
 from simulator.run import Run
 from simulator.track import Track
@@ -302,6 +302,39 @@ def test_reconnects_and_drives_on(realtime, death):
     assert client.reconnections == 1
     assert client.run.travelled >= 0.02 * client.run.track.length
     assert len(server.requests) == 2
+
+
+def test_the_window_sends_null_while_a_person_steers_and_is_never_held_up():
+    """A server that answers at once must not keep the window from being drawn."""
+
+    def reply(packet, n):
+        return ['42["manual",{}]'] if packet.endswith("null]") else [STEER % ("0.5", "0.25")]
+
+    with Server(reply) as server:
+        remote, run = Remote("127.0.0.1", server.port, Blank()), Run(Track("lake"), "autonomous")
+        for by_hand in (False, True, False):
+            before, ticks = len(server.messages), 0
+            while len(server.messages) < before + 12:
+                remote.answer(by_hand, run)
+                ticks += 1
+            assert ticks >= 4
+        remote.close()
+    assert (remote.steering, remote.throttle) == (0.5, 0.25)
+    sent = [message for message in server.messages if message.startswith("42")]
+    nulls = [message == '42["telemetry",null]' for message in sent]
+    assert 8 <= sum(nulls) <= 16
+    assert not any(nulls[:6])
+    assert not any(nulls[-4:])
+
+
+def test_the_window_looks_for_a_server_without_waiting():
+    closed = socket.create_server(("127.0.0.1", 0))
+    port = closed.getsockname()[1]
+    closed.close()
+    remote = Remote("127.0.0.1", port, Blank())
+    remote.answer(False, Run(Track("lake"), "autonomous"))
+    assert "no server" in remote.state
+    assert (remote.steering, remote.throttle) == (0, 0)
 
 
 def test_pings_and_leaves_a_server_that_does_not_answer_them(monkeypatch):
