@@ -1,0 +1,75 @@
+"""A tiny recording, drawn here, in the simulator's own format, and the means to run the commands on it."""
+
+import os
+import subprocess
+import sys
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    """What is remembered of checked images stays out of the user's cache folder."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+
+
+def draw_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarray:
+    """A grey road to the horizon, bent by -1..1 and seen from `offset` metres right of its centre: uint8 RGB."""
+    frame = np.zeros((160, 320, 3), np.uint8)
+    frame[:60] = (90, 140, 210)
+    frame[60:] = (120, 130, 60)
+    rows = np.arange(60, 160)
+    far = (160 - rows) / 100
+    middle = 160 + 120 * bend * far ** 2 - offset * (rows - 60) * 1.2
+    half = 3.5 * (rows - 60) * 1.2 + 4
+    for row, centre, width in zip(rows, middle, half, strict=True):
+        left, right = int(centre - width), int(centre + width)
+        frame[row, max(left, 0):max(right, 0)] = (110, 110, 105)
+        for edge in (left, right):
+            frame[row, max(edge - 3, 0):max(edge + 3, 0)] = (210, 180, 60)
+    return np.clip(frame + rng.normal(0, 6, frame.shape), 0, 255).astype(np.uint8)
+
+
+def draw_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/Users/driver/data/IMG/") -> Path:
+    """A folder as the simulator records it: no header, absolute paths, 15 rows a second, every tenth off throttle."""
+    rng = np.random.default_rng(seed)
+    (folder / "IMG").mkdir(parents=True)
+    clock, lines = datetime(2018, 7, 16, 17, 11, 43) + timedelta(days=seed), []
+    for row in range(rows):
+        clock += timedelta(milliseconds=67)
+        stamp = clock.strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
+        bend = float(np.sin(row / 5))
+        names = []
+        for camera, offset in (("center", 0), ("left", -0.8), ("right", 0.8)):
+            names.append(f"{camera}_{stamp}.jpg")
+            frame = draw_frame(bend, offset, rng)
+            cv2.imwrite(str(folder / "IMG" / names[-1]), frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 75])
+        throttle = 0 if row % 10 == 9 else 1
+        lines.append(",".join([prefix + name for name in names] + [f"{0.4 * bend:.6g}", str(throttle), "0", "30.19"]))
+    (folder / "driving_log.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def drawn(tmp_path_factory) -> Path:
+    """A recording of 60 rows; not to be changed."""
+    return draw_recording(tmp_path_factory.mktemp("data") / "lake drawn")
+
+
+@pytest.fixture
+def copied(tmp_path) -> Path:
+    """A recording of 60 rows that a test may change."""
+    return draw_recording(tmp_path / "data" / "lake")
+
+
+def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
+    """The real command line, with its output."""
+    command = command or [sys.executable, str(ROOT / "model.py")]
+    return subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, timeout=300,
+                          env={**os.environ, **more.pop("env", {})}, **more)

@@ -1,0 +1,241 @@
+"""drive.py without a network socket: the speed controller, telemetry of every kind, saved frames, the attention."""
+
+import base64
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import draw_frame
+from PIL import Image
+
+import attention
+import drive
+import frames
+from network import Network
+
+
+def jpeg_of(frame: np.ndarray) -> bytes:
+    return cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 75])[1].tobytes()
+
+
+@pytest.fixture(scope="module")
+def jpeg() -> bytes:
+    return jpeg_of(draw_frame(0.3, 0.5, np.random.default_rng(0)))
+
+
+def telemetry(jpeg, speed="0.0000", **more):
+    return {"steering_angle": "0.0000", "throttle": "0.0000", "speed": speed,
+            "image": base64.b64encode(jpeg).decode(), **more}
+
+
+@pytest.fixture(scope="module")
+def network() -> Network:
+    torch.manual_seed(3)
+    return Network().eval()
+
+
+@pytest.fixture
+def session(network) -> drive.Session:
+    return drive.Session(drive.DriveServer(network), {})
+
+
+class Car:
+    """A car of mass 1 whose speed follows throttle, drag and slope, in the simulator's figures roughly."""
+
+    def __init__(self):
+        self.speed = 0.0
+
+    def step(self, throttle: float, slope: float = 0.0):
+        self.speed = max(0.0, self.speed + 0.067 * (13 * throttle - 0.1 * self.speed - 22 * slope))
+
+
+def test_controller_begins_as_the_original():
+    """0.1 e + 0.002 Σe by hand, at set speed 9."""
+    controller = drive.SpeedController(9)
+    assert controller.throttle(4) == pytest.approx(0.1 * 5 + 0.002 * 5)
+    assert controller.throttle(8) == pytest.approx(0.1 * 1 + 0.002 * 6)
+    assert controller.throttle(10) == pytest.approx(-0.1 + 0.002 * 5)
+
+
+@pytest.mark.parametrize("set_speed", [9, 30])
+def test_controller_is_not_wound_up_by_a_wait_or_a_hill(set_speed):
+    controller, car, overshoot = drive.SpeedController(set_speed), Car(), 0.0
+    for _ in range(2000):
+        assert -1 <= controller.throttle(0) <= 1  # held by a wall for two minutes
+    for frame in range(2000):
+        car.step(controller.throttle(car.speed), slope=0.3 if 600 < frame < 1200 else 0)
+        if frame < 600:
+            overshoot = max(overshoot, car.speed - set_speed)
+    assert overshoot < 2, "mph over the set speed after the wait"
+    assert abs(car.speed - set_speed) < 0.5, "settled again after the hill"
+
+
+def test_frames_are_seen_in_rgb_and_alike_on_disk_and_in_telemetry(session, network, tmp_path):
+    path = tmp_path / "frame.jpg"
+    path.write_bytes(jpeg_of(draw_frame(0.3, 0.5, np.random.default_rng(0)) // np.array([1, 2, 4], np.uint8)))
+    with torch.inference_mode():
+        oracle = network(torch.from_numpy(np.array(Image.open(path)))[None])[0].item()  # Pillow decodes to RGB
+        swapped = network(torch.from_numpy(np.array(Image.open(path))[..., ::-1].copy())[None])[0].item()
+    answered = float(session.answer(telemetry(path.read_bytes()))["steering_angle"])
+    assert abs(answered - oracle) < 0.02 * abs(answered - swapped)
+    on_disk = drive.DriveServer(network).steer(drive.decode(path.read_bytes()))
+    assert np.float32(answered) == on_disk
+
+
+def huge(jpeg: bytes) -> bytes:
+    """The JPEG with 30,000 x 30,000 in its header."""
+    at = jpeg.index(b"\xff\xc0") + 5
+    return jpeg[:at] + (30000).to_bytes(2, "big") * 2 + jpeg[at + 4:]
+
+
+def png(jpeg: bytes) -> bytes:
+    return cv2.imencode(".png", cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR))[1].tobytes()
+
+
+BROKEN = {
+    "no keys": lambda good: {},
+    "a list": lambda good: [1, 2],
+    "text": lambda good: "telemetry",
+    "a number": lambda good: 7,
+    "true": lambda good: True,
+    "no image": lambda good: {key: value for key, value in good.items() if key != "image"},
+    "no speed": lambda good: {key: value for key, value in good.items() if key != "speed"},
+    "text for speed": lambda good: {**good, "speed": "fast"},
+    "null for speed": lambda good: {**good, "speed": None},
+    "NaN for speed": lambda good: {**good, "speed": "NaN"},
+    "infinite speed": lambda good: {**good, "speed": "1e999"},
+    "a list for the angle": lambda good: {**good, "steering_angle": [0]},
+    "null for the image": lambda good: {**good, "image": None},
+    "a number for the image": lambda good: {**good, "image": 5},
+    "empty image": lambda good: {**good, "image": ""},
+    "bad base64": lambda good: {**good, "image": "/9j/4AAQ*" + good["image"]},
+    "letters beyond ASCII": lambda good: {**good, "image": "ärger"},
+    "an image cut short": lambda good: {**good, "image": good["image"][:4000]},
+    "a huge image": lambda good: {**good, "image": base64.b64encode(huge(base64.b64decode(good["image"]))).decode()},
+    "a PNG": lambda good: {**good, "image": base64.b64encode(png(base64.b64decode(good["image"]))).decode()},
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_unusable_telemetry_gets_the_last_steering_and_no_throttle(session, jpeg, kind, caplog):
+    good = telemetry(jpeg)
+    before = session.answer(good)
+    assert float(before["throttle"]) > 0
+    with caplog.at_level(logging.WARNING, "drive"):
+        assert session.answer(BROKEN[kind](good)) == {"steering_angle": before["steering_angle"], "throttle": "0"}
+    assert "can't be used" in caplog.text
+    assert (session.served, session.unusable) == (1, 1)
+    assert session.answer(good)["steering_angle"] == before["steering_angle"]
+
+
+@pytest.mark.parametrize("failure", ["raises", "nan"])
+def test_a_failing_network_is_answered(session, jpeg, failure):
+    before = session.answer(telemetry(jpeg))
+
+    class Failing(torch.nn.Module):
+        def forward(self, frames):
+            if failure == "raises":
+                raise RuntimeError("out of memory")
+            return torch.full((1,), float("nan"))
+    session.server.network = Failing()
+    assert session.answer(telemetry(jpeg)) == {"steering_angle": before["steering_angle"], "throttle": "0"}
+
+
+def test_a_warning_is_logged_once_per_kind():
+    once = drive.OncePerKind()
+
+    def passes(message):
+        return once.filter(logging.LogRecord("drive", logging.WARNING, "", 0, message, None, None))
+    assert passes("30000x30000 pixels") and not passes("20000x100 pixels") and passes("not base64")
+
+
+def test_decimal_commas_are_read_and_answered_with_commas(session, jpeg):
+    pointed = drive.Session(session.server, {}).answer(telemetry(jpeg, speed="6.5000"))
+    answer = session.answer(telemetry(jpeg, speed="6,5000", steering_angle="0,0000", throttle="0,2000"))
+    assert answer == {key: value.replace(".", ",") for key, value in pointed.items()}
+    assert "," in answer["throttle"]
+    assert "." not in session.answer({})["steering_angle"], "an unusable frame is answered in kind too"
+
+
+@pytest.mark.parametrize("value", [1e-7, -3e-5, 0.1, -1.0, 123456.0])
+def test_numbers_are_written_without_exponent_and_exactly(value):
+    written = drive.text(np.float32(value))
+    assert "e" not in written and np.float32(written) == np.float32(value)
+
+
+@pytest.mark.parametrize("bias", [-7, 7])
+def test_steering_stays_within_its_range(jpeg, bias):
+    network = Network().eval()
+    torch.nn.init.constant_(network.dense[-1].bias, bias)
+    answer = drive.Session(drive.DriveServer(network), {}).answer(telemetry(jpeg))
+    assert answer["steering_angle"] == ("-1" if bias < 0 else "1")
+
+
+# --------------------------------------------------------------------------------------------------
+# Saved frames
+
+
+def test_each_session_saves_in_a_folder_of_its_own(tmp_path):
+    saver = frames.Saver(tmp_path / "run1")
+    first, second = saver.folder(), saver.folder()
+    for n in range(300):  # many within one millisecond
+        first.save(b"first %d" % n)
+        second.save(b"second %d" % n)
+    saver.close()
+    for name, kind in (("run1", b"first"), ("run1-2", b"second")):
+        paths = sorted((tmp_path / name).iterdir())
+        assert [path.read_bytes() for path in paths] == [b"%s %d" % (kind, n) for n in range(300)]
+        assert all(frames.taken_at(path.name) for path in paths)
+
+
+def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
+    folder = tmp_path / "run1"
+    folder.mkdir()
+    (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
+    frames.empty(folder)
+    assert list(folder.iterdir()) == []
+    for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "center_2018_07_16_17_11_43_382.jpg"):
+        (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
+        (folder / foreign).write_bytes(b"mine")
+        with pytest.raises(frames.FolderError, match=foreign):
+            frames.empty(folder)
+        assert len(list(folder.iterdir())) == 2
+        (folder / foreign).unlink()
+    with pytest.raises(frames.FolderError, match="not a folder"):
+        frames.empty(Path(__file__))
+
+
+# --------------------------------------------------------------------------------------------------
+# What the network looks at
+
+
+def test_attention_is_where_the_network_can_see_anything():
+    """A network whose every layer passes on where the image is bright looks at the bright spot, and nowhere else."""
+    network = Network().eval()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+        for layer in network.convolutions:
+            layer.weight.fill_(1 / layer.weight[0].numel())
+        network.convolutions[0].bias.fill_(0.9)  # black is -1: it falls below 0 and out of the positive part
+    frame = np.zeros((160, 320, 3), np.uint8)
+    frame[90:106, 200:216] = 255
+    steering, mask = attention.look(network, frame)
+    assert steering == 0
+    assert mask.shape == (160, 320) and mask.dtype == np.float32 and mask.max() == pytest.approx(1)
+    assert not mask[:60].any() and not mask[135:].any(), "the rows that are cropped off"
+    row, column = np.unravel_index(mask.argmax(), mask.shape)
+    assert abs(row - 98) < 12 and abs(column - 208) < 12
+    assert mask[:, :140].max() == 0
+
+
+def test_the_line_bends_to_the_side_of_the_steering():
+    frame = np.zeros((160, 320, 3), np.uint8)
+
+    def middle(steering):
+        return (attention.draw(frame, steering)[..., 1] > 128)[:180].nonzero()[1].mean()
+    assert middle(-0.3) < 300 < 340 < middle(0.3)
+    assert abs(middle(0.0) - 320) < 3

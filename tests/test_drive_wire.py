@@ -1,0 +1,401 @@
+"""drive.py as a process, spoken to over real sockets as the simulator does and as strangers would."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, draw_frame
+
+from benchmarks.client import Simulator, fragments, telemetry
+from images import decode
+from network import Network, load_model, save_model
+
+
+class Process:
+    """A drive.py process."""
+
+    def __init__(self, *arguments, port=0, cwd=None):
+        self.process = subprocess.Popen(
+            [sys.executable, str(ROOT / "drive.py"), *map(str, arguments), "--port", str(port)],
+            cwd=cwd, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.lines, self.listening = [], threading.Event()
+        self.reader = threading.Thread(target=self._read)
+        self.reader.start()
+        assert self.listening.wait(60)
+        self.port = int(re.search(r"Listening on [\d.]+:(\d+)", "".join(self.lines))[1])
+
+    def _read(self):
+        for line in self.process.stderr:
+            self.lines.append(line)
+            if "Watch at" in line:
+                self.listening.set()
+        self.listening.set()
+
+    def stop(self, number=signal.SIGINT) -> int:
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        code = self.process.wait(30)
+        self.reader.join()
+        self.process.stdout.close()
+        self.process.stderr.close()
+        return code
+
+    def memory(self) -> float:
+        """Resident MB."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
+
+
+@contextmanager
+def serving(*arguments, **more):
+    process = Process(*arguments, **more)
+    try:
+        yield process
+    finally:
+        process.stop(signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def model_file(tmp_path_factory) -> Path:
+    torch.manual_seed(3)
+    network = Network()
+    torch.nn.init.normal_(network.dense[-1].weight, std=3)  # so that the frames' steering differs
+    path = tmp_path_factory.mktemp("model") / "model.pt"
+    save_model(path, network)
+    return path
+
+
+@pytest.fixture(scope="module")
+def jpegs() -> list[bytes]:
+    rng = np.random.default_rng(0)
+    return [cv2.imencode(".jpg", draw_frame(np.sin(n), 0, rng))[1].tobytes() for n in range(8)]
+
+
+@pytest.fixture(scope="module")
+def server(model_file):
+    with serving(model_file) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def steering(model_file, jpegs) -> list[np.float32]:
+    """What the network says of the frames on disk, by itself."""
+    torch.set_num_threads(1)
+    network = load_model(model_file)
+    with torch.inference_mode():
+        return [network(torch.from_numpy(decode(jpeg))[None])[0].clamp(-1, 1).numpy()[()] for jpeg in jpegs]
+
+
+def test_the_recorded_session_byte_by_byte(server, jpegs, steering):
+    """The transcript of the real simulator's session: its handshake, its ping, driving, the driver's hand, its end."""
+    raw = socket.create_connection(("127.0.0.1", server.port), 10)
+    raw.sendall(b"GET /socket.io/?EIO=4&transport=websocket HTTP/1.1\r\nUser-Agent: websocket-sharp/1.0\r\n"
+                b"Host: 127.0.0.1:%d\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n" % server.port)
+    stream = raw.makefile("rb")
+
+    def frame() -> bytes:
+        first, length = stream.read(2)
+        length = int.from_bytes(stream.read(2), "big") if length == 126 else length
+        assert first in (0x81, 0x88)
+        payload = stream.read(length)
+        return payload if first == 0x81 else b"CLOSE"
+
+    def send(message):
+        for fragment in fragments(message):
+            raw.sendall(fragment)
+    head = b"".join(iter(stream.readline, b"\r\n"))
+    assert head.startswith(b"HTTP/1.1 101 ")
+    assert b"Sec-WebSocket-Accept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo=\r\n" in head  # RFC 6455's own example
+    assert b"Extensions" not in head
+    assert re.fullmatch(rb'0\{"sid":"\w+","upgrades":\[\],"pingTimeout":60000,"pingInterval":25000\}', frame())
+    assert frame() == b'42["steer",{"steering_angle":"0","throttle":"0"}]'
+    assert frame() == b"40"
+    send("2")
+    assert frame() == b"3"
+    for jpeg, expected in zip(jpegs, steering, strict=True):
+        send("42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")], separators=(",", ":")))
+        answer = re.fullmatch(rb'42\["steer",\{"steering_angle":"(-?[\d.]+)","throttle":"0"\}\]', frame())
+        assert np.float32(answer[1].decode()) == expected, "the same steering as on disk, to the last bit"
+    send('42["telemetry",null]')
+    assert frame() == b'42["manual",{}]'
+    send("41")
+    send("1")
+    raw.sendall(fragments((1000).to_bytes(2, "big"), opcode=8)[0])
+    assert frame() == b"CLOSE"
+    assert stream.read() == b""
+    raw.close()
+
+
+BROKEN = [
+    '42["telemetry",{"steering_angle":"0.0000"', '42["telemetry"', '42["telemetry",' + "[" * 50000,
+    '42["telemetry",{}]', '42["telemetry",{"speed":"fast"}]', '42["telemetry",7]', '42["telemetry",{},{},{}]',
+    '42["telemetry",{"image":"' + "A" * 20_000_000 + '"}]',
+]
+
+
+@pytest.mark.parametrize("message", BROKEN, ids=lambda message: message[2:40])
+def test_every_telemetry_gets_exactly_one_answer(server, jpegs, message):
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        last = simulator.drive(telemetry(jpegs[0]))["steering_angle"]
+        before = server.memory()
+        simulator.send(message)
+        assert json.loads(simulator.receive()[2:]) == ["steer", {"steering_angle": last, "throttle": "0"}]
+        assert server.memory() < before + 30, "MB; nothing of a huge message is kept"
+        simulator.send("2")
+        assert simulator.receive() == "3", "no second answer came before"
+        assert simulator.drive(telemetry(jpegs[0]))["steering_angle"] == last
+
+
+@pytest.mark.parametrize("message", [
+    "", "4", "9", "42", "42{", '42["connect"]', '42["disconnect"]', '42["unknown",{}]', "42" + "1" * 900_000,
+    '42/other,["telemetry",{}]', "451-[", "43[]", "\x00", "ä" * 1000, "42[" * 30000])
+def test_driving_goes_on_after_what_is_no_telemetry(server, jpegs, steering, message):
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        simulator.send(message)
+        simulator.send("2")
+        while simulator.receive() != "3":  # a steer may come of "connect"
+            pass
+        assert np.float32(simulator.drive(telemetry(jpegs[1]))["steering_angle"]) == steering[1]
+
+
+def test_each_kind_of_unusable_frame_is_logged_once(model_file, jpegs):
+    with serving(model_file) as process:
+        with Simulator(process.port) as simulator:
+            simulator.open()
+            simulator.drive(telemetry(jpegs[0]))
+            for _ in range(50):
+                simulator.drive({})
+                simulator.drive({**telemetry(jpegs[0]), "speed": "fast"})
+                simulator.drive(telemetry(jpegs[0][:3000]))
+        deadline = time.monotonic() + 20
+        while not any("has left" in line for line in process.lines) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.stop()
+    text = "".join(process.lines)
+    assert text.count("can't be used") == 3
+    assert all(reason in text for reason in ("steering_angle is missing", "speed is not a number", "cut short"))
+    assert "1 frames driven, 150 unusable" in text
+
+
+def test_two_simulators_are_driven_each_by_itself(server, jpegs, steering):
+    with Simulator(server.port) as slow, Simulator(server.port) as fast:
+        slow.open()
+        fast.open()
+        alone = []
+        with Simulator(server.port) as other:
+            other.open()
+            alone = [other.drive(telemetry(jpegs[n], speed="8.0000")) for n in range(8)]
+        for n in range(8):
+            assert slow.drive(telemetry(jpegs[n], speed="8.0000")) == alone[n]
+            answer = fast.drive(telemetry(jpegs[7 - n], speed="9,0000"))
+            assert np.float32(answer["steering_angle"].replace(",", ".")) == steering[7 - n]
+            assert answer["throttle"] == "0"
+
+
+def test_frames_in_flight_are_answered_in_order(server, jpegs, steering):
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        for jpeg in jpegs:
+            simulator.send("42" + json.dumps(["telemetry", telemetry(jpeg)]))
+        answers = [json.loads(simulator.receive()[2:])[1]["steering_angle"] for _ in jpegs]
+        assert [np.float32(answer) for answer in answers] == steering
+
+
+def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(ConnectionRefusedError):  # the simulator tries on and on before the server is there
+        Simulator(port)
+    for _ in range(2):
+        with serving(model_file, port=port) as process:
+            gone = Simulator(port)
+            gone.open()
+            for fragment in fragments("42" + json.dumps(["telemetry", telemetry(jpegs[0])]))[:5]:
+                gone.socket.sendall(fragment)
+            gone.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # it goes with a reset
+            gone.socket.close()
+            with Simulator(port) as simulator:
+                simulator.open()
+                assert np.float32(simulator.drive(telemetry(jpegs[2]))["steering_angle"]) == steering[2]
+                process.stop(signal.SIGTERM)
+                with pytest.raises((ConnectionError, OSError)):
+                    simulator.receive()
+
+
+def test_ten_thousand_malformed_messages_leave_the_other_driving_untouched(server, jpegs, steering):
+    junk = ['42["telemetry",{"image":"*"}]', '42["telemetry"', "42{", "9", '42["telemetry",null]', "4", "51-[", "hello"]
+    flood = b"".join(fragment for n in range(10_000) for fragment in fragments(junk[n % len(junk)]))
+    with Simulator(server.port) as simulator, Simulator(server.port) as stranger:
+        simulator.open()
+        stranger.open()
+        answers = []
+
+        def drain():
+            while not stopped.is_set():
+                try:
+                    answers.append(stranger.receive())
+                except OSError:
+                    return
+        stopped = threading.Event()
+        threads = [threading.Thread(target=stranger.socket.sendall, args=(flood,)), threading.Thread(target=drain)]
+        for thread in threads:
+            thread.start()
+        rounds = 0
+        while threads[0].is_alive() or rounds < 100:
+            answer = simulator.drive(telemetry(jpegs[rounds % 8], speed="9.0000"))
+            assert np.float32(answer["steering_angle"]) == steering[rounds % 8]
+            assert answer["throttle"] == "0"
+            rounds += 1
+        stopped.set()
+        stranger.socket.shutdown(socket.SHUT_RDWR)
+        threads[1].join()
+
+
+# --------------------------------------------------------------------------------------------------
+# Strangers and mistakes
+
+
+@pytest.mark.parametrize("header, status", [
+    ("Origin: http://evil.example\r\n", 403), ("Origin: null\r\n", 403), ("Origin: http://127.0.0.1:1\r\n", 403),
+    ("Sec-Fetch-Site: cross-site\r\n", 403), ("Origin: http://127.0.0.1:{port}\r\n", 101), ("", 101),
+])
+def test_another_origin_can_not_connect(server, header, status):
+    with Simulator(server.port, headers=header.format(port=server.port)) as stranger:
+        assert stranger.status == status
+
+
+@pytest.mark.parametrize("path", ["/", "/live", "/socket.io/?EIO=3&transport=polling"])
+def test_a_name_that_was_made_to_point_here_is_refused(server, path):
+    request = urllib.request.Request(f"http://127.0.0.1:{server.port}{path}", headers={"Host": "evil.example"})
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request, timeout=10)
+
+
+def test_it_listens_on_loopback_alone(server):
+    listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]
+                 if line.split()[1].endswith(f":{server.port:04X}") and line.split()[3] == "0A"]
+    assert listening == [f"0100007F:{server.port:04X}"]
+
+
+def failing(*arguments) -> str:
+    process = subprocess.run([sys.executable, str(ROOT / "drive.py"), *map(str, arguments)], timeout=60,
+                             capture_output=True, text=True)
+    assert process.returncode == 1 and "Traceback" not in process.stderr
+    return process.stderr
+
+
+def test_mistakes_are_told(server, model_file, tmp_path):
+    assert "no such file" in failing(tmp_path / "none.pt")
+    torch.save({"weights": [1]}, tmp_path / "foreign.pt")
+    assert "not a model of this project" in failing(tmp_path / "foreign.pt")
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.txt").write_text("words")
+    assert "thesis.txt" in failing(model_file, mine)
+    (tmp_path / "run1").mkdir()
+    frame = tmp_path / "run1" / "2018_07_16_17_11_43_382.jpg"
+    frame.write_bytes(b"frame")
+    assert f"127.0.0.1:{server.port}" in failing(model_file, tmp_path / "run1", "--port", server.port)
+    assert frame.exists(), "what can't be served deletes nothing"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path, number):
+    with serving(model_file, "run1", cwd=tmp_path) as process, Simulator(process.port) as simulator:
+        simulator.open()
+        for n in range(200):
+            simulator.drive(telemetry(jpegs[n % 8]))
+        assert process.stop(number) == 0
+    saved = sorted((tmp_path / "run1").iterdir())
+    assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(200)]
+    assert all(re.fullmatch(r"\d{4}(_\d\d){5}_\d{3}\.jpg", path.name) for path in saved)
+
+
+# --------------------------------------------------------------------------------------------------
+# Independent clients
+
+
+def test_the_page_and_its_events(server, jpegs):
+    page = urllib.request.urlopen(f"http://127.0.0.1:{server.port}/", timeout=10).read().decode()
+    assert "http" not in re.sub(r"<script>.*?</script>", "", page, flags=re.S), "no outside host"
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        simulator.drive(telemetry(jpegs[0], speed="8.5000"))
+        for query in ("", "?attention"):
+            with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/live{query}", timeout=10) as events:
+                event = next(line for line in events if line.startswith(b"data: "))
+            live = json.loads(event[6:])
+            time_stamp, _, speed, throttle, latency = live["rows"][-1]
+            assert abs(time_stamp - time.time()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
+            assert live["image"].startswith("data:image/jpeg;base64,/9j/")
+
+
+@pytest.mark.skipif(not shutil.which("chromium"), reason="no Chromium here")
+def test_the_page_in_a_real_browser(server, jpegs, tmp_path):
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        simulator.drive(telemetry(jpegs[0], speed="8.5000"))
+        subprocess.run(
+            ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+             "--disable-background-networking", "--disable-component-update", "--disable-sync", "--timeout=4000",
+             "--window-size=1000,800", f"--screenshot={tmp_path}/page.png", f"--user-data-dir={tmp_path}/profile",
+             f"http://127.0.0.1:{server.port}/"], capture_output=True, timeout=60, check=True)
+    sky = cv2.resize(cv2.imdecode(np.frombuffer(jpegs[0], np.uint8), cv2.IMREAD_COLOR), None, fx=2, fy=2)[:130]
+    match = cv2.matchTemplate(cv2.imread(f"{tmp_path}/page.png"), sky, cv2.TM_SQDIFF_NORMED)
+    assert match.min() < 0.01, "the page shows the camera's image; the upper part, on which no line is drawn"
+
+
+CLIENT = """
+const socket = require('socket.io-client')(`http://127.0.0.1:${process.argv[2]}`, JSON.parse(process.argv[3]));
+const telemetry = JSON.parse(require('fs').readFileSync(process.argv[4]));
+const answers = [];
+socket.on('steer', data => {
+  answers.push(data);
+  if (answers.length < 6) socket.emit('telemetry', telemetry); else socket.emit('telemetry', null);
+});
+socket.on('manual', data => { console.log(JSON.stringify({answers, data})); socket.close(); });
+"""
+
+
+@pytest.fixture(scope="module")
+def node_client(tmp_path_factory) -> Path:
+    if not shutil.which("npm"):
+        pytest.skip("no node here")
+    folder = tmp_path_factory.mktemp("node")
+    try:
+        subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"], cwd=folder,
+                       check=True, timeout=40, capture_output=True)
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
+        pytest.skip("npm can't install socket.io-client here")
+    (folder / "client.js").write_text(CLIENT)
+    return folder
+
+
+@pytest.mark.parametrize("transports", [["websocket"], ["polling", "websocket"], ["polling"]])
+def test_the_independent_client(server, node_client, jpegs, steering, transports):
+    (node_client / "telemetry.json").write_text(json.dumps(telemetry(jpegs[3], speed="9.0000")))
+    output = subprocess.run(
+        ["node", "client.js", str(server.port), json.dumps({"transports": transports}), "telemetry.json"],
+        cwd=node_client, capture_output=True, text=True, timeout=30, env=dict(os.environ)).stdout
+    session = json.loads(output)
+    assert session["answers"][0] == {"steering_angle": "0", "throttle": "0"} and session["data"] == {}
+    for answer in session["answers"][1:]:
+        assert np.float32(answer["steering_angle"]) == steering[3] and answer["throttle"] == "0"

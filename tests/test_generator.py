@@ -1,0 +1,194 @@
+"""From recordings to batches: the recipe's probabilities, ranges and geometry, against oracles outside the code."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import draw_recording
+
+import model
+from images import check_images
+from model import Generator, Observations, brighten, resample, shade, split
+from recordings import Recording, read_recording
+
+
+def recording(n, name="lake", seconds=0.0714, first=0):
+    """n rows of a recording that has no files."""
+    return Recording(Path(name), np.array([], "S9"), np.zeros((n, 3), np.int32), np.zeros((n, 4), np.float32),
+                     first + np.arange(n) * seconds, np.arange(1, n + 1, dtype=np.int32), n)
+
+
+def observations(steering, recordings=None, frame=None):
+    n = len(steering)
+    recordings = recordings or [recording(n)]
+    which = np.repeat(np.arange(len(recordings)), [len(r) for r in recordings])
+    return Observations(recordings, which, np.zeros((n, 3), np.int32), np.asarray(steering, np.float32),
+                        np.arange(n, dtype=np.uint64) if frame is None else frame,
+                        np.concatenate([r.time for r in recordings]))
+
+
+def loaded(folder):
+    found = read_recording(folder)
+    check_images(found)
+    return Observations([found], np.zeros(len(found), int), found.images, found.numbers[:, 0],
+                        found.digests[found.images[:, 0]], found.time)
+
+
+@pytest.fixture
+def generator(drawn):
+    with ThreadPoolExecutor(2) as pool:
+        yield Generator(loaded(drawn), 128, 0.2, 0, pool, ahead=1)
+
+
+def test_validation_is_a_fifth_in_stretches_of_two_seconds_over_the_whole_recording():
+    everything = observations(np.zeros(2800), [recording(1400), recording(1400, "other", first=7e6)])
+    train, validation = split(everything, seed=3)
+    assert sorted([*train, *validation]) == list(range(2800))
+    assert len(validation) / 2800 == pytest.approx(0.2, abs=0.02)
+    for part in np.split(everything.time[validation], np.flatnonzero(np.diff(validation) > 1) + 1):
+        assert 1.8 <= np.ptp(part) <= 2.0  # neighbours go together
+    assert np.diff(validation).max() <= 5 * 28 + 28  # and no stretch of a recording is without
+
+
+def test_copies_of_a_frame_are_all_on_one_side():
+    copies = np.tile(np.arange(700, dtype=np.uint64), 3)  # the same folder under three names
+    everything = observations(np.zeros(2100), [recording(700, str(i), first=7e6 * i) for i in range(3)], copies)
+    for seed in range(5):
+        train, validation = split(everything, seed)
+        assert len(validation)
+        assert not set(copies[train]) & set(copies[validation])
+
+
+def test_resampling_has_the_recipes_shares():
+    steering = np.repeat([0.0, 0.019, -0.02, 0.2, 0.21, -0.5, 0.51, 1], 10000)
+    got = resample(observations(steering), seed=1).steering
+    straight = (np.abs(got) < 0.0195).sum()
+    assert straight / 20000 == pytest.approx(0.8, abs=0.01)
+    for once in (-0.02, 0.2, 0.51, 1):
+        assert (np.abs(got - once) < 1e-6).sum() == 10000
+    for turn in (0.21, -0.5):
+        near = got[np.abs(got / turn - 1) <= 0.01001] / turn - 1
+        assert len(near) == 20000  # the row and one copy
+        jitter = near[np.abs(near) > 1e-6]
+        assert (jitter.min(), jitter.max()) == (pytest.approx(-0.01, abs=1e-4), pytest.approx(0.01, abs=1e-4))
+        assert jitter.mean() == pytest.approx(0, abs=3e-4)
+
+
+def test_problem_areas_are_repeated_four_times():
+    names = ["lake", "bridge-repetitive", "data-corrections"]
+    got = resample(observations(np.full(30, 0.1), [recording(10, name) for name in names]), seed=0)
+    assert np.bincount(got.recording).tolist() == [10, 40, 40]
+
+
+@pytest.mark.parametrize("factor", [0.4, 0.83, 1.2])
+def test_brightness_is_opencvs_hsv_value_clipped_and_never_wrapped(factor):
+    image = np.random.default_rng(0).integers(0, 256, (75, 320, 3), np.uint8)
+    image[:20] = 250  # would wrap
+    value = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)[..., 2].astype(float)
+    changed, one = brighten(np.stack([image, image]), np.array([factor, 1]))
+    got = cv2.cvtColor(changed, cv2.COLOR_RGB2HSV)[..., 2]
+    assert np.abs(got - np.minimum(value * factor, 255)).max() <= 1
+    exact = image * np.minimum(factor, 255 / np.maximum(image.max(-1, keepdims=True), 1))  # same hue and saturation
+    assert np.abs(changed - exact).mean() < 1.5
+    assert np.abs(one.astype(int) - image).mean() < 1.5  # each image by its own factor
+
+
+def one_shaded(image, line, left, factor, first_row=0):
+    return shade(image[None], np.array([line]), np.array([left]), np.array([factor]), first_row)[0]
+
+
+@pytest.mark.parametrize("left", [True, False])
+def test_shadow_is_opencvs_hls_lightness_on_one_side_of_the_line(left):
+    image = np.random.default_rng(0).integers(0, 256, (160, 320, 3), np.uint8)
+    top, bottom, factor = 250.0, 40.0, 0.3
+    got = one_shaded(image, (top, bottom), left, factor)
+    polygon = np.array([[0, 0], [top, 0], [bottom, 160], [0, 160]], np.int32)  # OpenCV's own drawing as the oracle
+    inside = cv2.fillPoly(np.zeros((160, 320), np.uint8), [polygon], 1) == (1 if left else 0)
+    edge = cv2.dilate(cv2.Canny(inside.astype(np.uint8) * 255, 1, 2), np.ones((5, 5))) > 0
+    assert np.array_equal(got[~inside & ~edge], image[~inside & ~edge])
+    lightness = cv2.cvtColor(image, cv2.COLOR_RGB2HLS)[..., 1].astype(float)
+    dark = cv2.cvtColor(got, cv2.COLOR_RGB2HLS)[..., 1]
+    assert np.abs(dark - lightness * factor)[inside & ~edge].max() <= 2
+
+
+def test_shadow_of_a_cropped_image_is_the_crop_of_the_shadowed_frame():
+    image = np.random.default_rng(0).integers(0, 256, (160, 320, 3), np.uint8)
+    whole = one_shaded(image, (30.5, 300.2), True, 0.4)
+    np.testing.assert_array_equal(one_shaded(image[60:135], (30.5, 300.2), True, 0.4, 60), whole[60:135])
+
+
+def test_chances_and_ranges_over_many_draws(generator):
+    draws = [generator.draw(number) for number in range(200)]
+    n = 200 * 128
+    kinds = sum((d["places"] >= 0).sum(0) for d in draws) / n
+    np.testing.assert_allclose(kinds, [1, 0.9, 1, 0.8], atol=0.01)
+    np.testing.assert_allclose(np.bincount(np.concatenate([d["camera"] for d in draws])) / n, [1 / 3] * 3, atol=0.01)
+    for name, low, high in (("brightness", 0.4, 1.2), ("darkness", 0.2, 0.5), ("line", 0, 320)):
+        values = np.concatenate([d[name] for d in draws])
+        assert low <= values.min() and values.max() <= high
+        assert values.mean() == pytest.approx((low + high) / 2, rel=0.01)
+        assert values.std() == pytest.approx((high - low) / 12 ** 0.5, rel=0.02)
+    assert np.concatenate([d["left"] for d in draws]).mean() == pytest.approx(0.5, abs=0.01)
+    assert np.mean([d["keep"].mean() for d in draws]) == pytest.approx(0.5, abs=0.001)
+    assert np.mean([len(d["keep"]) for d in draws]) == pytest.approx(473.6, rel=0.005)  # the original log's batches
+
+
+def test_a_pass_takes_every_observation_once_and_the_next_one_in_another_order(generator):
+    size = len(generator.observations)
+    seen = np.concatenate([generator.draw(number)["observation"] for number in range(size)])  # 128 passes
+    first, second = seen[:size], seen[size:2 * size]
+    assert sorted(first) == sorted(second) == list(range(size))
+    assert list(first) != list(second)
+
+
+def test_images_and_angles_of_an_observation(generator):
+    drawn, everything = generator.draw(5), generator.observations
+    batch = next(generator.batches(5))
+    assert (batch.images.shape[1:], batch.images.dtype) == ((75, 320, 3), np.uint8)
+    for i in range(0, 128, 9):
+        at, camera = drawn["observation"][i], drawn["camera"][i]
+        name = ("center", "left", "right")[camera]
+        assert Path(everything.path(at, camera)).name.startswith(name)
+        jpeg = cv2.imread(str(everything.path(at, camera)))[60:135, :, ::-1]
+        angle = everything.steering[at] + {"center": 0, "left": 0.2, "right": -0.2}[name]
+        places = drawn["places"][i]
+        np.testing.assert_array_equal(batch.images[places[0]], jpeg)
+        np.testing.assert_allclose(batch.angles[places[places >= 0]],
+                                   np.array([angle, -angle, angle, angle])[places >= 0], rtol=1e-6)
+        if places[1] >= 0:
+            np.testing.assert_array_equal(cv2.flip(batch.images[places[1]], 1), jpeg)  # twice is the identity
+        np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], drawn["brightness"][i:i + 1])[0])
+
+
+def test_a_batch_depends_on_seed_and_number_alone(generator):
+    third = next(generator.batches(3))
+    batches = generator.batches(2)
+    next(batches)
+    again = next(batches)
+    np.testing.assert_array_equal(third.images, again.images)
+    np.testing.assert_array_equal(third.keep, again.keep)
+    other = Generator(generator.observations, 128, 0.2, 1, generator.pool, ahead=1)
+    assert not np.array_equal(other.draw(3)["camera"], generator.draw(3)["camera"])
+
+
+def test_two_ranks_make_the_batch_that_one_process_makes(generator, monkeypatch):
+    whole = next(generator.batches(7))
+    monkeypatch.setattr(model, "world", lambda: 2)
+    shares = []
+    for number in (0, 1):
+        monkeypatch.setattr(model, "rank", lambda number=number: number)
+        shares.append(generator.begin(7)())
+    assert [share.total for share in shares] == [whole.total] * 2
+    for name in ("images", "angles", "keep"):
+        both = np.concatenate([getattr(share, name) for share in shares])
+        assert sorted(map(bytes, both)) == sorted(map(bytes, getattr(whole, name)))
+
+
+def test_a_file_that_changes_during_the_run_is_named(tmp_path):
+    everything = loaded(draw_recording(tmp_path / "lake", rows=5))
+    path = everything.path(2, 0)
+    path.write_bytes(b"")
+    with pytest.raises(model.RecordingError, match=str(path)):
+        everything.read(2, 0)

@@ -1,0 +1,146 @@
+"""The network against the report's table and plain arithmetic, its arithmetic in pieces, and model.pt."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from arithmetic import SquaredErrors, squared_errors
+from model import Batch
+from network import ModelError, Network, layer_table, load_model, save_model, write
+
+REPORT = """
+lambda_1 (Lambda)                (None, 160, 320, 3)   0           lambda_input_1[0][0]
+cropping2d_1 (Cropping2D)        (None, 75, 320, 3)    0           lambda_1[0][0]
+convolution2d_1 (Convolution2D)  (None, 36, 158, 24)   1824        cropping2d_1[0][0]
+convolution2d_2 (Convolution2D)  (None, 16, 77, 36)    21636       convolution2d_1[0][0]
+convolution2d_3 (Convolution2D)  (None, 6, 37, 48)     43248       convolution2d_2[0][0]
+convolution2d_4 (Convolution2D)  (None, 4, 35, 64)     27712       convolution2d_3[0][0]
+convolution2d_5 (Convolution2D)  (None, 2, 33, 64)     36928       convolution2d_4[0][0]
+flatten_1 (Flatten)              (None, 4224)          0           convolution2d_5[0][0]
+dropout_1 (Dropout)              (None, 4224)          0           flatten_1[0][0]
+dense_1 (Dense)                  (None, 100)           422500      dropout_1[0][0]
+dense_2 (Dense)                  (None, 50)            5050        dense_1[0][0]
+dense_3 (Dense)                  (None, 10)            510         dense_2[0][0]
+dense_4 (Dense)                  (None, 1)             11          dense_3[0][0]
+"""
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(0)
+    return Network()
+
+
+@pytest.fixture
+def frames():
+    return torch.from_numpy(np.random.default_rng(0).integers(0, 256, (5, 160, 320, 3), np.uint8))
+
+
+def test_layer_table_is_the_reports(network):
+    table = [line.split() for line in layer_table(network).splitlines() if "[0][0]" in line]
+    assert table == [line.split() for line in REPORT.strip().splitlines()]
+    assert layer_table(network).endswith("559,419")
+
+
+def test_forward_is_the_recipes(network, frames):
+    """Against torch's own layers put together anew, on an image transposed by numpy (`view` would scramble it)."""
+    layers = []
+    for convolution in network.convolutions:
+        layers += [convolution, nn.ELU()]
+    layers += [nn.Flatten()]
+    for dense in network.dense:
+        layers += [dense, nn.ELU()]
+    x = np.stack([frame.transpose(2, 0, 1) for frame in frames.numpy()])[:, :, 60:135].astype(np.float32) / 127.5 - 1
+    expected = nn.Sequential(*layers[:-1])(torch.from_numpy(np.ascontiguousarray(x)))[:, 0]
+    torch.testing.assert_close(network(frames), expected)
+    torch.testing.assert_close(network(frames[:, 60:135]), expected)  # cropped already
+
+
+def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):
+    keep = torch.zeros(5, 4224, dtype=torch.bool)
+    flat = []
+    network.dense[0].register_forward_pre_hook(lambda _, inputs: flat.append(inputs[0]))
+    network(frames)
+    keep[:, ::2] = True
+    network(frames, keep)
+    torch.testing.assert_close(flat[1][:, ::2], flat[0][:, ::2] * 2)
+    assert not flat[1][:, 1::2].any()
+
+
+def test_pieces_give_the_gradient_of_the_whole_batch(network):
+    rng = np.random.default_rng(1)
+    batch = Batch(rng.integers(0, 256, (45, 75, 320, 3), np.uint8), rng.normal(0, 0.2, 45).astype(np.float32),
+                  rng.random((45, 4224)) < 0.5, 45)
+    cpu = torch.device("cpu")
+    squared_errors(network, torch.float32, cpu, batch.images, batch.angles, batch.keep).backward()
+    whole = [parameter.grad.clone() for parameter in network.parameters()]
+    network.zero_grad()
+    with ThreadPoolExecutor(2) as pool:
+        loss = SquaredErrors(network, torch.float32, cpu, pool)(batch)
+        (loss * 3).backward()
+        for parameter, expected in zip(network.parameters(), whole, strict=True):
+            torch.testing.assert_close(parameter.grad, expected * 3, rtol=1e-4, atol=1e-4)
+        again = SquaredErrors(network, torch.float32, cpu, pool)(batch)
+    assert torch.equal(loss, again)  # whichever thread was faster
+
+
+def test_bfloat16_steps_where_float32_does(network):
+    """The processor may only emulate it; the direction of the gradient says that it is the same function."""
+    rng = np.random.default_rng(2)
+    images, angles = rng.integers(0, 256, (4, 75, 320, 3), np.uint8), rng.normal(0, 0.2, 4).astype(np.float32)
+    gradients = []
+    for precision in (torch.float32, torch.bfloat16):
+        network.zero_grad()
+        squared_errors(network, precision, torch.device("cpu"), images, angles).backward()
+        gradients.append(torch.cat([parameter.grad.flatten() for parameter in network.parameters()]))
+    assert torch.cosine_similarity(*gradients, dim=0) > 0.99
+
+
+def test_model_file_carries_what_driving_needs(network, frames, tmp_path):
+    path = tmp_path / "model.pt"
+    save_model(path, network.eval(), arguments={"seed": 1})
+    saved = torch.load(path, weights_only=True)
+    assert saved["recipe"] == {"frame": (160, 320, 3), "colour": "RGB", "crop": (60, 25), "scale": 127.5, "offset": 1.0}
+    assert saved["arguments"] == {"seed": 1}
+    assert {"torch", "opencv", "numpy", "python"} <= set(saved["versions"])
+    torch.testing.assert_close(load_model(path)(frames), network(frames))
+
+
+@pytest.mark.parametrize("content, words", [
+    (None, "no such file"), (b"", "damaged"), (b"\x89HDF\r\n", "damaged"),
+    ({"format": "other"}, "not a model of this project"), (torch.zeros(3), "not a model of this project"),
+    ({"format": "behavioral-cloning", "version": 99}, "version 99"),
+    ({"format": "behavioral-cloning", "version": 1}, "do not fit"),
+])
+def test_other_files_are_refused_clearly(tmp_path, content, words):
+    path = tmp_path / "model.pt"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        torch.save(content, path)
+    with pytest.raises(ModelError, match=words) as error:
+        load_model(path)
+    assert str(path) in str(error.value)
+
+
+def test_code_in_a_model_file_is_not_run(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return open, (str(tmp_path / "sprung"), "w")
+
+    torch.save({"format": "behavioral-cloning", "version": 1, "network": Trap()}, tmp_path / "model.pt")
+    with pytest.raises(ModelError):
+        load_model(tmp_path / "model.pt")
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "model.pt"
+    write(path, b"good")
+    (tmp_path / ".model.pt.part").mkdir()  # the new file cannot be opened
+    with pytest.raises(OSError, match=r"model.pt"):
+        write(path, b"new")
+    assert path.read_bytes() == b"good"

@@ -1,0 +1,134 @@
+"""video.py as it is called, its films read back by OpenCV's own FFmpeg."""
+
+import subprocess
+import sys
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT
+
+import video
+from network import Network, save_model
+
+
+def draw(number: int, rows=160, columns=320) -> np.ndarray:
+    """A red frame whose brightness counts: BGR."""
+    frame = np.zeros((rows, columns, 3), np.uint8)
+    frame[..., 2] = 40 + 6 * number
+    return frame
+
+
+def save(folder: Path, count=30, gap=0.05, rows=160, columns=320, begin=datetime(2018, 7, 16, 17, 11, 43), first=0):
+    folder.mkdir(exist_ok=True)
+    for number in range(count):
+        name = (begin + timedelta(seconds=gap * number)).strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
+        cv2.imwrite(str(folder / f"{name}.jpg"), draw(first + number, rows, columns))
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """The command, in this process and in tmp_path: its exit status and what it says."""
+    def run(*arguments) -> tuple[int, str]:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["video.py", *arguments])
+        try:
+            video.main()
+        except SystemExit as exit:
+            return (exit.code, capsys.readouterr().err) if isinstance(exit.code, int) else (1, exit.code)
+        return 0, "".join(capsys.readouterr())
+    return run
+
+
+def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
+    capture, seen = cv2.VideoCapture(str(path)), []
+    while (frame := capture.read()[1]) is not None:
+        seen.append(frame)
+    return capture.get(cv2.CAP_PROP_FPS), seen
+
+
+def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
+    save(tmp_path / "run1")
+    result = subprocess.run([sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True,
+                            text=True, timeout=60)
+    assert result.returncode == 0 and "run1.mp4: 30 frames at 20 frames/s" in result.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run1", "run1.mp4"]
+    fps, seen = frames_of(tmp_path / "run1.mp4")
+    assert fps == pytest.approx(20) and len(seen) == 30
+    for number, frame in enumerate(seen):
+        assert np.abs(frame.mean((0, 1)) - draw(number).mean((0, 1))).max() < 4, "in order, red still red"
+    with av.open(str(tmp_path / "run1.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
+
+
+def test_what_a_person_would_wish(run, tmp_path):
+    """Foreign files and unreadable frames are left out and told, other sizes scaled; the given rate is taken."""
+    folder = tmp_path / "run.1"
+    save(folder, 10)
+    save(folder, 2, rows=80, columns=160, begin=datetime(2018, 7, 16, 17, 11, 44), first=10)
+    (folder / "notes.txt").write_text("mine")
+    (folder / "2018_07_16_17_11_44_900.jpg").write_bytes(b"")
+    whole = (folder / "2018_07_16_17_11_43_000.jpg").read_bytes()
+    (folder / "2018_07_16_17_11_44_901.jpg").write_bytes(whole[:len(whole) // 2])
+    status, said = run("run.1", "--fps", "60")
+    assert status == 0
+    assert "no frames: notes.txt" in said
+    assert "unreadable: 2018_07_16_17_11_44_900.jpg, 2018_07_16_17_11_44_901.jpg" in said
+    assert "2 frames of another size were scaled to 320x160" in said
+    fps, seen = frames_of(tmp_path / "run.1.mp4")
+    assert fps == pytest.approx(60) and len(seen) == 12
+    assert {frame.shape for frame in seen} == {(160, 320, 3)}
+    assert abs(seen[11][..., 2].mean() - 106) < 4
+
+
+def test_odd_sizes_lose_a_row_and_a_column(run, tmp_path):
+    save(tmp_path / "odd", 3, rows=121, columns=161)
+    assert run("odd")[0] == 0
+    assert frames_of(tmp_path / "odd.mp4")[1][0].shape == (120, 160, 3)
+
+
+@pytest.mark.parametrize("name, content, said", [
+    (None, None, "no such folder"), ("notes.txt", b"", "no frames"), ("2018_07_16_17_11_43_382.jpg", b"", "readable")])
+def test_no_film_is_a_clear_error(run, tmp_path, name, content, said):
+    if name:
+        (tmp_path / "run1").mkdir()
+        (tmp_path / "run1" / name).write_bytes(content)
+    status, error = run("run1")
+    assert status == 1 and said in error
+    assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("fps", ["0", "-5", "fast", "nan"])
+def test_a_rate_that_is_none_is_refused(run, tmp_path, fps):
+    save(tmp_path / "run1", 2)
+    status, said = run("run1", "--fps", fps)
+    assert status == 2 and "--fps" in said
+
+
+def test_a_pause_and_bunches_leave_the_rate_alone():
+    begin, times = datetime(2018, 7, 16), []
+    for bunch in range(100):  # three frames within two milliseconds, ten times a second, and a minute's pause
+        at = begin + timedelta(seconds=bunch / 10 + (60 if bunch >= 50 else 0))
+        times += [at, at + timedelta(milliseconds=1), at + timedelta(milliseconds=2)]
+    assert float(video.rate(times)) == pytest.approx(30, rel=0.02)
+
+
+def test_the_overlay_draws_steering_and_attention(run, tmp_path):
+    torch.manual_seed(0)
+    network = Network()
+    torch.nn.init.constant_(network.dense[-1].bias, -0.3)
+    save_model(tmp_path / "model.pt", network)
+    save(tmp_path / "run1", 3)
+    assert run("run1", "--overlay", "model.pt")[0] == 0
+    frame = frames_of(tmp_path / "run1.mp4")[1][0]
+    assert frame.shape == (320, 640, 3)
+    green = (frame[..., 1] > 150).nonzero()[1]
+    assert len(green) > 200 and green.min() < 280 and green.max() < 330, "the line bends to the left"
+    save(tmp_path / "small", 3, rows=80, columns=160)
+    assert "320x160" in run("small", "--overlay", "model.pt")[1]
+    assert "no such file" in run("run1", "--overlay", "none.pt")[1]
