@@ -1,0 +1,11 @@
+"""A stand-in for Udacity's driving simulator: the same roads, car, cameras, recordings and wire, without a
+screen.
+
+The modules in the order in which a frame goes through them: track, scenery (with lake, jungle, shapes and
+textures), world,
+car, cameras, then recording or wire, then report. `python -m simulator --help` tells what it does.
+"""
+
+
+class SimulatorError(Exception):
+    """Something the user can mend; the message says what and how."""

@@ -1,0 +1,117 @@
+"""The cameras: what they see of a scene, as frames and as JPEG."""
+
+import cv2
+import numpy as np
+from panda3d.core import (
+    Camera,
+    FrameBufferProperties,
+    GraphicsEngine,
+    GraphicsOutput,
+    GraphicsPipe,
+    GraphicsPipeSelection,
+    NodePath,
+    PerspectiveLens,
+    Texture,
+    WindowProperties,
+    load_prc_file_data,
+)
+
+from . import SimulatorError
+from .world import INSIDE, Scene
+
+ROWS, COLUMNS = 160, 320
+QUALITY = 75
+VERTICAL_FIELD = 60.0  # degrees
+NEAR, FAR = 0.3, 1000.0
+MOUNTS = {
+    "center": (0.0, 1.0, 1.2),
+    "left": (-0.806, 0.984, 1.2),
+    "right": (0.825, 0.999, 1.2),
+}  # right, forward, up, m
+# Degrees. The scene file's 9.5 down and the body's pitch on its springs come to this: the horizon at row 60
+# to 62.
+YAW, PITCH, ROLL = 0.7, 7.8, 0.0
+
+load_prc_file_data(
+    "",
+    "window-type none\naudio-library-name null\nsync-video false\nnotify-level-display error\n"
+    "load-display p3tinydisplay\n",
+)
+
+
+def lens(rows: int = ROWS, columns: int = COLUMNS) -> PerspectiveLens:
+    made = PerspectiveLens()
+    made.set_near_far(NEAR, FAR)
+    across = 2 * np.degrees(np.arctan(np.tan(np.radians(VERTICAL_FIELD / 2)) * columns / rows))
+    made.set_fov(across, VERTICAL_FIELD)
+    return made
+
+
+def jpeg(frame: np.ndarray) -> bytes:
+    """A frame, uint8 (rows, columns, 3) RGB, as the simulator's JPEG: quality 75, colour at half
+    resolution."""
+    done, data = cv2.imencode(
+        ".jpg",
+        cv2.cvtColor(frame, cv2.COLOR_RGB2BGR),
+        [
+            cv2.IMWRITE_JPEG_QUALITY,
+            QUALITY,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
+        ],
+    )
+    if not done:
+        raise ValueError("the frame cannot be written as JPEG")
+    return data.tobytes()
+
+
+class Buffer:
+    """Regions below one another in one picture that is drawn without a screen."""
+
+    def __init__(self, rows: int, columns: int, cameras: list[NodePath]):
+        """rows: of each region. Raises SimulatorError."""
+        pipe = GraphicsPipeSelection.get_global_ptr().make_pipe("TinyOffscreenGraphicsPipe", "p3tinydisplay")
+        if not pipe:
+            raise SimulatorError(
+                "panda3d's software renderer does not load: it needs libX11.so.6 (apt-get install libx11-6)"
+            )
+        properties = FrameBufferProperties()
+        properties.set_rgba_bits(8, 8, 8, 0)
+        properties.set_depth_bits(24)
+        self.shape = (len(cameras), rows, columns, 3)
+        self.engine = GraphicsEngine(pipe)
+        size = WindowProperties.size(columns, rows * len(cameras))
+        buffer = self.engine.make_output(pipe, "buffer", 0, properties, size, GraphicsPipe.BF_refuse_window)
+        self.image = Texture()
+        buffer.add_render_texture(self.image, GraphicsOutput.RTM_copy_ram, GraphicsOutput.RTP_color)
+        for i, camera in enumerate(cameras):
+            region = buffer.make_display_region(0, 1, 1 - (i + 1) / len(cameras), 1 - i / len(cameras))
+            region.set_camera(camera)
+
+    def draw(self) -> np.ndarray:
+        """uint8 (regions, rows, columns, 3), RGB."""
+        self.engine.render_frame()
+        pixels = np.frombuffer(self.image.get_ram_image_as("RGB"), np.uint8)
+        return np.ascontiguousarray(pixels.reshape(-1, self.shape[2], 3)[::-1]).reshape(self.shape)
+
+
+class Cameras:
+    """The car's cameras on a scene."""
+
+    def __init__(self, scene: Scene, names: tuple[str, ...] = ("center", "left", "right")):
+        self.scene = scene
+        mounted = []
+        for name in names:
+            camera = scene.car.attach_new_node(Camera(name, lens()))
+            camera.node().set_camera_mask(INSIDE)
+            camera.set_pos(*MOUNTS[name])
+            camera.set_hpr(-YAW, -PITCH, -ROLL)
+            mounted.append(camera)
+        self.buffer = Buffer(ROWS, COLUMNS, mounted)
+
+    def frames(self, transform) -> np.ndarray:
+        """uint8 (cameras, 160, 320, 3), RGB, in the order of the names, with the car's node at the
+        transform."""
+        self.scene.car.set_transform(transform)
+        self.scene.look_from(*transform.get_pos())
+        return self.buffer.draw()

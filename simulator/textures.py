@@ -1,0 +1,177 @@
+"""Textures drawn from a seed: uint8 (rows, columns, 3 RGB or 4 RGBA). They are bright: the vertices carry the
+colours."""
+
+import cv2
+import numpy as np
+
+
+def noise(random, shape: tuple[int, int], blur: float) -> np.ndarray:
+    """Gaussian noise of unit variance that repeats at its edges, smoothed over `blur` pixels."""
+    grain = random.standard_normal(shape).astype(np.float32)
+    if blur:
+        edge = int(3 * blur) + 1
+        grain = cv2.GaussianBlur(np.pad(grain, edge, mode="wrap"), (0, 0), blur)[edge:-edge, edge:-edge]
+    return grain / grain.std()
+
+
+def clouds(random, size: int, coarsest: float, octaves: int = 5) -> np.ndarray:
+    """Noise of several scales, each half as strong as the one twice its size; zero mean, unit variance."""
+    total = sum(noise(random, (size, size), coarsest / 2**k) / 2**k for k in range(octaves))
+    return (total - total.mean()) / total.std()
+
+
+def grey(mean: float, *layers: np.ndarray) -> np.ndarray:
+    """A grey texture from a mean (0..1) and layers of deviations."""
+    level = np.clip((mean + sum(layers)) * 255, 0, 255).astype(np.uint8)
+    return np.repeat(level[..., None], 3, axis=2)
+
+
+def asphalt(random, size: int = 512, grain: float = 0.15, spots: float = 1.0) -> np.ndarray:
+    stones = noise(random, (size, size), 0.8)
+    return grey(
+        0.72,
+        grain * stones,
+        spots * 0.12 * np.maximum(noise(random, (size, size), 0.9) - 1, 0),
+        spots * 0.06 * noise(random, (size, size), 6),
+        spots * 0.03 * noise(random, (size, size), 40),
+    )
+
+
+def concrete(random, size: int = 128) -> np.ndarray:
+    texture = grey(0.90, 0.02 * noise(random, (size, size), 1.5), 0.03 * noise(random, (size, size), 20))
+    texture[:2] = 160  # the joint between two slabs
+    return texture
+
+
+def kerb(size: int = 64) -> np.ndarray:
+    texture = np.full((size, size, 3), (250, 248, 240), np.uint8)
+    texture[: size // 2] = (232, 92, 92)
+    return texture
+
+
+def line() -> np.ndarray:
+    return np.full((4, 4, 3), 255, np.uint8)
+
+
+def soil(random, size: int = 256) -> np.ndarray:
+    return grey(0.80, 0.07 * clouds(random, size, 24), 0.05 * noise(random, (size, size), 0.8))
+
+
+def rock(random, size: int = 256, streak: float = 6.0) -> np.ndarray:
+    """Streaked downwards, as the cliffs' stretched textures are; streak: how many times longer than wide."""
+    pad = 40
+    grain = np.pad(random.standard_normal((size, size)).astype(np.float32), pad, mode="wrap")
+    streaks = cv2.GaussianBlur(grain, (0, 0), 2, sigmaY=2 * streak)[pad:-pad, pad:-pad]
+    return grey(0.74, 0.13 * streaks / streaks.std(), 0.06 * clouds(random, size, 24))
+
+
+def cobbles(random, size: int = 512, stones: int = 12) -> np.ndarray:
+    """Irregular setts, longer along the road (rows) than across it, with pale joints."""
+    rows, columns = np.mgrid[0:size, 0:size].astype(np.float32)
+    rows += 7 * noise(random, (size, size), 18)
+    columns += 5 * noise(random, (size, size), 18)
+    across = columns / size * stones
+    course = np.floor(across)
+    along = rows / size * stones * 0.6 + 0.37 * course
+    edge = np.minimum(np.minimum(across % 1, 1 - across % 1), np.minimum(along % 1, 1 - along % 1) / 0.6)
+    tint = random.uniform(-0.13, 0.10, (64, 64))[course.astype(int) % 64, np.floor(along).astype(int) % 64]
+    level = 0.76 + tint + 0.09 * noise(random, (size, size), 1.5)
+    level = np.where(edge < 0.08, 0.95, level)
+    return grey(0.0, level)
+
+
+def pine(random, size: int = 128, low: float = 0.62) -> np.ndarray:
+    """A pine on a bare trunk; low: where its branches end, 0 the top, 1 the ground."""
+    texture = np.zeros((size, size, 4), np.uint8)
+    texture[:, :, :3] = 150
+    middle = size // 2
+    cv2.line(texture, (middle, size - 1), (middle, size // 5), (150, 120, 100, 255), max(2, size // 48))
+    for _ in range(230):
+        y = random.uniform(0.03, low)
+        width = 0.05 + 0.30 * (y / low) ** 0.7
+        x = middle + random.normal() * width * size * 0.42
+        level = int(
+            255 * np.clip(random.uniform(0.45, 0.85) + 0.25 * (1 - y / low) + 0.1 * (x > middle), 0, 1)
+        )
+        cv2.ellipse(
+            texture,
+            (int(x), int(y * size)),
+            (int(random.integers(3, 8)), int(random.integers(2, 4))),
+            float(random.uniform(-25, 25)),
+            0,
+            360,
+            (level, level, int(level * 0.9), 255),
+            -1,
+        )
+    return texture
+
+
+def bush(random, size: int = 64) -> np.ndarray:
+    """Dark tufts along the ground."""
+    texture = np.zeros((size, size, 4), np.uint8)
+    texture[:, :, :3] = 140
+    for _ in range(6):
+        middle, wide, tall = random.uniform(0.15, 0.85), random.uniform(0.05, 0.13), random.uniform(0.3, 0.9)
+        for _ in range(22):
+            x, y = middle + random.normal() * wide * 0.6, 1 - abs(random.normal()) * tall * 0.45
+            level = int(random.uniform(120, 250))
+            centre = (int(np.clip(x, 0.04, 0.96) * size), int(max(0.1, y) * size))
+            cv2.circle(
+                texture, centre, int(random.integers(1, 4)), (level, level, int(0.85 * level), 255), -1
+            )
+    return texture
+
+
+def reeds(random, size: int = 64) -> np.ndarray:
+    texture = np.zeros((size, size, 4), np.uint8)
+    texture[:, :, :3] = 140
+    for _ in range(60):
+        part = random.uniform(0.04, 0.96)
+        tall = np.sin(np.pi * part) ** 0.5 * random.uniform(0.5, 0.95)
+        level = int(random.uniform(110, 240))
+        cv2.line(
+            texture,
+            (int(part * size), size),
+            (int(part * size + random.normal() * 4), int((1 - tall) * size)),
+            (level, level, int(0.8 * level), 255),
+            1,
+        )
+    return texture
+
+
+def palm(random, size: int = 128) -> np.ndarray:
+    texture = np.zeros((size, size, 4), np.uint8)
+    texture[:, :, :3] = 150
+    crown = np.array([size * 0.52, size * 0.26])
+    bend = random.uniform(-0.14, 0.14) * size
+    trunk = np.array(
+        [[size * 0.5 + bend * (1 - t) ** 2, size - t * size * 0.74] for t in np.linspace(0, 1, 12)]
+    )
+    crown[0] = trunk[-1][0]
+    cv2.polylines(texture, [trunk.astype(np.int32)], False, (120, 100, 80, 255), max(3, size // 30))
+    for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False) + random.uniform(0, 0.5):
+        t = np.linspace(0, 1, 10)
+        reach = size * random.uniform(0.32, 0.46)
+        frond = crown + np.column_stack(
+            [np.cos(angle) * reach * t, np.sin(angle) * reach * 0.55 * t + reach * 0.5 * t * t]
+        )
+        level = int(random.uniform(120, 255))
+        cv2.polylines(texture, [frond.astype(np.int32)], False, (level, level, int(0.8 * level), 255), 4)
+        for (x, y), u in zip(frond[2:], t[2:], strict=True):
+            for drop in (-1, 1):
+                tip = (int(x + drop * 3), int(y + size * 0.07 * (1.2 - u)))
+                cv2.line(
+                    texture,
+                    (int(x), int(y)),
+                    tip,
+                    (int(level * 0.8), int(level * 0.8), int(level * 0.6), 255),
+                    2,
+                )
+    return texture
+
+
+def sky(zenith, horizon, rows: int = 128) -> np.ndarray:
+    """Colours 0..1 at the top and at the bottom row."""
+    part = np.linspace(0, 1, rows)[:, None, None]
+    level = (1 - part) * np.array(zenith) + part * np.array(horizon)
+    return np.repeat(level * 255, 8, axis=1).astype(np.uint8)

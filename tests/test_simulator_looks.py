@@ -1,0 +1,125 @@
+"""What is drawn: other looks on the same road, returns from the road's sides, and the film."""
+
+import csv
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from simulator import SimulatorError, scenery
+from simulator.cameras import Cameras, jpeg
+from simulator.expert import Recovery
+from simulator.film import Film
+from simulator.run import Run
+from simulator.track import Track
+from simulator.world import Scene
+
+
+def view(track, look, s=300.0, offset=0.0):
+    """What the three cameras see from the lane's middle, s metres along."""
+    run = Run(Track(track))
+    run.s = s
+    run.set_back(offset)
+    return Cameras(Scene(scenery.build(track, look))).frames(run.car.node.get_transform())
+
+
+@pytest.mark.parametrize("track", ["lake", "jungle"])
+def test_another_look_is_another_picture_of_the_same_road(track):
+    run = Run(Track(track))
+    same, again, other = (view(track, look) for look in (0, 0, 4))
+    assert np.array_equal(same, again)
+    assert np.abs(same.astype(int) - other).mean() > 10
+    assert run.track.points.shape == Track(track).points.shape
+
+
+def test_horizon_and_vanishing_point_lie_where_the_real_frames_have_them():
+    """The road's edges, straight here, meet at row 60 to 62 and column 157 to 162."""
+    frame = view("lake", 0, s=300.0)[0].astype(int)
+    yellow = frame[..., 0] + frame[..., 1] - 2 * frame[..., 2]
+    lines = []
+    for side in (-1, 1):
+        rows = np.arange(82, 110)
+        found = []
+        for row in rows:  # 3.5 m aside, seen from 1.2 m up
+            near = 159.5 + side * 3.5 / 1.2 * (row - 61)
+            columns = np.arange(max(0, round(near) - 12), min(320, round(near) + 13))
+            found.append(columns[np.argmax(yellow[row, columns])])
+        lines.append(np.polyfit(rows, found, 1))
+    (left, a), (right, b) = lines
+    row = (b - a) / (left - right)
+    assert row == pytest.approx(61, abs=2)
+    assert left * row + a == pytest.approx(159.5, abs=4)
+
+
+def test_the_side_cameras_see_from_the_sides():
+    """A car 0.8 m to the left sees with its centre camera what the left camera saw."""
+    centre, left, right = view("lake", 0)
+    moved = view("lake", 0, offset=0.806)[0]
+    road = np.s_[70:130]
+    assert (
+        np.abs(moved[road].astype(int) - left[road]).mean()
+        < 0.6 * np.abs(centre[road].astype(int) - left[road]).mean()
+    )
+    assert np.abs(left[road].astype(int) - right[road]).mean() > 5
+
+
+def test_recovery_records_only_the_way_back():
+    run = Run(Track("lake"))
+    expert = Recovery(run.track, seed=1)
+    returns, offsets = 0, []
+    while run.time < 60:
+        before = expert.recording
+        run.step(*expert.drive(run))
+        if expert.recording:
+            offsets.append(abs(run.offset))
+        if before and not expert.recording:
+            returns += 1
+            assert abs(run.offset) < 0.3
+            assert offsets[0] > 0.9
+            assert offsets[-1] < offsets[0]
+            offsets = []
+    assert returns >= 4
+    assert not run.departures
+
+
+def test_recovery_folder_has_gaps_in_time(tmp_path):
+    folder = tmp_path / "recovery"
+    done = subprocess.run(
+        [sys.executable, "-m", "simulator", "record", str(folder), "--recovery", "--laps", "0.3"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    names = [row[0] for row in csv.reader((folder / "driving_log.csv").read_text().splitlines())]
+    seconds = [int(name[-13:-11]) * 60 + int(name[-10:-8]) + int(name[-7:-4]) / 1000 for name in names]
+    assert sum(np.diff(seconds) > 0.5) >= 1
+    assert len(list((folder / "IMG").iterdir())) == 3 * len(names)
+
+
+def test_films_the_drive(tmp_path):
+    run = Run(Track("lake"))
+    film = Film(str(tmp_path / "drive.mp4"), Scene(scenery.build("lake")))
+    for _ in range(100):
+        run.step(0.0, 1.0)
+        film.watch(run)
+    film.close()
+    reader = cv2.VideoCapture(str(tmp_path / "drive.mp4"))
+    frames = []
+    while (got := reader.read())[0]:
+        frames.append(got[1])
+    assert len(frames) == pytest.approx(2.0 * 15, abs=1)
+    assert frames[0].shape == (360, 640, 3)
+    assert reader.get(cv2.CAP_PROP_FPS) == 15
+    assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 5
+    assert list(tmp_path.iterdir()) == [tmp_path / "drive.mp4"]
+    with pytest.raises(SimulatorError, match=r"\.mp4"):
+        Film(str(tmp_path / "nowhere" / "drive.mp4"), film.scene)
+
+
+def test_jpegs_are_the_simulators_size_and_rgb():
+    frame = np.zeros((160, 320, 3), np.uint8)
+    frame[..., 0] = 200
+    decoded = cv2.imdecode(np.frombuffer(jpeg(frame), np.uint8), cv2.IMREAD_COLOR)
+    assert np.abs(decoded[80, 160].astype(int) - (0, 0, 200)).max() < 6
