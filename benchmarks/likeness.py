@@ -10,40 +10,29 @@ they meet.
 
 import argparse
 import sys
-from datetime import datetime
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pandas as pd
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from recordings import CAMERAS, read_recording  # noqa: E402
 from simulator import scenery  # noqa: E402
 from simulator.cameras import Cameras, jpeg  # noqa: E402
 from simulator.run import Run  # noqa: E402
 from simulator.track import MPH, Track  # noqa: E402
 from simulator.world import Scene  # noqa: E402
 
-CAMERAS = ("center", "left", "right")
 ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
 
 
 def read(folder: Path) -> tuple[list[list[Path]], np.ndarray, np.ndarray, np.ndarray]:
     """Paths of each row's three images, its steering, speed (m/s) and time (s)."""
-    table = pd.read_csv(folder / "driving_log.csv", header=None, skipinitialspace=True)
-    if table.iloc[0, 0] == "center":
-        table = table.iloc[1:]
-    paths = [
-        [folder / "IMG" / str(name).replace("\\", "/").split("/")[-1] for name in row[:3]]
-        for row in table.values
-    ]
-    steering, speed = table[3].astype(float).to_numpy(), table[6].astype(float).to_numpy() * MPH
-    moments = [
-        datetime.strptime(row[0].stem[7:] + "000", "%Y_%m_%d_%H_%M_%S_%f").timestamp() for row in paths
-    ]
-    return paths, steering, speed, np.array(moments)
+    recording = read_recording(folder)
+    paths = [[folder / "IMG" / recording.names[image].decode() for image in row] for row in recording.images]
+    return paths, recording.numbers[:, 0].astype(float), recording.numbers[:, 3] * float(MPH), recording.time
 
 
 def along(track: Track, steering, speed, moments) -> np.ndarray:
