@@ -24,7 +24,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import cv2
@@ -105,6 +105,9 @@ class Observations:
         # Decoded images, by recording and image; memory is only taken as it is filled, all in one piece.
         self.cropped = np.empty((KEEP_CROPPED, FRAME[0] - sum(CROP), *FRAME[1:]), np.uint8)
         self.places, self.free = {}, itertools.count()
+
+    def __reduce__(self):  # for the other ranks: the rows, not the memory for images
+        return Observations, tuple(getattr(self, one.name) for one in fields(self))
 
     def __len__(self):
         return len(self.steering)

@@ -1,5 +1,6 @@
 """From recordings to batches: the recipe's probabilities, ranges and geometry, against oracles outside the code."""
 
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -184,6 +185,14 @@ def test_two_ranks_make_the_batch_that_one_process_makes(generator, monkeypatch)
     for name in ("images", "angles", "keep"):
         both = np.concatenate([getattr(share, name) for share in shares])
         assert sorted(map(bytes, both)) == sorted(map(bytes, getattr(whole, name)))
+
+
+def test_what_goes_to_other_ranks_is_small(drawn):
+    everything = loaded(drawn)
+    everything.read_cropped(0, 0)
+    packed = pickle.dumps(everything)
+    assert len(packed) < 100_000
+    np.testing.assert_array_equal(pickle.loads(packed).steering, everything.steering)
 
 
 def test_a_file_that_changes_during_the_run_is_named(tmp_path):
