@@ -638,8 +638,8 @@ def prepare(arguments: argparse.Namespace, given: dict) -> tuple[Observations, O
     saved = load_resumed(arguments, given)
     output = Path(arguments.output)
     (output.parent / "diagnostic_images").mkdir(parents=True, exist_ok=True)
-    arguments.recordings = [str(folder.resolve()) for folder in find_folders(arguments.recordings)]
     folders = find_folders(arguments.recordings)
+    arguments.recordings = [str(folder.resolve()) for folder in folders]
     observations = read_observations(folders, arguments.throttle_threshold, arguments.strict,
                                      output.with_name("rejected_rows.csv"))
     train, validation = split(observations, arguments.seed)
@@ -654,14 +654,14 @@ def run(arguments: argparse.Namespace, given: dict) -> None:
     data = [None]
     if rank() == 0:
         try:
-            data = [prepare(arguments, given)]
+            data = [(*prepare(arguments, given), arguments)]
         except (RecordingError, ModelError, OSError) as error:
             data = [error]
     if dist.is_initialized():
         dist.broadcast_object_list(data)
     if isinstance(data[0], Exception):
         raise data[0]
-    training, validation, saved = data[0]
+    training, validation, saved, arguments = data[0]  # with --resume, the arguments are the checkpoint's on every rank
     one = Run(arguments, training, validation)
     if saved:
         one.resume(saved)

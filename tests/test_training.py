@@ -201,12 +201,24 @@ def test_default_is_every_recording_under_data(tmp_path):
     assert (tmp_path / "model.pt").exists()
 
 
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0", "--standalone",
+            str(ROOT / "model.py")]
+
+
+def test_two_processes_go_on_with_the_runs_own_arguments(finished, drawn, tmp_path):
+    begun = run_model(drawn, *SHORT, "--epochs", 1, "--output", tmp_path / "model.pt", command=TORCHRUN)
+    resumed = run_model("--output", tmp_path / "model.pt", "--resume", "--epochs", 2, command=TORCHRUN)
+    assert (begun.returncode, resumed.returncode) == (0, 0), resumed.stderr
+    a, b = weights(finished[1] / "model.pt"), weights(tmp_path / "model.pt")
+    for name in a:
+        assert (a[name] - b[name]).abs().mean() < 2e-6
+
+
 def test_two_processes_train_as_one(drawn, tmp_path):
     """Two ranks with half of every batch each end where one process ends, up to rounding; rank 0 alone prints."""
     one = run_model(drawn, *SHORT, "--output", tmp_path / "one.pt")
     two = run_model(drawn, *SHORT, "--output", tmp_path / "two.pt",
-                    command=[sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0",
-                             "--standalone", str(ROOT / "model.py")])
+                    command=TORCHRUN)
     assert (one.returncode, two.returncode) == (0, 0), two.stderr
     a, b = weights(tmp_path / "one.pt"), weights(tmp_path / "two.pt")
     for name in a:  # Adam moves a weight by up to 1e-4 a step, of which there were 12
