@@ -6,10 +6,10 @@ import torch
 from torch import nn
 
 from images import FRAME
+from motion import curvature
 from network import Network
+from viewpoint import project
 
-# The centre camera, for drawing on the road: focal length (px), horizon (row), height (m); and the car's wheelbase (m).
-FOCAL, HORIZON, HEIGHT, WHEELBASE = 138.6, 61, 1.2, 2.87
 GREEN, MAGENTA = (60, 255, 60), (255, 0, 200)  # RGB
 
 
@@ -56,7 +56,6 @@ def draw(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> 
         picture = picture * (1 - strength) + np.float32(MAGENTA) * strength
     picture = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides what is nearer
-    sideways = np.tan(np.radians(25) * steering) / WHEELBASE * ahead**2 / 2
-    points = np.stack([FRAME[1] / 2 + FOCAL * sideways / ahead, HORIZON + FOCAL * HEIGHT / ahead], 1) * 2
+    points = project(curvature(steering) * ahead**2 / 2, ahead) * 2
     cv2.polylines(picture, [np.round(points).astype(np.int32)], False, GREEN, 3, cv2.LINE_AA)
     return picture

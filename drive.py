@@ -22,7 +22,7 @@ import frames
 import page
 import wire
 from images import FRAME, decode
-from network import ModelError, Network, load_model
+from network import ModelError, Network, load_model, steer
 
 NUMBERS = ("steering_angle", "throttle", "speed")  # of a telemetry: degrees, -1..1, mph
 log = logging.getLogger("drive")
@@ -126,7 +126,7 @@ class Session:
         try:
             self.comma = writes_commas(telemetry, self.comma)
             jpeg, frame, speed = read(telemetry)
-            steering = self.server.steer(frame)
+            steering = steer(self.server.network, frame)
             throttle = text(self.controller.throttle(speed))
         except Exception as error:  # whatever it is: without an answer the car would stand still
             self.unusable += 1
@@ -158,22 +158,13 @@ class DriveServer:
 
     def __init__(self, network: Network, set_speed: float = 9.0, saver: frames.Saver | None = None):
         self.network, self.set_speed, self.saver = network, set_speed, saver
-        self.device = next(network.parameters()).device
         self.sessions: dict[str, Session] = {}
         self.socket = wire.Server()
         self.socket.on("connect", self.connect)
         self.socket.on("telemetry", self.telemetry)
         self.socket.on("disconnect", self.disconnect)
         self.app = wire.closed_to_strangers(wire.socketio.WSGIApp(self.socket, page.create_app(self)))
-        self.steer(np.zeros(FRAME, np.uint8))  # the first pass is slow, so it is not the first frame's
-
-    def steer(self, frame: np.ndarray) -> np.float32:
-        """Steering -1..1 for a frame, uint8 (160, 320, 3), RGB. Raises ArithmeticError if the network gives none."""
-        with torch.inference_mode():
-            steering = self.network(torch.from_numpy(frame)[None].to(self.device)).cpu().numpy()[0]
-        if not np.isfinite(steering):
-            raise ArithmeticError("the network's steering is not finite")
-        return np.clip(steering, np.float32(-1), np.float32(1))
+        steer(network, np.zeros(FRAME, np.uint8))  # the first pass is slow, so it is not the first frame's
 
     def session(self, sid: str) -> Session:
         if sid not in self.sessions:

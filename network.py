@@ -1,7 +1,6 @@
 """NVIDIA's network, and the file that it is kept in: all that driving needs of training."""
 
 import io
-import os
 import platform
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from files import write
 from images import FRAME
 
 FORMAT, VERSION = "behavioral-cloning", 1  # of model.pt
@@ -81,24 +81,6 @@ def layer_table(network: Network) -> str:
 # model.pt
 
 
-def write(path: Path, data: bytes) -> None:
-    """Write a file beside its place and rename it there, so that a kill leaves the old file or the new one, whole.
-
-    Raises OSError with the file's name (a full disk, say); the old file stays.
-    """
-    path = Path(path)
-    beside = path.with_name(f".{path.name}.part")
-    try:
-        with open(beside, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(path)) from error
-
-
 def save_model(path: Path, network: Network, **more) -> None:
     """Write a model file: weights, what driving needs to use them, and `more` (plain values and tensors)."""
     buffer = io.BytesIO()
@@ -142,3 +124,12 @@ def load_model(path, device="cpu") -> Network:
     except (KeyError, RuntimeError) as error:
         raise ModelError(f"{path}: its contents do not fit this project's network ({error})") from None
     return network.to(device, memory_format=torch.channels_last).eval()
+
+
+def steer(network: Network, frame: np.ndarray) -> np.float32:
+    """Steering -1..1 for a frame, uint8 (160, 320, 3), RGB. Raises ArithmeticError if the network gives none."""
+    with torch.inference_mode():
+        steering = network(torch.from_numpy(frame)[None].to(next(network.parameters()).device)).cpu().numpy()[0]
+    if not np.isfinite(steering):
+        raise ArithmeticError("the network's steering is not finite")
+    return np.clip(steering, np.float32(-1), np.float32(1))

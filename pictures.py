@@ -6,6 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
+from motion import FULL_LOCK
+from network import CROP
+from recordings import CAMERAS
+
 
 def panel(frame: np.ndarray, title: str, angle: float) -> Image.Image:
     """A frame at twice its size under a title, with the angle as a number and as the way that the wheels point."""
@@ -17,7 +21,7 @@ def panel(frame: np.ndarray, title: str, angle: float) -> Image.Image:
     font = ImageFont.load_default(26)
     draw.text((10, 4), title, "black", font)
     draw.text((width - 10, 4), f"steering {angle + 0:+.3f}", "black", font, anchor="ra")
-    heading = np.radians(25 * angle)  # steering -1..1 is -25°..25° at the front wheels
+    heading = np.radians(FULL_LOCK * angle)
     start, end = (width / 2, height + 10), (width / 2 + 150 * np.sin(heading), height + 10 - 150 * np.cos(heading))
     draw.line([start, end], "black", 9)
     draw.line([start, end], "yellow", 5)
@@ -33,6 +37,31 @@ def side_by_side(panels: list[Image.Image]) -> bytes:
     file = io.BytesIO()
     whole.save(file, "PNG", compress_level=1)  # the usual 6 takes half a second and saves a tenth
     return file.getvalue()
+
+
+def batch_pictures(generator, number: int) -> dict[str, bytes]:
+    """The report's two pictures of the first observation in a batch of model.py's Generator, by the three cameras and
+    augmented: file name, with {} for the count, -> PNG."""
+    drawn, observations = generator.draw(number), generator.observations
+    at, camera = drawn["observation"][0], drawn["camera"][0]
+    frames = [observations.read(at, i) for i in range(3)]
+    drawn["places"][0] = 0  # show every kind, also what chance left out of the batch
+    if observations.lanes:
+        angles = observations.lanes.beside_cameras(at)
+        shown, first_row, titles = generator.images(drawn, np.array([0])), CROP[0], ["from a pose", "from another"]
+    else:
+        angles = observations.steering[at] + generator.corrections
+        frame = frames[camera][None]
+        shown, first_row, titles = [frame, frame[:, :, ::-1], frame, frame], 0, [f"{CAMERAS[camera]} camera", "flipped"]
+    titles += [f"brightness x {drawn['brightness'][0]:.2f}", f"shadow x {drawn['darkness'][0]:.2f}"]
+    augmented = [made[0] for _, made in generator.augment(drawn, np.array([0]), shown, first_row)]
+    angle = drawn["angles"][0]
+    center, left, right = (panel(*one) for one in zip(frames, CAMERAS, angles, strict=True))
+    return {
+        "training_generator_LRC_{}.png": side_by_side([left, center, right]),
+        "training_generator_augmented-{}.png": side_by_side(
+            [panel(*one) for one in zip(augmented, titles, angle, strict=True)]),
+    }
 
 
 def loss_picture(history: list[dict]) -> bytes:

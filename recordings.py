@@ -4,7 +4,9 @@ A number that cannot be read for certain is never guessed: its row is left out, 
 """
 
 import csv
+import os
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -69,12 +71,24 @@ def find_folders(given: list[str]) -> list[Path]:
         path = Path(name)
         if not path.exists():
             raise RecordingError(f"{path}: no such folder. {WHERE_TO_GET_RECORDINGS}")
-        logs = [path / LOG] if (path / LOG).is_file() else sorted(path.rglob(LOG)) if path.is_dir() else []
+        logs = [path / LOG] if (path / LOG).is_file() else sorted(logs_below(path))
         if not logs:
             raise RecordingError(f"{path}: no {LOG} in or below it. {WHERE_TO_GET_RECORDINGS}")
         for log in logs:
             folders.setdefault(log.parent.resolve(), log.parent)
     return list(folders.values())
+
+
+def logs_below(path: Path) -> Iterator[Path]:
+    """Also through symbolic links: recordings are large, and often lie on another disk."""
+    been = set()
+    for folder, below, files in os.walk(path, followlinks=True):
+        if (real := os.path.realpath(folder)) in been:
+            below.clear()  # a link leads back up
+            continue
+        been.add(real)
+        if LOG in files:
+            yield Path(folder) / LOG
 
 
 def print_findings(recording: Recording) -> None:

@@ -13,12 +13,12 @@ from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 from tqdm import tqdm
 
 import frames
+from files import Film
 from images import FRAME, jpeg_size
 
 PAUSE = 1.0  # seconds between two frames from which it is a pause, which says nothing about the rate
@@ -72,43 +72,31 @@ def read(path: Path) -> np.ndarray | None:
 
 
 def film(folder: Path, fps: Fraction | None = None, overlay=None) -> Path:
-    """Write `folder`.mp4 beside the folder: H.264 in yuv420p, which browsers and desktop players play.
-
-    PyAV's wheel brings FFmpeg's libraries with x264: no program to install, and the film is finished or an error.
+    """Write `folder`.mp4 beside the folder.
 
     overlay: a function from a frame to its picture. Raises FilmError.
     """
     found = find(folder)
     fps = fps or rate([time for time, _ in found])
     path = folder.with_name(folder.name + ".mp4")
-    beside = path.with_name(f".{path.name}.part")
     unreadable, sizes = [], Counter()
+    made = Film(path, fps)
     try:
-        with av.open(str(beside), "w", format="mp4", options={"movflags": "faststart"}) as container:
-            stream = None
-            for _, frame_path in tqdm(found, unit="frame", disable=None):
-                frame = read(frame_path)
-                if frame is None:
-                    unreadable.append(frame_path.name)
-                    continue
-                sizes[frame.shape] += 1
-                shape = next(iter(sizes))
-                if frame.shape != shape:
-                    frame = cv2.resize(frame, shape[1::-1], interpolation=cv2.INTER_AREA)
-                if overlay:
-                    frame = overlay(frame)
-                # yuv420p halves the colour's resolution, so both sides are even
-                frame = np.ascontiguousarray(frame[:frame.shape[0] // 2 * 2, :frame.shape[1] // 2 * 2])
-                if stream is None:
-                    stream = container.add_stream("libx264", fps, options={"crf": "18"})
-                    stream.pix_fmt, stream.height, stream.width = "yuv420p", *frame.shape[:2]
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, "rgb24")))
-            if stream is None:
-                raise FilmError(f"{folder}: none of its {len(found)} frames is readable")
-            container.mux(stream.encode(None))
-        beside.replace(path)
+        for _, frame_path in tqdm(found, unit="frame", disable=None):
+            frame = read(frame_path)
+            if frame is None:
+                unreadable.append(frame_path.name)
+                continue
+            sizes[frame.shape] += 1
+            shape = next(iter(sizes))
+            if frame.shape != shape:
+                frame = cv2.resize(frame, shape[1::-1], interpolation=cv2.INTER_AREA)
+            made.add(overlay(frame) if overlay else frame)
+        made.close()
     finally:
-        beside.unlink(missing_ok=True)
+        made.discard()
+    if not sizes:
+        raise FilmError(f"{folder}: none of its {len(found)} frames is readable")
     if unreadable:
         print(f"left out, unreadable: {listed(unreadable)}", file=sys.stderr)
     if len(sizes) > 1:

@@ -81,7 +81,7 @@ def test_frames_are_seen_in_rgb_and_alike_on_disk_and_in_telemetry(session, netw
         swapped = network(torch.from_numpy(np.array(Image.open(path))[..., ::-1].copy())[None])[0].item()
     answered = float(session.answer(telemetry(path.read_bytes()))["steering_angle"])
     assert abs(answered - oracle) < 0.02 * abs(answered - swapped)
-    on_disk = drive.DriveServer(network).steer(drive.decode(path.read_bytes()))
+    on_disk = drive.steer(network, drive.decode(path.read_bytes()))
     assert np.float32(answered) == on_disk
 
 
@@ -238,4 +238,4 @@ def test_the_line_bends_to_the_side_of_the_steering():
     def middle(steering):
         return (attention.draw(frame, steering)[..., 1] > 128)[:180].nonzero()[1].mean()
     assert middle(-0.3) < 300 < 340 < middle(0.3)
-    assert abs(middle(0.0) - 320) < 3
+    assert abs(middle(0.0) - 320) < 6  # the camera is turned by 0.7 degrees and rolled by 1.2

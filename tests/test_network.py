@@ -5,11 +5,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from conftest import ROOT
 from torch import nn
 
 from arithmetic import SquaredErrors, squared_errors
+from files import write
 from model import Batch
-from network import ModelError, Network, layer_table, load_model, save_model, write
+from network import ModelError, Network, layer_table, load_model, save_model, steer
 
 REPORT = """
 lambda_1 (Lambda)                (None, 160, 320, 3)   0           lambda_input_1[0][0]
@@ -144,3 +146,9 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     with pytest.raises(OSError, match=r"model.pt"):
         write(path, b"new")
     assert path.read_bytes() == b"good"
+
+
+def test_the_model_that_comes_with_the_project_steers():
+    network = load_model(ROOT / "model.pt")
+    frame = np.random.default_rng(0).integers(0, 256, (160, 320, 3)).astype(np.uint8)
+    assert -1 <= steer(network, frame) <= 1

@@ -8,7 +8,7 @@ import pytest
 from conftest import draw_recording
 
 from images import check_images, decode, jpeg_size
-from recordings import RecordingError, read_recording
+from recordings import RecordingError, find_folders, read_recording
 
 STAMPS = ["2018_07_16_17_11_43_382", "2018_07_16_17_11_43_453", "2018_07_16_17_11_43_524"]
 
@@ -179,3 +179,15 @@ def test_drawn_recording_is_whole(tmp_path):
     found = read_recording(draw_recording(tmp_path / "a b", rows=3))
     check_images(found)
     assert (found.read, len(found), found.rejected, found.repairs) == (3, 3, [], {})
+
+
+def test_folders_are_found_below_links_and_each_once(tmp_path):
+    for name in ("disk/lake", "disk/more/jungle", "data/own"):
+        draw_recording(tmp_path / name, rows=1)
+    data = tmp_path / "data"
+    (data / "disk").symlink_to(tmp_path / "disk")
+    (data / "own" / "up").symlink_to(data)
+    found = find_folders([str(data), str(tmp_path / "disk" / "lake")])
+    assert [folder.relative_to(data).as_posix() for folder in found] == ["disk/lake", "disk/more/jungle", "own"]
+    with pytest.raises(RecordingError, match="no such folder"):
+        find_folders([str(tmp_path / "nowhere")])
