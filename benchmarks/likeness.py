@@ -18,11 +18,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from motion import MPH, curvature  # noqa: E402
 from recordings import CAMERAS, read_recording  # noqa: E402
 from simulator import scenery  # noqa: E402
 from simulator.cameras import Cameras, jpeg  # noqa: E402
 from simulator.run import Run  # noqa: E402
-from simulator.track import MPH, Track  # noqa: E402
+from simulator.track import Track  # noqa: E402
 from simulator.world import Scene  # noqa: E402
 
 ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
@@ -35,24 +36,27 @@ def read(folder: Path) -> tuple[list[list[Path]], np.ndarray, np.ndarray, np.nda
     return paths, recording.numbers[:, 0].astype(float), recording.numbers[:, 3] * float(MPH), recording.time
 
 
-def along(track: Track, steering, speed, moments) -> np.ndarray:
-    """Where on the track each row was taken, m: the start that fits the turning best."""
+def along(track: Track, steering, speed, moments) -> tuple[np.ndarray, float]:
+    """Where on the track each row was taken, m, and how much the car turns for what its wheels' angle says.
+
+    Of all starts (and slightly different lengths) the one that fits the turning best.
+    """
     pause = np.clip(np.diff(moments, prepend=moments[0]), 0, 0.2)
-    turned = np.cumsum(-0.8 * speed / 2.87 * np.tan(np.radians(25 * steering)) * pause)
+    turned = np.cumsum(-curvature(steering) * speed * pause)
     driven = np.cumsum(speed * pause)
     lap, whole = track.length, 2 * np.pi * round((track.heading[-1] - track.heading[0]) / (2 * np.pi))
-    best = (np.inf, None)
+    best = (np.inf,)
     for scale in np.arange(0.96, 1.07, 0.01):
         for start in np.arange(0, lap, 3.0):
             s = start + driven * scale
             heading = np.interp(
                 s % lap, np.arange(len(track.heading)) * track.step, track.heading
             ) + whole * (s // lap)
-            off = heading - turned
-            off -= np.polyval(np.polyfit(driven, off, 1), driven)
-            best = min(best, (float(np.square(off).mean()), (start, scale)))
-    start, scale = best[1]
-    return (start + driven * scale) % lap
+            gain, level = np.polyfit(turned, heading, 1)
+            off = float(np.square(heading - gain * turned - level).mean())
+            best = min(best, (off, start, scale, gain))
+    _, start, scale, gain = best
+    return (start + driven * scale) % lap, gain
 
 
 def lines(frame: np.ndarray) -> tuple[float, float, float, float] | None:
@@ -103,7 +107,8 @@ def main():
     args = parser.parse_args()
     track = Track(args.track, args.direction)
     paths, steering, speed, moments = read(args.recording)
-    place = along(track, steering, speed, moments)
+    place, gain = along(track, steering, speed, moments)
+    print(f"over the whole recording the car turns {gain:.2f} times what its wheels' angle says")
     chosen = np.linspace(0, len(paths) - 1, args.frames).astype(int)
     run, cameras = Run(track), Cameras(Scene(scenery.build(args.track)))
     real, drawn = [], []

@@ -3,11 +3,9 @@
     python benchmarks/simulator.py                 # both tracks, a table
     python benchmarks/simulator.py --laps 0.3      # sooner
 
-Recording: three cameras, JPEG and csv, as `python -m simulator record` does it, in a process of its own.
-Lock-step: what
-the simulator itself adds to a frame, its server's time and the wire's left out. "cpu" figures count processor
-time, which
-other load on the machine disturbs less than wall time.
+Recording: three cameras, JPEG and csv, as `python -m simulator record` does it, in a process of its own. Lock-step:
+what the simulator itself adds to a frame, its server's time and the wire's left out. "cpu" figures count the processor
+time of all cores, which other load on the machine disturbs less than wall time.
 """
 
 import argparse
@@ -33,17 +31,7 @@ from simulator.world import Scene  # noqa: E402
 def recording(track: str, laps: float) -> dict:
     """Record in a process of its own; seconds are simulated ones unless they say otherwise."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [
-            sys.executable,
-            "-m",
-            "simulator",
-            "record",
-            f"{folder}/out",
-            "--track",
-            track,
-            "--laps",
-            str(laps),
-        ]
+        command = [sys.executable, "-m", "simulator", "record", f"{folder}/out", "--track", track, "--laps", str(laps)]
         begin = time.perf_counter()
         process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
         _, status, usage = os.wait4(process.pid, 0)

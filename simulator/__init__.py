@@ -6,6 +6,8 @@ textures), world,
 car, cameras, then recording or wire, then report. `python -m simulator --help` tells what it does.
 """
 
+PENALTY = 6.0  # s that NVIDIA counts for a human taking over (arXiv 1604.07316, section 6)
+
 
 class SimulatorError(Exception):
     """Something the user can mend; the message says what and how."""

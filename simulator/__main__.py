@@ -1,8 +1,11 @@
-"""What a user gets: python -m simulator record, drive, window."""
+"""What a user gets: python -m simulator record, drive, window, replay."""
 
 import argparse
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+from recordings import RecordingError
 
 from . import SimulatorError
 from .track import ROADS, Track
@@ -47,9 +50,7 @@ def add_drive(commands) -> argparse.ArgumentParser:
     parser.set_defaults(run=drive)
     parser.add_argument("--laps", type=positive, default=1, help="default 1")
     add_server(parser)
-    parser.add_argument(
-        "--wait", type=positive, default=60.0, help="seconds to wait for a server or an answer (default 60)"
-    )
+    add_wait(parser)
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(
         "--lockstep",
@@ -61,6 +62,30 @@ def add_drive(commands) -> argparse.ArgumentParser:
     parser.add_argument("--picture", metavar="FILE.png", help="draw the track from above with the way driven")
     parser.add_argument("--film", metavar="FILE.mp4", help="film the drive from behind the car")
     return parser
+
+
+def add_replay(commands) -> None:
+    parser = commands.add_parser("replay", help="a model drives real recordings; how far it stays on the road")
+    parser.set_defaults(run=replay)
+    parser.add_argument("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
+    parser.add_argument("--model", metavar="model.pt", help="drive by it in this process, not by drive.py's answers")
+    parser.add_argument("--limit", type=positive, nargs="+", default=[1.0, 2.5],
+                        help="m off-centre at which a human would take over (default 1 2.5: NVIDIA's, and where the "
+                        "car's side touches the edge line)")
+    parser.add_argument("--reference", choices=("lane", "human"), default="lane",
+                        help="what off-centre is counted from: the lane's centre as read from the frames (default), or "
+                        "the way that the human drove")
+    add_server(parser)
+    add_wait(parser)
+    parser.add_argument("--report", metavar="FILE", help="write the figures as JSON, a list with one entry a recording")
+    parser.add_argument("--picture", metavar="FILE.png", help="draw distance and steering over the recording")
+    parser.add_argument("--film", metavar="FILE.mp4", help="film what the model saw, at the last limit")
+
+
+def add_wait(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--wait", type=positive, default=60.0, help="seconds to wait for a server or an answer (default 60)"
+    )
 
 
 def add_window(commands) -> argparse.ArgumentParser:
@@ -82,6 +107,7 @@ def arguments(argv=None) -> argparse.Namespace:
         prog="python -m simulator", description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
+    add_replay(commands)
     for command in (add_record(commands), add_drive(commands), add_window(commands)):
         command.add_argument("--track", choices=sorted(ROADS), default="lake", help="default lake")
         command.add_argument(
@@ -120,9 +146,7 @@ def drive(args) -> int:
     from .run import Run
     from .world import Scene
 
-    for path in filter(None, (args.report, args.picture, args.film)):
-        if not Path(path).absolute().parent.is_dir():
-            raise SimulatorError(f"{path}: there is no such folder; make it first")
+    outputs(args.report, args.picture, args.film)
     run = Run(Track(args.track, args.direction), "autonomous")
     scene = Scene(scenery.build(args.track, args.look))
     film = Film(args.film, scene) if args.film else None
@@ -144,6 +168,61 @@ def drive(args) -> int:
     return 1 if run.departures else 0
 
 
+def replay(args) -> int:
+    from recordings import find_folders
+
+    from . import replay as replaying
+    from . import report, score
+    from .progress import Progress
+    from .steering import InProcess, Served
+
+    outputs(args.report, args.picture, args.film)
+    folders = find_folders(args.folders)
+    steer = InProcess(args.model) if args.model else Served(args.host, args.port, args.wait)
+    film = score.SideBySide(args.film) if args.film else None
+    reports = []
+    try:
+        for folder in folders:
+            recording = replaying.load(folder)
+            references = replaying.references(recording, args.reference == "lane")
+            if not references:
+                raise SimulatorError(f"{folder}: no two seconds of driving without a break to replay")
+            rows = sum(reference.rows.stop - reference.rows.start for reference in references)
+
+            def drive(limit, folder=folder, recording=recording, references=references, rows=rows):
+                progress = Progress(rows, f"rows of {folder.name} at {limit:g} m")
+
+                def watch(moment, done):
+                    progress.show(len(done.row), sum(done.time))
+                    if film and limit == args.limit[-1]:
+                        film.watch(moment, done)
+
+                return replaying.drive(recording, references, limit, steer, watch)
+
+            with ThreadPoolExecutor(len(args.limit) if args.model else 1) as pool:
+                drives = list(pool.map(drive, args.limit))
+            reports.append(score.figures(recording, references, drives, args.reference))
+            print(score.text(reports[-1]), flush=True)
+            if args.picture:
+                path = Path(args.picture)
+                path = path if len(folders) == 1 else path.with_stem(f"{path.stem}-{folder.name}")
+                score.picture(path, recording, drives)
+    finally:
+        steer.close()
+        if film:
+            film.close()
+        if args.report and reports:
+            report.write_json(args.report, reports)
+    return 0
+
+
+def outputs(*paths: str | None) -> None:
+    """Raises SimulatorError before the work, not after it, if a file's folder is missing."""
+    for path in filter(None, paths):
+        if not Path(path).absolute().parent.is_dir():
+            raise SimulatorError(f"{path}: there is no such folder; make it first")
+
+
 def window(args) -> int:
     from datetime import datetime
 
@@ -163,7 +242,7 @@ def main(argv=None) -> int:
     args = arguments(argv)
     try:
         return args.run(args)
-    except SimulatorError as error:
+    except (SimulatorError, RecordingError) as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

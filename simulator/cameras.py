@@ -16,21 +16,16 @@ from panda3d.core import (
     load_prc_file_data,
 )
 
+from viewpoint import ROLL, VERTICAL_FIELD, YAW
+
 from . import SimulatorError
+from .mounts import COLUMNS, MOUNTS, PITCH, ROWS
 from .world import INSIDE, Scene
 
-ROWS, COLUMNS = 160, 320
 QUALITY = 75
-VERTICAL_FIELD = 60.0  # degrees
 NEAR, FAR = 0.3, 1000.0
-MOUNTS = {
-    "center": (0.0, 1.0, 1.2),
-    "left": (-0.806, 0.984, 1.2),
-    "right": (0.825, 0.999, 1.2),
-}  # right, forward, up, m
-# Degrees. The scene file's 9.5 down and the body's pitch on its springs come to this: the horizon at row 60
-# to 62.
-YAW, PITCH, ROLL = 0.7, 7.8, 0.0
+# Rows drawn for one of the frame: the road, seen at a slant, flickers else, where the real one is smooth.
+FINER = 2
 
 load_prc_file_data(
     "",
@@ -107,11 +102,14 @@ class Cameras:
             camera.set_pos(*MOUNTS[name])
             camera.set_hpr(-YAW, -PITCH, -ROLL)
             mounted.append(camera)
-        self.buffer = Buffer(ROWS, COLUMNS, mounted)
+        self.buffer = Buffer(FINER * ROWS, COLUMNS, mounted)
 
     def frames(self, transform) -> np.ndarray:
         """uint8 (cameras, 160, 320, 3), RGB, in the order of the names, with the car's node at the
         transform."""
         self.scene.car.set_transform(transform)
         self.scene.look_from(*transform.get_pos())
-        return self.buffer.draw()
+        fine = self.buffer.draw()
+        tall = cv2.resize(fine.reshape(-1, COLUMNS, 3), (COLUMNS, len(fine) * ROWS), interpolation=cv2.INTER_AREA)
+        tone = self.scene.scenery.tone
+        return (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)

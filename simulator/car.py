@@ -6,18 +6,18 @@ import math
 from panda3d.bullet import BulletBoxShape, BulletRigidBodyNode, BulletVehicle, BulletWorld, ZUp
 from panda3d.core import NodePath, Point3, TransformState, Vec3
 
-from .track import MPH, Place
+from motion import FULL_LOCK, MPH, REAR_AXLE
+
+from .track import Place
 
 STEP = 0.02  # s, of the physics
-FULL_LOCK = 25.0  # degrees at steering 1
 TOP_SPEED = 30 * MPH
-WHEELBASE = 2.87
 # hub right, forward, up; radius
 WHEELS = (
     (-1.0, 1.27, 0.45, 0.335),
     (1.0, 1.27, 0.45, 0.335),
-    (-1.0, -1.60, 0.50, 0.37),
-    (1.0, -1.60, 0.50, 0.37),
+    (-1.0, -REAR_AXLE, 0.50, 0.37),
+    (1.0, -REAR_AXLE, 0.50, 0.37),
 )
 MASS = 1000.0
 TORQUE, REVERSE_TORQUE, BRAKE_TORQUE = 2000.0, 150.0, 20000.0  # Nm: all wheels; all wheels; each wheel
@@ -25,11 +25,10 @@ TORQUE_A_STEP = 60.0  # Nm: traction control lets the torque build up over two t
 DOWNFORCE = 100.0  # N per m/s
 SETTLE = 50  # steps until it rests on its springs
 GRIP = 2500.0  # N a wheel: what a locked wheel brakes with
-# Bullet's wheels never slip sideways short of their limit, where Unity's do: at 30 mph the real car yaws 0.8
-# times as fast as
-# v/L tan(angle). An understeering car of this characteristic speed does so at 30 mph, and none at walking
-# pace.
-CHARACTERISTIC_SPEED = 2 * TOP_SPEED  # m/s
+# How fast the real car yaws at 30 mph: by regression over single frames 0.8 times v/L tan(angle), but over whole laps
+# 1.06 times that. An understeering car of this characteristic speed yaws 0.86 times as fast at 30 mph, within a tenth
+# of the first and as near to the second as that allows, and as v/L tan(angle) at walking pace.
+CHARACTERISTIC_SPEED = 2.45 * TOP_SPEED  # m/s
 BRAKES_ABOVE = 5 * MPH  # below, a negative throttle reverses
 REST_HEIGHT = (
     0.2175  # m: the hubs sit this much higher in Bullet, which fixes its spring's rest length, than in Unity

@@ -1,6 +1,5 @@
 """The autonomous mode: the car sends what its centre camera sees and drives as the server answers."""
 
-import sys
 import time
 
 from . import SimulatorError
@@ -9,10 +8,10 @@ from .car import STEP
 from .progress import Progress
 from .recording import RATE, Clock
 from .run import Run
-from .wire import MANUAL, RETRY, Answer, Gone, Wire, read, telemetry
+from .session import OPENS, Session
+from .wire import MANUAL, Answer, Gone, Wire, read, telemetry
 
 STANDS_STILL = 60.0  # simulated seconds in which the car has to get on by a metre
-OPENS = 2  # telemetry is sent twice at the start, since the real client's "open" fires twice
 
 
 class Standstill(SimulatorError):
@@ -25,35 +24,18 @@ def picture(run: Run, cameras: Cameras, steering: float, throttle: float) -> str
     return telemetry(steering, throttle, run.speed_mph, jpeg(frame))
 
 
-class Client:
+class Client(Session):
     """Drives a run by a server's answers, connecting again when it goes away."""
 
     def __init__(self, run: Run, cameras: Cameras, host: str, port: int, wait: float, realtime: bool):
         """wait: seconds of patience with a server that is not there or does not answer usably."""
-        self.run, self.cameras, self.address = run, cameras, (host, port)
-        self.wait, self.realtime = wait, realtime
+        super().__init__(host, port, wait, patient=realtime)
+        self.run, self.cameras, self.realtime = run, cameras, realtime
         self.watch = None  # called after each physics step, if set
         self.steering = self.throttle = 0.0
-        self.round_trips: list[float] = []  # s
-        self.frames = self.dropped = self.reconnections = 0
+        self.frames = 0
         self.own_time = 0.0  # s of wall time not spent waiting for the server
         self.moved = (0.0, 0.0)
-        self.wire: Wire | None = None
-
-    def connect(self) -> Wire:
-        """Try until the server is there and has opened a session. Raises SimulatorError when patience is
-        at its end."""
-        until, said = time.monotonic() + self.wait, False
-        while True:
-            try:
-                return Wire(*self.address, patient=self.realtime)
-            except Gone as error:
-                if time.monotonic() > until:
-                    raise SimulatorError(f"{error}; is `python drive.py model.pt` running?") from None
-                if not said:
-                    print(f"{error}; trying again for {self.wait:.0f} s", file=sys.stderr)
-                    said = True
-                time.sleep(RETRY)
 
     def picture(self) -> str:
         """The telemetry packet of this moment."""
@@ -87,60 +69,20 @@ class Client:
                 drive(goal, progress)
                 return
             except Gone as error:
-                self.reconnections += 1
-                print(f"{error}; connecting again", file=sys.stderr)
+                self.reconnect(error)
             finally:
-                self.wire.close()
-
-    def _usable(self, packet: str) -> Answer | None:
-        answer = read(packet)
-        if answer is None and packet.startswith("4") and packet != "40":
-            self.dropped += 1
-        return answer
-
-    def _await(self) -> Answer:
-        """The next usable answer. Raises SimulatorError when patience is at its end, Gone with the
-        connection."""
-        until = time.monotonic() + self.wait
-        while True:
-            packet = self.wire.receive(max(0.0, until - time.monotonic()))
-            if packet is None:
-                raise SimulatorError(
-                    f"no usable answer in {self.wait:.0f} s ({self.dropped} unusable ones so far); "
-                    "steer must carry strings, see drive.py"
-                )
-            answer = self._usable(packet)
-            if answer:
-                return answer
+                self.close()
 
     def _in_lockstep(self, goal: float, progress: Progress) -> None:
-        """Simulated time waits for each answer: 15 frames a simulated second, one of them under way at a
-        time.
-
-        At the start there are three, as in the real client: two for its two opens, and one in answer to the
-        command that the server gives on its own. What comes of itself later is taken before the next frame is
-        sent, so that an answer is never mistaken for the next frame's.
-        """
-        tokens = OPENS
-        while (packet := self.wire.receive(1.0)) is not None:
-            if self._usable(packet):
-                tokens += 1
-            if packet.startswith("40"):
-                break
+        """Simulated time waits for each answer: 15 frames a simulated second."""
+        self.listen()
         clock = Clock(self.run.time + 1 / RATE)
         while self.run.travelled < goal:
-            while (early := self.wire.receive(0)) is not None:
-                self.obey(self._usable(early) or Answer())
+            self.obey(self.early())
             begin = time.perf_counter()
             packet = self.picture()
             self.own_time += time.perf_counter() - begin
-            sent = time.perf_counter()
-            for _ in range(tokens):
-                self.wire.send(packet)
-            for _ in range(tokens):
-                answer = self._await()
-                self.round_trips.append(time.perf_counter() - sent)
-            tokens = 1
+            answer = self.exchange(packet)
             begin = time.perf_counter()
             self.obey(answer)
             self.step()
@@ -163,7 +105,7 @@ class Client:
                 self.step()
             packet = self.wire.receive(max(0.0, begin + self.run.time - origin + STEP - time.perf_counter()))
             progress.show(max(0.0, self.run.travelled) / self.run.track.length, self.run.time)
-            answer = self._usable(packet) if packet else None
+            answer = self.usable(packet) if packet else None
             if answer is None:
                 if time.monotonic() - usable > self.wait:
                     raise SimulatorError(

@@ -5,13 +5,16 @@ import math
 
 import numpy as np
 
-from .car import CHARACTERISTIC_SPEED, FULL_LOCK, TOP_SPEED, WHEELBASE
+from motion import FULL_LOCK, WHEELBASE
+
+from .car import CHARACTERISTIC_SPEED, TOP_SPEED
 from .run import Run
 from .track import Track
 
 SIDEWAYS, BRAKING = 5.0, 4.0  # m/s²: what it takes in a bend and when slowing for one
 LOOKAHEAD, LOOKAHEAD_TIME = 3.0, 0.45  # m and s ahead of the car that it steers for
-WANDER, WANDER_LENGTH = 0.45, 60.0  # m (standard deviation) off the centre line, over about so many metres
+# m (standard deviation) off the centre line, at most about so many, over about so many: people are 1 m off on average.
+WANDER, WANDER_MOST, WANDER_LENGTH = 0.9, 1.8, 60.0
 SMOOTHING = 0.12  # s: hands follow the eyes
 
 
@@ -44,7 +47,8 @@ class Expert:
 
     def lane(self, travelled: float) -> float:
         """The offset in metres, positive left, that it aims for after so many metres."""
-        return self.aim + self.wander * float(np.sin(self.waves * travelled + self.phases).sum())
+        wandered = self.wander * float(np.sin(self.waves * travelled + self.phases).sum())
+        return self.aim + WANDER_MOST * math.tanh(wandered / WANDER_MOST)
 
     def drive(self, run: Run) -> tuple[float, float]:
         """Steering and throttle, both -1..1, for the run's next step."""

@@ -1,11 +1,10 @@
 """A film of a drive, from behind the car, with its speed and steering."""
 
-from pathlib import Path
-
-import av
 import cv2
 import numpy as np
 from panda3d.core import Camera, Vec3
+
+import files
 
 from . import SimulatorError
 from .cameras import Buffer, lens
@@ -31,19 +30,15 @@ class Film:
 
     def __init__(self, path: str, scene: Scene):
         """Raises SimulatorError."""
-        self.path, self.scene, self.clock = Path(path), scene, Clock()
+        self.scene, self.clock = scene, Clock()
         self.camera = scene.root.attach_new_node(Camera("film", lens(ROWS, COLUMNS)))
         self.camera.node().set_camera_mask(OUTSIDE)
         self.buffer = Buffer(ROWS, COLUMNS, [self.camera])
-        self.beside = self.path.with_name(f".{self.path.name}.part.mp4")
         try:
-            self.beside.touch()  # PyAV itself opens the file only for the first frame
+            # Drawn frames are for looking at, and drawing is what takes time: a fifth of the size of video.py's films.
+            self.film = files.Film(path, RATE, quality=28, preset="veryfast")
         except OSError as error:
             raise SimulatorError(f"{path}: no film can be written there ({error.strerror})") from error
-        self.container = av.open(str(self.beside), "w", format="mp4", options={"movflags": "faststart"})
-        # As video.py's films, but drawn frames are for looking at: a fifth of the size, and drawing is what takes time.
-        self.stream = self.container.add_stream("libx264", RATE, options={"crf": "28", "preset": "veryfast"})
-        self.stream.pix_fmt, self.stream.height, self.stream.width = "yuv420p", ROWS, COLUMNS
 
     def watch(self, run: Run) -> None:
         if not self.clock.due(run.time):
@@ -52,14 +47,11 @@ class Film:
         self.scene.car.set_transform(transform)
         self.scene.look_from(*transform.get_pos())
         follow(self.camera, transform)
-        frame = av.VideoFrame.from_ndarray(caption(self.buffer.draw()[0], run), "rgb24")
-        self.container.mux(self.stream.encode(frame))
+        self.film.add(caption(self.buffer.draw()[0], run))
 
     def close(self) -> None:
         """Put the finished film in its place."""
-        self.container.mux(self.stream.encode(None))
-        self.container.close()
-        self.beside.replace(self.path)
+        self.film.close()
 
 
 def caption(frame: np.ndarray, run: Run) -> np.ndarray:

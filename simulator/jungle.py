@@ -4,8 +4,9 @@ itself."""
 import numpy as np
 from scipy.spatial import cKDTree
 
-from . import textures
-from .scenery import Scenery, body, bonnet, dome, varied
+from . import looks, textures
+from .looks import Look
+from .scenery import Scenery, body, bonnet, dome
 from .shapes import Light, Mesh, around, beside, box, grid, lit, plants, ribbon, stretch, together
 from .track import Track
 
@@ -111,10 +112,11 @@ def ground(land: Land, random, light: Light, palette: dict) -> Mesh:
     return shadowed(lit(white, light, faced_up=True), land, light, 0.55)
 
 
-def tarmac(random, palette: dict) -> np.ndarray:
+def tarmac(random, look: Look) -> np.ndarray:
     """Asphalt as wide as the road, a dash and a gap long, divided by its own colour, which the vertices
     carry."""
-    texture = textures.asphalt(random, grain=0.03, spots=0.35).astype(float)
+    palette = look.palette
+    texture = textures.asphalt(random, grain=0.03 * look.grain, spots=0.35 * look.spots).astype(float)
     rows, columns = texture.shape[:2]
     left = ROAD - (np.arange(columns) + 0.5) / columns * 2 * ROAD
     white = np.array(palette["line"]) / palette["asphalt"] * 255
@@ -123,12 +125,13 @@ def tarmac(random, palette: dict) -> np.ndarray:
     return np.clip(texture, 0, 255).astype(np.uint8)
 
 
-def road(land: Land, random, light: Light, palette: dict) -> list[Mesh]:
+def road(land: Land, random, look: Look) -> list[Mesh]:
     """Asphalt with its lines, grassy verges, and the bridge's sides."""
     track, plain, soil = land.track, textures.line(), textures.soil(random)
+    light, palette = look.light, look.palette
     across = np.linspace(ROAD, -ROAD, 7)
     painted = 0.5 - across / (2 * ROAD)
-    surface = (palette["asphalt"], tarmac(random, palette), DASH + GAP)
+    surface = (palette["asphalt"], tarmac(random, look), DASH + GAP)
     meshes = [ribbon(track, around(track, 1.5), across, 0.0, *surface, painted)]
     for start, end in ((0.0, BRIDGE[0]), (BRIDGE[1], track.length)):
         for side in (1, -1):
@@ -225,13 +228,16 @@ def palms(land: Land, random, light: Light, palette: dict) -> list[Mesh]:
 
 def scenery(look: int) -> Scenery:
     random = np.random.default_rng(look)
-    light, palette = varied(look, LIGHT, PALETTE)
+    chosen = looks.look(look, LIGHT, PALETTE)
+    light, palette = chosen.light, chosen.palette
     land = Land(Track("jungle"), random)
     meshes = [
         ground(land, random, light, palette),
-        *road(land, random, light, palette),
+        *road(land, random, chosen),
         *furniture(land.track, light, palette),
         *palms(land, random, light, palette),
     ]
     sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
-    return Scenery(meshes, sky, bonnet(palette["bonnet"], light), body(palette["bonnet"], light), None)
+    return Scenery(
+        meshes, sky, bonnet(palette["bonnet"], light), body(palette["bonnet"], light), tone=chosen.tone
+    )

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from . import lakeside, textures
-from .scenery import Haze, Scenery, body, bonnet, dome, varied
+from . import lakeside, looks, textures
+from .looks import Look
+from .scenery import Haze, Scenery, body, bonnet, dome
 from .shapes import Light, Mesh, around, beside, grid, lit, ribbon, stretch
 from .track import Track
 
@@ -119,29 +120,31 @@ class Land:
 
     WATER = -1.2  # m: the lake's level
 
-    def __init__(self, track: Track, random):
-        self.track = track
+    def __init__(self, track: Track, random, relief: float = 1.0, moved: float = 0.0):
+        """relief: factor of its heights; moved: metres by which all of it lies further back along the road."""
+        self.track, self.relief, self.moved = track, relief, moved
         self.tree = cKDTree(track.points[:, :2])
         self.rolling = textures.clouds(random, 256, 24, 5)  # one metre of height a unit, 4 m a pixel
 
     def beside(self, places: np.ndarray):
-        """Distance to the centre line, s, and side (+1 left) of places (n, 2)."""
+        """Of places (n, 2): distance to the centre line, s as the land's tables have it, and side (+1 left)."""
         away, nearest = self.tree.query(places)
         across = np.einsum("ij,ij->i", places - self.track.points[nearest, :2], self.track.normal[nearest])
-        return away, nearest * self.track.step, np.where(across > 0, 1, -1)
+        return away, (nearest * self.track.step + self.moved) % self.track.length, np.where(across > 0, 1, -1)
 
     def height(self, places: np.ndarray) -> np.ndarray:
         """Metres above the road's level, which is the lake's zero; the water stands at -1.2."""
         away, s, side = self.beside(places)
         length = self.track.length
         near = np.where(side > 0, around_lap(LEFT, s, length), around_lap(RIGHT, s, length))
+        near = np.where(near > 0, self.relief * near, near)
         cliff = within((CLIFF,), s, side, length)
         rise = np.clip((away - np.where(cliff, 15, 9)) / np.where(cliff, 6, 22), 0, 1)
         rise = rise * rise * (3 - 2 * rise)
         row, column = (np.floor(places / 4).astype(int) % 256).T
         roll = self.rolling[row, column]
         far = np.clip((away - 35) / 90, 0, 1)
-        beyond = np.where(near > 2.5, 14 + 9 * roll, 1.5 + 4 * roll) if len(places) else roll
+        beyond = self.relief * np.where(near > 2.5, 14 + 9 * roll, 1.5 + 4 * roll) if len(places) else roll
         lake = (side > 0) & (away > 40)
         beyond = np.where(lake, -3 + 2.2 * roll, beyond)
         z = near * rise * (1 + 0.15 * roll) + np.where(
@@ -179,10 +182,11 @@ def ground(land: Land, random, light: Light, palette: dict, soil) -> list[Mesh]:
     return sheets
 
 
-def tarmac(random, palette: dict) -> np.ndarray:
+def tarmac(random, look: Look) -> np.ndarray:
     """Asphalt as wide as the road, with its double lines; divided by the asphalt's own colour, which the
     vertices carry."""
-    texture = textures.asphalt(random).astype(float)
+    palette = look.palette
+    texture = textures.asphalt(random, grain=0.15 * look.grain, spots=look.spots).astype(float)
     columns = texture.shape[1]
     left = ASPHALT - (np.arange(columns) + 0.5) / columns * 2 * ASPHALT
     for offset, half, name in ((3.72, 0.17, "seam"), (3.5, 0.05, "line"), (3.95, 0.04, "outer line")):
@@ -190,9 +194,9 @@ def tarmac(random, palette: dict) -> np.ndarray:
     return np.clip(texture, 0, 255).astype(np.uint8)
 
 
-def road(track: Track, random, light: Light, palette: dict, soil, shadows) -> list[Mesh]:
+def road(track: Track, random, look: Look, soil, shadows) -> list[Mesh]:
     """Asphalt with its double lines, kerbs, concrete edges, verges, and the bridge."""
-    s, black = around(track, 2.0), textures.line()
+    s, black, light, palette = around(track, 2.0), textures.line(), look.light, look.palette
     across = np.linspace(ASPHALT, -ASPHALT, 7)
     shade = np.ones((len(s), len(across), 3))
     for at, left, half_length, half_width in shadows:
@@ -201,20 +205,22 @@ def road(track: Track, random, light: Light, palette: dict, soil, shadows) -> li
         shade *= 1 - 0.5 * inside
     painted = 0.5 - across / (2 * ASPHALT)
     asphalt = np.array(palette["asphalt"]) * shade
-    meshes = [ribbon(track, s, across, 0.0, asphalt, tarmac(random, palette), 2 * ASPHALT, painted)]
+    surface = ribbon(track, s, across, 0.0, asphalt, tarmac(random, look), 2 * ASPHALT, painted)
+    meshes = [replace(surface, sheen=look.sheen)]
     slab, stripes = textures.concrete(random), textures.kerb()
+    hard = Light(light.sun, tuple(1.25 * np.array(light.sunlight)), tuple(0.75 * np.array(light.fill)))
     for side in (1, -1):
         verges = [(start, end) for which, start, end in VERGES if which == side]
         begin = 0.0
         for start, end in [*sorted([*verges, BRIDGE]), (track.length, None)]:
             shape = (track, stretch(begin, start, 3.0), side, (ASPHALT, 5.9, EDGE, EDGE + 0.2))
             paint = (palette["slab"], slab, 3.0, (0, 0.5, 0.9, 1))
-            # lit as if it rose steeply, which is how the real ones look, though their edges lie low
-            bright = lit(beside(*shape, (0, 0.5, 1.0, 1.1), *paint), light, faced_up=True)
+            # lit as if it rose steeply, which is how the real ones look, white or blue, though their edges lie low
+            bright = lit(beside(*shape, (0, 0.9, 1.9, 2.0), *paint), hard, faced_up=True)
             meshes.append(replace(bright, points=beside(*shape, (0.01, 0.05, 0.08, -0.5), *paint).points))
             begin = end
         for start, end in verges:
-            shape = (track, stretch(start, end, 2.0), side, (3.65, 6.0, 12.0), (0.015, 0.02, 0.1))
+            shape = (track, stretch(start, end, 2.0), side, (3.35, 3.8, 6.0, 12.0), (0.012, 0.016, 0.02, 0.1))
             meshes.append(lit(beside(*shape, palette["earth"], soil, 9.0), light, faced_up=True))
     for side, start, end in KERBS:
         kerb = (
@@ -225,7 +231,7 @@ def road(track: Track, random, light: Light, palette: dict, soil, shadows) -> li
             (0.03, 0.06),
             palette["kerb"],
             stripes,
-            1.6,
+            look.stripes,
             (0, 1),
         )
         meshes.append(beside(*kerb))
@@ -244,7 +250,7 @@ def road(track: Track, random, light: Light, palette: dict, soil, shadows) -> li
 PALETTE = {
     "zenith": (0.19, 0.31, 0.55),
     "horizon": (0.62, 0.74, 0.88),
-    "asphalt": (0.72, 0.745, 0.69),
+    "asphalt": (0.67, 0.69, 0.625),
     "line": (0.88, 0.76, 0.26),
     "outer line": (0.72, 0.63, 0.28),
     "seam": (0.36, 0.35, 0.32),
@@ -253,7 +259,7 @@ PALETTE = {
     "cobbles": (0.80, 0.72, 0.66),
     "grass": (1.0, 0.87, 0.45),
     "green": (0.50, 0.50, 0.18),
-    "earth": (0.95, 0.64, 0.36),
+    "earth": (0.88, 0.64, 0.40),
     "sand": (0.96, 0.84, 0.62),
     "cliff": (0.46, 0.54, 0.48),
     "rock": (0.96, 0.94, 0.86),
@@ -266,23 +272,24 @@ PALETTE = {
 LIGHT = Light(sun=(0.78, -0.10, 0.62), sunlight=(0.74, 0.68, 0.50), fill=(0.56, 0.61, 0.68))
 
 
-def cast(random, length: float) -> list[tuple]:
+def cast(random, length: float, count: int) -> list[tuple]:
     """Shadows of trees and posts at other places than the real simulator's."""
     return [
         (
             random.uniform(0, length),
             random.uniform(-4, 4),
-            random.choice((0.5, 3.0, 5.0)),
+            random.choice((0.5, 0.5, 3.0, 5.0, 12.0)),
             random.uniform(2, 9),
         )
-        for _ in range(random.integers(5, 40))
+        for _ in range(count)
     ]
 
 
 def scenery(look: int) -> Scenery:
     random = np.random.default_rng(look)
-    track, (light, palette) = Track("lake"), varied(look, LIGHT, PALETTE)
-    land = Land(track, random)
+    track, chosen = Track("lake"), looks.look(look, LIGHT, PALETTE)
+    light, palette = chosen.light, chosen.palette
+    land = Land(track, random, chosen.relief, chosen.moved)
     side = np.linspace(-760, 760, 27)
     flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     water = Mesh(
@@ -293,14 +300,14 @@ def scenery(look: int) -> Scenery:
         textures.grey(0.97, 0.02 * textures.noise(random, (64, 64), 3)),
     )
     soil = textures.soil(random)
-    shadows = cast(random, track.length) if look else SHADOWS
+    shadows = SHADOWS if chosen.shadows is None else cast(random, track.length, chosen.shadows)
     meshes = [
         *ground(land, random, light, palette, soil),
-        *road(track, random, light, palette, soil, shadows),
+        *road(track, random, chosen, soil, shadows),
         water,
         lakeside.mountains(random, light, palette, soil),
         lakeside.rocks(land, random, light, palette),
-        *lakeside.pines(land, random, palette),
+        *lakeside.pines(land, random, palette, chosen.plants),
         *lakeside.pylons(land, light),
     ]
     sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
@@ -310,4 +317,5 @@ def scenery(look: int) -> Scenery:
         bonnet(palette["bonnet"], light),
         body(palette["bonnet"], light),
         Haze((0.41, 0.60, 0.85), (100, 600), 0.8),
+        chosen.tone,
     )

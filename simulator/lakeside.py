@@ -24,11 +24,12 @@ BOULDERS = (
 )
 
 
-def pines(land, random, palette: dict) -> list[Mesh]:
-    """Forest on the hills to the right, single trees and bushes elsewhere, reeds at the water."""
+def pines(land, random, palette: dict, many: float) -> list[Mesh]:
+    """Forest on the hills to the right, single trees and bushes elsewhere, reeds at the water; many: factor of their
+    number."""
     track, length = land.track, land.track.length
     low, high = track.points[:, :2].min(axis=0) - 210, track.points[:, :2].max(axis=0) + 210
-    places = random.uniform(low, high, (5200, 2))
+    places = random.uniform(low, high, (round(5200 * many), 2))
     away, s, side = land.beside(places)
     z = land.height(places)
     forest = (side < 0) & ((s > 120) & (s < 545))
@@ -53,8 +54,8 @@ def pines(land, random, palette: dict) -> list[Mesh]:
             )
         )
     for texture, colour, count, near, far, tallest in (
-        (textures.bush(random), palette["bush"], 900, 9.5, 28, 1.4),
-        (textures.reeds(random), palette["reeds"], 260, 9.5, 16, 2.6),
+        (textures.bush(random), palette["bush"], round(900 * many), 9.5, 28, 1.4),
+        (textures.reeds(random), palette["reeds"], round(260 * many), 9.5, 16, 2.6),
     ):
         along = random.uniform(0, length, count)
         along = (along // 22) * 22 + random.normal(0, 4, count)  # in clumps
@@ -106,8 +107,11 @@ def rocks(land, random, light: Light, palette: dict) -> Mesh:
     track, texture = land.track, textures.rock(random)
     made = []
     for side, s, away, wide, tall in BOULDERS:
-        place = track.at(s, side * away)
-        z = float(land.height(np.array([[place.x, place.y]]))[0])
+        place = track.at(s - land.moved, side * away)
+        here = np.array([[place.x, place.y]])
+        if land.beside(here)[0] < wide + 12:  # moved onto the road
+            continue
+        z = float(land.height(here)[0])
         made.append(
             boulder(
                 (place.x, place.y, max(z, land.WATER)),

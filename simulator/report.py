@@ -1,15 +1,17 @@
 """What a drive was like: as text, as JSON, and as a picture of the track from above."""
 
+import io
 import json
 import math
-from pathlib import Path
 
 import numpy as np
+
+from files import write
+from motion import MPH
 
 from . import SimulatorError
 from .car import STEP
 from .run import Run
-from .track import MPH
 
 
 def figures(run: Run, client=None) -> dict:
@@ -90,16 +92,14 @@ def text(report: dict) -> str:
 
 def write_json(path: str, report: dict) -> None:
     """Raises SimulatorError."""
-    _write(path, json.dumps(report, indent=1) + "\n")
+    put(path, json.dumps(report, indent=1).encode() + b"\n")
 
 
-def _write(path, contents: str) -> None:
-    beside = Path(f"{path}.part")
+def put(path, data: bytes) -> None:
+    """Write a file that the user named. Raises SimulatorError."""
     try:
-        beside.write_text(contents)
-        beside.replace(path)
+        write(path, data)
     except OSError as error:
-        beside.unlink(missing_ok=True)
         raise SimulatorError(f"{path}: {error.strerror}; give a place that can be written") from error
 
 
@@ -148,10 +148,6 @@ def write_picture(path: str, run: Run) -> None:
             color="tab:red",
         )
     axes.set(xlabel="east, m", ylabel="north, m", title=text(figures(run)).splitlines()[0])
-    beside = Path(f"{path}.part")
-    try:
-        figure.savefig(beside, format="png", dpi=110)
-        beside.replace(path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise SimulatorError(f"{path}: {error.strerror}; give a place that can be written") from error
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    put(path, picture.getvalue())

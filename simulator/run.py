@@ -4,11 +4,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from motion import MPH
+
+from . import PENALTY
 from .car import STEP, WHEELS, Car
-from .track import MPH, Track
+from .track import Track
 from .world import ground
 
-PENALTY = 6.0  # s that NVIDIA counts for a human taking over (arXiv 1604.07316, section 6)
 REACH = 1.95  # m from the car's middle to a wheel, at most
 
 

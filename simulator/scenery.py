@@ -1,10 +1,10 @@
-"""All that is to be seen on a track: its meshes, sky and haze, the car's own bonnet, and other looks of
-them."""
+"""All that is to be seen on a track: its meshes, sky and haze, and the car's own bonnet."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from .mounts import height_seen
 from .shapes import Light, Mesh, box, grid, lit, together
 
 
@@ -24,7 +24,8 @@ class Scenery:
     sky: Mesh
     bonnet: Mesh
     body: Mesh
-    haze: Haze | None
+    haze: Haze | None = None
+    tone: np.ndarray | None = None  # (3, 4), the camera's: see looks
 
 
 def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
@@ -35,7 +36,7 @@ def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
     )
     height = np.clip(rise / np.radians(40), 0.01, 0.99)
     uv = np.stack([turn, height], axis=-1).reshape(-1, 2)
-    return Mesh(points.reshape(-1, 3), np.ones((turn.size, 3)), uv, grid(*turn.shape), texture, hazy=False)
+    return Mesh(points.reshape(-1, 3), np.ones((turn.size, 3)), uv, grid(*turn.shape), texture)
 
 
 def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
@@ -51,8 +52,7 @@ def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
         [-0.70, -0.67, -0.60, -0.53, -0.36, -0.22, 0.11, 0.32, 0.49, 0.605, 0.63],
         [175, 159, 154, 147, 142.7, 137.7, 137, 141.7, 150, 158, 172],
     )
-    below = np.radians(7.8) + np.arctan((rows - 80) / 138.6)
-    edge = 1.2 - (front - 1.0) * np.tan(below)
+    edge = height_seen(rows, aside, front)
     bands = np.array([0.0, 0.015, 0.03, 0.12, 0.2, 0.24, 0.28, 0.6, 1.0])  # of the way back from the edge
     shade = np.array([0.55, 0.85, 1.0, 0.95, 0.80, 0.45, 0.95, 1.15, 1.2])
     y = front + (1.40 - front) * bands[:, None]
@@ -68,7 +68,6 @@ def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
         np.zeros((points[..., 0].size, 2)),
         grid(*y.shape)[:, ::-1],
         np.full((4, 4, 3), 255, np.uint8),
-        hazy=False,
     )
     return lit(mesh, light, faced_up=True)
 
@@ -85,26 +84,7 @@ def body(colour: tuple[float, float, float], light: Light) -> Mesh:
     boxes += [
         box((x, y, 0.0), (0.25, 0.68, 0.68), 0.0, dark, plain) for x in (-0.88, 0.88) for y in (1.27, -1.60)
     ]
-    return replace(lit(together(boxes), light), hazy=False)
-
-
-def varied(look: int, light: Light, palette: dict) -> tuple[Light, dict]:
-    """Another look's light and colours: another hour and weather, other soils and plants. Look 0 changes
-    nothing."""
-    if not look:
-        return light, palette
-    random = np.random.default_rng([look, 7])
-    turn, rise = random.uniform(0, 2 * np.pi), np.radians(random.uniform(25, 70))
-    sun = (np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise))
-    overcast = random.uniform(0, 0.6)  # how much of the sun's light comes from the whole sky instead
-    strength = random.uniform(0.65, 1.1) * np.array(random.uniform(0.92, 1.08, 3))
-    sunlight = np.array(light.sunlight) * strength * (1 - overcast)
-    fill = (np.array(light.fill) + 0.5 * overcast * np.array(light.sunlight)) * strength
-    colours = {
-        name: tuple(np.clip(np.array(colour) * random.uniform(0.75, 1.2) * random.uniform(0.9, 1.1, 3), 0, 1))
-        for name, colour in palette.items()
-    }
-    return Light(sun, tuple(sunlight), tuple(fill)), colours
+    return lit(together(boxes), light)
 
 
 def build(track: str, look: int = 0) -> Scenery:

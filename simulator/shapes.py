@@ -13,7 +13,8 @@ class Mesh:
     """points (n, 3) in metres; colours (n, 3), 0..1, which the texture is multiplied with; uv (n, 2); faces
     (m, 3) indices.
 
-    texture: uint8 (rows, columns, 3 or 4); with 4 channels, parts whose alpha is under half are not drawn.
+    texture: uint8 (rows, columns, 3 or 4); with 4 channels, parts whose alpha is under half are not drawn. sheen: by
+    how much it is brighter where it is seen at a slant, far ahead.
     """
 
     points: np.ndarray
@@ -21,7 +22,7 @@ class Mesh:
     uv: np.ndarray
     faces: np.ndarray
     texture: np.ndarray
-    hazy: bool = True
+    sheen: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,8 @@ def lit(mesh: Mesh, light: Light, faced_up: bool = False) -> Mesh:
 def ribbon(track: Track, s, offsets, heights, colour, texture, metres: float, across=None) -> Mesh:
     """A strip along the road: at each of the distances s, points at `offsets` metres left of the centre line.
 
-    offsets, heights (above the road): (k,), left to right, the same everywhere. colour: (3,), or (len(s), k,
-    3).
-    metres: of road that one texture covers; across: the texture's coordinate at each offset, else by the same
-    metres.
+    offsets, heights (above the road): (k,), left to right, the same everywhere. colour: (3,), or (len(s), k, 3).
+    metres: of road that one texture covers; across: the texture's coordinate at each offset, else by the same metres.
     """
     s, offsets = np.asarray(s, float), np.asarray(offsets, float)
     n, k = len(s), len(offsets)

@@ -45,7 +45,7 @@ def concrete(random, size: int = 128) -> np.ndarray:
 
 def kerb(size: int = 64) -> np.ndarray:
     texture = np.full((size, size, 3), (250, 248, 240), np.uint8)
-    texture[: size // 2] = (232, 92, 92)
+    texture[: size // 2] = (232, 100, 98)
     return texture
 
 

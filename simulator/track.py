@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-MPH = 0.44704  # m/s
-
 
 @dataclass(frozen=True)
 class Place:
@@ -59,13 +57,11 @@ ROADS = {
 
 
 class Track:
-    """A track in one direction, as points about 1 m apart; s is the distance driven from the first, in
-    metres.
+    """A track in one direction, as points about 1 m apart; s is the distance driven from the first, in metres.
 
-    Arrays of n points: points (n, 3) in metres, heading (n,) in radians, continuous, normal (n, 2) to the
-    left,
-    curvature (n,) in 1/m, positive to the left, grade (n,), edges (n, 2): where the surface ends to the left
-    and right, m.
+    Arrays of n points: points (n, 3) in metres, heading (n,) in radians, continuous, normal (n, 2) to the left,
+    curvature (n,) in 1/m, positive to the left, grade (n,), edges (n, 2): where the surface ends to the left and right,
+    in metres.
     """
 
     def __init__(self, name: str, direction: str | None = None):
@@ -98,7 +94,7 @@ class Track:
         self.normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
         self.grade = around[:, 2] / flat
         self.heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-        turn = np.diff(np.r_[self.heading, self.heading[0] + self._whole_turns()])
+        turn = np.diff(np.r_[self.heading, self.heading[0] + self.turns()])
         kernel = np.ones(5) / 5
         self.curvature = np.convolve(np.r_[turn[-3:], turn, turn[:2]], kernel, "valid")[:n] / self.step
         self.starts = {
@@ -106,7 +102,8 @@ class Track:
             for mode, where in (("training", road.training), ("autonomous", road.autonomous))
         }
 
-    def _whole_turns(self) -> float:
+    def turns(self) -> float:
+        """Radians by which the heading has grown after a lap."""
         return 2 * np.pi * round((self.heading[-1] - self.heading[0]) / (2 * np.pi))
 
     def _stretch(self, start: float, end: float) -> np.ndarray:
@@ -129,8 +126,7 @@ class Track:
     def locate(self, x: float, y: float, near: float | None = None) -> tuple[float, float]:
         """(s, offset to the left) of the point of the centre line nearest to (x, y), in metres.
 
-        near: an earlier s; only 30 m around it are looked at, which is fast and tells a road from one it
-        crosses.
+        near: an earlier s; only 30 m around it are looked at, which is fast and tells a road from one it crosses.
         """
         n = len(self.points)
         if near is None:

@@ -15,6 +15,8 @@ from panda3d.core import (
     WindowProperties,
 )
 
+from motion import MPH
+
 from . import SimulatorError, scenery
 from .cameras import MOUNTS, PITCH, YAW, Cameras
 from .car import STEP
@@ -23,7 +25,7 @@ from .controls import ACTIONS, HELD, HELP, Controls, Sticks
 from .film import follow
 from .recording import Clock, Recording
 from .run import Run
-from .track import MPH, Track
+from .track import Track
 from .world import INSIDE, OUTSIDE, Scene
 
 SIZE = 960, 540

@@ -16,7 +16,7 @@ from wsproto import ConnectionType, WSConnection
 from wsproto.events import CloseConnection, Ping, RejectConnection, Request, TextMessage
 from wsproto.utilities import ProtocolError
 
-from .car import FULL_LOCK
+from motion import FULL_LOCK
 
 PATH = "/socket.io/?EIO=4&transport=websocket"
 FRAGMENT = 1016  # bytes

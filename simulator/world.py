@@ -34,7 +34,8 @@ GROUND_HALF_WIDTH = (
 )
 CELL = 120.0  # m: meshes are cut into cells so that the engine can leave out what is out of sight
 INSIDE, OUTSIDE = BitMask32.bit(0), BitMask32.bit(1)  # what the car's own cameras see, and what others do
-HAZE_STEP = 25.0  # m: the haze is drawn anew when the camera has moved so far
+HAZE_STEP, SHEEN_STEP = 25.0, 2.0  # m: haze, and sheen, are drawn anew when the camera has moved so far
+DULL = 3.0  # m away, from above, nothing is brighter
 
 
 def ground(track: Track) -> BulletWorld:
@@ -146,13 +147,17 @@ class Batch:
         self.points, self.colours = mesh.points.astype(np.float32), mesh.colours.astype(np.float32) * 255
         self.brightness = float(mesh.texture[..., :3].mean()) / 255
 
-    def cover(self, eye: np.ndarray, haze: Haze) -> None:
-        """Mix the haze as seen from the eye, (3,), into the colours."""
-        start, end = haze.range
-        away = np.sqrt(np.square(self.points - eye).sum(axis=1))
-        share = np.clip((away - start) / (end - start), 0, haze.most)[:, None]
-        goal = np.array(haze.colour, np.float32) * (255 / self.brightness)
-        colours = _bytes(self.colours + (goal - self.colours) * share)
+    def cover(self, eye: np.ndarray, haze: Haze | None) -> None:
+        """Bring the colours to what haze and sheen make of them for the eye, (3,)."""
+        colours, away = self.colours, np.sqrt(np.square(self.points - eye).sum(axis=1))[:, None]
+        if haze:
+            start, end = haze.range
+            share = np.clip((away - start) / (end - start), 0, haze.most)
+            goal = np.array(haze.colour, np.float32) * (255 / self.brightness)
+            colours = colours + (goal - colours) * share
+        if self.mesh.sheen:
+            colours = colours * (1 + self.mesh.sheen * np.clip(1 - DULL / np.maximum(away, DULL), 0, 1))
+        colours = _bytes(colours)
         for part in self.parts:
             part.paint(colours[part.used])
             part.node.modify_geom(0).set_vertex_data(part.data)
@@ -181,16 +186,18 @@ class Scene:
         self.car.set_bin("fixed", len(self.batches))
         Batch(scenery.bonnet, self.car).root.hide(OUTSIDE)
         Batch(scenery.body, self.car).root.hide(INSIDE)
-        self.haze_at = None
+        self.seen_from: dict[float, tuple] = {}
 
     def look_from(self, x: float, y: float, z: float) -> None:
-        """Bring haze and sky to a viewer there, in metres. The haze depends on the place alone, not on the
-        way to it."""
+        """Bring haze, sheen and sky to a viewer there, in metres. They depend on the place alone, not on the way to
+        it."""
         self.sky.set_pos(x, y, z)
-        here = (round(x / HAZE_STEP), round(y / HAZE_STEP))
-        if not self.scenery.haze or here == self.haze_at:
-            return
-        self.haze_at = here
-        eye = np.array([here[0] * HAZE_STEP, here[1] * HAZE_STEP, 0], np.float32)
-        for batch in self.batches:
-            batch.cover(eye, self.scenery.haze)
+        for step, changing in ((HAZE_STEP, bool(self.scenery.haze)), (SHEEN_STEP, True)):
+            here = (round(x / step), round(y / step))
+            if not changing or here == self.seen_from.get(step):
+                continue
+            self.seen_from[step] = here
+            eye = np.array([here[0] * step, here[1] * step, 0], np.float32)
+            for batch in self.batches:
+                if bool(batch.mesh.sheen) == (step == SHEEN_STEP):
+                    batch.cover(eye, self.scenery.haze)

@@ -15,11 +15,12 @@ import cv2
 import numpy as np
 import pytest
 
+from motion import MPH
 from simulator import SimulatorError
 from simulator.expert import Expert
 from simulator.recording import Recording, number
 from simulator.run import Run
-from simulator.track import MPH, Track
+from simulator.track import Track
 
 
 def free(track="lake"):

@@ -35,15 +35,17 @@ def test_another_look_is_another_picture_of_the_same_road(track):
 
 
 def test_horizon_and_vanishing_point_lie_where_the_real_frames_have_them():
-    """The road's edges, straight here, meet at row 60 to 62 and column 157 to 162."""
-    frame = view("lake", 0, s=300.0)[0].astype(int)
+    """The road's edges, straight here, meet at row 60 to 62 and column 157 to 162, in a frame rolled by 1.2 degrees."""
+    frame = view("lake", 0, s=300.0)[0]
+    level = cv2.getRotationMatrix2D((159.5, 79.5), 1.2, 1.0)
+    frame = cv2.warpAffine(frame, level, (320, 160)).astype(int)
     yellow = frame[..., 0] + frame[..., 1] - 2 * frame[..., 2]
     lines = []
     for side in (-1, 1):
         rows = np.arange(82, 110)
         found = []
-        for row in rows:  # 3.5 m aside, seen from 1.2 m up
-            near = 159.5 + side * 3.5 / 1.2 * (row - 61)
+        for row in rows:  # 3.5 m aside, seen from 1.26 m up
+            near = 159.5 + side * 3.5 / 1.26 * (row - 61)
             columns = np.arange(max(0, round(near) - 12), min(320, round(near) + 13))
             found.append(columns[np.argmax(yellow[row, columns])])
         lines.append(np.polyfit(rows, found, 1))

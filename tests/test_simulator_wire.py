@@ -342,17 +342,14 @@ def test_pings_and_leaves_a_server_that_does_not_answer_them(monkeypatch):
     monkeypatch.setattr("simulator.wire.PONG_WITHIN", 0.5)
     monkeypatch.setattr("simulator.wire.ANSWERS_WITHIN", 0.5)
 
-    def silent(packet, n):
-        return ahead(packet, n) if n < 50 else []
-
-    server = Server(silent, sessions=2)
+    server = Server(ahead, sessions=2)
     send = server.send
     server.send = lambda client, text: None if text == "3" else send(client, text)
     with server, pytest.raises(SimulatorError):
         client = Client(Run(Track("lake"), "autonomous"), Blank(), "127.0.0.1", server.port, 1.5, False)
         client.drive(1, Progress(1, "laps"))
     assert client.reconnections >= 1
-    assert server.messages.count("2") > 3
+    assert server.messages.count("2") >= 3  # not the first alone
 
 
 def test_a_car_that_is_never_driven_is_said(monkeypatch):
