@@ -2,6 +2,7 @@
 
     python model.py                                     # every folder with a driving_log.csv under data/
     python model.py data/lake-ccw data/lake-cw          # or these
+    python model.py --robust                            # not as the report, but to stay on the road
     python model.py --resume                            # go on where a run was stopped or killed
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes, each with its share of every batch
 
@@ -17,6 +18,7 @@ import hashlib
 import io
 import itertools
 import json
+import math
 import os
 import signal
 import sys
@@ -45,6 +47,7 @@ from arithmetic import (
     repeatable,
     threads,
 )
+from files import set_aside, write
 from images import FRAME, check_images, decode
 from network import (
     CROP,
@@ -52,14 +55,14 @@ from network import (
     ModelError,
     Network,
     layer_table,
-    load_checkpoint,
     load_model,
     save_model,
     versions,
-    write,
 )
-from pictures import loss_picture, panel, side_by_side
-from recordings import CAMERAS, LOG, Recording, RecordingError, find_folders, print_findings, read_recording
+from options import load_resumed, model_files, parse
+from pictures import batch_pictures, loss_picture
+from recordings import LOG, Recording, RecordingError, find_folders, print_findings, read_recording
+from shifts import ROWS, Lanes, Poses
 
 # The recipe's figures (report, "Data Pipeline") that are no options.
 STRAIGHT, KEEP_STRAIGHT = 0.02, 0.8  # |steering| below which an observation is kept with this probability
@@ -92,6 +95,7 @@ class Observations:
     steering    float32 (n,): -1..1, right positive
     frame       uint64 (n,): digest of the centre image's file
     time        float64 (n,): seconds
+    lanes       with --robust, the lane beside each row; steering is then what leads back onto its centre
     """
 
     recordings: list[Recording]
@@ -100,10 +104,12 @@ class Observations:
     steering: np.ndarray
     frame: np.ndarray
     time: np.ndarray
+    lanes: Lanes | None = None
 
     def __post_init__(self):
         # Decoded images, by recording and image; memory is only taken as it is filled, all in one piece.
-        self.cropped = np.empty((KEEP_CROPPED, FRAME[0] - sum(CROP), *FRAME[1:]), np.uint8)
+        self.rows = ROWS if self.lanes else slice(CROP[0], FRAME[0] - CROP[1])
+        self.cropped = np.empty((KEEP_CROPPED, self.rows.stop - self.rows.start, *FRAME[1:]), np.uint8)
         self.places, self.free = {}, itertools.count()
 
     def __reduce__(self):  # for the other ranks: the rows, not the memory for images
@@ -114,46 +120,80 @@ class Observations:
 
     def take(self, rows: np.ndarray, steering=None) -> "Observations":
         return Observations(self.recordings, self.recording[rows], self.images[rows],
-                            self.steering[rows] if steering is None else steering, self.frame[rows], self.time[rows])
+                            self.steering[rows] if steering is None else steering, self.frame[rows], self.time[rows],
+                            self.lanes and self.lanes.take(rows))
 
-    def path(self, at: int, camera: int) -> Path:
+    def shuffled(self, rng: np.random.Generator) -> np.ndarray:
+        """All of them once in a random order; with --robust as many, by lot, of bends more often: int (n,)."""
+        n = len(self)
+        return rng.choice(n, n, p=self.lanes.weights()) if self.lanes else rng.permutation(n)
+
+    def image(self, at: int, camera: int, before: bool = False) -> int:
+        """Index into the recording's names; before: of the earlier row that `lanes` has for this one."""
+        images = self.recordings[self.recording[at]].images[self.lanes.before[at]] if before else self.images[at]
+        return images[camera]
+
+    def path(self, at: int, camera: int, before: bool = False) -> Path:
         recording = self.recordings[self.recording[at]]
-        return recording.folder / "IMG" / os.fsdecode(recording.names[self.images[at, camera]])
+        return recording.folder / "IMG" / os.fsdecode(recording.names[self.image(at, camera, before)])
 
-    def read(self, at: int, camera: int) -> np.ndarray:
+    def read(self, at: int, camera: int, before: bool = False) -> np.ndarray:
         """uint8 (160, 320, 3), RGB. Raises RecordingError if the file has changed since it was checked."""
-        path = self.path(at, camera)
+        path = self.path(at, camera, before)
         try:
             return decode(path.read_bytes())
         except (OSError, ValueError) as error:
             raise RecordingError(f"{path}: {error}; it was whole when the run began. Restore it and --resume") from None
 
-    def read_cropped(self, at: int, camera: int) -> np.ndarray:
-        """uint8 (75, 320, 3), RGB, not to be changed. The first KEEP_CROPPED of them are read and decoded only once."""
-        key = self.recording[at], self.images[at, camera]
+    def read_cropped(self, at: int, camera: int, before: bool = False) -> np.ndarray:
+        """uint8 (75, 320, 3), RGB, not to be changed; with lanes (90, 320, 3), the same rows at its end.
+
+        The first KEEP_CROPPED of them are read and decoded only once.
+        """
+        key = self.recording[at], self.image(at, camera, before)
         if key in self.places:
             return self.cropped[self.places[key]]
-        cropped = self.read(at, camera)[CROP[0]:FRAME[0] - CROP[1]]
+        cropped = self.read(at, camera, before)[self.rows]
         if (place := next(self.free)) < KEEP_CROPPED:
             self.cropped[place] = cropped
             self.places[key] = place
         return cropped
 
+    def center(self, rows: np.ndarray) -> np.ndarray:
+        """The centre images of these rows as the network sees them: uint8 (len(rows), 75, 320, 3), RGB."""
+        return np.stack([self.read_cropped(at, 0)[sum(CROP) - FRAME[0]:] for at in rows])
+
+    def views(self, rows: np.ndarray, poses: list[Poses]) -> list[np.ndarray]:
+        """What the network sees of these rows from each of the poses: uint8 (len(rows), 75, 320, 3), RGB, each."""
+        made = [np.empty((len(rows), FRAME[0] - sum(CROP), *FRAME[1:]), np.uint8) for _ in poses]
+        for i, at in enumerate(rows):
+            read = functools.cache(functools.partial(self.read_cropped, at))
+            for images, places in zip(made, poses, strict=True):
+                images[i] = places.view(i, read)
+        return made
+
 
 def read_observations(folders: list[Path], throttle_threshold: float, strict: bool,
-                      rejected_file: Path) -> Observations:
+                      rejected_file: Path, robust: bool = False) -> Observations:
     """Steps 2 to 4 of the report: read each csv, drop rows off throttle, rewrite the images' paths; print the counts.
 
+    robust: drop the rows where it is not known how the lane goes on, instead of those off throttle.
     Raises RecordingError when nothing is left, and with `strict` for the first row that is unusable.
     """
-    recordings, table, rejected = [], [], []
+    recordings, lanes, table, rejected = [], [], [], []
     for folder in folders:
         recording = read_recording(folder)
         check_images(recording, threads())
         usable = len(recording)
-        recording.keep(recording.numbers[:, 1] >= throttle_threshold)
+        if robust:
+            print(f"reading where the lane goes in {folder}", flush=True)
+            lanes.append(Lanes.beside(recording))
+            kept = int(lanes[-1].known.sum())
+        else:
+            recording.keep(recording.numbers[:, 1] >= throttle_threshold)
+            kept = len(recording)
         recordings.append(recording)
-        table.append((str(folder), recording.read, recording.read - usable, usable - len(recording), len(recording)))
+        table.append((str(folder), recording.read, recording.read - usable, usable - kept, kept))
         print_findings(recording)
         rejected += [(folder / LOG, *row) for row in recording.rejected]
     if rejected:
@@ -165,17 +205,26 @@ def read_observations(folders: list[Path], throttle_threshold: float, strict: bo
         write(rejected_file, text.getvalue().encode(errors="surrogateescape"))
         print(f"{len(rejected)} unusable rows are left out; all are listed in {rejected_file}")
     width = max(len(row[0]) for row in table)
-    print(f"\n{'recording':{width}}  rows read  unusable  throttle < {throttle_threshold:g}  kept")
+    dropped = "way on unknown" if robust else f"throttle < {throttle_threshold:g}"
+    print(f"\n{'recording':{width}}  rows read  unusable  {dropped}  kept")
     table.append(("total", *np.array([row[1:] for row in table]).sum(0)))
     for name, read, unusable, off, kept in table:
-        print(f"{name:{width}}  {read:9,}  {unusable:8,}  {off:14,}  {kept:,}")
+        print(f"{name:{width}}  {read:9,}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
+    joined = Lanes.joined(lanes) if robust else None
+    steering = (joined.steering(joined.offset, joined.yaw) if robust
+                else np.concatenate([r.numbers[:, 0] for r in recordings]))
     observations = Observations(
         recordings, np.repeat(np.arange(len(recordings), dtype=np.int16), [len(r) for r in recordings]),
-        np.concatenate([r.images for r in recordings]), np.concatenate([r.numbers[:, 0] for r in recordings]),
+        np.concatenate([r.images for r in recordings]), steering,
         np.concatenate([r.digests[r.images[:, 0]] for r in recordings]), np.concatenate([r.time for r in recordings]),
+        joined,
     )
+    if robust:
+        observations = observations.take(np.flatnonzero(observations.lanes.known))
     if len(observations) < FOLDS:
-        why = "--throttle-threshold drops most of them" if table[-1][3] > table[-1][2] else f"see {rejected_file}"
+        why = f"see {rejected_file}"
+        if table[-1][3] > table[-1][2]:
+            why = "the drives are too short" if robust else "--throttle-threshold drops most of them"
         raise RecordingError(f"{len(observations)} rows are left of {table[-1][1]}, at least {FOLDS} are needed: {why}")
     return observations
 
@@ -290,7 +339,7 @@ class Generator:
         self.corrections = np.array([0, side_correction, -side_correction], np.float32)  # centre, left, right
         self.pool, self.ahead = pool, ahead
         self.shuffled = functools.lru_cache(2)(
-            lambda turn: np.random.default_rng([seed, 2, turn]).permutation(len(observations)))
+            lambda turn: observations.shuffled(np.random.default_rng([seed, 2, turn])))
 
     def draw(self, number: int) -> dict[str, np.ndarray]:
         """All that chance decides in a batch; one entry an observation, but `keep` one an image."""
@@ -307,25 +356,38 @@ class Generator:
         angle = self.observations.steering[chosen] + self.corrections[camera]
         angles = np.stack([angle, -angle, angle, angle], axis=1)
         bits = np.unpackbits(np.frombuffer(rng.bytes(total * UNITS // 8), np.uint8))
-        return {
+        drawn = {
             "observation": chosen, "camera": camera, "places": places, "angles": angles,
             "brightness": rng.uniform(*BRIGHTNESS, n), "darkness": rng.uniform(*DARKNESS, n),
             "line": rng.uniform(0, FRAME[1], (n, 2)), "left": rng.random(n) < 0.5,
             "keep": bits.view(bool).reshape(total, UNITS),
         }
+        if self.observations.lanes:  # every kind from a pose of its own, half of them in the mirror world
+            near = self.observations.lanes.take(chosen)
+            drawn["poses"] = [near.drawn(rng, rng.random(n) < 0.5) for _ in range(kinds.shape[1])]
+            drawn["angles"] = np.stack([poses.steering for poses in drawn["poses"]], axis=1)
+        return drawn
 
-    def augment(self, drawn: dict, part: np.ndarray, images: np.ndarray, first_row: int):
-        """Of each kind (as it is, flipped, brightened, shadowed): which observations have it, and their images.
+    def images(self, drawn: dict, part: np.ndarray) -> list[np.ndarray]:
+        """What each kind is made of, for these of the batch's observations: uint8 (len(part), 75, 320, 3) each."""
+        if self.observations.lanes:
+            return self.observations.views(drawn["observation"][part], [poses.take(part) for poses in drawn["poses"]])
+        images = np.stack([self.observations.read_cropped(at, camera) for at, camera in
+                           zip(drawn["observation"][part], drawn["camera"][part], strict=True)])
+        return [images, images[:, :, ::-1], images, images]
 
-        part: indices into the batch's observations; images: theirs, uint8 (len(part), rows, 320, 3); first_row: the
-        full frame's row that is the images' first.
+    def augment(self, drawn: dict, part: np.ndarray, images: list[np.ndarray], first_row: int):
+        """Of each kind (as it is, mirrored, brightened, shadowed): which observations have it, and their images.
+
+        part: indices into the batch's observations; images: what each kind is made of, uint8 (len(part), rows, 320, 3);
+        first_row: the full frame's row that is the images' first.
         """
-        flipped, shadowed = (np.flatnonzero(drawn["places"][part, kind] >= 0) for kind in (1, 3))
-        dark = part[shadowed]
-        shadow = drawn["line"][dark], drawn["left"][dark], drawn["darkness"][dark]
-        return ((part, images), (part[flipped], images[flipped, :, ::-1]),
-                (part, brighten(images, drawn["brightness"][part])),
-                (dark, shade(images[shadowed], *shadow, first_row)))
+        plain, flipped, bright, dark = images
+        some, shadowed = (np.flatnonzero(drawn["places"][part, kind] >= 0) for kind in (1, 3))
+        shade_at = part[shadowed]
+        shadow = drawn["line"][shade_at], drawn["left"][shade_at], drawn["darkness"][shade_at]
+        return ((part, plain), (part[some], flipped[some]), (part, brighten(bright, drawn["brightness"][part])),
+                (shade_at, shade(dark[shadowed], *shadow, first_row)))
 
     def begin(self, number: int):
         """Start making this rank's share of a batch; the returned call waits for it."""
@@ -337,9 +399,7 @@ class Generator:
         angles = np.empty(len(order), np.float32)
 
         def make(part):
-            cropped = np.stack([self.observations.read_cropped(at, camera) for at, camera in
-                                zip(drawn["observation"][part], drawn["camera"][part], strict=True)])
-            for kind, (which, made) in enumerate(self.augment(drawn, part, cropped, CROP[0])):
+            for kind, (which, made) in enumerate(self.augment(drawn, part, self.images(drawn, part), CROP[0])):
                 at = np.searchsorted(order, drawn["places"][which, kind])
                 images[at], angles[at] = made, drawn["angles"][which, kind]
 
@@ -365,25 +425,6 @@ class Generator:
             batch = begun.popleft()()
             batch.begin_next = begin_next
             yield batch
-
-
-def batch_pictures(generator: Generator, number: int) -> dict[str, bytes]:
-    """The report's two pictures of a batch's first observation: file name, with {} for the count, -> PNG."""
-    drawn, observations = generator.draw(number), generator.observations
-    at, camera = drawn["observation"][0], drawn["camera"][0]
-    frames = [observations.read(at, i) for i in range(3)]
-    angles = observations.steering[at] + generator.corrections
-    drawn["places"][0] = 0  # show every kind, also what chance left out of the batch
-    augmented = [made[0] for _, made in generator.augment(drawn, np.array([0]), frames[camera][None], first_row=0)]
-    angle = drawn["angles"][0]
-    titles = (f"{CAMERAS[camera]} camera", "flipped", f"brightness x {drawn['brightness'][0]:.2f}",
-              f"shadow x {drawn['darkness'][0]:.2f}")
-    center, left, right = (panel(*one) for one in zip(frames, CAMERAS, angles, strict=True))
-    return {
-        "training_generator_LRC_{}.png": side_by_side([left, center, right]),
-        "training_generator_augmented-{}.png": side_by_side(
-            [panel(*one) for one in zip(augmented, titles, angle, strict=True)]),
-    }
 
 
 # --------------------------------------------------------------------------------------------------
@@ -478,6 +519,7 @@ class Run:
                 # DistributedDataParallel takes the mean over the ranks, each of which has its share of the sum.
                 loss = self.errors(batch)
                 (loss * (world() / batch.total)).backward()
+                self.optimizer.param_groups[0]["lr"] = self.learning_rate()
                 self.optimizer.step()
                 self.optimizer.zero_grad()
                 self.number += 1
@@ -496,17 +538,39 @@ class Run:
                 if time.monotonic() - self.saved_at > SAVE_SECONDS:
                     self.save()
 
+    def learning_rate(self) -> float:
+        """Of the next step: the recipe's is constant, that of --robust falls to 0 along a cosine over the whole run."""
+        arguments = self.arguments
+        done = (len(self.history) + self.images / arguments.samples_per_epoch) / arguments.epochs
+        return arguments.learning_rate * ((1 + math.cos(math.pi * done)) / 2 if arguments.robust else 1)
+
     def validate(self) -> float:
-        """Mean squared error on centre images, unchanged; 0.2 x samples_per_epoch of them, or all if they are fewer."""
+        """Mean squared error on centre images, unchanged; 0.2 x samples_per_epoch of them, or all if they are fewer.
+
+        With --robust, as many views from other poses count as much.
+        """
         count = min(len(self.validation), self.arguments.samples_per_epoch // 5)
         chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[:max(count, 1)]
         mine = chosen[rank()::world()]
-        predicted = predict(self.network, self.validation, mine, self.device, self.precision, self.pool)
-        errors = torch.tensor(((predicted - self.validation.steering[mine]) ** 2).sum())
+        errors = torch.tensor(self.squared_errors(self.validation.center, mine, self.validation.steering))
+        if self.validation.lanes:
+            poses = self.validation_poses
+            errors += self.squared_errors(lambda rows: self.validation.views(rows, [poses.take(rows)])[0], mine,
+                                          poses.steering)
+            errors /= 2
         if dist.is_initialized():
             errors = errors.to(self.device)
             dist.all_reduce(errors)
         return float(errors) / len(chosen)
+
+    def squared_errors(self, frames: Callable, rows: np.ndarray, truth: np.ndarray) -> float:
+        predicted = predict(self.network, frames, rows, self.device, self.precision, self.pool)
+        return float(((predicted - truth[rows]) ** 2).sum())
+
+    @functools.cached_property
+    def validation_poses(self) -> Poses:
+        rows = len(self.validation)
+        return self.validation.lanes.drawn(np.random.default_rng([self.arguments.seed, 5]), np.zeros(rows, bool))
 
     def write_log(self) -> None:
         """training_log.csv and training_loss.png, from the history."""
@@ -530,7 +594,7 @@ class Run:
         truth = self.validation.steering
         guesses = {"steer 0": np.zeros_like(truth), "steer mean": np.full_like(truth, self.training.steering.mean())}
         for path in (self.last_file, self.best_file):
-            guesses[path.name] = predict(load_model(path, self.device), self.validation, np.arange(len(truth)),
+            guesses[path.name] = predict(load_model(path, self.device), self.validation.center, np.arange(len(truth)),
                                          self.device, self.precision, self.pool)
         lines = ["\n" + f"{'validation: mean squared error':32} {'rows':>6}" + "".join(f"{n:>15}" for n in guesses)]
         size = np.abs(truth)
@@ -541,18 +605,18 @@ class Run:
                 lines.append(f"{f'steering of {low:g} to {min(high, 1):g}':32} {rows.sum():6,}{errors}")
         with np.errstate(invalid="ignore"):  # a constant correlates with nothing
             follows = [np.corrcoef(guess, truth)[0, 1] for guess in guesses.values()]
-        lines.append(f"{'correlation with the driver':39}" + "".join(f"{value:15.2f}" for value in follows))
+        whom = "correlation with the " + ("way back" if self.validation.lanes else "driver")
+        lines.append(f"{whom:39}" + "".join(f"{value:15.2f}" for value in follows))
         if not follows[2] > 0.3:
             lines.append(f"{self.last_file} hardly follows the driver: train longer, or record more turns.")
         return "\n".join(lines)
 
 
-def predict(network, observations: Observations, rows: np.ndarray, device, precision, pool) -> np.ndarray:
-    """Steering for the centre images of these rows: float32 (len(rows),)."""
+def predict(network, frames: Callable, rows: np.ndarray, device, precision, pool) -> np.ndarray:
+    """Steering for these rows, float32 (len(rows),); frames gives what the network sees of some of them."""
     def part(chosen):
-        frames = np.stack([observations.read_cropped(at, 0) for at in chosen])
         with torch.inference_mode(), in_precision(precision, device):
-            return network(torch.from_numpy(frames).to(device)).cpu().numpy()
+            return network(torch.from_numpy(frames(chosen)).to(device)).cpu().numpy()
 
     return np.concatenate([np.empty(0, np.float32),
                            *pool.map(part, [rows[i:i + PIECE] for i in range(0, len(rows), PIECE)])])
@@ -560,77 +624,6 @@ def predict(network, observations: Observations, rows: np.ndarray, device, preci
 
 # --------------------------------------------------------------------------------------------------
 # The command
-
-
-def parse(argv: list[str] | None) -> tuple[argparse.Namespace, dict]:
-    """The command line's arguments, and of them those that were given."""
-    parser = argparse.ArgumentParser(
-        description=__doc__.split("\n\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        epilog="The defaults are the report's. Interrupt with Ctrl-C at any time; --resume goes on.")
-    parser.add_argument("recordings", nargs="*", default=["data"],
-                        help="folders with a driving_log.csv, or folders of such folders")
-    add = parser.add_argument_group("training").add_argument
-    add("--epochs", type=at_least(1, int), default=10, help="epochs in all, also with --resume")
-    add("--batch-size", type=at_least(1, int), default=128, help="observations a batch; each gives 3.7 images")
-    add("--learning-rate", type=at_least(1e-9, float), default=1e-4, help="Adam's")
-    add("--samples-per-epoch", type=at_least(1, int), default=20224,
-        help="images an epoch, at least; a fifth as many observations validate")
-    add("--seed", type=at_least(0, int), default=0, help="the same seed gives the same run on a machine")
-    add("--device", choices=["auto", "cpu", "cuda", "mps"], default="auto",
-        help="auto: an NVIDIA GPU, else Apple's, else the CPU")
-    add = parser.add_argument_group("observations").add_argument
-    add("--throttle-threshold", type=float, default=0.25, help="rows with less throttle are dropped")
-    add("--side-correction", type=float, default=0.2,
-        help="added to the left camera's steering, taken off the right's")
-    add("--strict", action="store_true", help="stop at an unusable row, instead of leaving it out")
-    add = parser.add_argument_group("output").add_argument
-    add("--output", default="model.pt", help="the model; all else is written beside it")
-    add("--resume", action="store_true",
-        help="go on from the output's -resume.pt, with that run's arguments; --epochs may be raised")
-    arguments = parser.parse_args(argv)
-    absent = object()  # argparse sets a default only where a namespace has nothing yet
-    given = vars(parser.parse_args(argv, argparse.Namespace(**dict.fromkeys(vars(arguments), absent))))
-    return arguments, {name: value for name, value in given.items()
-                       if value is not absent and value is not parser.get_default(name)}
-
-
-def at_least(least, kind):
-    """A type for argparse: a number of this kind, not below the least."""
-    def number(text: str):
-        value = kind(text)
-        if not least <= value < float("inf"):
-            raise argparse.ArgumentTypeError(f"{text} is not a number from {least} up")
-        return value
-
-    number.__name__ = kind.__name__
-    return number
-
-
-def model_files(output: str) -> tuple[Path, Path, Path]:
-    """For model.pt: itself, the last epoch's; model-best.pt; and model-resume.pt, which --resume goes on from."""
-    path = Path(output)
-    return path, path.with_stem(f"{path.stem}-best"), path.with_stem(f"{path.stem}-resume")
-
-
-def load_resumed(arguments: argparse.Namespace, given: dict) -> dict | None:
-    """The checkpoint to go on from, its run's arguments taken over; None to begin. Raises ModelError."""
-    *_, path = model_files(arguments.output)
-    if not arguments.resume:
-        return None
-    if not path.exists():
-        print(f"{path}: nothing to resume yet; the run begins")
-        return None
-    saved = load_checkpoint(path)
-    if "training" not in saved:
-        raise ModelError(f"{path}: holds no state of a run; name the run's --output")
-    free = ("recordings", "epochs", "device", "output", "strict", "resume")  # other recordings are found out later
-    for name, value in saved["arguments"].items():
-        if name in given and name not in free and given[name] != value:
-            raise ModelError(f"{path}: was begun with --{name.replace('_', '-')} {value}, not {given[name]}; "
-                             "leave it out, or begin anew without --resume")
-        if name not in given:
-            setattr(arguments, name, value)
-    return saved
 
 
 def prepare(arguments: argparse.Namespace, given: dict) -> tuple[Observations, Observations, dict | None]:
@@ -641,9 +634,11 @@ def prepare(arguments: argparse.Namespace, given: dict) -> tuple[Observations, O
     folders = find_folders(arguments.recordings)
     arguments.recordings = [str(folder.resolve()) for folder in folders]
     observations = read_observations(folders, arguments.throttle_threshold, arguments.strict,
-                                     output.with_name("rejected_rows.csv"))
+                                     output.with_name("rejected_rows.csv"), arguments.robust)
     train, validation = split(observations, arguments.seed)
-    training = resample(observations.take(train), arguments.seed)
+    training = observations.take(train)
+    if not arguments.robust:
+        training = resample(training, arguments.seed)
     print(f"\ntraining: {len(train):,} rows, {len(training):,} observations after resampling; "
           f"validation: {len(validation):,} rows\n")
     return training, observations.take(validation), saved
@@ -692,15 +687,6 @@ def run(arguments: argparse.Namespace, given: dict) -> None:
         for number, handler in handlers.items():
             signal.signal(number, handler)
         one.pool.shutdown(cancel_futures=True)
-
-
-def set_aside(*files: Path) -> None:
-    """Keep an earlier run's models under -previous."""
-    for path in files:
-        if path.exists():
-            previous = path.with_stem(f"{path.stem}-previous")
-            os.replace(path, previous)
-            print(f"{path} of an earlier run is now {previous}")
 
 
 def main(argv: list[str] | None = None) -> int:
