@@ -1,0 +1,221 @@
+"""Replaying recordings: the integration against geometry, known drivers' scores, and the real commands."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, draw_recording
+
+from images import decode
+from lane import Lane
+from motion import LAG, MPH, REAR_AXLE, curvature
+from network import Network, load_model, save_model, steer
+from recordings import read_recording
+from simulator import replay
+from simulator.score import against
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A recording of 20 seconds through bends."""
+    return draw_recording(tmp_path_factory.mktemp("replay") / "lake", rows=300, seed=4)
+
+
+@pytest.fixture
+def recording(folder):
+    return replay.load(folder)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("model") / "model.pt"
+    save_model(path, Network())
+    return path
+
+
+def human(recording):
+    return replay.references(recording, by_lane=False)
+
+
+def test_an_echo_of_the_human_is_exactly_right(recording):
+    for limit in replay.LIMITS:
+        done = replay.drive(recording, human(recording), limit, lambda moment: moment.human)
+        assert done.autonomy() == 1 and not done.interventions
+        assert not np.any(done.distance) and not np.any(done.beside)
+        assert len(done.row) == 300
+
+
+@pytest.mark.parametrize("driver", ["nothing", "noise", "the other way"])
+def test_bad_drivers_score_badly(recording, driver):
+    random = np.random.default_rng(0)
+    steering = {"nothing": lambda moment: 0.0, "noise": lambda moment: random.uniform(-1, 1),
+                "the other way": lambda moment: -moment.human}[driver]
+    done = replay.drive(recording, human(recording), 1.0, steering)
+    assert done.autonomy() < 0
+    assert done.autonomy() == pytest.approx(1 - 6 * len(done.interventions) / sum(done.time))
+
+
+def test_the_car_goes_where_geometry_says(recording):
+    """On a straight, a constant steering drives a circle off the human's way, once the car has begun to turn."""
+    recording.numbers[:, 0], recording.numbers[:, 3] = 0.0, 15
+    done = replay.drive(recording, human(recording), 3.0, lambda moment: 0.02)
+    at = next(iter(done.interventions))
+    seconds, speed, bend = np.cumsum(done.time[:at]), 15 * MPH, curvature(np.float32(0.02))
+    yaw = np.arcsin(speed * bend * (seconds - LAG * (1 - np.exp(-seconds / LAG))))  # abreast of the human, on a circle
+    expected = np.r_[0, np.cumsum(np.diff(seconds) * speed * np.tan((yaw[1:] + yaw[:-1]) / 2))]
+    assert done.beside[:at] == pytest.approx(expected + REAR_AXLE * np.sin(yaw), abs=0.03)
+    assert done.interventions[at] > 3 and done.distance[at] == 0
+
+
+def test_in_a_bend_the_inner_way_is_shorter(recording):
+    """Whoever steers a little more than the human in a bend runs a circle of his own, whatever the human's speed."""
+    recording.numbers[:, 0], recording.numbers[:, 3] = 0.3, 20
+    done = replay.drive(recording, human(recording)[:1], 30.0, lambda moment: 0.32)
+    r, own = 1 / curvature(np.float32(0.3)), 1 / curvature(np.float32(0.32))
+    # Both start from the same place: the own circle's centre lies r - own nearer, so it comes back after a round.
+    assert max(done.beside) == pytest.approx(2 * (r - own), rel=0.15)
+
+
+def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
+    """The human drives 0.8 m right of the lane's centre: an echo is off by as much, and set back beyond a limit."""
+    offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
+    trusted = np.ones(len(recording), bool)
+    monkeypatch.setattr("roads.read_lane", lambda recording: Lane(offset, yaw, trusted))
+    references = replay.references(recording)
+    done = replay.drive(recording, references, 1.0, lambda moment: moment.human)
+    assert not done.interventions and done.distance == pytest.approx(np.full(300, 0.8))
+    offset[150:] = 1.2
+    done = replay.drive(recording, replay.references(recording), 1.0, lambda moment: moment.human)
+    assert min(done.interventions) == 150 and done.distance[150] == pytest.approx(0, abs=1e-6)
+    assert done.beside[150] == pytest.approx(-1.2)
+    offset[100:200] = 6  # off the road
+    assert [reference.rows for reference in replay.references(recording)] == [slice(0, 100), slice(200, 300)]
+    trusted[:] = False
+    [reference] = replay.references(recording)
+    assert not reference.lane and not reference.offset.any()
+
+
+def test_the_model_sees_the_recorded_file_itself_while_it_is_on_the_humans_way(recording):
+    seen = []
+
+    def driver(moment):
+        seen.append((moment.jpeg(), moment.recorded, moment.seen))
+        return moment.human + (0.3 if len(seen) == 100 else 0)
+
+    replay.drive(recording, human(recording), 2.5, driver)
+    names = [recording.folder / "IMG" / os.fsdecode(recording.names[image]) for image in recording.images[:, 0]]
+    assert all(jpeg == path.read_bytes() for (jpeg, *_), path in zip(seen[:100], names, strict=False))
+    jpeg, recorded, view = seen[150]
+    assert np.abs(view.astype(int) - recorded)[70:130].mean() > 5, "moved"
+    assert np.abs(decode(jpeg).astype(int) - view)[60:135].mean() < 4, "sent as seen"
+
+
+def test_errors_and_correlations_are_what_they_say():
+    human = np.sin(np.arange(200) / 9)
+    assert against(human, human) == {"error": 0, "correlation": 1}
+    assert against(-human, human)["correlation"] == -1
+    assert against(np.zeros(200), human) == {"error": pytest.approx(np.sqrt(np.mean(human**2)), abs=1e-4),
+                                             "correlation": None}
+
+
+def run(*arguments) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-m", "simulator", "replay", *map(str, arguments)], cwd=ROOT,
+                          capture_output=True, text=True, timeout=300)
+
+
+def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_path):
+    folder = "--reference", "human", folder
+    outputs = "--picture", tmp_path / "way.png", "--film", tmp_path / "seen.mp4"
+    alone = run(*folder, "--model", model, "--report", tmp_path / "a.json", *outputs)
+    assert alone.returncode == 0, alone.stderr
+    server = subprocess.Popen([sys.executable, "drive.py", model, "--port", "0"], cwd=ROOT, text=True,
+                              stderr=subprocess.PIPE)
+    try:
+        port = re.search(r":(\d+)\.", server.stderr.readline())[1]
+        served = run(*folder, "--port", port, "--report", tmp_path / "b.json")
+    finally:
+        server.terminate()
+        server.wait(20)
+    assert served.returncode == 0, served.stderr
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    assert alone.stdout == served.stdout
+    [report] = json.loads((tmp_path / "a.json").read_text())
+    assert set(report["limits"]) == {"1", "2.5"} and report["rows_driven"] == 300
+    assert report["reference"] == {"lane centre": 0, "human's way": 300} and "not trusted" not in alone.stdout
+    one = report["limits"]["1"]
+    assert one["interventions"] == len(one["where"]) and one["autonomy_percent"] < 100
+    assert (folder[-1] / "IMG" / one["where"][0]["image"]).is_file()
+    assert one["compared"]["the human"] == {"autonomy_percent": 100, "interventions": 0, "distance_mean_m": 0,
+                                            "distance_p95_m": 0}
+    assert (tmp_path / "way.png").read_bytes()[:4] == b"\x89PNG"
+    probe = __import__("av").open(str(tmp_path / "seen.mp4"))
+    assert sum(1 for _ in probe.decode(video=0)) == 300
+    assert probe.streams.video[0].width == 1280
+
+
+def test_on_an_unknown_road_the_humans_way_is_the_reference(tmp_path, model):
+    folder, random = draw_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
+    for path in (folder / "IMG").iterdir():
+        cv2.imwrite(str(path), random.integers(0, 255, (160, 320, 3), np.uint8))
+    done = run(folder, "--model", model, "--limit", "2", "--report", tmp_path / "r.json")
+    assert done.returncode == 0, done.stderr
+    assert "the human's way in 60 rows" in done.stdout and "an unknown road?" in done.stdout
+    assert list(json.loads((tmp_path / "r.json").read_text())[0]["limits"]) == ["2"]
+
+
+def test_the_same_answer_in_process_as_by_the_network(recording, model):
+    network, answers = load_model(model), []
+    recording.keep(np.arange(45))
+
+    def driver(moment):
+        answers.append(float(steer(network, decode(moment.jpeg()))))
+        return answers[-1]
+
+    done = replay.drive(recording, human(recording), 2.5, driver)
+    assert done.steering == answers
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    (["nowhere"], "no such folder"),
+    (["FOLDER", "--model", "nothing.pt"], "no such file"),
+    (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
+    (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
+])
+def test_unusable_arguments_are_said(folder, model, arguments, said):
+    known = {"FOLDER": folder, "MODEL": model}
+    done = run(*[known.get(argument, argument) for argument in arguments])
+    assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_recording_without_two_seconds_of_driving_is_refused(tmp_path, model):
+    done = run(draw_recording(tmp_path / "short", rows=20), "--model", model)
+    assert done.returncode == 2 and "two seconds" in done.stderr
+
+
+def test_stretches_are_joined_in_one_report(folder, tmp_path):
+    recording = read_recording(folder)
+    recording.time[150:] += 60
+    done = replay.drive(recording, human(recording), 1.0, lambda moment: moment.human)
+    assert len(human(recording)) == 2 and sum(done.time) == pytest.approx(298 * 0.067, abs=0.01)
+
+
+def test_the_score_board_keeps_what_it_has(tmp_path, model):
+    folder = draw_recording(tmp_path / "lake", rows=40)
+    for name, extra in (("one", ["--what", "untrained"]), ("two", [])):
+        done = subprocess.run([sys.executable, "benchmarks/driving.py", model, "--name", name, "--recordings", folder,
+                               "--tracks", "--table", tmp_path / "table.md", *extra], cwd=ROOT, capture_output=True,
+                              text=True, timeout=200)
+        assert done.returncode == 0, done.stderr
+    lines = (tmp_path / "table.md").read_text().splitlines()
+    assert "| course | one | two |" in lines
+    rows = [line.split("|")[1:-1] for line in lines if line.startswith("| real lake, 1 m from")]
+    assert len(rows) == 1 and rows[0][1] == rows[0][2] and "%" in rows[0][1]
+    assert lines[lines.index("* one: untrained") + 1] == (
+        "  * `python benchmarks/driving.py model.pt --name one --recordings lake --tracks --table table.md`")
