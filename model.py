@@ -500,9 +500,10 @@ class Run:
                    "loss": self.loss / self.images, "val_loss": loss}
             self.history.append(row)
             self.images, self.loss, self.seconds = 0, 0.0, 0.0
+            if rank() == 0:
+                self.write_log()  # before the checkpoint, from which a killed run would not write this epoch's again
             self.save(self.last_file, *[self.best_file] * is_best)
             if rank() == 0:
-                self.write_log()
                 print("{images}/{0} [{1}] - {seconds:.0f}s - loss: {loss:.4f} - val_loss: {val_loss:.4f}".format(
                     self.arguments.samples_per_epoch, "=" * 30, **row), flush=True)
 

@@ -108,6 +108,17 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, drawn,
     assert ours == theirs
 
 
+def test_killed_when_an_epoch_was_just_saved_loses_nothing_of_its_log(finished, drawn, tmp_path):
+    killed = [sys.executable, "-c", f"import os, sys; sys.path.insert(0, {str(ROOT)!r}); import model; "
+              "save = model.Run.save; "
+              "model.Run.save = lambda run, *models: (save(run, *models), models and os._exit(9)); model.main()"]
+    arguments = (drawn, *SHORT, "--output", tmp_path / "model.pt", "--resume")
+    assert [run_model(*arguments, command=killed).returncode for _ in range(2)] == [9, 9]
+    done = run_model(*arguments)
+    assert done.returncode == 0, done.stderr
+    assert [row["val_loss"] for row in log(tmp_path)] == [row["val_loss"] for row in log(finished[1])]
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_cleanly_with_everything_saved(finished, drawn, tmp_path, number):
     output = tmp_path / "model.pt"
