@@ -5,11 +5,14 @@
 
 Recording: three cameras, JPEG and csv, as `python -m simulator record` does it, in a process of its own. Lock-step:
 what the simulator itself adds to a frame, its server's time and the wire's left out. "cpu" figures count the processor
-time of all cores, which other load on the machine disturbs less than wall time.
+time of all cores, which other load on the machine disturbs less than wall time. Memory is that of all the processes
+that record, what they share counted once (Linux tells it).
 """
 
 import argparse
+import contextlib
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -28,13 +31,27 @@ from simulator.track import Track  # noqa: E402
 from simulator.world import Scene  # noqa: E402
 
 
+def memory(pid: int) -> float:
+    """MB that a process and its children hold in memory."""
+    total = 0
+    for one in (str(pid), *Path(f"/proc/{pid}/task/{pid}/children").read_text().split()):
+        text = Path(f"/proc/{one}/smaps_rollup").read_text()
+        total += int(re.search(r"^Pss: +(\d+)", text, re.MULTILINE)[1])
+    return total / 1024
+
+
 def recording(track: str, laps: float) -> dict:
     """Record in a process of its own; seconds are simulated ones unless they say otherwise."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "simulator", "record", f"{folder}/out", "--track", track, "--laps", str(laps)]
         begin = time.perf_counter()
         process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
-        _, status, usage = os.wait4(process.pid, 0)
+        most = 0.0
+        while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError, TypeError):  # one that has just ended
+                most = max(most, memory(process.pid))
+            time.sleep(0.2)
+        _, status, usage = ended
         wall = time.perf_counter() - begin
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
@@ -42,7 +59,7 @@ def recording(track: str, laps: float) -> dict:
         rows = (Path(folder) / "out" / "driving_log.csv").read_text().count("\n")
     cpu = usage.ru_utime + usage.ru_stime
     simulated = rows / 15
-    return {"rows": rows, "wall": simulated / wall, "cpu": simulated / cpu, "memory": usage.ru_maxrss / 1024}
+    return {"rows": rows, "wall": simulated / wall, "cpu": simulated / cpu, "memory": most}
 
 
 def lockstep(track: str, frames: int) -> tuple[float, float]:

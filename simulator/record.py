@@ -1,18 +1,47 @@
 """An expert drives and is recorded, faster than real time."""
 
-from concurrent.futures import ThreadPoolExecutor
+import functools
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from datetime import timedelta
 
 from motion import MPH
 
-from . import scenery
-from .cameras import Cameras
+from . import SimulatorError, scenery
+from .cameras import Cameras, jpeg
 from .expert import Expert, Recovery
 from .progress import Progress
 from .recording import EPOCH, Clock, Recording
 from .run import Run
 from .track import Track
 from .world import Scene
+
+DRAWERS = min(3, os.cpu_count() or 1)  # processes that draw; the engine uses one core, and 50 MB of its own, in each
+
+
+def _begin_drawing() -> None:
+    """In a drawing process: leave Ctrl-C to the recorder, and end when it does, even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def end():
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
+
+
+@functools.cache
+def _cameras(track: str, look: int) -> Cameras:
+    return Cameras(Scene(scenery.build(track, look)))
+
+
+def _draw(track: str, look: int, transform) -> list[bytes]:
+    """In a drawing process: the three cameras' JPEGs. They depend on the car's place alone, not on rows before."""
+    return [jpeg(frame) for frame in _cameras(track, look).frames(transform)]
 
 
 def record(
@@ -29,25 +58,34 @@ def record(
     recovery: only its returns from the road's sides. The images' names tell the seed's day, not today: the same seed
     and arguments make the same files.
     """
-    # A row is written while the next is drawn.
-    with Recording(folder, EPOCH + timedelta(days=seed % 10_000)) as recording, ThreadPoolExecutor(1) as writer:
-        run = Run(track)
-        run.car.speed_limit = speed * MPH
-        expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
-        cameras = Cameras(Scene(scenery.build(track.name, look)))
-        clock, progress = Clock(), Progress(laps, "laps")
-        written = None
-        while run.travelled < laps * track.length:
-            steering, throttle = expert.drive(run)
-            run.step(steering, throttle)
-            if clock.due(run.time) and (not recovery or expert.recording):
-                frames = cameras.frames(run.car.node.get_transform())
-                if written:
-                    written.result()
-                written = writer.submit(recording.add, run.time, frames, run.steering, max(0.0, run.throttle),
-                                        max(0.0, -run.throttle), run.speed_mph)
-                progress.show(max(0.0, run.travelled) / track.length, run.time)
-        if written:
-            written.result()
-        progress.finish(laps, run.time)
+    run = Run(track)
+    run.car.speed_limit = speed * MPH
+    expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
+    clock, progress = Clock(), Progress(laps, "laps")
+    with (
+        Recording(folder, EPOCH + timedelta(days=seed % 10_000)) as recording,
+        ProcessPoolExecutor(DRAWERS, initializer=_begin_drawing) as drawers,
+    ):
+        rows = deque()  # that are being drawn
+
+        def write():
+            time, images, *numbers = rows.popleft()
+            recording.add(time, images.result(), *numbers)
+
+        try:
+            while run.travelled < laps * track.length:
+                run.step(*expert.drive(run))
+                if clock.due(run.time) and (not recovery or expert.recording):
+                    images = drawers.submit(_draw, track.name, look, run.car.node.get_transform())
+                    rows.append((run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle),
+                                 run.speed_mph))
+                    if len(rows) > 2 * DRAWERS:
+                        write()
+                    progress.show(max(0.0, run.travelled) / track.length, run.time)
+            while rows:
+                write()
+        except BrokenExecutor as error:
+            raise SimulatorError(f"{folder}: a process that draws was killed (out of memory?); the {recording.rows} "
+                                 "rows before are whole") from error
+    progress.finish(laps, run.time)
     return run

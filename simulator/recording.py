@@ -6,10 +6,7 @@ import re
 from datetime import datetime, timedelta
 from pathlib import Path
 
-import numpy as np
-
 from . import SimulatorError
-from .cameras import jpeg
 
 RATE = 15  # samples a second of simulated time
 NAMES = ("center", "left", "right")  # in the order of the csv
@@ -50,9 +47,9 @@ class Recording:
         self.rows = 0
 
     def add(
-        self, time: float, frames: np.ndarray, steering: float, throttle: float, brake: float, speed: float
+        self, time: float, images: list[bytes], steering: float, throttle: float, brake: float, speed: float
     ) -> None:
-        """frames: uint8 (3, 160, 320, 3) RGB, center, left, right; time: simulated seconds; speed: mph.
+        """images: JPEGs of center, left, right; time: simulated seconds; speed: mph.
 
         Raises SimulatorError, with nothing half-written, if the disk is full.
         """
@@ -61,8 +58,8 @@ class Recording:
         row = ",".join([*map(str, paths), *map(number, (steering, throttle, brake, speed))]) + "\n"
         size = os.fstat(self.log.fileno()).st_size
         try:
-            for path, frame in zip(paths, frames, strict=True):
-                path.write_bytes(jpeg(frame))
+            for path, image in zip(paths, images, strict=True):
+                path.write_bytes(image)
             if self.log.write(row.encode()) != len(row.encode()):
                 raise OSError(28, "No space left on device")
         except OSError as error:

@@ -18,7 +18,7 @@ from panda3d.core import (
 from motion import MPH
 
 from . import SimulatorError, scenery
-from .cameras import MOUNTS, PITCH, YAW, Cameras
+from .cameras import MOUNTS, PITCH, YAW, Cameras, jpeg
 from .car import STEP
 from .client import Remote
 from .controls import ACTIONS, HELD, HELP, Controls, Sticks
@@ -151,9 +151,9 @@ class Window(ShowBase):
 
     def sample(self) -> None:
         run = self.run_
-        frames = self.cameras.frames(run.car.node.get_transform())
+        images = [jpeg(frame) for frame in self.cameras.frames(run.car.node.get_transform())]
         self.recording.add(
-            run.time, frames, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph
+            run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph
         )
 
     def do_record(self) -> None:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ from simulator.expert import Expert
 from simulator.recording import Recording, number
 from simulator.run import Run
 from simulator.track import Track
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def free(track="lake"):
@@ -220,19 +223,47 @@ def test_a_kill_leaves_a_readable_folder(tmp_path):
     for row in csv.reader(text.splitlines()):
         assert len(row) == 7
         assert all(cv2.imread(path) is not None for path in row[:3])
+    ends = time.monotonic() + 20
+    while any(str(folder).encode() in file.read_bytes() for file in processes()):
+        assert time.monotonic() < ends  # the processes that draw end with it
+        time.sleep(0.1)
+
+
+def processes() -> list[Path]:
+    return [file for file in Path("/proc").glob("[0-9]*/cmdline") if file.exists()]
+
+
+DRAW = """
+import sys, zlib
+from simulator import cameras, run, scenery, track, world
+drive, eyes = run.Run(track.Track("lake")), cameras.Cameras(world.Scene(scenery.build("lake", 0)))
+for i in range(1000):
+    drive.step(0.0004 * (i % 100 - 20), 1)
+    if i % int(sys.argv[1]) == 0:
+        print(i, zlib.crc32(eyes.frames(drive.car.node.get_transform())))
+"""
+
+
+def test_a_frame_depends_on_the_place_alone():
+    few, many = (
+        subprocess.run([sys.executable, "-c", DRAW, step], capture_output=True, text=True, check=True, cwd=ROOT)
+        .stdout.splitlines() for step in ("8", "4")
+    )
+    assert len(few) == 125
+    assert few == many[::2]
 
 
 def test_a_full_disk_is_told_and_leaves_whole_rows(tmp_path, monkeypatch):
-    frames = np.zeros((3, 160, 320, 3), np.uint8)
+    images = [b"a whole JPEG"] * 3
     with Recording(tmp_path / "full") as recording:
-        recording.add(0, frames, 0, 1, 0, 10)
+        recording.add(0, images, 0, 1, 0, 10)
 
         def full(*_):
             raise OSError(28, os.strerror(28))
 
         monkeypatch.setattr("pathlib.Path.write_bytes", full)
         with pytest.raises(SimulatorError, match="No space left"):
-            recording.add(1, frames, 0, 1, 0, 10)
+            recording.add(1, images, 0, 1, 0, 10)
     assert len((tmp_path / "full" / "driving_log.csv").read_text().splitlines()) == 1
 
 
