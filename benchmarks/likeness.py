@@ -1,11 +1,10 @@
 """How much the drawn frames are like real ones: a table of figures, and frames side by side.
 
-    python benchmarks/likeness.py data/lake-ccw --track lake --direction ccw --picture side_by_side.png
+    python benchmarks/likeness.py data/lake-ccw --picture side_by_side.png
 
-The real recording is laid along the track by its steering and speeds, and the same places are drawn. Of every
-camera:
-mean colour, brightness by rows, and where the lane's yellow lines lie: their columns at row 100 and where
-they meet.
+`roads.py` tells where on a known road a real recording was driven, and the car is drawn at the same places. Of every
+camera: mean colour, brightness by rows, and where the lake's inner yellow lines lie, in columns from where flat
+geometry has them.
 """
 
 import argparse
@@ -18,77 +17,60 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from motion import MPH, curvature  # noqa: E402
+from lane import see  # noqa: E402
+from motion import ARM, REAR_AXLE  # noqa: E402
 from recordings import CAMERAS, read_recording  # noqa: E402
+from roads import known  # noqa: E402
 from simulator import scenery  # noqa: E402
 from simulator.cameras import Cameras, jpeg  # noqa: E402
 from simulator.run import Run  # noqa: E402
-from simulator.track import Track  # noqa: E402
+from simulator.track import Place, Track  # noqa: E402
 from simulator.world import Scene  # noqa: E402
+from viewpoint import SIDES, project  # noqa: E402
 
 ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
+BANDS = (range(76, 82), range(86, 94), range(104, 116))  # rows in which the lines are looked for: far, middle, near
+LINE = 3.5  # m from the lake's centre line to the middle of the inner yellow line
+AROUND = np.arange(-14, 14.1, 0.5)  # columns
 
 
-def read(folder: Path) -> tuple[list[list[Path]], np.ndarray, np.ndarray, np.ndarray]:
-    """Paths of each row's three images, its steering, speed (m/s) and time (s)."""
-    recording = read_recording(folder)
-    paths = [[folder / "IMG" / recording.names[image].decode() for image in row] for row in recording.images]
-    return paths, recording.numbers[:, 0].astype(float), recording.numbers[:, 3] * float(MPH), recording.time
+def axle(track: Track, place: np.ndarray) -> tuple[Place, np.ndarray]:
+    """The rear axle's middle at a place as `roads.Placed` has it, with the car's heading, and the way it points."""
+    s, right, yaw = place
+    at = track.at(s, -right)
+    heading = at.heading - yaw
+    return Place(at.x, at.y, at.z, heading, at.grade), np.array([np.cos(heading), np.sin(heading)])
 
 
-def along(track: Track, steering, speed, moments) -> tuple[np.ndarray, float]:
-    """Where on the track each row was taken, m, and how much the car turns for what its wheels' angle says.
+def line_columns(track: Track, place: np.ndarray, aside: float, camera: str, rows: range) -> np.ndarray:
+    """Where flat geometry has the line `aside` metres left of the centre line, in some rows: columns, or nan."""
+    at, forward = axle(track, place)
+    right = np.array([forward[1], -forward[0]])
+    eye = (at.x, at.y) + ARM * forward + SIDES[camera] * right
+    near = (round(place[0] / track.step) + np.arange(45)) % len(track.points)
+    away = track.points[near, :2] + aside * track.normal[near] - eye
+    ahead = away @ forward
+    seen = project(away[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
+    return np.interp(rows, seen[:, 1], seen[:, 0], left=np.nan, right=np.nan)
 
-    Of all starts (and slightly different lengths) the one that fits the turning best.
+
+def line_profile(frames: np.ndarray, columns: list[np.ndarray], rows: range) -> tuple[float, int]:
+    """Where the yellow is, in columns from those given, on the mean over all rows in which they are in view.
+
+    frames: uint8 (n, 160, 320, 3) RGB. Also how many rows those are. nan where nothing stands out.
     """
-    pause = np.clip(np.diff(moments, prepend=moments[0]), 0, 0.2)
-    turned = np.cumsum(-curvature(steering) * speed * pause)
-    driven = np.cumsum(speed * pause)
-    lap, whole = track.length, 2 * np.pi * round((track.heading[-1] - track.heading[0]) / (2 * np.pi))
-    best = (np.inf,)
-    for scale in np.arange(0.96, 1.07, 0.01):
-        for start in np.arange(0, lap, 3.0):
-            s = start + driven * scale
-            heading = np.interp(
-                s % lap, np.arange(len(track.heading)) * track.step, track.heading
-            ) + whole * (s // lap)
-            gain, level = np.polyfit(turned, heading, 1)
-            off = float(np.square(heading - gain * turned - level).mean())
-            best = min(best, (off, start, scale, gain))
-    _, start, scale, gain = best
-    return (start + driven * scale) % lap, gain
-
-
-def lines(frame: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Columns at row 100 of the left and right inner yellow line, and the column and row where they meet.
-
-    Of all pairs of lines that meet near the horizon, the pair that is most yellow against its surroundings.
-    frame: uint8 (160, 320, 3) RGB. None if the lines cannot be made out.
-    """
-    colours = frame.astype(np.float32)
-    yellow = colours[..., 0] + colours[..., 1] - 2 * colours[..., 2]
-    yellow = np.clip(yellow - cv2.blur(yellow, (15, 1)), -20, 60)
-    rows = np.arange(78, 132)
-    steep = np.arange(0.6, 5.0, 0.06)  # columns a row
-    best = (9.0, None)
-    for row in np.arange(56, 66):
-        for column in range(146, 174, 2):
-            found = []
-            for side in (-1, 1):
-                at = column + side * steep[:, None] * (rows - row)
-                inside = (at >= 0) & (at < 319.5)
-                value = yellow[rows, np.clip(np.round(at), 0, 319).astype(int)] * inside
-                score = value.sum(axis=1) / np.maximum(inside.sum(axis=1), 1)
-                score[inside.sum(axis=1) < 14] = -np.inf
-                k = int(np.argmax(score))
-                found.append((score[k], steep[k]))
-            total = min(found[0][0], found[1][0])
-            if total > best[0]:
-                best = (
-                    total,
-                    (column - found[0][1] * (100 - row), column + found[1][1] * (100 - row), column, row),
-                )
-    return best[1]
+    profiles = []
+    for frame, expected in zip(frames.astype(np.float32), columns, strict=True):
+        yellow = frame[..., 0] + frame[..., 1] - 2 * frame[..., 2]
+        for row, column in zip(rows, expected, strict=True):
+            if AROUND[-1] < column < 319 - AROUND[-1]:
+                profiles.append(np.interp(column + AROUND, np.arange(320), yellow[row]))
+    if not profiles:
+        return np.nan, 0
+    mean = np.mean(profiles, axis=0)
+    mean -= np.linspace(mean[:8].mean(), mean[-8:].mean(), len(mean))
+    weight = np.clip(mean - mean.max() / 2, 0, None) * (np.abs(AROUND - AROUND[mean.argmax()]) < 5)
+    return float((weight * AROUND).sum() / weight.sum()), len(profiles)
 
 
 def load(path: Path) -> np.ndarray:
@@ -99,23 +81,27 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("recording", type=Path, help="a real recording of one lap or more")
-    parser.add_argument("--track", default="lake")
-    parser.add_argument("--direction", default="ccw")
+    parser.add_argument("recording", type=Path, help="a real recording of the lake or the jungle")
     parser.add_argument("--frames", type=int, default=120, help="places to compare (default 120)")
     parser.add_argument("--picture", help="write frames side by side: real above, drawn below")
     args = parser.parse_args()
-    track = Track(args.track, args.direction)
-    paths, steering, speed, moments = read(args.recording)
-    place, gain = along(track, steering, speed, moments)
-    print(f"over the whole recording the car turns {gain:.2f} times what its wheels' angle says")
-    chosen = np.linspace(0, len(paths) - 1, args.frames).astype(int)
-    run, cameras = Run(track), Cameras(Scene(scenery.build(args.track)))
+    recording = read_recording(args.recording)
+    stretches = list(known(recording, see(recording)))
+    if not stretches:
+        raise SystemExit(f"{args.recording}: not found on a known road")
+    rows, found = max(stretches, key=lambda one: one[0].stop - one[0].start)
+    track, name = found.track, found.track.name
+    print(f"{name}, {track.direction}, {rows.stop - rows.start} rows")
+    chosen = np.linspace(0, len(found.place) - 1, args.frames).astype(int)
+    run, cameras = Run(track), Cameras(Scene(scenery.build(name)))
     real, drawn = [], []
     for i in chosen:
-        real.append([load(path) for path in paths[i]])
-        run.s = float(place[i])
-        run.set_back()
+        real.append([load(args.recording / "IMG" / recording.names[image].decode())
+                     for image in recording.images[rows][i]])
+        at, forward = axle(track, found.place[i])
+        x, y = (at.x, at.y) + REAR_AXLE * forward
+        run.car.place(Place(x, y, at.z + REAR_AXLE * at.grade, at.heading, at.grade))
+        run.car.settle()
         frames = cameras.frames(run.car.node.get_transform())
         decoded = [cv2.imdecode(np.frombuffer(jpeg(frame), np.uint8), cv2.IMREAD_COLOR) for frame in frames]
         drawn.append([cv2.cvtColor(frame, cv2.COLOR_BGR2RGB) for frame in decoded])
@@ -135,24 +121,14 @@ def main():
         f"{'row profile, correlation':28}{np.corrcoef(*profile)[0, 1]:>24.3f}"
         f"   mean difference {np.abs(profile[0] - profile[1]).mean():.1f}"
     )
-    if args.track == "lake":
-        straight = np.flatnonzero(np.abs(steering[chosen]) < 0.03)[::2]
+    if name == "lake":
         for c, camera in enumerate(CAMERAS):
-            found = [
-                [line for frame in frames[straight, c] if (line := lines(frame))] for frames in (real, drawn)
-            ]
-            names = (
-                "left line at row 100",
-                "right line at row 100",
-                "lines meet at column",
-                "lines meet at row",
-            )
-            for k, name in enumerate(names):
-                cells = "".join(
-                    f"{np.median([f[k] for f in one]):>17.1f} (n={len(one):3})" if one else f"{'-':>24}"
-                    for one in found
-                )
-                print(f"{camera + ', ' + name:28}{cells}")
+            for side, aside in (("left", LINE), ("right", -LINE)):
+                for band in BANDS:
+                    columns = [line_columns(track, found.place[i], aside, camera, band) for i in chosen]
+                    pair = [line_profile(frames[:, c], columns, band) for frames in (real, drawn)]
+                    print(f"{f'{camera}, {side} line, row {band[len(band) // 2]}':28}"
+                          + "".join(f"{at:>+15.1f} (n={n:4})" for at, n in pair))
     if args.picture:
         strips = []
         for i in np.linspace(0, len(chosen) - 1, 8).astype(int):
