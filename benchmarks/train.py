@@ -91,8 +91,9 @@ def one_by_one(generator, number: int):
 
     drawn, images, angles = generator.draw(number), [], []
     for i, (at, camera) in enumerate(zip(drawn["observation"], drawn["camera"], strict=True)):
-        cropped = generator.observations.read(at, camera)[CROP[0]:FRAME[0] - CROP[1]]
-        for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), cropped[None], CROP[0])):
+        cropped = generator.observations.read(at, camera)[None, CROP[0]:FRAME[0] - CROP[1]]
+        kinds = [cropped, cropped[:, :, ::-1], cropped, cropped]
+        for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), kinds, CROP[0])):
             images += list(made)
             angles += [drawn["angles"][i, kind]] * len(which)
     return np.stack(images), np.array(angles)

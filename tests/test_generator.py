@@ -10,6 +10,7 @@ import pytest
 from conftest import draw_recording
 
 import model
+from benchmarks.train import one_by_one
 from images import check_images
 from model import Generator, Observations, brighten, resample, shade, split
 from recordings import Recording, read_recording
@@ -161,6 +162,14 @@ def test_images_and_angles_of_an_observation(generator):
         if places[1] >= 0:
             np.testing.assert_array_equal(cv2.flip(batch.images[places[1]], 1), jpeg)  # twice is the identity
         np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], drawn["brightness"][i:i + 1])[0])
+
+
+def test_the_yardsticks_batch_is_the_generators(generator):
+    made, angles = one_by_one(generator, 3)
+    batch = generator.begin(3)()
+    assert made.shape == batch.images.shape
+    for ours, theirs in ((batch.images, made), (batch.angles, angles.astype(np.float32))):
+        assert sorted(one.tobytes() for one in ours) == sorted(one.tobytes() for one in theirs)
 
 
 def test_a_batch_depends_on_seed_and_number_alone(generator):
