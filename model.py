@@ -302,6 +302,11 @@ def shade(images: np.ndarray, lines: np.ndarray, left: np.ndarray, factors: np.n
     return np.where(shadow[..., None], dark, images)
 
 
+def of_each_kind(images: np.ndarray) -> list[np.ndarray]:
+    """What the recipe makes its kinds of (as it is, mirrored, brightened, shadowed) of images (n, rows, columns, 3)."""
+    return [images, images[:, :, ::-1], images, images]
+
+
 def rank() -> int:
     return dist.get_rank() if dist.is_initialized() else 0
 
@@ -374,7 +379,7 @@ class Generator:
             return self.observations.views(drawn["observation"][part], [poses.take(part) for poses in drawn["poses"]])
         images = np.stack([self.observations.read_cropped(at, camera) for at, camera in
                            zip(drawn["observation"][part], drawn["camera"][part], strict=True)])
-        return [images, images[:, :, ::-1], images, images]
+        return of_each_kind(images)
 
     def augment(self, drawn: dict, part: np.ndarray, images: list[np.ndarray], first_row: int):
         """Of each kind (as it is, mirrored, brightened, shadowed): which observations have it, and their images.

@@ -17,6 +17,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from images import decode  # noqa: E402
 from lane import see  # noqa: E402
 from motion import ARM, REAR_AXLE  # noqa: E402
 from recordings import CAMERAS, read_recording  # noqa: E402
@@ -73,10 +74,6 @@ def line_profile(frames: np.ndarray, columns: list[np.ndarray], rows: range) -> 
     return float((weight * AROUND).sum() / weight.sum()), len(profiles)
 
 
-def load(path: Path) -> np.ndarray:
-    return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-
-
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -96,15 +93,14 @@ def main():
     run, cameras = Run(track), Cameras(Scene(scenery.build(name)))
     real, drawn = [], []
     for i in chosen:
-        real.append([load(args.recording / "IMG" / recording.names[image].decode())
+        real.append([decode((args.recording / "IMG" / recording.names[image].decode()).read_bytes())
                      for image in recording.images[rows][i]])
         at, forward = axle(track, found.place[i])
         x, y = (at.x, at.y) + REAR_AXLE * forward
         run.car.place(Place(x, y, at.z + REAR_AXLE * at.grade, at.heading, at.grade))
         run.car.settle()
         frames = cameras.frames(run.car.node.get_transform())
-        decoded = [cv2.imdecode(np.frombuffer(jpeg(frame), np.uint8), cv2.IMREAD_COLOR) for frame in frames]
-        drawn.append([cv2.cvtColor(frame, cv2.COLOR_BGR2RGB) for frame in decoded])
+        drawn.append([decode(jpeg(frame)) for frame in frames])
     real, drawn = np.array(real), np.array(drawn)
     print(f"{'':28}{'real':>24}{'drawn':>24}")
     for c, camera in enumerate(CAMERAS):

@@ -87,13 +87,12 @@ def one_by_one(generator, number: int):
     import numpy as np
 
     from images import FRAME
-    from model import CROP
+    from model import CROP, of_each_kind
 
     drawn, images, angles = generator.draw(number), [], []
     for i, (at, camera) in enumerate(zip(drawn["observation"], drawn["camera"], strict=True)):
         cropped = generator.observations.read(at, camera)[None, CROP[0]:FRAME[0] - CROP[1]]
-        kinds = [cropped, cropped[:, :, ::-1], cropped, cropped]
-        for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), kinds, CROP[0])):
+        for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), of_each_kind(cropped), CROP[0])):
             images += list(made)
             angles += [drawn["angles"][i, kind]] * len(which)
     return np.stack(images), np.array(angles)

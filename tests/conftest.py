@@ -9,8 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 ROOT = Path(__file__).parent.parent
+SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
 
 
 @pytest.fixture(autouse=True)
@@ -73,3 +75,14 @@ def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
     command = command or [sys.executable, str(ROOT / "model.py")]
     return subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, timeout=300,
                           env={**os.environ, **more.pop("env", {})}, **more)
+
+
+def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.CompletedProcess, Path]:
+    """A run that was never interrupted: what it printed, and its folder."""
+    done = run_model(recording, *arguments, "--output", folder / "model.pt")
+    assert done.returncode == 0, done.stderr
+    return done, folder
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return torch.load(path, weights_only=True)["network"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, draw_recording, run_model
+from conftest import ROOT, SHORT, draw_recording, finished_run, run_model, weights
 
 import model
 import shifts
@@ -163,19 +163,12 @@ def test_drawn_poses_are_on_both_sides_by_every_camera_and_lead_back(monkeypatch
 # --------------------------------------------------------------------------------------------------
 # The command
 
-SHORT = ("--robust", "--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
+ROBUST = ("--robust", *SHORT)
 
 
 @pytest.fixture(scope="module")
 def finished(drawn, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("robust")
-    done = run_model(drawn, *SHORT, "--output", folder / "model.pt")
-    assert done.returncode == 0, done.stderr
-    return done, folder
-
-
-def weights(path):
-    return torch.load(path, weights_only=True)["network"]
+    return finished_run(drawn, tmp_path_factory.mktemp("robust"), *ROBUST)
 
 
 def test_robust_trains_and_says_what_was_left_out(finished, drawn):
@@ -192,7 +185,7 @@ def test_robust_trains_and_says_what_was_left_out(finished, drawn):
 
 
 def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, drawn, tmp_path):
-    command = [sys.executable, str(ROOT / "model.py"), str(drawn), *map(str, SHORT), "--output", tmp_path / "model.pt"]
+    command = [sys.executable, str(ROOT / "model.py"), str(drawn), *map(str, ROBUST), "--output", tmp_path / "model.pt"]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert any(line.startswith("Epoch 2") for line in run.stdout)
     run.kill()

@@ -13,19 +13,14 @@ import time
 
 import pytest
 import torch
-from conftest import ROOT, draw_recording, run_model
+from conftest import ROOT, SHORT, draw_recording, finished_run, run_model, weights
 from PIL import Image
 
 import model
 
-SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
 # The same command, but it saves after every batch: kills then strike at every place of an epoch, and while writing.
 SAVING = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}); import model; model.SAVE_SECONDS = 0; "
           "sys.exit(model.main())"]
-
-
-def weights(path):
-    return torch.load(path, weights_only=True)["network"]
 
 
 def log(folder):
@@ -39,11 +34,7 @@ def same(a, b):
 
 @pytest.fixture(scope="module")
 def finished(drawn, tmp_path_factory):
-    """A run that was never interrupted: what it printed, and its folder."""
-    folder = tmp_path_factory.mktemp("run")
-    done = run_model(drawn, *SHORT, "--output", folder / "model.pt")
-    assert done.returncode == 0, done.stderr
-    return done, folder
+    return finished_run(drawn, tmp_path_factory.mktemp("run"), *SHORT)
 
 
 def test_what_a_run_prints(finished, drawn):
