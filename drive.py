@@ -18,11 +18,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import frames
-import page
-import wire
-from images import FRAME, decode
-from network import ModelError, Network, load_model, steer
+from cloning.errors import ModelError
+from cloning.pilot import page
+from cloning.pilot.network import Network, load_model, steer
+from cloning.recordings import saved_frames as frames
+from cloning.recordings.images import FRAME, decode
+from cloning.wire import server as wire
 
 NUMBERS = ("steering_angle", "throttle", "speed")  # of a telemetry: degrees, -1..1, mph
 log = logging.getLogger("drive")

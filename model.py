@@ -36,9 +36,7 @@ import torch.distributed as dist
 from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
-from arithmetic import (
-    PIECE,
-    SquaredErrors,
+from cloning.compute import (
     choose_device,
     choose_precision,
     in_precision,
@@ -47,22 +45,16 @@ from arithmetic import (
     repeatable,
     threads,
 )
-from files import set_aside, write
-from images import FRAME, check_images, decode
-from network import (
-    CROP,
-    UNITS,
-    ModelError,
-    Network,
-    layer_table,
-    load_model,
-    save_model,
-    versions,
-)
-from options import load_resumed, model_files, parse
-from pictures import batch_pictures, loss_picture
-from recordings import LOG, Recording, RecordingError, find_folders, print_findings, read_recording
-from shifts import ROWS, Lanes, Poses
+from cloning.errors import ModelError, RecordingError
+from cloning.files import set_aside, write
+from cloning.pilot.network import CROP, UNITS, Network, layer_table, load_model, save_model, versions
+from cloning.recordings.check import check_images
+from cloning.recordings.images import FRAME, decode
+from cloning.recordings.log import LOG, Recording, find_folders, print_findings, read_recording
+from cloning.training.options import load_resumed, model_files, parse
+from cloning.training.pictures import batch_pictures, loss_picture
+from cloning.training.pieces import PIECE, SquaredErrors
+from cloning.training.robust import ROWS, Lanes, Poses
 
 # The recipe's figures (report, "Data Pipeline") that are no options.
 STRAIGHT, KEEP_STRAIGHT = 0.02, 0.8  # |steering| below which an observation is kept with this probability
@@ -190,7 +182,7 @@ def read_observations(folders: list[Path], throttle_threshold: float, strict: bo
             lanes.append(Lanes.beside(recording))
             kept = int(lanes[-1].known.sum())
         else:
-            recording.keep(recording.numbers[:, 1] >= throttle_threshold)
+            recording.keep(recording.throttle >= throttle_threshold)
             kept = len(recording)
         recordings.append(recording)
         table.append((str(folder), recording.read, recording.read - usable, usable - kept, kept))
@@ -212,7 +204,7 @@ def read_observations(folders: list[Path], throttle_threshold: float, strict: bo
         print(f"{name:{width}}  {read:9,}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
     joined = Lanes.joined(lanes) if robust else None
     steering = (joined.steering(joined.offset, joined.yaw) if robust
-                else np.concatenate([r.numbers[:, 0] for r in recordings]))
+                else np.concatenate([r.steering for r in recordings]))
     observations = Observations(
         recordings, np.repeat(np.arange(len(recordings), dtype=np.int16), [len(r) for r in recordings]),
         np.concatenate([r.images for r in recordings]), steering,

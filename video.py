@@ -17,14 +17,15 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-import frames
-from files import Film
-from images import FRAME, jpeg_size
+from cloning.errors import UserError
+from cloning.film import Film
+from cloning.recordings import saved_frames as frames
+from cloning.recordings.images import FRAME, jpeg_size
 
 PAUSE = 1.0  # seconds between two frames from which it is a pause, which says nothing about the rate
 
 
-class FilmError(Exception):
+class FilmError(UserError):
     """A film that cannot be made; the message names the folder and the remedy."""
 
 
@@ -108,8 +109,9 @@ def film(folder: Path, fps: Fraction | None = None, overlay=None) -> Path:
 
 def overlay_of(model_file: str):
     """The overlay with the network's own steering and what it looks at. Raises FilmError."""
-    import attention  # which loads torch, and that takes longer than a short film
-    from network import ModelError, load_model
+    from cloning.errors import ModelError
+    from cloning.pilot import attention  # which loads torch, and that takes longer than a short film
+    from cloning.pilot.network import load_model
     try:
         network = load_model(model_file)
     except ModelError as error:

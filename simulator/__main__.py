@@ -5,10 +5,8 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from recordings import RecordingError
-
-from . import SimulatorError
-from .track import ROADS, Track
+from cloning.errors import RecordingError, SimulatorError
+from cloning.road.track import ROADS, Track
 
 
 def positive(text: str) -> float:
@@ -128,7 +126,7 @@ def arguments(argv=None) -> argparse.Namespace:
 
 
 def record(args) -> int:
-    from .record import record
+    from simulator.record import record
 
     track = Track(args.track, args.direction)
     run = record(args.folder, track, args.laps, args.speed, args.seed, args.look, args.recovery)
@@ -138,13 +136,13 @@ def record(args) -> int:
 
 
 def drive(args) -> int:
-    from . import report, scenery
-    from .cameras import Cameras
-    from .client import Client
-    from .film import Film
-    from .progress import Progress
-    from .run import Run
-    from .world import Scene
+    from simulator import report, scenery
+    from simulator.cameras import Cameras
+    from simulator.client import Client
+    from simulator.film import Film
+    from simulator.progress import Progress
+    from simulator.run import Run
+    from simulator.world import Scene
 
     outputs(args.report, args.picture, args.film)
     run = Run(Track(args.track, args.direction), "autonomous")
@@ -169,12 +167,12 @@ def drive(args) -> int:
 
 
 def replay(args) -> int:
-    from recordings import find_folders
-
-    from . import replay as replaying
-    from . import report, score
-    from .progress import Progress
-    from .steering import InProcess, Served
+    from cloning.recordings.log import find_folders
+    from cloning.replay import replay as replaying
+    from cloning.replay import score
+    from cloning.replay.drivers import InProcess, Served
+    from simulator import report
+    from simulator.progress import Progress
 
     outputs(args.report, args.picture, args.film)
     folders = find_folders(args.folders)
@@ -187,7 +185,7 @@ def replay(args) -> int:
             references = replaying.references(recording, args.reference == "lane")
             if not references:
                 raise SimulatorError(f"{folder}: no two seconds of driving without a break to replay")
-            rows = sum(reference.rows.stop - reference.rows.start for reference in references)
+            rows = sum(len(reference.stretch) for reference in references)
 
             def drive(limit, folder=folder, recording=recording, references=references, rows=rows):
                 progress = Progress(rows, f"rows of {folder.name} at {limit:g} m")
@@ -226,7 +224,7 @@ def outputs(*paths: str | None) -> None:
 def window(args) -> int:
     from datetime import datetime
 
-    from .window import Window
+    from simulator.window import Window
 
     folder = args.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}"
     server = (args.host, args.port) if args.autonomous else None

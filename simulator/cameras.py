@@ -16,14 +16,14 @@ from panda3d.core import (
     load_prc_file_data,
 )
 
-from viewpoint import ROLL, VERTICAL_FIELD, YAW
-
-from . import SimulatorError
-from .mounts import COLUMNS, MOUNTS, PITCH, ROWS
-from .world import INSIDE, Scene
+from cloning.errors import SimulatorError
+from cloning.recordings.images import FRAME
+from cloning.road.camera import CAMERA_POSITIONS, MOUNT_PITCH, ROLL, VERTICAL_FIELD, YAW
+from simulator.world import INSIDE, Scene
 
 QUALITY = 75
-NEAR, FAR = 0.3, 1000.0
+NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m
+ROWS, COLUMNS = FRAME[:2]
 # Rows drawn for one of the frame: the road, seen at a slant, flickers else, where the real one is smooth.
 FINER = 2
 
@@ -37,7 +37,7 @@ load_prc_file_data(
 
 def lens(rows: int = ROWS, columns: int = COLUMNS) -> PerspectiveLens:
     made = PerspectiveLens()
-    made.set_near_far(NEAR, FAR)
+    made.set_near_far(NEAR_PLANE, FAR_PLANE)
     across = 2 * np.degrees(np.arctan(np.tan(np.radians(VERTICAL_FIELD / 2)) * columns / rows))
     made.set_fov(across, VERTICAL_FIELD)
     return made
@@ -100,8 +100,8 @@ class Cameras:
         for name in names:
             camera = scene.car.attach_new_node(Camera(name, lens()))
             camera.node().set_camera_mask(INSIDE)
-            camera.set_pos(*MOUNTS[name])
-            camera.set_hpr(-YAW, -PITCH, -ROLL)
+            camera.set_pos(*CAMERA_POSITIONS[name])
+            camera.set_hpr(-YAW, -MOUNT_PITCH, -ROLL)
             mounted.append(camera)
         self.buffer = Buffer(FINER * ROWS, COLUMNS, mounted)
 

@@ -6,9 +6,8 @@ import math
 from panda3d.bullet import BulletBoxShape, BulletRigidBodyNode, BulletVehicle, BulletWorld, ZUp
 from panda3d.core import NodePath, Point3, TransformState, Vec3
 
-from motion import FULL_LOCK, MPH, REAR_AXLE
-
-from .track import Place
+from cloning.road.motion import FULL_LOCK, MPH, REAR_AXLE
+from cloning.road.track import Place
 
 STEP = 0.02  # s, of the physics
 TOP_SPEED = 30 * MPH

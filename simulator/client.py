@@ -2,14 +2,14 @@
 
 import time
 
-from . import SimulatorError
-from .cameras import Cameras, jpeg
-from .car import STEP
-from .progress import Progress
-from .recording import RATE, Clock
-from .run import Run
-from .session import OPENS, Session
-from .wire import MANUAL, Answer, Gone, Wire, read, telemetry
+from cloning.errors import SimulatorError
+from cloning.recordings.writer import RATE, Clock
+from cloning.wire.client import MANUAL, Answer, Gone, Wire, read, telemetry
+from cloning.wire.session import OPENS, Session
+from simulator.cameras import Cameras, jpeg
+from simulator.car import STEP
+from simulator.progress import Progress
+from simulator.run import Run
 
 STANDS_STILL = 60.0  # simulated seconds in which the car has to get on by a metre
 

@@ -5,11 +5,10 @@ import math
 
 import numpy as np
 
-from motion import FULL_LOCK, WHEELBASE
-
-from .car import CHARACTERISTIC_SPEED, TOP_SPEED
-from .run import Run
-from .track import Track
+from cloning.road.motion import FULL_LOCK, WHEELBASE
+from cloning.road.track import Track
+from simulator.car import CHARACTERISTIC_SPEED, TOP_SPEED
+from simulator.run import Run
 
 SIDEWAYS, BRAKING = 5.0, 4.0  # m/s²: what it takes in a bend and when slowing for one
 LOOKAHEAD, LOOKAHEAD_TIME = 3.0, 0.45  # m and s ahead of the car that it steers for

@@ -4,13 +4,12 @@ import cv2
 import numpy as np
 from panda3d.core import Camera, Vec3
 
-import files
-
-from . import SimulatorError
-from .cameras import Buffer, lens
-from .recording import RATE, Clock
-from .run import Run
-from .world import OUTSIDE, Scene
+from cloning import files
+from cloning.errors import SimulatorError
+from cloning.recordings.writer import RATE, Clock
+from simulator.cameras import Buffer, lens
+from simulator.run import Run
+from simulator.world import OUTSIDE, Scene
 
 ROWS, COLUMNS = 360, 640
 BEHIND, ABOVE, TARGET = 7.5, 2.9, 1.0  # m

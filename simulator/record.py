@@ -9,16 +9,16 @@ from collections import deque
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from datetime import timedelta
 
-from motion import MPH
-
-from . import SimulatorError, scenery
-from .cameras import Cameras, jpeg
-from .expert import Expert, Recovery
-from .progress import Progress
-from .recording import EPOCH, Clock, Recording
-from .run import Run
-from .track import Track
-from .world import Scene
+from cloning.errors import SimulatorError
+from cloning.recordings.writer import EPOCH, Clock, Recording
+from cloning.road.motion import MPH
+from cloning.road.track import Track
+from simulator import scenery
+from simulator.cameras import Cameras, jpeg
+from simulator.expert import Expert, Recovery
+from simulator.progress import Progress
+from simulator.run import Run
+from simulator.world import Scene
 
 DRAWERS = min(3, os.cpu_count() or 1)  # processes that draw; the engine uses one core, and 50 MB of its own, in each
 

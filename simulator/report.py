@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 
-from files import write
-from motion import MPH
-
-from . import SimulatorError
-from .car import STEP
-from .run import Run
+from cloning.errors import SimulatorError
+from cloning.files import write
+from cloning.road.motion import MPH
+from simulator.car import STEP
+from simulator.run import Run
 
 
 def figures(run: Run, client=None) -> dict:

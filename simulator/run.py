@@ -4,12 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from motion import MPH
-
-from . import PENALTY
-from .car import STEP, WHEELS, Car
-from .track import Track
-from .world import ground
+from cloning.replay.autonomy import autonomy
+from cloning.road.motion import MPH
+from cloning.road.track import Track
+from simulator.car import STEP, WHEELS, Car
+from simulator.world import ground
 
 REACH = 1.95  # m from the car's middle to a wheel, at most
 
@@ -113,7 +112,7 @@ class Run:
 
     def autonomy(self) -> float:
         """NVIDIA's measure, 0..1: the share of the time in which no human would have had to take over."""
-        return max(0.0, 1 - len(self.departures) * PENALTY / self.time) if self.time else 1.0
+        return autonomy(len(self.departures), self.time)
 
     def roughness(self) -> float:
         """Mean absolute change of the steering per second."""

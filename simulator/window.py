@@ -15,18 +15,19 @@ from panda3d.core import (
     WindowProperties,
 )
 
-from motion import MPH
-
-from . import SimulatorError, scenery
-from .cameras import MOUNTS, PITCH, YAW, Cameras, jpeg
-from .car import STEP
-from .client import Remote
-from .controls import ACTIONS, HELD, HELP, Controls, Sticks
-from .film import follow
-from .recording import Clock, Recording
-from .run import Run
-from .track import Track
-from .world import INSIDE, OUTSIDE, Scene
+from cloning.errors import SimulatorError
+from cloning.recordings.writer import Clock, Recording
+from cloning.road.camera import CAMERA_POSITIONS, MOUNT_PITCH, YAW
+from cloning.road.motion import MPH
+from cloning.road.track import Track
+from simulator import scenery
+from simulator.cameras import Cameras, jpeg
+from simulator.car import STEP
+from simulator.client import Remote
+from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks
+from simulator.film import follow
+from simulator.run import Run
+from simulator.world import INSIDE, OUTSIDE, Scene
 
 SIZE = 960, 540
 BEHIND_AT_MOST = 0.2  # s of physics that a slow frame is caught up with; the rest is lost
@@ -197,7 +198,7 @@ class Window(ShowBase):
             follow(self.camera, transform)
         else:
             self.camera.reparent_to(self.scene.car)
-            self.camera.set_pos_hpr(*MOUNTS["center"], -YAW, -PITCH, 0)
+            self.camera.set_pos_hpr(*CAMERA_POSITIONS["center"], -YAW, -MOUNT_PITCH, 0)
         lines = [
             f"{run.speed_mph:4.1f} mph   set speed {self.controls.set_speed}   steering {run.steering:+.2f}",
             f"lap {run.laps + 1}   {run.time:.0f} s   departures {len(run.departures)}",

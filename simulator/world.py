@@ -25,9 +25,9 @@ from panda3d.core import (
     Vec3,
 )
 
-from .scenery import Haze, Scenery
-from .shapes import Mesh, together
-from .track import Track
+from cloning.road.track import Track
+from simulator.scenery.parts import Haze, Scenery
+from simulator.scenery.shapes import Mesh, together
 
 GROUND_HALF_WIDTH = (
     8.0  # m of ground to each side of a climbing road; the car is set back before it gets there

@@ -11,10 +11,10 @@ import torch
 from conftest import draw_frame
 from PIL import Image
 
-import attention
 import drive
-import frames
-from network import Network
+from cloning.pilot import attention
+from cloning.pilot.network import Network
+from cloning.recordings import saved_frames as frames
 
 
 def jpeg_of(frame: np.ndarray) -> bytes:

@@ -21,9 +21,9 @@ import pytest
 import torch
 from conftest import ROOT, draw_frame
 
-from benchmarks.client import Simulator, fragments, telemetry
-from images import decode
-from network import Network, load_model, save_model
+from cloning.pilot.network import Network, load_model, save_model
+from cloning.recordings.images import decode
+from tools.simulator_client import Simulator, fragments, telemetry
 
 
 class Process:

@@ -10,15 +10,15 @@ import pytest
 from conftest import draw_recording
 
 import model
-from benchmarks.train import one_by_one
-from images import check_images
+from cloning.recordings.check import check_images
+from cloning.recordings.log import Recording, read_recording
 from model import Generator, Observations, brighten, resample, shade, split
-from recordings import Recording, read_recording
+from tools.bench_training import one_by_one
 
 
 def recording(n, name="lake", seconds=0.0714, first=0):
     """n rows of a recording that has no files."""
-    return Recording(Path(name), np.array([], "S9"), np.zeros((n, 3), np.int32), np.zeros((n, 4), np.float32),
+    return Recording(Path(name), np.array([], "S9"), np.zeros((n, 3), np.int32), *np.zeros((4, n), np.float32),
                      first + np.arange(n) * seconds, np.arange(1, n + 1, dtype=np.int32), n)
 
 
@@ -34,7 +34,7 @@ def observations(steering, recordings=None, frame=None):
 def loaded(folder):
     found = read_recording(folder)
     check_images(found)
-    return Observations([found], np.zeros(len(found), int), found.images, found.numbers[:, 0],
+    return Observations([found], np.zeros(len(found), int), found.images, found.steering,
                         found.digests[found.images[:, 0]], found.time)
 
 

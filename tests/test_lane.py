@@ -10,8 +10,9 @@ import pytest
 import torch
 from conftest import ROOT, draw_recording
 
-from images import decode
-from lane import (
+from cloning.errors import ModelError
+from cloning.lane.place import LIKELY, centre_ahead, placed, read_lane
+from cloning.lane.reader import (
     AHEAD,
     MOUNTS,
     STRIP,
@@ -25,15 +26,14 @@ from lane import (
     see,
     strip,
 )
-from lane_training import disagreement, draw, in_sight, seen_from
-from motion import RATE, REAR_AXLE, stretches
-from network import ModelError
-from recordings import find_folders, logs_below, read_recording
-from roads import LIKELY, centre_ahead, placed, read_lane
+from cloning.recordings.images import decode
+from cloning.recordings.log import find_folders, logs_below, read_recording
+from cloning.road.camera import CAMERA_MATRIX, HEIGHT
+from cloning.road.motion import RATE, REAR_AXLE, stretches
+from cloning.road.track import Track
 from simulator.car import STEP
 from simulator.record import record
-from simulator.track import Track
-from viewpoint import CAMERA_MATRIX, HEIGHT
+from tools.train_lane import disagreement, draw, in_sight, seen_from
 
 UNSEEN = 1003  # a look that the network was not trained on
 REAL = sorted(logs_below(ROOT / "data"))
@@ -90,17 +90,18 @@ def test_where_the_centre_lies_ahead(direction):
 def test_a_drive_is_placed_on_its_road(drive):
     """By what the network sees, a quarter of it made nonsense."""
     recording, true = drive
-    rows = stretches(recording)[0]
+    stretch = stretches(recording)[0]
+    rows = stretch.rows
     seen = see(recording)[rows]
     rng = np.random.default_rng(0)
     nonsense = rng.random(len(seen)) < 0.25
     seen[nonsense] = rng.uniform(-4, 4, seen[nonsense].shape)
-    found = placed(recording, rows, seen)
+    found = placed(stretch, seen)
     assert (found.track.name, found.track.direction) == ("lake", "ccw")
     assert found.likely > LIKELY
     off = found.place[:, 1] + REAR_AXLE * np.sin(found.place[:, 2]) - true[rows]
     assert np.abs(off).mean() < 0.15
-    assert placed(recording, rows, -seen).likely < LIKELY  # a road that it is not
+    assert placed(stretch, -seen).likely < LIKELY  # a road that it is not
 
 
 @pytest.mark.parametrize("pose", [(0.8, 0, 0), (0.3, 4, 0.05), (-1.2, 1, -0.1)])
@@ -150,7 +151,7 @@ def test_mirrored_frames_mirror_the_place():
 
 def test_a_drawn_drive(drive):
     recording, true = drive
-    found = read_lane(recording)
+    found = read_lane(recording, stretches(recording))
     assert isinstance(found, Lane) and found.offset.dtype == found.yaw.dtype == np.float32
     assert found.offset.shape == found.yaw.shape == found.trusted.shape == (len(recording),)
     assert found.trusted.mean() > 0.9
@@ -171,8 +172,7 @@ def test_the_side_cameras_stand_where_they_are_mounted(drive):
 def test_cameras_time_and_way_are_laid_together(drive):
     """What perfect cameras see of a straight road from a car that drives along it, 0.7 m right of the centre."""
     recording, _ = drive
-    recording.numbers = recording.numbers.copy()
-    recording.numbers[:, 0], recording.numbers[:, 3] = 0, 30
+    recording.steering[:], recording.speed[:] = 0, 30
     seen = np.broadcast_to(-0.7 - MOUNTS[:, None], (len(recording), 3, len(AHEAD)))
     found = combine(recording, seen.astype(np.float32))
     assert found.trusted.all()
@@ -186,11 +186,13 @@ def test_noise_is_an_unknown_road(tmp_path):
     rng = np.random.default_rng(0)
     for path in (folder / "IMG").iterdir():
         cv2.imwrite(str(path), rng.integers(0, 256, (160, 320, 3)).astype(np.uint8))
-    assert read_lane(read_recording(folder)).trusted.mean() < 0.1
+    recording = read_recording(folder)
+    assert read_lane(recording, stretches(recording)).trusted.mean() < 0.1
 
 
 def test_a_drawing_of_another_kind_is_an_unknown_road(drawn):
-    assert read_lane(read_recording(drawn)).trusted.mean() < 0.5
+    recording = read_recording(drawn)
+    assert read_lane(recording, stretches(recording)).trusted.mean() < 0.5
 
 
 @pytest.mark.skipif(not REAL, reason="no recordings under data/")
@@ -203,7 +205,7 @@ def test_real_side_cameras():
 
 def test_training_leaves_weights_that_load(tmp_path, drawn):
     output = tmp_path / "lane.pt"
-    done = subprocess.run([sys.executable, ROOT / "lane_training.py", drawn, "--looks", "1", "--frames", "6", "--steps",
+    done = subprocess.run([sys.executable, "-m", "tools.train_lane", drawn, "--looks", "1", "--frames", "6", "--steps",
                            "2", "--output", output], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "step 2/2" in done.stdout
@@ -219,6 +221,6 @@ def test_bad_files_are_named(tmp_path):
     Path(tmp_path / "bad.pt").write_bytes(b"nothing")
     with pytest.raises(ModelError, match="no weights"):
         load(tmp_path / "bad.pt")
-    done = subprocess.run([sys.executable, ROOT / "lane_training.py", tmp_path / "nowhere"], capture_output=True,
+    done = subprocess.run([sys.executable, "-m", "tools.train_lane", tmp_path / "nowhere"], capture_output=True,
                           text=True, timeout=120)
     assert done.returncode == 2 and "nowhere" in done.stderr

@@ -8,10 +8,11 @@ import torch
 from conftest import ROOT
 from torch import nn
 
-from arithmetic import SquaredErrors, squared_errors
-from files import write
+from cloning.errors import ModelError
+from cloning.files import write
+from cloning.pilot.network import Network, layer_table, load_model, save_model, steer
+from cloning.training.pieces import SquaredErrors, squared_errors
 from model import Batch
-from network import ModelError, Network, layer_table, load_model, save_model, steer
 
 REPORT = """
 lambda_1 (Lambda)                (None, 160, 320, 3)   0           lambda_input_1[0][0]
@@ -149,6 +150,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 
 def test_the_model_that_comes_with_the_project_steers():
-    network = load_model(ROOT / "model.pt")
+    network = load_model(ROOT / "cloning" / "pilot" / "shipped.pt")
     frame = np.random.default_rng(0).integers(0, 256, (160, 320, 3)).astype(np.uint8)
     assert -1 <= steer(network, frame) <= 1

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from conftest import draw_recording
 
-from images import check_images, decode, jpeg_size
-from recordings import RecordingError, find_folders, read_recording
+from cloning.errors import RecordingError
+from cloning.recordings.check import check_images
+from cloning.recordings.images import decode, jpeg_size
+from cloning.recordings.log import find_folders, read_recording
 
 STAMPS = ["2018_07_16_17_11_43_382", "2018_07_16_17_11_43_453", "2018_07_16_17_11_43_524"]
 
@@ -26,6 +28,10 @@ WINDOWS = "C:\\Users\\driver\\Desktop\\track3\\IMG\\"
 EXPECTED = [(-0.0597, 0.98, 0, 30.18), (0, 1, 0, 6.9e-05), (0.25, 0.3, 0, 22.14829)]
 PLAIN = ["-0.0597,0.98,0,30.18", "0,1,0,6.9E-05", "0.25,0.3,0,22.14829"]
 SPACED = [numbers.replace(",", ", ") for numbers in PLAIN]
+
+
+def numbers(found):
+    return np.column_stack([found.steering, found.throttle, found.brake, found.speed])
 
 
 def lines(before="", numbers=PLAIN, between=","):
@@ -53,7 +59,7 @@ def lines(before="", numbers=PLAIN, between=","):
 ])
 def test_formats_that_are_read_right(tmp_path, text):
     found = log(tmp_path, *text)
-    np.testing.assert_allclose(found.numbers, EXPECTED, rtol=1e-6)
+    np.testing.assert_allclose(numbers(found), EXPECTED, rtol=1e-6)
     names = [os.fsdecode(found.names[i]) for i in found.images[1]]
     assert names == [f"{camera}_{STAMPS[1]}.jpg" for camera in ("center", "left", "right")]
     assert not found.rejected
@@ -69,14 +75,14 @@ def test_formats_that_are_read_right(tmp_path, text):
 ])
 def test_formats_that_are_repaired_and_told(tmp_path, text, kind):
     found = log(tmp_path, *text)
-    np.testing.assert_allclose(found.numbers, EXPECTED, rtol=1e-6)
+    np.testing.assert_allclose(numbers(found), EXPECTED, rtol=1e-6)
     assert found.repairs[kind][1] == 1
     assert not found.rejected
 
 
 def test_the_facts_own_decimal_commas(tmp_path):
     found = log(tmp_path, *lines(numbers=["-0,004694836,1,0,30,19023", "0,1,0,30,19", "0,0,1,0,5"]))
-    np.testing.assert_allclose(found.numbers, [(-0.004694836, 1, 0, 30.19023), (0, 1, 0, 30.19)], rtol=1e-6)
+    np.testing.assert_allclose(numbers(found), [(-0.004694836, 1, 0, 30.19023), (0, 1, 0, 30.19)], rtol=1e-6)
     line, kind, detail = found.rejected[0]  # 0 | 0,1 | 0 | 5 or 0 | 0 | 1 | 0,5: never guessed
     assert (line, kind) == (3, "ambiguous columns")
     assert "2 ways" in detail
@@ -92,7 +98,7 @@ def test_the_facts_own_decimal_commas(tmp_path):
 ])
 def test_rows_that_are_left_out_and_told(tmp_path, bad, words):
     found = log(tmp_path, lines()[0], bad, lines()[2])
-    np.testing.assert_allclose(found.numbers, [EXPECTED[0], EXPECTED[2]], rtol=1e-6)
+    np.testing.assert_allclose(numbers(found), [EXPECTED[0], EXPECTED[2]], rtol=1e-6)
     (line, _, detail), = found.rejected
     assert line == 2
     assert words in detail
@@ -113,7 +119,7 @@ def test_files_that_are_refused(tmp_path, content, words):
 
 def test_utf_16_and_no_newline_at_the_end(tmp_path):
     (tmp_path / "driving_log.csv").write_bytes("\n".join(lines()).encode("utf-16"))
-    np.testing.assert_allclose(read_recording(tmp_path).numbers, EXPECTED, rtol=1e-6)
+    np.testing.assert_allclose(numbers(read_recording(tmp_path)), EXPECTED, rtol=1e-6)
 
 
 def test_apple_double_beside_the_real_one_is_not_looked_at(tmp_path):
@@ -171,7 +177,7 @@ def test_colour_is_rgb(tmp_path):
 def test_a_recording_without_time_stamps_keeps_the_file_order(tmp_path):
     text = [f"a{i}.jpg,b{i}.jpg,c{i}.jpg,0.{i},1,0,9" for i in (3, 1, 2)]
     found = log(tmp_path, *text)
-    np.testing.assert_allclose(found.numbers[:, 0], [0.3, 0.1, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(found.steering, [0.3, 0.1, 0.2], rtol=1e-6)
     np.testing.assert_allclose(np.diff(found.time), 1 / 15)
 
 

@@ -12,13 +12,13 @@ import pytest
 import torch
 from conftest import ROOT, draw_recording
 
-from images import decode
-from lane import Lane
-from motion import LAG, MPH, REAR_AXLE, curvature
-from network import Network, load_model, save_model, steer
-from recordings import read_recording
-from simulator import replay
-from simulator.score import against
+from cloning.lane.reader import Lane
+from cloning.pilot.network import Network, load_model, save_model, steer
+from cloning.recordings.images import decode
+from cloning.recordings.log import read_recording
+from cloning.replay import replay
+from cloning.replay.score import against
+from cloning.road.motion import LAG, MPH, REAR_AXLE, curvature
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_bad_drivers_score_badly(recording, driver):
 
 def test_the_car_goes_where_geometry_says(recording):
     """On a straight, a constant steering drives a circle off the human's way, once the car has begun to turn."""
-    recording.numbers[:, 0], recording.numbers[:, 3] = 0.0, 15
+    recording.steering[:], recording.speed[:] = 0.0, 15
     done = replay.drive(recording, human(recording), 3.0, lambda moment: 0.02)
     at = next(iter(done.interventions))
     seconds, speed, bend = np.cumsum(done.time[:at]), 15 * MPH, curvature(np.float32(0.02))
@@ -76,7 +76,7 @@ def test_the_car_goes_where_geometry_says(recording):
 
 def test_in_a_bend_the_inner_way_is_shorter(recording):
     """Whoever steers a little more than the human in a bend runs a circle of his own, whatever the human's speed."""
-    recording.numbers[:, 0], recording.numbers[:, 3] = 0.3, 20
+    recording.steering[:], recording.speed[:] = 0.3, 20
     done = replay.drive(recording, human(recording)[:1], 30.0, lambda moment: 0.32)
     r, own = 1 / curvature(np.float32(0.3)), 1 / curvature(np.float32(0.32))
     # Both start from the same place: the own circle's centre lies r - own nearer, so it comes back after a round.
@@ -87,7 +87,7 @@ def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
     """The human drives 0.8 m right of the lane's centre: an echo is off by as much, and set back beyond a limit."""
     offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
     trusted = np.ones(len(recording), bool)
-    monkeypatch.setattr("roads.read_lane", lambda recording: Lane(offset, yaw, trusted))
+    monkeypatch.setattr("cloning.lane.place.read_lane", lambda *_: Lane(offset, yaw, trusted))
     references = replay.references(recording)
     done = replay.drive(recording, references, 1.0, lambda moment: moment.human)
     assert not done.interventions and done.distance == pytest.approx(np.full(300, 0.8))
@@ -209,7 +209,7 @@ def test_stretches_are_joined_in_one_report(folder, tmp_path):
 def test_the_score_board_keeps_what_it_has(tmp_path, model):
     folder = draw_recording(tmp_path / "lake", rows=40)
     for name, extra in (("one", ["--what", "untrained"]), ("two", [])):
-        done = subprocess.run([sys.executable, "benchmarks/driving.py", model, "--name", name, "--recordings", folder,
+        done = subprocess.run([sys.executable, "-m", "tools.scoreboard", model, "--name", name, "--recordings", folder,
                                "--tracks", "--table", tmp_path / "table.md", *extra], cwd=ROOT, capture_output=True,
                               text=True, timeout=200)
         assert done.returncode == 0, done.stderr
@@ -218,4 +218,4 @@ def test_the_score_board_keeps_what_it_has(tmp_path, model):
     rows = [line.split("|")[1:-1] for line in lines if line.startswith("| real lake, 1 m from")]
     assert len(rows) == 1 and rows[0][1] == rows[0][2] and "%" in rows[0][1]
     assert lines[lines.index("* one: untrained") + 1] == (
-        "  * `python benchmarks/driving.py model.pt --name one --recordings lake --tracks --table table.md`")
+        "  * `python -m tools.scoreboard model.pt --name one --recordings lake --tracks --table table.md`")

@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 import pytest
 
-from motion import MPH
-from simulator import SimulatorError
+from cloning.errors import SimulatorError
+from cloning.recordings.writer import Recording, number
+from cloning.road.motion import MPH
+from cloning.road.track import Track
 from simulator.expert import Expert
-from simulator.recording import Recording, number
 from simulator.run import Run
-from simulator.track import Track
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -132,7 +132,7 @@ def test_leaving_the_road_is_noted_and_the_car_set_back():
     assert departure.time == run.time
     assert abs(run.offset) < 0.01
     assert run.speed_mph < 0.1
-    assert run.autonomy() == pytest.approx(max(0, 1 - 6 / run.time))
+    assert run.autonomy() == pytest.approx(1 - 6 / run.time)
 
 
 def in_bends(run):
@@ -235,7 +235,8 @@ def processes() -> list[Path]:
 
 DRAW = """
 import sys, zlib
-from simulator import cameras, run, scenery, track, world
+from cloning.road import track
+from simulator import cameras, run, scenery, world
 drive, eyes = run.Run(track.Track("lake")), cameras.Cameras(world.Scene(scenery.build("lake", 0)))
 for i in range(1000):
     drive.step(0.0004 * (i % 100 - 20), 1)

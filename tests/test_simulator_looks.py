@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from simulator import SimulatorError, scenery
+from cloning.errors import SimulatorError
+from cloning.road.track import Track
+from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Recovery
 from simulator.film import Film
 from simulator.run import Run
-from simulator.track import Track
 from simulator.world import Scene
 
 

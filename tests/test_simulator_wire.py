@@ -17,12 +17,13 @@ import cv2
 import numpy as np
 import pytest
 
-from simulator import SimulatorError, report
+from cloning.errors import SimulatorError
+from cloning.road.track import Track
+from cloning.wire.client import FRAGMENT, Answer, read
+from simulator import report
 from simulator.client import Client, Remote, Standstill
 from simulator.progress import Progress
 from simulator.run import Run
-from simulator.track import Track
-from simulator.wire import FRAGMENT, Answer, read
 
 STEER = '42["steer",{"steering_angle":"%s","throttle":"%s"}]'
 

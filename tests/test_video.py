@@ -13,7 +13,7 @@ import torch
 from conftest import ROOT
 
 import video
-from network import Network, save_model
+from cloning.pilot.network import Network, save_model
 
 
 def draw(number: int, rows=160, columns=320) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Learning to drive from recordings: everything but the commands and the stand-in simulator."""

@@ -1,0 +1,1 @@
+"""The lane: lateral offset and heading, estimated from camera frames."""

@@ -1,0 +1,132 @@
+"""NVIDIA's network, and the file that it is kept in: all that driving needs of training."""
+
+import io
+import platform
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+
+from cloning.errors import ModelError
+from cloning.files import write
+from cloning.recordings.images import FRAME
+
+FORMAT, VERSION = "behavioral-cloning", 1  # of model.pt
+CROP = (60, 25)  # rows cut off the top and the bottom
+UNITS = 4224  # of the flattened layer, half of which dropout leaves
+
+
+class Network(nn.Module):
+    """NVIDIA's network (arXiv 1604.07316) as the report uses it: 559,419 parameters.
+
+    forward: frames uint8 (N, 160, 320, 3), RGB, or already cropped (N, 75, 320, 3) -> steering float32 (N,), where
+    -1..1 is the simulator's -25°..25°, positive to the right. keep: bool (N, 4224), what dropout leaves, in training.
+    """
+
+    def __init__(self, crop=CROP, scale=127.5, offset=1.0):
+        """crop: rows cut off the top and the bottom; a pixel value x enters as x / scale - offset."""
+        super().__init__()
+        self.crop, self.scale, self.offset = tuple(crop), scale, offset
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(into, out, kernel, stride) for into, out, kernel, stride in
+            [(3, 24, 5, 2), (24, 36, 5, 2), (36, 48, 5, 2), (48, 64, 3, 1), (64, 64, 3, 1)])
+        self.dense = nn.ModuleList(nn.Linear(into, out) for into, out in [(UNITS, 100), (100, 50), (50, 10), (10, 1)])
+
+    def forward(self, frames: torch.Tensor, keep: torch.Tensor | None = None) -> torch.Tensor:
+        if frames.shape[1] == FRAME[0]:
+            frames = frames[:, self.crop[0]:FRAME[0] - self.crop[1]]
+        x = frames.permute(0, 3, 1, 2).float().div_(self.scale).sub_(self.offset)  # in memory still channels last
+        for convolution in self.convolutions:
+            x = nn.functional.elu(convolution(x), inplace=True)
+        x = x.flatten(1)
+        if keep is not None:
+            x = x * keep.to(x.dtype).mul_(2)
+        for layer in self.dense[:-1]:
+            x = nn.functional.elu(layer(x), inplace=True)
+        return self.dense[-1](x).squeeze(1).float()
+
+
+def layer_table(network: Network) -> str:
+    """The report's table of layers, with the shapes and counts of this network."""
+    rows, before, x = [], "lambda_input_1", torch.zeros(1, FRAME[2], *FRAME[:2])
+
+    def row(name, kind, x, module=None):
+        nonlocal before
+        shape = (None, *x.shape[2:], x.shape[1]) if x.dim() == 4 else (None, *x.shape[1:])
+        count = sum(p.numel() for p in module.parameters()) if module else 0
+        rows.append(f"{f'{name} ({kind})':32} {shape!s:22} {count:<11} {before}[0][0]")
+        before = name
+
+    row("lambda_1", "Lambda", x)
+    x = x[:, :, network.crop[0]:FRAME[0] - network.crop[1]]
+    row("cropping2d_1", "Cropping2D", x)
+    with torch.no_grad():
+        for i, convolution in enumerate(network.convolutions, 1):
+            row(f"convolution2d_{i}", "Convolution2D", x := convolution(x), convolution)
+        row("flatten_1", "Flatten", x := x.flatten(1))
+        row("dropout_1", "Dropout", x)
+        for i, layer in enumerate(network.dense, 1):
+            row(f"dense_{i}", "Dense", x := layer(x), layer)
+    title = f"{'Layer (type)':32} {'Output Shape':22} {'Param #':11} Connected to"
+    total = f"Total params: {sum(p.numel() for p in network.parameters()):,}"
+    return "\n".join(["_" * 90, title, "=" * 90, f"\n{'_' * 90}\n".join(rows), "=" * 90, total])
+
+
+# --------------------------------------------------------------------------------------------------
+# model.pt
+
+
+def save_model(path: Path, network: Network, **more) -> None:
+    """Write a model file: weights, what driving needs to use them, and `more` (plain values and tensors)."""
+    buffer = io.BytesIO()
+    torch.save({
+        "format": FORMAT, "version": VERSION, "network": network.state_dict(),
+        "recipe": {"frame": FRAME, "colour": "RGB", "crop": network.crop, "scale": network.scale,
+                   "offset": network.offset},
+        "versions": versions(), **more,
+    }, buffer)
+    write(path, buffer.getvalue())
+
+
+def versions() -> dict[str, str]:
+    return {"python": platform.python_version(), "torch": str(torch.__version__), "opencv": cv2.__version__,
+            "numpy": np.__version__}
+
+
+def load_checkpoint(path) -> dict:
+    """The contents of a model file, read with weights_only=True. Raises ModelError."""
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise ModelError(f"{path}: no such file; `python model.py` trains one") from None
+    except Exception as error:
+        raise ModelError(f"{path}: not a model of this project, or damaged ({type(error).__name__})") from error
+    if not isinstance(saved, dict) or saved.get("format") != FORMAT:
+        raise ModelError(f"{path}: not a model of this project; `python model.py` trains one")
+    if saved.get("version") != VERSION:
+        raise ModelError(f"{path}: version {saved.get('version')} of the model file where this program reads "
+                         f"version {VERSION}; train it again with `python model.py`")
+    return saved
+
+
+def load_model(path, device="cpu") -> Network:
+    """The network of a model file, ready to drive. Raises ModelError."""
+    saved = load_checkpoint(path)
+    try:
+        recipe = saved["recipe"]
+        network = Network(recipe["crop"], recipe["scale"], recipe["offset"])
+        network.load_state_dict(saved["network"])
+    except (KeyError, RuntimeError) as error:
+        raise ModelError(f"{path}: its contents do not fit this project's network ({error})") from None
+    return network.to(device, memory_format=torch.channels_last).eval()
+
+
+def steer(network: Network, frame: np.ndarray) -> np.float32:
+    """Steering -1..1 for a frame, uint8 (160, 320, 3), RGB. Raises ArithmeticError if the network gives none."""
+    with torch.inference_mode():
+        steering = network(torch.from_numpy(frame)[None].to(next(network.parameters()).device)).cpu().numpy()[0]
+    if not np.isfinite(steering):
+        raise ArithmeticError("the network's steering is not finite")
+    return np.clip(steering, np.float32(-1), np.float32(1))

@@ -1,0 +1,95 @@
+"""Recordings as the simulator writes them: IMG/ with three cameras' JPEGs, and driving_log.csv."""
+
+import math
+import os
+import re
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from cloning.errors import SimulatorError
+
+RATE = 15  # samples a second of simulated time
+NAMES = ("center", "left", "right")  # in the order of the csv
+EPOCH = datetime(
+    2018, 1, 1, 12
+)  # when a recording with seed 0 begins: file names must not depend on the day they are made
+
+
+def number(value: float) -> str:
+    """A number as C# writes a float: seven digits, 6.9E-05."""
+    return (
+        re.sub(r"E([+-]\d)$", r"E\g<1>", f"{value:.7G}").replace("-0", "0") if value == 0 else f"{value:.7G}"
+    )
+
+
+class Recording:
+    """Writes samples into a folder. A row follows its three whole images, so a kill at any time leaves a
+    readable folder."""
+
+    def __init__(self, folder: str | Path, begin: datetime = EPOCH):
+        """begin: the moment of simulated second 0, for the images' names.
+
+        Raises SimulatorError if the folder holds a recording already, or cannot be made.
+        """
+        self.folder = Path(folder).absolute()
+        self.images = self.folder / "IMG"
+        log = self.folder / "driving_log.csv"
+        if log.exists():
+            raise SimulatorError(f"{log} exists already: give another folder, or delete this one")
+        try:
+            self.images.mkdir(parents=True, exist_ok=True)
+            self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+        except OSError as error:
+            raise SimulatorError(
+                f"{self.folder}: {error.strerror}; give a folder that can be written"
+            ) from error
+        self.begin = begin
+        self.rows = 0
+
+    def add(
+        self, time: float, images: list[bytes], steering: float, throttle: float, brake: float, speed: float
+    ) -> None:
+        """images: JPEGs of center, left, right; time: simulated seconds; speed: mph.
+
+        Raises SimulatorError, with nothing half-written, if the disk is full.
+        """
+        moment = (self.begin + timedelta(seconds=time)).strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
+        paths = [self.images / f"{name}_{moment}.jpg" for name in NAMES]
+        row = ",".join([*map(str, paths), *map(number, (steering, throttle, brake, speed))]) + "\n"
+        size = os.fstat(self.log.fileno()).st_size
+        try:
+            for path, image in zip(paths, images, strict=True):
+                path.write_bytes(image)
+            if self.log.write(row.encode()) != len(row.encode()):
+                raise OSError(28, "No space left on device")
+        except OSError as error:
+            for path in paths:
+                path.unlink(missing_ok=True)
+            os.ftruncate(self.log.fileno(), size)
+            raise SimulatorError(
+                f"{self.folder}: {error.strerror}; the {self.rows} rows before are whole"
+            ) from error
+        self.rows += 1
+
+    def close(self) -> None:
+        self.log.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+class Clock:
+    """Tells the steps, 0.02 s each, after which a sample is due: 15 a second."""
+
+    def __init__(self, start: float = 0.0):
+        """start: simulated seconds; the first sample is due at once."""
+        self.taken = math.ceil(start * RATE - 1e-9)
+
+    def due(self, time: float) -> bool:
+        if time * RATE < self.taken - 1e-9:
+            return False
+        self.taken += 1
+        return True

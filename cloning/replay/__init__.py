@@ -1,0 +1,1 @@
+"""Replay: real recordings driven by a model, and scored."""

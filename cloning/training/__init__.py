@@ -1,0 +1,1 @@
+"""Training: all that model.py needs besides the report's own steps."""

@@ -1,0 +1,244 @@
+"""Recorded frames as seen from beside the lane's centre, and the steering that brings the car back onto it: NVIDIA's
+shifts and rotations by viewpoint transform (arXiv 1604.07316, section 5), for `model.py --robust`.
+
+A pose is that of the rear axle's middle: metres to the right of the lane's centre, radians to the lane's heading,
+right positive. The lane's frame of a row has its origin on the lane's centre beside the recorded car's rear axle.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+
+from cloning.lane.place import read_lane
+from cloning.pilot.network import CROP
+from cloning.recordings.images import FRAME
+from cloning.recordings.log import Recording
+from cloning.road.camera import CAMERA_MATRIX, EARLIER, FAR, HEIGHT, HIDDEN, SIDES
+from cloning.road.motion import ARM, OFF_ROAD, REAR_AXLE, TRUSTED, steering_for, stretches
+
+AHEAD = 6.0  # m along the lane's centre: the point that the car is steered for
+STEEP = 1.0  # m: from further off the car comes back no steeper than from here, at up to STEEP / AHEAD radians
+CHORD = 3.0  # m before and after: the lane's heading is that of the chord between
+RIGHT, YAW = 2.0, np.radians(8)  # poses: metres drawn evenly from - to + this; the yaw's standard deviation
+FURTHEST = np.radians(25)  # of yaw
+SHARE = 0.2  # where the lane is straight, of what a row counts where it takes all steering more
+REACH = 2.4  # m from the human's way: further to the side too little was seen
+NEARBY = 1.7  # m: a camera within this distance from a pose may show it
+TINTED = 0.5  # of the views
+STRENGTH, TINTS = (0.1, 1.5), (0.85, 1.15)  # of their colours, and factors of red, green and blue
+ROWS = slice(45, HIDDEN)  # of a recorded frame: what is needed for the rows that the network sees
+HORIZON = 6  # rows of what the network sees that may show what is above the horizon
+
+
+@dataclass
+class Lanes:
+    """Beside each of n rows of recordings: where the car stood in its lane, where the lane goes, and an earlier row.
+
+    offset, yaw  float32 (n,): the recorded car's pose
+    goal         float32 (n, 2): metres to the right and forward, in the lane's frame, of the lane's centre `AHEAD` on
+    known        bool (n,): whether all this is known; what else stands there means nothing where it is not
+    before       int32 (n,): the recording's row that was `EARLIER` metres earlier, or this one
+    moved        float32 (n, 3): the earlier row's rear axle as seen from this one: right, forward in metres, heading
+    """
+
+    offset: np.ndarray
+    yaw: np.ndarray
+    goal: np.ndarray
+    known: np.ndarray
+    before: np.ndarray
+    moved: np.ndarray
+
+    @staticmethod
+    def empty(n: int) -> "Lanes":
+        goal = np.tile(np.float32([0, AHEAD]), (n, 1))
+        return Lanes(np.zeros(n, np.float32), np.zeros(n, np.float32), goal, np.zeros(n, bool),
+                     np.arange(n, dtype=np.int32), np.zeros((n, 3), np.float32))
+
+    @staticmethod
+    def beside(recording: Recording) -> "Lanes":
+        """Of a recording's every row, from what is read of its frames."""
+        whole = stretches(recording)
+        read = read_lane(recording, whole)
+        lanes = Lanes.empty(len(recording))
+        for stretch in whole:
+            rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
+            axle = np.stack([stretch.right, stretch.forward], axis=1)
+            place, centre, beside = driven, axle, np.zeros(len(driven))
+            sure = np.flatnonzero(read.trusted[rows])
+            if len(sure) >= TRUSTED * len(driven):
+                beside = np.interp(np.arange(len(driven)), sure, read.offset[rows][sure])
+                place = driven + REAR_AXLE  # the reading is that of the car's middle
+                centre = axle + REAR_AXLE * ahead(heading) - beside[:, None] * across(np.interp(place, driven, heading))
+
+            def lane(metres, place=place, centre=centre):
+                return np.stack([np.interp(metres, place, centre[:, i]) for i in (0, 1)], axis=1)
+
+            # The lane's heading is that of its centre, which agrees with the way that is driven; a reading would not.
+            along = np.arctan2(*(lane(driven + CHORD) - lane(driven - CHORD)).T)
+            away = axle - lane(driven)
+            lanes.offset[rows] = (away * across(along)).sum(1)
+            lanes.yaw[rows] = np.angle(np.exp(1j * (heading - along)))
+            goal = lane(driven + AHEAD) - axle + lanes.offset[rows, None] * across(along)
+            goal = np.stack([(goal * across(along)).sum(1), (goal * ahead(along)).sum(1)], axis=1)
+            known = (driven >= 2 * CHORD) & (driven + AHEAD <= driven[-1]) & (np.abs(beside) < OFF_ROAD)
+            lanes.goal[rows], lanes.known[rows] = np.where(known[:, None], goal, lanes.goal[rows]), known
+            before = np.maximum(np.searchsorted(driven, driven - EARLIER, "right") - 1, 0)
+            lanes.before[rows] = rows.start + before
+            back = axle[before] - axle
+            lanes.moved[rows] = np.stack([(back * across(heading)).sum(1), (back * ahead(heading)).sum(1),
+                                          heading[before] - heading], axis=1)
+        return lanes
+
+    @staticmethod
+    def joined(parts: list["Lanes"]) -> "Lanes":
+        return Lanes(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Lanes)))
+
+    def take(self, rows: np.ndarray) -> "Lanes":
+        return Lanes(*(getattr(self, one.name)[rows] for one in fields(self)))
+
+    def steering(self, right: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+        """What leads each row's car from a pose onto the lane's centre: float32 (n,), -1..1 (pure pursuit)."""
+        away = self.goal[:, 0] - np.clip(right, -STEEP, STEEP)
+        beside = away * np.cos(yaw) - self.goal[:, 1] * np.sin(yaw)
+        return steering_for(2 * beside / (away ** 2 + self.goal[:, 1] ** 2)).astype(np.float32)
+
+    def weights(self) -> np.ndarray:
+        """How often each row is to be drawn, float64 (n,), sum 1: the more, the harder the lane turns there."""
+        here = np.zeros(len(self.yaw))
+        weights = SHARE + np.abs(self.steering(here, here).astype(float))
+        return weights / weights.sum()
+
+    def beside_cameras(self, row: int) -> np.ndarray:
+        """The steering back from where each camera stands, as if it were the centre one: float32 (3,)."""
+        one, sides = self.take(np.array([row])), np.array(list(SIDES.values()))
+        return one.steering(one.offset + sides, one.yaw)
+
+    def drawn(self, rng: np.random.Generator, mirrored: np.ndarray) -> "Poses":
+        """Each row from a place drawn at random, by one of the cameras that are not too far from there.
+
+        Which one is chance, too, so that what warping leaves in a frame does not tell where it was taken from.
+        """
+        n = len(self.yaw)
+        right = np.clip(rng.uniform(-RIGHT, RIGHT, n), self.offset - REACH, self.offset + REACH)
+        yaw = np.clip(rng.normal(0, YAW, n), -FURTHEST, FURTHEST)
+        eye = right - self.offset + ARM * (np.sin(yaw) - np.sin(self.yaw))
+        distance = np.abs(eye[:, None] - list(SIDES.values()))
+        near = distance <= np.maximum(NEARBY, distance.min(1, keepdims=True))
+        poses = Poses.of(self, right, yaw, np.argmax(near * rng.uniform(1, 2, (n, 3)), axis=1), mirrored)
+        poses.colours = np.where((rng.random(n) < TINTED)[:, None, None], other_colours(rng, n), poses.colours)
+        return poses
+
+
+@dataclass
+class Poses:
+    """Where n rows are seen from, and how.
+
+    camera    int (n,): centre, left or right: whose frame is warped
+    mirrored  bool (n,): whether the view is that of the mirror world, seen by the camera as it is
+    warps     float64 (n, 2, 2, 3, 3): from the rows `ROWS` of a frame to what the network sees; by the row itself and
+              the one before, for the ground and for what is infinitely far
+    steering  float32 (n,): what leads back from there, -1..1
+    colours   float32 (n, 3, 3): what becomes of red, green and blue
+    """
+
+    camera: np.ndarray
+    mirrored: np.ndarray
+    warps: np.ndarray
+    steering: np.ndarray
+    colours: np.ndarray
+
+    @staticmethod
+    def of(lanes: Lanes, right, yaw, camera: np.ndarray, mirrored: np.ndarray) -> "Poses":
+        turn = yaw - lanes.yaw
+        # Of the camera, from the recorded rear axle, along the recorded car.
+        eye = np.stack([(right - lanes.offset) * np.cos(lanes.yaw) + ARM * np.sin(turn),
+                        (right - lanes.offset) * np.sin(lanes.yaw) + ARM * np.cos(turn)], axis=1)
+        side = np.array(list(SIDES.values()))[camera]
+        warps = [warps_between(eye, turn, moved, side, mirrored) for moved in (np.zeros_like(lanes.moved), lanes.moved)]
+        steering = lanes.steering(right, yaw)
+        colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
+        return Poses(camera, mirrored, np.stack(warps, axis=1), np.where(mirrored, -steering, steering), colours)
+
+    def take(self, rows: np.ndarray) -> "Poses":
+        return Poses(*(getattr(self, one.name)[rows] for one in fields(self)))
+
+    def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:
+        """What the network sees of one row, uint8 (75, 320, 3), RGB.
+
+        read(camera, before): the row's frame, or that of the earlier row, by this camera: uint8, its rows `ROWS`.
+        """
+        camera, mirrored = int(self.camera[at]), bool(self.mirrored[at])
+        made, seen = warp(read(camera, False), self.warps[at, 0], mirrored)
+        if not seen.all():
+            before, _ = warp(read(camera, True), self.warps[at, 1], mirrored)
+            cv2.copyTo(before, cv2.bitwise_not(seen), made)
+        return cv2.transform(made, self.colours[at])
+
+
+def other_colours(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Paler or stronger, and tinted: float32 (n, 3, 3)."""
+    strength = rng.uniform(*STRENGTH, n)[:, None, None]
+    tints = rng.uniform(*TINTS, (n, 3, 1))
+    return (tints * (strength * np.eye(3) + (1 - strength) / 3)).astype(np.float32)
+
+
+def across(heading: np.ndarray) -> np.ndarray:
+    """The unit vector to the right of a heading: (n, 2), right and forward where the heading is 0."""
+    return np.stack([np.cos(heading), -np.sin(heading)], axis=1)
+
+
+def ahead(heading: np.ndarray) -> np.ndarray:
+    return np.stack([np.sin(heading), np.cos(heading)], axis=1)
+
+
+# --------------------------------------------------------------------------------------------------
+# Warping what the network sees
+
+SEEN = (FRAME[0] - sum(CROP), FRAME[1])  # rows and columns
+_FROM = np.linalg.inv(CAMERA_MATRIX) @ np.array([[1, 0, 0], [0, 1, ROWS.start], [0, 0, 1.0]])
+_CROP = np.array([[1, 0, 0], [0, 1, -CROP[0]], [0, 0, 1.0]])
+# The camera is turned and tilted, so that a flipped frame is not what it would see of the mirror world; the second is.
+_INTO = np.stack([_CROP @ CAMERA_MATRIX, _CROP @ CAMERA_MATRIX @ np.diag([-1.0, 1, 1])])
+
+
+def warps_between(eye, turn, stood, side, mirrored) -> np.ndarray:
+    """From frames to views: float64 (n, 2, 3, 3), for the ground and for what is infinitely far.
+
+    eye: (n, 2), right and forward, the camera looked through; turn: (n,), where it looks; stood: (n, 3), right,
+    forward, heading of the recorded rear axle; side: (n,), metres from there to the right, the recording camera.
+    """
+    s, c = np.sin(stood[:, 2]), np.cos(stood[:, 2])
+    away = eye - stood[:, :2] - np.stack([ARM * s + side * c, ARM * c - side * s], axis=1)
+    moved = np.tile(np.eye(3), (len(turn), 2, 1, 1))
+    moved[:, 0, 0, 1] = -(away[:, 0] * c - away[:, 1] * s) / HEIGHT
+    moved[:, 0, 2, 1] = -(away[:, 0] * s + away[:, 1] * c) / HEIGHT
+    s, c, o = np.sin(turn - stood[:, 2]), np.cos(turn - stood[:, 2]), np.zeros(len(turn))
+    turned = np.stack([c, o, -s, o, o + 1, o, s, o, c], axis=1).reshape(-1, 1, 3, 3)
+    return _INTO[mirrored.astype(int)][:, None] @ turned @ moved @ _FROM
+
+
+def _sky(mirrored: bool) -> np.ndarray:
+    """uint8 (HORIZON, 320): 255 where a view does not show ground near enough to move with the camera."""
+    columns, rows = np.meshgrid(np.arange(SEEN[1]), np.arange(HORIZON))
+    directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(_INTO[int(mirrored)]).T
+    return np.where(directions[..., 1] > FAR * directions[..., 2], 0, 255).astype(np.uint8)
+
+
+_SKY = _sky(False), _sky(True)
+_ROAD = np.zeros((ROWS.stop - ROWS.start, FRAME[1]), np.uint8)
+_ROAD[:, 1:-1] = 255
+
+
+def warp(frame: np.ndarray, warps: np.ndarray, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
+    """A frame's rows `ROWS`, uint8, as seen through `warps` (2, 3, 3): uint8 (75, 320, 3); and 255 where it was really
+    seen: uint8 (75, 320)."""
+    size = SEEN[::-1]
+    made = cv2.warpPerspective(frame, warps[0], size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.warpPerspective(_ROAD, warps[0], size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+    far = cv2.warpPerspective(frame, warps[1], (size[0], HORIZON), flags=cv2.INTER_LINEAR,
+                              borderMode=cv2.BORDER_REFLECT_101)
+    cv2.copyTo(far, _SKY[mirrored], made[:HORIZON])
+    seen[:HORIZON] |= _SKY[mirrored]
+    return made, seen

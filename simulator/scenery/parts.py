@@ -1,0 +1,87 @@
+"""All that is to be seen on a track: its meshes, sky and haze, and the car's own bonnet."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cloning.road.camera import height_seen
+from simulator.scenery.shapes import Light, Mesh, box, grid, lit, together
+
+
+@dataclass(frozen=True)
+class Haze:
+    """colour: 0..1; range: metres from where to where it grows from nothing to all; most: its largest
+    share."""
+
+    colour: tuple[float, float, float]
+    range: tuple[float, float]
+    most: float = 1.0
+
+
+@dataclass(frozen=True)
+class Scenery:
+    meshes: list[Mesh]
+    sky: Mesh
+    bonnet: Mesh
+    body: Mesh
+    haze: Haze | None = None
+    tone: np.ndarray | None = None  # (3, 4), the camera's: see looks
+
+
+def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
+    """A sky around the viewer, its texture's bottom row at the horizon."""
+    turn, rise = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.radians([-8, 0, 5, 10, 20, 40, 88]))
+    points = radius * np.stack(
+        [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1
+    )
+    height = np.clip(rise / np.radians(40), 0.01, 0.99)
+    uv = np.stack([turn, height], axis=-1).reshape(-1, 2)
+    return Mesh(points.reshape(-1, 3), np.ones((turn.size, 3)), uv, grid(*turn.shape), texture)
+
+
+def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
+    """The car's bonnet in the car's coordinates (x right, y forward, z up, in metres), shaped to fit the real
+    frames.
+
+    Its front edge hides what the real one hides from the centre camera: image row at each sideways x.
+    """
+    aside = np.linspace(-0.70, 0.63, 43)
+    front = 2.10 - 0.40 * (aside / 0.64) ** 2
+    rows = np.interp(
+        aside,
+        [-0.70, -0.67, -0.60, -0.53, -0.36, -0.22, 0.11, 0.32, 0.49, 0.605, 0.63],
+        [175, 159, 154, 147, 142.7, 137.7, 137, 141.7, 150, 158, 172],
+    )
+    edge = height_seen(rows, aside, front)
+    bands = np.array([0.0, 0.015, 0.03, 0.12, 0.2, 0.24, 0.28, 0.6, 1.0])  # of the way back from the edge
+    shade = np.array([0.55, 0.85, 1.0, 0.95, 0.80, 0.45, 0.95, 1.15, 1.2])
+    y = front + (1.40 - front) * bands[:, None]
+    z = edge + (0.62 - edge) * bands[:, None] ** 0.8 - 0.25 * (aside / 0.64) ** 4 * bands[:, None]
+    points = np.stack([np.broadcast_to(aside, y.shape), y, z], axis=-1)
+    colours = np.clip(shade[:, None, None] * np.array(colour), 0, 1)
+    colours = np.broadcast_to(colours, points.shape).copy()
+    lamps = np.abs(np.abs(aside + 0.03) - 0.50) < 0.035
+    colours[2:4, lamps] = 0.85
+    mesh = Mesh(
+        points.reshape(-1, 3),
+        colours.reshape(-1, 3),
+        np.zeros((points[..., 0].size, 2)),
+        grid(*y.shape)[:, ::-1],
+        np.full((4, 4, 3), 255, np.uint8),
+    )
+    return lit(mesh, light, faced_up=True)
+
+
+def body(colour: tuple[float, float, float], light: Light) -> Mesh:
+    """The car as seen from outside, in the car's coordinates as the bonnet is."""
+    plain, dark = np.full((4, 4, 3), 255, np.uint8), (0.08, 0.08, 0.09)
+    boxes = [
+        box((0, -0.15, 0.35), (1.75, 4.3, 0.45), 0.0, colour, plain),
+        box((0, -0.45, 0.80), (1.45, 2.1, 0.50), 0.0, dark, plain),
+        box((0, -0.45, 1.26), (1.30, 1.8, 0.06), 0.0, colour, plain),
+        box((0, -2.35, 0.65), (1.5, 0.08, 0.12), 0.0, (0.75, 0.10, 0.08), plain),
+    ]
+    boxes += [
+        box((x, y, 0.0), (0.25, 0.68, 0.68), 0.0, dark, plain) for x in (-0.88, 0.88) for y in (1.27, -1.60)
+    ]
+    return lit(together(boxes), light)

@@ -1,0 +1,107 @@
+"""The car's way and the camera's view from beside it, against geometry."""
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from cloning.recordings.log import logs_below, read_recording
+from cloning.replay.views import Views
+from cloning.road import camera, motion
+
+REAL = sorted(path.parent for path in logs_below(ROOT / "data"))
+
+
+def ground_picture(right: float, forward: float, yaw: float) -> np.ndarray:
+    """An oracle: what a camera at this pose sees of a ground of smooth stripes, drawn ray by ray."""
+    columns, rows = np.meshgrid(np.arange(320), np.arange(160))
+    rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(camera.CAMERA_MATRIX).T
+    x, y, z = rays[..., 0], np.maximum(rays[..., 1], 1e-3), rays[..., 2]
+    x, z = camera.HEIGHT * x / y, camera.HEIGHT * z / y
+    world_x = right + x * np.cos(yaw) + z * np.sin(yaw)
+    world_z = forward - x * np.sin(yaw) + z * np.cos(yaw)
+    waves = [np.sin(world_x * 1.1), np.cos(world_z * 0.7), np.sin(world_x * 0.4 + world_z * 0.5)]
+    return np.stack([128 + 100 * wave for wave in waves], -1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("pose", [(0.8, 0, 0), (-1.2, 0, 0), (0, 1.5, 0), (0, 0, 0.1), (0.9, 0.5, -0.12)])
+def test_a_warped_frame_is_what_is_seen_from_there(pose):
+    made, seen = camera.warp(ground_picture(0, 0, 0), *pose)
+    expected = ground_picture(*pose)
+    near = seen & (np.arange(160) > 72)[:, None]  # further away the stripes are finer than pixels
+    assert near[75:135].mean() > 0.6
+    difference = np.abs(made.astype(int) - expected)[near]
+    assert difference.mean() < 1.5 and np.percentile(difference, 99) < 12
+
+
+def test_unseen_is_told_and_the_bonnet_is_no_road():
+    _, seen = camera.warp(np.zeros((160, 320, 3), np.uint8), 0, 0, 0)
+    assert seen[2:134, 2:-2].all() and not seen[136:].any()
+    _, seen = camera.warp(np.zeros((160, 320, 3), np.uint8), 1.5, 0, 0)  # to the right: its right is unknown
+    assert not seen[120, 300] and seen[120, 20]
+
+
+def test_the_ground_is_projected_where_it_is_warped_from():
+    """A point 10 m ahead and 2 m to the right is seen in the middle of the road from 2 m to the right."""
+    near, far = camera.project(np.array([2.0, 0.0]), np.array([10.0, 10.0]))
+    ground, _ = camera.homographies(2, 0, 0)
+    moved = ground @ [*near, 1]
+    assert moved[:2] / moved[2] == pytest.approx(far, abs=1e-9)
+
+
+def test_steering_and_curvature_are_inverse():
+    steering = np.linspace(-1, 1, 21)
+    assert motion.steering_for(motion.curvature(steering)) == pytest.approx(steering)
+    assert motion.curvature(1.0) == pytest.approx(np.tan(np.radians(25)) / 2.87)
+
+
+def test_a_constant_steering_drives_a_circle(drawn):
+    recording = read_recording(drawn)
+    recording.steering[:], recording.speed[:] = 0.5, 20
+    path = motion.Stretch.of(recording, slice(0, len(recording)))
+    radius = 1 / motion.curvature(0.5)
+    assert np.hypot(path.right - radius, path.forward) == pytest.approx(radius, rel=1e-3)
+    assert path.heading == pytest.approx(path.driven / radius)
+    assert path.driven[-1] == pytest.approx(20 * motion.MPH * (recording.time[-1] - recording.time[0]))
+
+
+def test_the_car_follows_its_wheels_with_a_lag(drawn):
+    recording = read_recording(drawn)
+    recording.steering[:], recording.speed[:] = 0.0, 20
+    recording.steering[20:] = 0.5
+    path = motion.Stretch.of(recording, slice(0, len(recording)))
+    turning = np.diff(path.heading) / np.diff(path.driven)
+    seconds = recording.time[21:] - recording.time[20]
+    assert not turning[:20].any()
+    assert turning[20:] == pytest.approx(motion.curvature(0.5) * (1 - np.exp(-seconds / motion.LAG)), rel=1e-6)
+
+
+def test_breaks_are_not_driven_over(drawn):
+    recording = read_recording(drawn)
+    recording.keep(np.tile(np.arange(60), 4))
+    recording.time[:] = np.arange(240) / 15
+
+    def rows():
+        return [stretch.rows for stretch in motion.stretches(recording)]
+
+    assert rows() == [slice(0, 240)]
+    recording.time[100:] += 5  # a gap
+    recording.speed[150:160] = 0.1  # it stands; before and after, it stops and starts more quickly than a car can
+    assert rows() == [slice(0, 100), slice(100, 150), slice(160, 240)]
+    recording.speed[200] = 9  # set back
+    assert rows()[-1] == slice(201, 240)
+
+
+@pytest.mark.skipif(not REAL, reason="no recordings under data/")
+@pytest.mark.parametrize("folder", REAL)
+def test_a_real_centre_frame_warped_to_the_side_cameras_is_theirs(folder):
+    recording = read_recording(folder)
+    straight = np.flatnonzero(np.abs(recording.steering) < 0.05)[::40]
+    views = Views(recording, motion.Stretch.of(recording, slice(0, len(recording))))
+    gains = []
+    for at in straight:
+        for which, side in ((1, camera.SIDES["left"]), (2, camera.SIDES["right"])):
+            truth, before = views.frame(int(at), which).astype(int), views.frame(int(at), 0).astype(int)
+            made, seen = camera.warp(views.frame(int(at), 0), side, 0, 0)
+            road = seen & (np.arange(160) >= 66)[:, None]
+            gains.append(np.abs(before - truth)[road].mean() / np.abs(made.astype(int) - truth)[road].mean())
+    assert np.median(gains) > 1.4

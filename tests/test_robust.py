@@ -1,0 +1,249 @@
+"""The way back onto the lane's centre, against geometry; frames seen from there, against a drawn plane; --robust."""
+
+import subprocess
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, SHORT, draw_recording, finished_run, run_model, weights
+
+import model
+from cloning.lane.reader import Lane
+from cloning.pilot.network import CROP
+from cloning.recordings.images import FRAME
+from cloning.recordings.log import Recording
+from cloning.road.camera import CAMERA_MATRIX, FAR, HEIGHT, HIDDEN, ground
+from cloning.road.motion import ARM, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
+from cloning.training import robust
+from cloning.training.robust import ROWS, Lanes, Poses
+
+N, SPEED = 300, 20.0  # rows; mph
+
+
+def recording(steering, pause_after=None):
+    """One drive of N rows, 15 a second, with no files."""
+    columns = [np.full(N, value, np.float32) for value in (steering, 1, 0, SPEED)]
+    time = np.arange(N) / 15
+    if pause_after is not None:
+        time[pause_after + 1:] += 2
+    return Recording(Path("drive"), np.array([], "S9"), np.zeros((N, 3), np.int32), *columns, time,
+                     np.arange(1, N + 1, dtype=np.int32), N)
+
+
+def lanes(monkeypatch, steering=0.0, offset=0.0, **more) -> Lanes:
+    reading = Lane(np.full(N, offset), np.zeros(N), np.ones(N, bool))
+    monkeypatch.setattr(robust, "read_lane", lambda *_: reading)
+    return Lanes.beside(recording(steering, **more))
+
+
+def drive_back(lanes: Lanes, bend: float, right: float, yaw: float, metres: float) -> tuple[float, float]:
+    """The pose after so many metres of steering by the labels along a lane of constant curvature."""
+    step, middle = 0.1, lanes.take(np.array([100]))
+    for _ in range(round(metres / step)):
+        turn = np.tan(np.radians(25) * float(middle.steering(right, yaw)[0])) / WHEELBASE
+        along = step * np.cos(yaw) / (1 - bend * right)
+        right, yaw = right + step * np.sin(yaw), yaw + turn * step - bend * along
+    return right, yaw
+
+
+def bend_of_middle(steering: float) -> float:
+    """Of the circle that the car's middle goes round, before the rear axle: 1/m."""
+    bend = float(curvature(steering))
+    return bend / np.hypot(1, REAR_AXLE * bend)
+
+
+@pytest.mark.parametrize("steering", [0.0, 0.1, -0.5, 0.7])  # of a straight, and of circles down to 9 m
+def test_on_the_lanes_centre_the_way_back_is_the_lane_itself(monkeypatch, steering):
+    found = lanes(monkeypatch, steering)
+    expected = float(steering_for(bend_of_middle(steering)))
+    assert found.steering(0.0, 0.0)[found.known] == pytest.approx(expected, abs=5e-3)
+    assert found.steering(found.offset, found.yaw)[found.known] == pytest.approx(steering, abs=0.05)
+
+
+@pytest.mark.parametrize("steering", [0.0, 0.3, -0.5])
+@pytest.mark.parametrize("right, yaw", [(1.5, 0.1), (-2, 0), (0, -0.15), (-1, 0.1)])
+def test_a_shifted_car_comes_back_and_stays(monkeypatch, steering, right, yaw):
+    found = lanes(monkeypatch, steering)
+    assert np.abs(drive_back(found, float(curvature(steering)), right, yaw, 30)) == pytest.approx([0, 0], abs=0.2)
+
+
+def test_the_further_off_the_harder_back(monkeypatch):
+    one = lanes(monkeypatch).take(np.array([50]))
+    by_place = [float(one.steering(right, 0.0)[0]) for right in np.linspace(-robust.STEEP, robust.STEEP, 9)]
+    by_yaw = [float(one.steering(0.0, yaw)[0]) for yaw in np.linspace(-0.2, 0.2, 9)]
+    for found in (by_place, by_yaw):
+        assert (np.diff(found) < 0).all()
+        assert found[4] == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("bend", [0.0, 1 / 20, -1 / 20])
+@pytest.mark.parametrize("offset", [1.0, -1.5])
+def test_the_lane_is_beside_the_human_as_far_as_was_read(monkeypatch, bend, offset):
+    """The human keeps `offset` metres right of the lane's centre, round the same middle."""
+    human = 1 / np.sqrt((1 / bend - offset) ** 2 - REAR_AXLE ** 2) * np.sign(bend) if bend else 0.0
+    found = lanes(monkeypatch, float(steering_for(human)), offset)
+    assert found.offset[found.known] == pytest.approx(1 / bend - 1 / human if bend else offset, abs=1e-2)
+    assert found.steering(0.0, 0.0)[found.known] == pytest.approx(float(steering_for(bend)), abs=0.01)
+
+
+def test_where_most_is_not_trusted_the_humans_way_stands_for_the_lane(monkeypatch):
+    reading = Lane(np.ones(N), np.ones(N), np.arange(N) % 2 == 0)
+    monkeypatch.setattr(robust, "read_lane", lambda *_: reading)
+    found = Lanes.beside(recording(0.2))
+    assert not found.offset.any()
+    assert found.steering(found.offset, found.yaw)[found.known] == pytest.approx(0.2, abs=1e-3)
+
+
+def test_the_way_on_is_not_known_before_a_break(monkeypatch):
+    found = lanes(monkeypatch, pause_after=149)
+    rows = robust.AHEAD / (SPEED * MPH / 15)
+    missing = np.flatnonzero(~found.known)
+    for end in (150, N):
+        assert len(missing[(missing < end) & (missing > end - 100)]) == pytest.approx(rows, abs=4)
+    assert (found.before[150:] >= 150).all()
+
+
+# --------------------------------------------------------------------------------------------------
+# Views
+
+
+def plane(right: float, forward: float, heading: float, mirrored: bool = False) -> np.ndarray:
+    """A frame of a smoothly painted plane under a plain sky, by a camera standing there: uint8 (160, 320, 3)."""
+    columns, rows = np.meshgrid(np.arange(FRAME[1]), np.arange(FRAME[0]))
+    directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(CAMERA_MATRIX).T
+    down = np.maximum(directions[..., 1], FAR)
+    across, ahead = HEIGHT * directions[..., 0] / down, HEIGHT * directions[..., 2] / down
+    if mirrored:
+        across = -across
+    x = right + across * np.cos(heading) + ahead * np.sin(heading)
+    z = forward - across * np.sin(heading) + ahead * np.cos(heading)
+    painted = np.stack([127 + 100 * np.sin(x / a + z / b) for a, b in ((1.1, 9.0), (2.3, -7.0), (-1.7, 12.0))], axis=-1)
+    return np.where(ground()[..., None], painted, 127).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("right, yaw, camera", [(0, 0, 0), (1.2, 0.1, 2), (-1.5, -0.12, 1), (0.5, -0.1, 0)])
+def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, right, yaw, camera):
+    """And mirrored, what the same camera, tilted as it is, would see of the mirror world."""
+    one = lanes(monkeypatch, 0.05, offset=0.4).take(np.array([100]))
+    poses = Poses.of(one, np.array([right]), np.array([yaw]), np.array([camera]), np.array([mirrored]))
+    side = list(robust.SIDES.values())[camera]
+
+    def stood(x, z, heading):  # in the lane's frame
+        return plane(x + ARM * np.sin(heading) + side * np.cos(heading),
+                     z + ARM * np.cos(heading) - side * np.sin(heading), heading)[ROWS]
+
+    def read(_, before):
+        offset, turned = float(one.offset[0]), float(one.yaw[0])
+        if not before:
+            return stood(offset, 0, turned)
+        x, z, heading = one.moved[0].astype(float)
+        return stood(offset + x * np.cos(turned) + z * np.sin(turned), -x * np.sin(turned) + z * np.cos(turned),
+                     turned + heading)
+
+    expected = plane(right + ARM * np.sin(yaw), ARM * np.cos(yaw), yaw, mirrored)[CROP[0]:HIDDEN]
+    wrong = np.abs(poses.view(0, read).astype(int) - expected).max(2)
+    assert np.percentile(wrong[12:], 95) < 12
+    assert np.median(wrong[12:]) < 3
+    assert poses.steering[0] == pytest.approx(one.steering(right, yaw)[0] * (-1 if mirrored else 1), rel=1e-6)
+
+
+def test_drawn_poses_are_on_both_sides_by_every_camera_and_lead_back(monkeypatch):
+    found = lanes(monkeypatch).take(np.full(4000, 100))
+    poses = found.drawn(np.random.default_rng(0), np.zeros(4000, bool))
+    assert np.bincount(poses.camera, minlength=3).min() > 800
+    assert abs(poses.steering.mean()) < 0.01
+    for camera in range(3):  # the camera does not tell the side
+        assert 0.1 < (poses.steering[poses.camera == camera] > 0).mean() < 0.9
+
+
+# --------------------------------------------------------------------------------------------------
+# The command
+
+ROBUST = ("--robust", *SHORT)
+
+
+@pytest.fixture(scope="module")
+def finished(drawn, tmp_path_factory):
+    return finished_run(drawn, tmp_path_factory.mktemp("robust"), *ROBUST)
+
+
+def test_robust_trains_and_says_what_was_left_out(finished, drawn):
+    done, folder = finished
+    assert "way on unknown" in done.stdout
+    row = next(line for line in done.stdout.splitlines() if line.startswith("total"))
+    assert int(row.split()[-1]) == 60 - int(row.split()[-2])
+    metres = 2 * robust.CHORD + robust.AHEAD  # at the beginning and at the end
+    assert int(row.split()[-2]) == pytest.approx(metres / (30.19 * MPH * 0.067), abs=2)
+    assert (folder / "diagnostic_images" / "training_generator_augmented-0.png").exists()
+    arguments = torch.load(folder / "model.pt", weights_only=True)["arguments"]
+    assert arguments["robust"]
+    assert (arguments["batch_size"], arguments["learning_rate"]) == (8, 3e-4)  # as given, and as --robust sets it
+
+
+def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, drawn, tmp_path):
+    command = [sys.executable, str(ROOT / "model.py"), str(drawn), *map(str, ROBUST), "--output", tmp_path / "model.pt"]
+    run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert any(line.startswith("Epoch 2") for line in run.stdout)
+    run.kill()
+    run.wait()
+    assert run_model("--output", tmp_path / "model.pt", "--resume").returncode == 0
+    for name in ("model.pt", "model-best.pt"):
+        a, b = weights(finished[1] / name), weights(tmp_path / name)
+        assert all(torch.equal(a[key], b[key]) for key in a)
+
+
+def test_the_rate_of_learning_falls_to_nothing_over_a_robust_run_and_stands_in_the_recipe(finished, drawn):
+    saved = torch.load(finished[1] / "model-resume.pt", weights_only=True)
+    assert 0 < saved["training"]["optimizer"]["param_groups"][0]["lr"] < 3e-5
+
+    class Standing:
+        arguments = Namespace(learning_rate=1e-4, samples_per_epoch=100, epochs=10, robust=False)
+        history, images = [{}] * 5, 0
+
+    assert model.Run.learning_rate(Standing) == 1e-4
+    Standing.arguments.robust = True
+    assert model.Run.learning_rate(Standing) == pytest.approx(0.5e-4)
+
+
+def test_the_recipes_options_do_not_go_with_robust(drawn, tmp_path):
+    for option in ("--throttle-threshold", "--side-correction"):
+        done = run_model(drawn, "--robust", option, 0.1, "--output", tmp_path / "model.pt")
+        assert done.returncode == 2
+        assert f"{option} is the recipe's" in done.stderr
+
+
+def test_drives_too_short_are_named(tmp_path):
+    done = run_model(draw_recording(tmp_path / "short", rows=20), *SHORT, "--output", tmp_path / "model.pt")
+    assert done.returncode == 2
+    assert "too short" in done.stderr
+
+
+def test_other_colours_keep_grey_nearly_grey_and_light():
+    grey, red = (np.float32([100, 100, 100]), np.float32([200, 50, 50]))
+    colours = robust.other_colours(np.random.default_rng(0), 1000)
+    assert colours.shape == (1000, 3, 3) and colours.dtype == np.float32
+    made = colours @ grey
+    assert made.min() >= 84.9 and made.max() <= 115.1 and made.std(0) == pytest.approx(8.7, abs=1)
+    paler = np.ptp(colours @ red, axis=1) / 150
+    assert paler.min() < 0.2 and paler.max() > 1.4
+
+
+def test_half_of_the_views_are_of_other_colours(monkeypatch):
+    many = lanes(monkeypatch, 0.05, offset=0.4).take(np.full(1000, 100))
+    poses = many.drawn(np.random.default_rng(0), np.zeros(1000, bool))
+    plain = (poses.colours == np.eye(3)).all((1, 2))
+    assert 0.4 < plain.mean() < 0.6
+
+
+def test_rows_in_bends_are_drawn_more_often(monkeypatch):
+    many = lanes(monkeypatch, 0.4)
+    straight, bent = Lanes.empty(3), many.take(np.array([100]))
+    weights = Lanes.joined([straight, bent]).weights()
+    steering = abs(float(bent.steering(np.zeros(1), np.zeros(1))[0]))
+    assert steering > 0.2
+    assert weights.sum() == pytest.approx(1)
+    assert weights[3] / weights[0] == pytest.approx((robust.SHARE + steering) / robust.SHARE)
