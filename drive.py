@@ -22,7 +22,8 @@ from cloning.errors import ModelError
 from cloning.pilot import page
 from cloning.pilot.network import Network, load_model, steer
 from cloning.recordings import saved_frames as frames
-from cloning.recordings.images import FRAME, decode
+from cloning.recordings.format import FRAME
+from cloning.recordings.images import decode
 from cloning.wire import server as wire
 
 NUMBERS = ("steering_angle", "throttle", "speed")  # of a telemetry: degrees, -1..1, mph

@@ -49,8 +49,9 @@ from cloning.errors import ModelError, RecordingError
 from cloning.files import set_aside, write
 from cloning.pilot.network import CROP, UNITS, Network, layer_table, load_model, save_model, versions
 from cloning.recordings.check import check_images
-from cloning.recordings.images import FRAME, decode
-from cloning.recordings.log import LOG, Recording, find_folders, print_findings, read_recording
+from cloning.recordings.format import FRAME, LOG
+from cloning.recordings.images import decode
+from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
 from cloning.training.options import load_resumed, model_files, parse
 from cloning.training.pictures import batch_pictures, loss_picture
 from cloning.training.pieces import PIECE, SquaredErrors
@@ -428,7 +429,7 @@ class Generator:
 # Training: the run
 
 
-class Run:
+class TrainingRun:
     """A training run: its state, and the files that it leaves. rank 0 writes them."""
 
     def __init__(self, arguments: argparse.Namespace, training: Observations, validation: Observations):
@@ -655,7 +656,7 @@ def run(arguments: argparse.Namespace, given: dict) -> None:
     if isinstance(data[0], Exception):
         raise data[0]
     training, validation, saved, arguments = data[0]  # with --resume, the arguments are the checkpoint's on every rank
-    one = Run(arguments, training, validation)
+    one = TrainingRun(arguments, training, validation)
     if saved:
         one.resume(saved)
     if rank() == 0:

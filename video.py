@@ -18,9 +18,10 @@ import numpy as np
 from tqdm import tqdm
 
 from cloning.errors import UserError
-from cloning.film import Film
+from cloning.film import FilmWriter
 from cloning.recordings import saved_frames as frames
-from cloning.recordings.images import FRAME, jpeg_size
+from cloning.recordings.format import FRAME
+from cloning.recordings.images import jpeg_size
 
 PAUSE = 1.0  # seconds between two frames from which it is a pause, which says nothing about the rate
 
@@ -81,7 +82,7 @@ def film(folder: Path, fps: Fraction | None = None, overlay=None) -> Path:
     fps = fps or rate([time for time, _ in found])
     path = folder.with_name(folder.name + ".mp4")
     unreadable, sizes = [], Counter()
-    made = Film(path, fps)
+    made = FilmWriter(path, fps)
     try:
         for _, frame_path in tqdm(found, unit="frame", disable=None):
             frame = read(frame_path)
@@ -121,7 +122,7 @@ def overlay_of(model_file: str):
         if frame.shape != FRAME:
             raise FilmError(f"the frames are {frame.shape[1]}x{frame.shape[0]} where a model sees "
                             f"{FRAME[1]}x{FRAME[0]}; leave out --overlay")
-        return attention.draw(frame, *attention.look(network, frame))
+        return attention.overlay(frame, *attention.visual_backprop(network, frame))
     return overlay
 
 

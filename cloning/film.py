@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 
-class Film:
+class FilmWriter:
     """An mp4 film being written: H.264 in yuv420p, which browsers and desktop players play.
 
     PyAV's wheel brings FFmpeg's libraries with x264: no program to install, and the film is finished or an error.

@@ -139,7 +139,7 @@ def drive(args) -> int:
     from simulator import report, scenery
     from simulator.cameras import Cameras
     from simulator.client import Client
-    from simulator.film import Film
+    from simulator.film import ChaseFilm
     from simulator.progress import Progress
     from simulator.run import Run
     from simulator.world import Scene
@@ -147,7 +147,7 @@ def drive(args) -> int:
     outputs(args.report, args.picture, args.film)
     run = Run(Track(args.track, args.direction), "autonomous")
     scene = Scene(scenery.build(args.track, args.look))
-    film = Film(args.film, scene) if args.film else None
+    film = ChaseFilm(args.film, scene) if args.film else None
     client = Client(run, Cameras(scene, ("center",)), args.host, args.port, args.wait, args.realtime)
     if film:
         client.watch = lambda: film.watch(run)

@@ -17,8 +17,8 @@ from panda3d.core import (
 )
 
 from cloning.errors import SimulatorError
-from cloning.recordings.images import FRAME
-from cloning.road.camera import CAMERA_POSITIONS, MOUNT_PITCH, ROLL, VERTICAL_FIELD, YAW
+from cloning.recordings.format import FRAME
+from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, MOUNT_PITCH, VERTICAL_FIELD
 from simulator.world import INSIDE, Scene
 
 QUALITY = 75
@@ -101,7 +101,7 @@ class Cameras:
             camera = scene.car.attach_new_node(Camera(name, lens()))
             camera.node().set_camera_mask(INSIDE)
             camera.set_pos(*CAMERA_POSITIONS[name])
-            camera.set_hpr(-YAW, -MOUNT_PITCH, -ROLL)
+            camera.set_hpr(-CAMERA_YAW, -MOUNT_PITCH, -CAMERA_ROLL)
             mounted.append(camera)
         self.buffer = Buffer(FINER * ROWS, COLUMNS, mounted)
 

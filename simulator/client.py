@@ -3,9 +3,10 @@
 import time
 
 from cloning.errors import SimulatorError
-from cloning.recordings.writer import RATE, Clock
-from cloning.wire.client import MANUAL, Answer, Gone, Wire, read, telemetry
-from cloning.wire.session import OPENS, Session
+from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.writer import Clock
+from cloning.wire.client import MANUAL, Answer, Connection, Gone, read, telemetry
+from cloning.wire.session import OPENS, ClientSession
 from simulator.cameras import Cameras, jpeg
 from simulator.car import STEP
 from simulator.progress import Progress
@@ -24,7 +25,7 @@ def picture(run: Run, cameras: Cameras, steering: float, throttle: float) -> str
     return telemetry(steering, throttle, run.speed_mph, jpeg(frame))
 
 
-class Client(Session):
+class Client(ClientSession):
     """Drives a run by a server's answers, connecting again when it goes away."""
 
     def __init__(self, run: Run, cameras: Cameras, host: str, port: int, wait: float, realtime: bool):
@@ -76,7 +77,7 @@ class Client(Session):
     def _in_lockstep(self, goal: float, progress: Progress) -> None:
         """Simulated time waits for each answer: 15 frames a simulated second."""
         self.listen()
-        clock = Clock(self.run.time + 1 / RATE)
+        clock = Clock(self.run.time + 1 / SAMPLE_RATE)
         while self.run.travelled < goal:
             self.obey(self.early())
             begin = time.perf_counter()
@@ -126,7 +127,7 @@ class Remote:
     def __init__(self, host: str, port: int, cameras: Cameras):
         self.address, self.cameras = (host, port), cameras
         self.steering = self.throttle = 0.0
-        self.wire: Wire | None = None
+        self.wire: Connection | None = None
         self.state, self.next_try = "not connected", 0.0
 
     def answer(self, by_hand: bool, run: Run) -> None:
@@ -152,7 +153,7 @@ class Remote:
         if time.monotonic() < self.next_try:
             return
         self.next_try = time.monotonic() + 1
-        self.wire = Wire(*self.address, patient=True)
+        self.wire = Connection(*self.address, patient=True)
         self.state = "drives"
         for _ in range(OPENS):
             self.wire.send(picture(run, self.cameras, 0.0, 0.0))

@@ -41,12 +41,12 @@ class Expert:
         self.waves = 2 * np.pi * (waves * random.uniform(0.9, 1.1, len(waves))) / track.length
         self.phases = random.uniform(0, 2 * np.pi, len(waves))
         self.wander = wander * math.sqrt(2 / len(waves))
-        self.aim = 0.0  # m to the left of the lane's centre: where recovery drives to
+        self.aim = 0.0  # m to the right of the lane's centre: where recovery drives to
         self.steering = 0.0
 
     def lane(self, travelled: float) -> float:
-        """The offset in metres, positive left, that it aims for after so many metres."""
-        wandered = self.wander * float(np.sin(self.waves * travelled + self.phases).sum())
+        """The metres to the right of the lane's centre that it aims for after so many metres."""
+        wandered = -self.wander * float(np.sin(self.waves * travelled + self.phases).sum())
         return self.aim + WANDER_MOST * math.tanh(wandered / WANDER_MOST)
 
     def drive(self, run: Run) -> tuple[float, float]:
@@ -91,9 +91,9 @@ class Recovery(Expert):
             if abs(run.offset - self.goal) < 0.2 or run.time > self.until:
                 self.goal, self.recording = 0.0, True
         elif run.time > self.until:
-            side = self.random.choice((1, -1))
+            side = self.random.choice((-1, 1))
             room = self.track.edges[
-                int(run.s / self.track.step) % len(self.track.edges), 0 if side > 0 else 1
+                int(run.s / self.track.step) % len(self.track.edges), 0 if side < 0 else 1
             ]
             self.goal = side * self.random.uniform(*self.SHARE) * (room - self.MARGIN)
             self.until = run.time + 6.0

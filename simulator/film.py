@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 from panda3d.core import Camera, Vec3
 
-from cloning import files
 from cloning.errors import SimulatorError
-from cloning.recordings.writer import RATE, Clock
+from cloning.film import FilmWriter
+from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.writer import Clock
 from simulator.cameras import Buffer, lens
 from simulator.run import Run
 from simulator.world import OUTSIDE, Scene
@@ -15,7 +16,7 @@ ROWS, COLUMNS = 360, 640
 BEHIND, ABOVE, TARGET = 7.5, 2.9, 1.0  # m
 
 
-def follow(camera, transform) -> None:
+def place_chase_camera(camera, transform) -> None:
     """Put a camera behind a car that stands at the transform, level, looking over its roof."""
     ahead = transform.get_quat().get_forward()
     ahead = Vec3(ahead.x, ahead.y, 0.4 * ahead.z)
@@ -24,7 +25,7 @@ def follow(camera, transform) -> None:
     camera.look_at(transform.get_pos() + ahead * 4 + Vec3(0, 0, TARGET))
 
 
-class Film:
+class ChaseFilm:
     """15 frames a simulated second into an mp4 file."""
 
     def __init__(self, path: str, scene: Scene):
@@ -35,7 +36,7 @@ class Film:
         self.buffer = Buffer(ROWS, COLUMNS, [self.camera])
         try:
             # Drawn frames are for looking at, and drawing is what takes time: a fifth of the size of video.py's films.
-            self.film = files.Film(path, RATE, quality=28, preset="veryfast")
+            self.film = FilmWriter(path, SAMPLE_RATE, quality=28, preset="veryfast")
         except OSError as error:
             raise SimulatorError(f"{path}: no film can be written there ({error.strerror})") from error
 
@@ -45,7 +46,7 @@ class Film:
         transform = run.car.node.get_transform()
         self.scene.car.set_transform(transform)
         self.scene.look_from(*transform.get_pos())
-        follow(self.camera, transform)
+        place_chase_camera(self.camera, transform)
         self.film.add(caption(self.buffer.draw()[0], run))
 
     def close(self) -> None:

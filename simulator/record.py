@@ -10,7 +10,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from datetime import timedelta
 
 from cloning.errors import SimulatorError
-from cloning.recordings.writer import EPOCH, Clock, Recording
+from cloning.recordings.writer import EPOCH, Clock, RecordingWriter
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import scenery
@@ -63,7 +63,7 @@ def record(
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
     clock, progress = Clock(), Progress(laps, "laps")
     with (
-        Recording(folder, EPOCH + timedelta(days=seed % 10_000)) as recording,
+        RecordingWriter(folder, EPOCH + timedelta(days=seed % 10_000)) as recording,
         ProcessPoolExecutor(DRAWERS, initializer=_begin_drawing) as drawers,
     ):
         rows = deque()  # that are being drawn

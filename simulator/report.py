@@ -117,8 +117,8 @@ def write_picture(path: str, run: Run) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(aspect="equal")
     ring = np.r_[np.arange(len(track.points)), 0]
-    for side, column in ((1, 0), (-1, 1)):
-        edge = track.points[ring, :2] + side * track.normal[ring] * track.edges[ring, column, None]
+    for side, column in ((-1, 0), (1, 1)):
+        edge = track.points[ring, :2] + side * track.rightward[ring] * track.edges[ring, column, None]
         axes.plot(*edge.T, color="0.6", linewidth=0.7)
     every = max(1, round(0.1 / STEP))
     way = np.column_stack([run.path.x, run.path.y])[::every]

@@ -32,7 +32,7 @@ class Path:
 
     x: list = field(default_factory=list)
     y: list = field(default_factory=list)
-    offset: list = field(default_factory=list)  # from the centre line, positive to the left
+    offset: list = field(default_factory=list)  # to the right of the centre line
     speed: list = field(default_factory=list)
     steering: list = field(default_factory=list)
 
@@ -100,13 +100,13 @@ class Run:
         ):
             return ""  # no wheel can reach so far: most of the time
         matrix = self.car.node.get_mat()
-        for right, forward, _, _ in WHEELS:
-            wheel = matrix.xform_point((right, forward, 0))
+        for aside, forward, _, _ in WHEELS:
+            wheel = matrix.xform_point((aside, forward, 0))
             s, offset = self.track.locate(wheel.x, wheel.y, self.s)
-            left, right_edge = self.track.edges[int(s / self.track.step) % len(self.track.edges)]
-            if offset > left:
+            left, right = self.track.edges[int(s / self.track.step) % len(self.track.edges)]
+            if offset < -left:
                 return "left"
-            if offset < -right_edge:
+            if offset > right:
                 return "right"
         return ""
 

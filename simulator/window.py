@@ -16,8 +16,8 @@ from panda3d.core import (
 )
 
 from cloning.errors import SimulatorError
-from cloning.recordings.writer import Clock, Recording
-from cloning.road.camera import CAMERA_POSITIONS, MOUNT_PITCH, YAW
+from cloning.recordings.writer import Clock, RecordingWriter
+from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import scenery
@@ -25,7 +25,7 @@ from simulator.cameras import Cameras, jpeg
 from simulator.car import STEP
 from simulator.client import Remote
 from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks
-from simulator.film import follow
+from simulator.film import place_chase_camera
 from simulator.run import Run
 from simulator.world import INSIDE, OUTSIDE, Scene
 
@@ -159,7 +159,7 @@ class Window(ShowBase):
 
     def do_record(self) -> None:
         if self.recording is None:
-            self.recording = Recording(self.folder, begin=datetime.now())
+            self.recording = RecordingWriter(self.folder, begin=datetime.now())
         self.recording_on = not self.recording_on
         self.clock = Clock(self.run_.time)
 
@@ -195,10 +195,10 @@ class Window(ShowBase):
         self.cam.node().set_camera_mask(OUTSIDE if self.chase else INSIDE)
         if self.chase:
             self.camera.reparent_to(self.render)
-            follow(self.camera, transform)
+            place_chase_camera(self.camera, transform)
         else:
             self.camera.reparent_to(self.scene.car)
-            self.camera.set_pos_hpr(*CAMERA_POSITIONS["center"], -YAW, -MOUNT_PITCH, 0)
+            self.camera.set_pos_hpr(*CAMERA_POSITIONS["center"], -CAMERA_YAW, -MOUNT_PITCH, 0)
         lines = [
             f"{run.speed_mph:4.1f} mph   set speed {self.controls.set_speed}   steering {run.steering:+.2f}",
             f"lap {run.laps + 1}   {run.time:.0f} s   departures {len(run.departures)}",

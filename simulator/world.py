@@ -46,8 +46,8 @@ def ground(track: Track) -> BulletWorld:
     body = BulletRigidBodyNode("ground")
     if track.points[:, 2].any():
         mesh = BulletTriangleMesh()
-        side = np.c_[track.normal, np.zeros(len(track.normal))] * GROUND_HALF_WIDTH
-        left, right = ([Point3(*point) for point in (track.points + a * side).tolist()] for a in (1, -1))
+        side = np.c_[track.rightward, np.zeros(len(track.rightward))] * GROUND_HALF_WIDTH
+        left, right = ([Point3(*point) for point in (track.points + a * side).tolist()] for a in (-1, 1))
         for i in range(len(left)):
             j = (i + 1) % len(left)
             mesh.add_triangle(left[i], right[i], right[j])
@@ -127,7 +127,7 @@ def _bytes(colours: np.ndarray) -> np.ndarray:
     return rgba
 
 
-class Batch:
+class MeshGroup:
     """All the scene's faces with one texture, cut into cells."""
 
     def __init__(self, mesh: Mesh, parent: NodePath):
@@ -173,19 +173,19 @@ class Scene:
         textures: dict[int, list[Mesh]] = {}
         for mesh in scenery.meshes:
             textures.setdefault(id(mesh.texture), []).append(mesh)
-        self.batches = [Batch(together(meshes), self.root) for meshes in textures.values()]
+        self.batches = [MeshGroup(together(meshes), self.root) for meshes in textures.values()]
         for i, batch in enumerate(self.batches):
             batch.root.set_bin(
                 "fixed", i
             )  # else the engine sorts by memory addresses, which differ from run to run
-        self.sky = Batch(scenery.sky, self.root).root
+        self.sky = MeshGroup(scenery.sky, self.root).root
         self.sky.set_bin("background", 0)
         self.sky.set_depth_write(False)
         self.sky.set_depth_test(False)
         self.car = self.root.attach_new_node("car")
         self.car.set_bin("fixed", len(self.batches))
-        Batch(scenery.bonnet, self.car).root.hide(OUTSIDE)
-        Batch(scenery.body, self.car).root.hide(INSIDE)
+        MeshGroup(scenery.bonnet, self.car).root.hide(OUTSIDE)
+        MeshGroup(scenery.body, self.car).root.hide(INSIDE)
         self.seen_from: dict[float, tuple] = {}
 
     def look_from(self, x: float, y: float, z: float) -> None:

@@ -16,7 +16,7 @@ def ground_picture(right: float, forward: float, yaw: float) -> np.ndarray:
     columns, rows = np.meshgrid(np.arange(320), np.arange(160))
     rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(camera.CAMERA_MATRIX).T
     x, y, z = rays[..., 0], np.maximum(rays[..., 1], 1e-3), rays[..., 2]
-    x, z = camera.HEIGHT * x / y, camera.HEIGHT * z / y
+    x, z = camera.CAMERA_HEIGHT * x / y, camera.CAMERA_HEIGHT * z / y
     world_x = right + x * np.cos(yaw) + z * np.sin(yaw)
     world_z = forward - x * np.sin(yaw) + z * np.cos(yaw)
     waves = [np.sin(world_x * 1.1), np.cos(world_z * 0.7), np.sin(world_x * 0.4 + world_z * 0.5)]
@@ -72,7 +72,7 @@ def test_the_car_follows_its_wheels_with_a_lag(drawn):
     turning = np.diff(path.heading) / np.diff(path.driven)
     seconds = recording.time[21:] - recording.time[20]
     assert not turning[:20].any()
-    assert turning[20:] == pytest.approx(motion.curvature(0.5) * (1 - np.exp(-seconds / motion.LAG)), rel=1e-6)
+    assert turning[20:] == pytest.approx(motion.curvature(0.5) * (1 - np.exp(-seconds / motion.YAW_LAG)), rel=1e-6)
 
 
 def test_breaks_are_not_driven_over(drawn):
@@ -99,7 +99,7 @@ def test_a_real_centre_frame_warped_to_the_side_cameras_is_theirs(folder):
     views = Views(recording, motion.Stretch.of(recording, slice(0, len(recording))))
     gains = []
     for at in straight:
-        for which, side in ((1, camera.SIDES["left"]), (2, camera.SIDES["right"])):
+        for which, side in ((1, camera.CAMERA_OFFSETS["left"]), (2, camera.CAMERA_OFFSETS["right"])):
             truth, before = views.frame(int(at), which).astype(int), views.frame(int(at), 0).astype(int)
             made, seen = camera.warp(views.frame(int(at), 0), side, 0, 0)
             road = seen & (np.arange(160) >= 66)[:, None]

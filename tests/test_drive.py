@@ -223,7 +223,7 @@ def test_attention_is_where_the_network_can_see_anything():
         network.convolutions[0].bias.fill_(0.9)  # black is -1: it falls below 0 and out of the positive part
     frame = np.zeros((160, 320, 3), np.uint8)
     frame[90:106, 200:216] = 255
-    steering, mask = attention.look(network, frame)
+    steering, mask = attention.visual_backprop(network, frame)
     assert steering == 0
     assert mask.shape == (160, 320) and mask.dtype == np.float32 and mask.max() == pytest.approx(1)
     assert not mask[:60].any() and not mask[135:].any(), "the rows that are cropped off"
@@ -236,6 +236,6 @@ def test_the_line_bends_to_the_side_of_the_steering():
     frame = np.zeros((160, 320, 3), np.uint8)
 
     def middle(steering):
-        return (attention.draw(frame, steering)[..., 1] > 128)[:180].nonzero()[1].mean()
+        return (attention.overlay(frame, steering)[..., 1] > 128)[:180].nonzero()[1].mean()
     assert middle(-0.3) < 300 < 340 < middle(0.3)
     assert abs(middle(0.0) - 320) < 6  # the camera is turned by 0.7 degrees and rolled by 1.2

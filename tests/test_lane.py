@@ -14,7 +14,7 @@ from cloning.errors import ModelError
 from cloning.lane.place import LIKELY, centre_ahead, placed, read_lane
 from cloning.lane.reader import (
     AHEAD,
-    MOUNTS,
+    MOUNT_OFFSETS,
     STRIP,
     TO_FRAME,
     Lane,
@@ -26,10 +26,11 @@ from cloning.lane.reader import (
     see,
     strip,
 )
+from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import decode
 from cloning.recordings.log import find_folders, logs_below, read_recording
-from cloning.road.camera import CAMERA_MATRIX, HEIGHT
-from cloning.road.motion import RATE, REAR_AXLE, stretches
+from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
+from cloning.road.motion import REAR_AXLE, stretches
 from cloning.road.track import Track
 from simulator.car import STEP
 from simulator.record import record
@@ -46,14 +47,14 @@ def drive(tmp_path_factory):
     run = record(folder, Track("lake"), 0.12, 30, seed=3)
     recording = read_recording(folder)
     steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-    return recording, -np.array(run.path.offset)[steps]
+    return recording, np.array(run.path.offset)[steps]
 
 
 def test_a_strip_is_level_and_looks_straight_ahead():
     """The lane's edges on a straight road, seen from its centre, are each other's mirror image."""
     into_strip = np.linalg.inv(TO_FRAME) @ CAMERA_MATRIX
     for ahead in (3, 8, 40):
-        left, right = (into_strip @ (side, HEIGHT, ahead) for side in (-3.5, 3.5))
+        left, right = (into_strip @ (side, CAMERA_HEIGHT, ahead) for side in (-3.5, 3.5))
         left, right = left[:2] / left[2], right[:2] / right[2]
         assert left[0] + right[0] == pytest.approx(STRIP[1] - 1, abs=1e-6)
         assert left[1] == pytest.approx(right[1], abs=1e-6)
@@ -82,7 +83,7 @@ def test_where_the_centre_lies_ahead(direction):
     """On a straight: a camera 1 m right of the centre, turned right by 3 degrees."""
     track = Track("lake", direction)
     straight = np.convolve(np.abs(track.curvature), np.ones(60), "same").argmin()
-    place, yaw = track.at(straight * track.step, -1.0), np.radians(3)
+    place, yaw = track.at(straight * track.step, 1.0), np.radians(3)
     found = centre_ahead(track, straight * track.step, place.x, place.y, place.heading - yaw)
     assert found == pytest.approx(-1 / np.cos(yaw) - AHEAD * np.tan(yaw), abs=0.12)
 
@@ -124,9 +125,9 @@ def test_the_ground_moves_with_the_camera():
     into_strip = np.linalg.inv(TO_FRAME) @ CAMERA_MATRIX
     yaw = np.radians(4)
     for right, ahead in ((0.3, 4.0), (-1.0, 9.0)):
-        before = into_strip @ (right, HEIGHT, ahead)
+        before = into_strip @ (right, CAMERA_HEIGHT, ahead)
         aside = right - 0.5
-        there = (aside * np.cos(yaw) - ahead * np.sin(yaw), HEIGHT, ahead * np.cos(yaw) + aside * np.sin(yaw))
+        there = (aside * np.cos(yaw) - ahead * np.sin(yaw), CAMERA_HEIGHT, ahead * np.cos(yaw) + aside * np.sin(yaw))
         after, carried = into_strip @ there, seen_from(0.5, yaw) @ (before / before[2])
         assert carried[:2] / carried[2] == pytest.approx(after[:2] / after[2], abs=1e-6)
     assert not in_sight(seen_from(1, 0))[-1, -1] and in_sight(seen_from(1, 0))[-1, 0]
@@ -155,7 +156,7 @@ def test_a_drawn_drive(drive):
     assert isinstance(found, Lane) and found.offset.dtype == found.yaw.dtype == np.float32
     assert found.offset.shape == found.yaw.shape == found.trusted.shape == (len(recording),)
     assert found.trusted.mean() > 0.9
-    rolling = slice(RATE, None)
+    rolling = slice(SAMPLE_RATE, None)
     assert np.abs(found.offset - true)[rolling].mean() < 0.25
     assert np.abs(found.yaw).max() < np.radians(12)
 
@@ -166,14 +167,14 @@ def test_the_side_cameras_stand_where_they_are_mounted(drive):
                         for image in row] for row in recording.images[::4]])
     seen = estimate(strips.reshape(-1, *STRIP)).reshape(-1, 3, len(AHEAD))
     for camera in (1, 2):
-        assert (seen[:, 0] - seen[:, camera])[:, :3].mean(0) == pytest.approx(MOUNTS[camera], abs=0.15)
+        assert (seen[:, 0] - seen[:, camera])[:, :3].mean(0) == pytest.approx(MOUNT_OFFSETS[camera], abs=0.15)
 
 
 def test_cameras_time_and_way_are_laid_together(drive):
     """What perfect cameras see of a straight road from a car that drives along it, 0.7 m right of the centre."""
     recording, _ = drive
     recording.steering[:], recording.speed[:] = 0, 30
-    seen = np.broadcast_to(-0.7 - MOUNTS[:, None], (len(recording), 3, len(AHEAD)))
+    seen = np.broadcast_to(-0.7 - MOUNT_OFFSETS[:, None], (len(recording), 3, len(AHEAD)))
     found = combine(recording, seen.astype(np.float32))
     assert found.trusted.all()
     assert found.offset == pytest.approx(0.7, abs=1e-3) and found.yaw == pytest.approx(0, abs=1e-3)

@@ -18,7 +18,7 @@ from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.replay import replay
 from cloning.replay.score import against
-from cloning.road.motion import LAG, MPH, REAR_AXLE, curvature
+from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,8 @@ def test_the_car_goes_where_geometry_says(recording):
     done = replay.drive(recording, human(recording), 3.0, lambda moment: 0.02)
     at = next(iter(done.interventions))
     seconds, speed, bend = np.cumsum(done.time[:at]), 15 * MPH, curvature(np.float32(0.02))
-    yaw = np.arcsin(speed * bend * (seconds - LAG * (1 - np.exp(-seconds / LAG))))  # abreast of the human, on a circle
+    # abreast of the human, on a circle
+    yaw = np.arcsin(speed * bend * (seconds - YAW_LAG * (1 - np.exp(-seconds / YAW_LAG))))
     expected = np.r_[0, np.cumsum(np.diff(seconds) * speed * np.tan((yaw[1:] + yaw[:-1]) / 2))]
     assert done.beside[:at] == pytest.approx(expected + REAR_AXLE * np.sin(yaw), abs=0.03)
     assert done.interventions[at] > 3 and done.distance[at] == 0

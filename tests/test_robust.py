@@ -13,10 +13,10 @@ from conftest import ROOT, SHORT, draw_recording, finished_run, run_model, weigh
 import model
 from cloning.lane.reader import Lane
 from cloning.pilot.network import CROP
-from cloning.recordings.images import FRAME
+from cloning.recordings.format import FRAME
 from cloning.recordings.log import Recording
-from cloning.road.camera import CAMERA_MATRIX, FAR, HEIGHT, HIDDEN, ground
-from cloning.road.motion import ARM, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
+from cloning.road.camera import BONNET_ROW, CAMERA_HEIGHT, CAMERA_MATRIX, FAR_SLOPE, ground_mask
+from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
 from cloning.training import robust
 from cloning.training.robust import ROWS, Lanes, Poses
 
@@ -114,14 +114,14 @@ def plane(right: float, forward: float, heading: float, mirrored: bool = False) 
     """A frame of a smoothly painted plane under a plain sky, by a camera standing there: uint8 (160, 320, 3)."""
     columns, rows = np.meshgrid(np.arange(FRAME[1]), np.arange(FRAME[0]))
     directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(CAMERA_MATRIX).T
-    down = np.maximum(directions[..., 1], FAR)
-    across, ahead = HEIGHT * directions[..., 0] / down, HEIGHT * directions[..., 2] / down
+    down = np.maximum(directions[..., 1], FAR_SLOPE)
+    across, ahead = CAMERA_HEIGHT * directions[..., 0] / down, CAMERA_HEIGHT * directions[..., 2] / down
     if mirrored:
         across = -across
     x = right + across * np.cos(heading) + ahead * np.sin(heading)
     z = forward - across * np.sin(heading) + ahead * np.cos(heading)
     painted = np.stack([127 + 100 * np.sin(x / a + z / b) for a, b in ((1.1, 9.0), (2.3, -7.0), (-1.7, 12.0))], axis=-1)
-    return np.where(ground()[..., None], painted, 127).round().astype(np.uint8)
+    return np.where(ground_mask()[..., None], painted, 127).round().astype(np.uint8)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -133,8 +133,8 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
     side = list(robust.SIDES.values())[camera]
 
     def stood(x, z, heading):  # in the lane's frame
-        return plane(x + ARM * np.sin(heading) + side * np.cos(heading),
-                     z + ARM * np.cos(heading) - side * np.sin(heading), heading)[ROWS]
+        return plane(x + AXLE_TO_CAMERA * np.sin(heading) + side * np.cos(heading),
+                     z + AXLE_TO_CAMERA * np.cos(heading) - side * np.sin(heading), heading)[ROWS]
 
     def read(_, before):
         offset, turned = float(one.offset[0]), float(one.yaw[0])
@@ -144,7 +144,7 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
         return stood(offset + x * np.cos(turned) + z * np.sin(turned), -x * np.sin(turned) + z * np.cos(turned),
                      turned + heading)
 
-    expected = plane(right + ARM * np.sin(yaw), ARM * np.cos(yaw), yaw, mirrored)[CROP[0]:HIDDEN]
+    expected = plane(right + AXLE_TO_CAMERA * np.sin(yaw), AXLE_TO_CAMERA * np.cos(yaw), yaw, mirrored)[CROP[0]:BONNET_ROW]
     wrong = np.abs(poses.view(0, read).astype(int) - expected).max(2)
     assert np.percentile(wrong[12:], 95) < 12
     assert np.median(wrong[12:]) < 3

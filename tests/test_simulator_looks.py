@@ -13,7 +13,7 @@ from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Recovery
-from simulator.film import Film
+from simulator.film import ChaseFilm
 from simulator.run import Run
 from simulator.world import Scene
 
@@ -103,7 +103,7 @@ def test_recovery_folder_has_gaps_in_time(tmp_path):
 
 def test_films_the_drive(tmp_path):
     run = Run(Track("lake"))
-    film = Film(str(tmp_path / "drive.mp4"), Scene(scenery.build("lake")))
+    film = ChaseFilm(str(tmp_path / "drive.mp4"), Scene(scenery.build("lake")))
     for _ in range(100):
         run.step(0.0, 1.0)
         film.watch(run)
@@ -118,7 +118,7 @@ def test_films_the_drive(tmp_path):
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 5
     assert list(tmp_path.iterdir()) == [tmp_path / "drive.mp4"]
     with pytest.raises(SimulatorError, match=r"\.mp4"):
-        Film(str(tmp_path / "nowhere" / "drive.mp4"), film.scene)
+        ChaseFilm(str(tmp_path / "nowhere" / "drive.mp4"), film.scene)
 
 
 def test_jpegs_are_the_simulators_size_and_rgb():

@@ -85,7 +85,7 @@ def one_by_one(generator, number: int):
     """A batch as a classic generator makes it, from its files, an image at a time: images and angles."""
     import numpy as np
 
-    from cloning.recordings.images import FRAME
+    from cloning.recordings.format import FRAME
     from model import CROP, of_each_kind
 
     drawn, images, angles = generator.draw(number), [], []

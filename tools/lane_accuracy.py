@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 
 from cloning.lane.place import read_lane
-from cloning.lane.reader import AHEAD, MOUNTS, STRIP, combine, estimate, load, read_strips, see
+from cloning.lane.reader import AHEAD, MOUNT_OFFSETS, STRIP, combine, estimate, load, read_strips, see
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
-from cloning.road.camera import CAMERA_MATRIX, HEIGHT
-from cloning.road.motion import CAMERA, stretches
+from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
+from cloning.road.motion import CAMERA_FORWARD, stretches
 from cloning.road.track import Track
 from simulator.car import STEP
 from simulator.record import record
@@ -52,7 +52,7 @@ def drives(network, laps: float) -> None:
                 recording = read_recording(folder)
                 found = combine(recording, see(recording, network))
             step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-            true = -np.array(run.path.offset)[step]
+            true = np.array(run.path.offset)[step]
             error = found.offset - true
             print(f"{f'drawn drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
                   f"95th percentile {np.quantile(np.abs(error), 0.95):.2f}, bias {error.mean():+.2f}, "
@@ -73,7 +73,7 @@ def real(folder: str, network) -> None:
     for side, name in enumerate(("left", "right")):
         cells = [f"{np.mean(beside[:, side, k]):+.2f} ± {np.std(beside[:, side, k]):.2f}" for k in range(3)]
         print(f"  {name + ' camera stands at':32}{', '.join(cells)} m, seen {AHEAD[0]:g}, {AHEAD[1]:g}, {AHEAD[2]:g} m "
-              f"ahead (mounted at {MOUNTS[side + 1]:+.2f})")
+              f"ahead (mounted at {MOUNT_OFFSETS[side + 1]:+.2f})")
     print(f"  {'off the centre':32}{np.abs(found.offset).mean():.2f} m, 95th percentile "
           f"{np.quantile(np.abs(found.offset), 0.95):.2f}, mean {found.offset.mean():+.2f}; "
           f"yaw {np.degrees(found.yaw).std():.1f} degrees; trusted {found.trusted.mean():.1%}")
@@ -84,12 +84,12 @@ def real(folder: str, network) -> None:
 def drawn_in(recording, found, row: int, edge: float) -> np.ndarray:
     """A centre frame with the lane's centre (green) and its edges (red) as far as 12 m ahead, taken as straight."""
     frame = cv2.cvtColor(decode(recording.path(row).read_bytes()), cv2.COLOR_RGB2BGR)
-    ahead = np.linspace(CAMERA + 2.2, 12, 30)
+    ahead = np.linspace(CAMERA_FORWARD + 2.2, 12, 30)
     s, c = np.sin(-found.yaw[row]), np.cos(-found.yaw[row])
     for aside, colour in ((0, (0, 220, 0)), (-edge, (0, 0, 255)), (edge, (0, 0, 255))):
         right = (aside - found.offset[row]) * c + ahead * s
         forward = ahead * c - (aside - found.offset[row]) * s
-        pixels = np.stack([right, np.full_like(right, HEIGHT), forward - CAMERA]).T @ CAMERA_MATRIX.T
+        pixels = np.stack([right, np.full_like(right, CAMERA_HEIGHT), forward - CAMERA_FORWARD]).T @ CAMERA_MATRIX.T
         pixels = pixels[pixels[:, 2] > 0.3]
         points = np.round(pixels[:, :2] / pixels[:, 2:]).astype(np.int32)
         cv2.polylines(frame, [points[:, None]], False, colour, 1, cv2.LINE_AA)

@@ -15,10 +15,11 @@ import numpy as np
 
 from cloning.lane.place import known
 from cloning.lane.reader import see
+from cloning.recordings.format import CAMERAS
 from cloning.recordings.images import decode
-from cloning.recordings.log import CAMERAS, read_recording
-from cloning.road.camera import SIDES, project
-from cloning.road.motion import ARM, REAR_AXLE, stretches
+from cloning.recordings.log import read_recording
+from cloning.road.camera import CAMERA_OFFSETS, project
+from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, stretches
 from cloning.road.track import Place, Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
@@ -34,7 +35,7 @@ AROUND = np.arange(-14, 14.1, 0.5)  # columns
 def axle(track: Track, place: np.ndarray) -> tuple[Place, np.ndarray]:
     """The rear axle's middle at a place as `roads.Placed` has it, with the car's heading, and the way it points."""
     s, right, yaw = place
-    at = track.at(s, -right)
+    at = track.at(s, right)
     heading = at.heading - yaw
     return Place(at.x, at.y, at.z, heading, at.grade), np.array([np.cos(heading), np.sin(heading)])
 
@@ -43,9 +44,9 @@ def line_columns(track: Track, place: np.ndarray, aside: float, camera: str, row
     """Where flat geometry has the line `aside` metres left of the centre line, in some rows: columns, or nan."""
     at, forward = axle(track, place)
     right = np.array([forward[1], -forward[0]])
-    eye = (at.x, at.y) + ARM * forward + SIDES[camera] * right
+    eye = (at.x, at.y) + AXLE_TO_CAMERA * forward + CAMERA_OFFSETS[camera] * right
     near = (round(place[0] / track.step) + np.arange(45)) % len(track.points)
-    away = track.points[near, :2] + aside * track.normal[near] - eye
+    away = track.points[near, :2] - aside * track.rightward[near] - eye
     ahead = away @ forward
     seen = project(away[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
     return np.interp(rows, seen[:, 1], seen[:, 0], left=np.nan, right=np.nan)

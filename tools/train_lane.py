@@ -23,11 +23,22 @@ from cloning.compute import choose_precision, in_precision, one_thread, threads
 from cloning.errors import RecordingError
 from cloning.files import write
 from cloning.lane.place import centre_ahead
-from cloning.lane.reader import AHEAD, HALF, LEVEL, MOUNTS, SHIPPED, STRIP, LaneNetwork, normal, read_strips, strip
+from cloning.lane.reader import (
+    AHEAD,
+    HALF,
+    LEVEL,
+    MOUNT_OFFSETS,
+    SHIPPED,
+    STRIP,
+    LaneNetwork,
+    normal,
+    read_strips,
+    strip,
+)
 from cloning.recordings.images import decode
 from cloning.recordings.log import find_folders, read_recording
-from cloning.road.camera import HEIGHT
-from cloning.road.motion import ARM, CAMERA, PAUSE, Stretch
+from cloning.road.camera import CAMERA_HEIGHT
+from cloning.road.motion import AXLE_TO_CAMERA, CAMERA_FORWARD, MAX_GAP, Stretch
 from cloning.road.track import Track
 
 TRACKS = {"lake": 1, "jungle": 2}  # and how much of each is drawn: hills and narrow bends are harder
@@ -64,14 +75,14 @@ def draw(track_name: str, look: int, frames: int, seed: int) -> tuple[np.ndarray
         track, s = tracks[way], (s, tracks[0].length - s)[way]
         right = rng.uniform(-OFFSET, OFFSET)
         yaw = rng.uniform(-YAW, YAW) if rng.random() < 0.3 else np.clip(rng.normal(0, YAW / 3), -YAW, YAW)
-        place = track.at(s, -right)
+        place = track.at(s, right)
         heading = place.heading - np.radians(yaw)
         nod = np.degrees(np.arctan(place.grade)) + rng.normal(0.1, 0.5)
         pose = Vec3(np.degrees(heading) - 90, nod, rng.normal(0, 0.6))
         frame = cameras.frames(TransformState.make_pos_hpr(
             Point3(place.x, place.y, place.z + rng.normal(0.025, 0.03)), pose))[0]
         strips[k] = strip(decode(jpeg(frame)))
-        eye = place.x + CAMERA * np.cos(heading), place.y + CAMERA * np.sin(heading)
+        eye = place.x + CAMERA_FORWARD * np.cos(heading), place.y + CAMERA_FORWARD * np.sin(heading)
         centres[k] = centre_ahead(track, s, *eye, heading)
     return strips, centres
 
@@ -92,7 +103,7 @@ def draw_many(looks: range, frames: int, seed: int) -> tuple[np.ndarray, np.ndar
 def seen_from(right: float, yaw: float) -> np.ndarray:
     """From a strip's pixels to those of one seen `right` m further right, turned right by `yaw` radians: (3, 3)."""
     moved = np.eye(3)
-    moved[0, 1] = -right / HEIGHT
+    moved[0, 1] = -right / CAMERA_HEIGHT
     turned = LEVEL @ cv2.Rodrigues(np.array([0.0, -yaw, 0.0]))[0]
     return np.linalg.inv(HALF) @ turned @ moved @ np.linalg.inv(LEVEL) @ HALF
 
@@ -159,10 +170,10 @@ class Real:
         self.strips = read_strips(recording)
         stretch = Stretch.of(recording, slice(0, len(recording)))
         self.heading, self.driven = stretch.heading, stretch.driven
-        self.right = stretch.right + ARM * np.sin(self.heading)
-        self.forward = stretch.forward + ARM * np.cos(self.heading)
+        self.right = stretch.right + AXLE_TO_CAMERA * np.sin(self.heading)
+        self.forward = stretch.forward + AXLE_TO_CAMERA * np.cos(self.heading)
         pause = np.diff(recording.time, append=np.inf)
-        self.breaks = np.flatnonzero((pause <= 0) | (pause > PAUSE))
+        self.breaks = np.flatnonzero((pause <= 0) | (pause > MAX_GAP))
 
     def later(self, row: int, driven: float) -> tuple[int, tuple[float, float, float]]:
         """The row `driven` metres on, or the last before a break, and where it is: m right, m forward, yaw."""
@@ -212,13 +223,13 @@ class Batches:
         if kind < 0.4:
             one, other = rng.permutation(3)[:2]
             views = recording.strips[row, [one, other]]
-            return views, self.photographs.wedge(rng, 0.3), (MOUNTS[other] - MOUNTS[one], 0, 0, np.inf)
+            return views, self.photographs.wedge(rng, 0.3), (MOUNT_OFFSETS[other] - MOUNT_OFFSETS[one], 0, 0, np.inf)
         if kind < 0.7:
             later, pose = recording.later(row, rng.uniform(*ON))
             one, other = rng.integers(0, 3, 2)
             views = recording.strips[row, one], recording.strips[later, other]
             c, s = np.cos(pose[2]), np.sin(pose[2])
-            pose = pose[0] + MOUNTS[other] * c - MOUNTS[one], pose[1] - MOUNTS[other] * s, pose[2], np.inf
+            pose = pose[0] + MOUNT_OFFSETS[other] * c - MOUNT_OFFSETS[one], pose[1] - MOUNT_OFFSETS[other] * s, pose[2], np.inf
             return views, self.photographs.wedge(rng, 0.3), pose
         views, mask, poses = [], self.photographs.wedge(rng, 0.5), []
         for camera in rng.integers(0, 3, 2):
@@ -227,7 +238,7 @@ class Batches:
             views.append(cv2.warpPerspective(recording.strips[row, camera], view, STRIP[1::-1], flags=cv2.INTER_LINEAR,
                                              borderMode=cv2.BORDER_REFLECT))
             mask = mask & in_sight(view)
-            poses.append((MOUNTS[camera] + right, yaw))
+            poses.append((MOUNT_OFFSETS[camera] + right, yaw))
         (right, yaw), (other, turned) = poses
         c, s = np.cos(yaw), np.sin(yaw)
         return views, mask, ((other - right) * c, (other - right) * s, turned - yaw, FLAT)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cloning.lane.reader import AHEAD, MOUNTS, Lane, LaneNetwork, combine, see
+from cloning.lane.reader import AHEAD, MOUNT_OFFSETS, Lane, LaneNetwork, combine, see
 from cloning.recordings.log import Recording
-from cloning.road.motion import ARM, REAR_AXLE, Stretch
+from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch
 from cloning.road.track import ROADS, Track
 
 BLUR = (0.3 + 0.08 * AHEAD) * 2  # m: of what is seen ahead, twice as much as of a single frame: neighbours err alike
@@ -68,11 +68,11 @@ class Filter:
     def __init__(self, stretch: Stretch, seen: np.ndarray, track: Track):
         """seen: float32 (n, 3, 5), what the three cameras see in the stretch's rows."""
         self.track, self.step, self.turn = track, np.diff(stretch.driven), np.diff(stretch.heading)
-        self.seen = np.median(seen + MOUNTS[:, None], axis=1)
+        self.seen = np.median(seen + MOUNT_OFFSETS[:, None], axis=1)
 
     def bend(self, s: float) -> float:
         """The road's curvature, 1/m, right positive."""
-        return -float(self.track.curvature[round(s / self.track.step) % len(self.track.curvature)])
+        return float(self.track.curvature[round(s / self.track.step) % len(self.track.curvature)])
 
     def move(self, at: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The state a row later, and its derivatives by this one: (3,), (3, 3)."""
@@ -91,13 +91,13 @@ class Filter:
     def view(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What would be seen of the centre line, and its derivatives by the state: (5,), (5, 3); nan out of reach."""
         s, right, yaw = state
-        axle = self.track.at(s, -right)
+        axle = self.track.at(s, right)
         heading = axle.heading - yaw
-        eye = axle.x + ARM * np.cos(heading), axle.y + ARM * np.sin(heading)
+        eye = axle.x + AXLE_TO_CAMERA * np.cos(heading), axle.y + AXLE_TO_CAMERA * np.sin(heading)
         seen, before, after = centre_ahead(self.track, s, *eye, heading, AROUND.ravel()).reshape(3, -1)
         slope = (after - before) / (AROUND[2] - AROUND[1])
         bend = self.bend(s)
-        turned = -(AHEAD + ARM) - slope * seen  # by the car's turning about its rear axle
+        turned = -(AHEAD + AXLE_TO_CAMERA) - slope * seen  # by the car's turning about its rear axle
         on = (1 - bend * right) * (slope * np.cos(yaw) + np.sin(yaw)) + bend * turned
         return seen, np.stack([on, slope * np.sin(yaw) - np.cos(yaw), turned], axis=1)
 

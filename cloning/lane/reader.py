@@ -20,14 +20,14 @@ from cloning.compute import choose_precision, in_precision, one_thread, threads
 from cloning.errors import ModelError
 from cloning.recordings.images import decode
 from cloning.recordings.log import Recording
-from cloning.road.camera import CAMERA_MATRIX, LENS, PITCH, SIDES
-from cloning.road.motion import ARM, PAUSE, REAR_AXLE, Stretch
+from cloning.road.camera import CAMERA_MATRIX, CAMERA_OFFSETS, CAMERA_PITCH, INTRINSICS
+from cloning.road.motion import AXLE_TO_CAMERA, MAX_GAP, REAR_AXLE, Stretch
 
 SHIPPED = Path(__file__).with_name("lane.pt")
 STRIP = (32, 160, 3)  # rows, columns, RGB
 TOP = 60  # of the frame's rows: the horizon; 64 rows further down begins what the bonnet tints in the JPEG
 AHEAD = np.array([3.0, 4.5, 6.5, 9.0, 13.0], np.float32)  # m before the camera
-MOUNTS = np.array(list(SIDES.values()), np.float32)  # m to the right: centre, left, right
+MOUNT_OFFSETS = np.array(list(CAMERA_OFFSETS.values()), np.float32)  # m to the right: centre, left, right
 BATCH = 48  # strips that a thread works through at once
 
 BEHIND = 40  # rows that may have seen the road beside the car
@@ -37,7 +37,7 @@ TOLERANCE = 0.3  # m by which the side cameras may stand elsewhere than where th
 SCATTER = 0.9  # m that what the frames of a second have seen of the centre may lie beside it, over a window
 
 # A camera that looks straight ahead and stands upright.
-LEVEL = LENS @ cv2.Rodrigues(np.array([np.radians(PITCH), 0, 0]))[0]
+LEVEL = INTRINSICS @ cv2.Rodrigues(np.array([np.radians(CAMERA_PITCH), 0, 0]))[0]
 HALF = np.array([[2, 0, 0.5], [0, 2, TOP + 0.5], [0, 0, 1]])  # from a strip's pixels to its frame's
 TO_FRAME = CAMERA_MATRIX @ np.linalg.inv(LEVEL) @ HALF
 
@@ -159,9 +159,9 @@ def combine(recording: Recording, seen: np.ndarray) -> Lane:
 
     Nothing is laid together over a break in time.
     """
-    seen = seen + MOUNTS[:, None]
+    seen = seen + MOUNT_OFFSETS[:, None]
     pause = np.diff(recording.time)
-    breaks = np.flatnonzero((pause <= 0) | (pause > PAUSE)) + 1
+    breaks = np.flatnonzero((pause <= 0) | (pause > MAX_GAP)) + 1
     edges = [0, *breaks.tolist(), len(recording)]
     parts = [_stretch(recording, slice(a, b), seen[a:b]) for a, b in itertools.pairwise(edges)]
     return Lane(*(np.concatenate(values) for values in zip(*parts, strict=True)))
@@ -172,7 +172,7 @@ def _stretch(recording: Recording, rows: slice, seen: np.ndarray):
     aside = _smoothed(seen[:, 1:] - seen[:, :1])[..., :2]  # nearest: further ahead a metre is few pixels
     stretch = Stretch.of(recording, rows)
     right, forward, heading = stretch.right, stretch.forward, stretch.heading
-    ahead = AHEAD + ARM  # of the rear axle, whose way is known
+    ahead = AHEAD + AXLE_TO_CAMERA  # of the rear axle, whose way is known
     s, c = np.sin(heading)[:, None], np.cos(heading)[:, None]
     centre = seen.mean(1)
     there = np.stack([right[:, None] + ahead * s + centre * c, forward[:, None] + ahead * c - centre * s], axis=-1)

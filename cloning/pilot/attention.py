@@ -6,14 +6,14 @@ import torch
 from torch import nn
 
 from cloning.pilot.network import Network
-from cloning.recordings.images import FRAME
+from cloning.recordings.format import FRAME
 from cloning.road.camera import project
 from cloning.road.motion import curvature
 
 GREEN, MAGENTA = (60, 255, 60), (255, 0, 200)  # RGB
 
 
-def look(network: Network, frame: np.ndarray) -> tuple[float, np.ndarray]:
+def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndarray]:
     """Steering -1..1 for a frame, uint8 (160, 320, 3), RGB, and what it rests on, float32 (160, 320), 0..1.
 
     VisualBackProp: the feature maps of each layer are averaged; from the last layer to the first, the average is
@@ -47,9 +47,9 @@ def look(network: Network, frame: np.ndarray) -> tuple[float, np.ndarray]:
     return steering, whole
 
 
-def draw(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> np.ndarray:
+def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> np.ndarray:
     """A frame at twice its size, uint8 (320, 640, 3), RGB, with the way that the steering takes in green and, in
-    magenta, the mask of `look`."""
+    magenta, the mask of `visual_backprop`."""
     picture = frame.astype(np.float32)
     if mask is not None:
         strength = np.sqrt(mask)[..., None] * 0.7  # the root brings out what is weak

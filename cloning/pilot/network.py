@@ -11,7 +11,7 @@ from torch import nn
 
 from cloning.errors import ModelError
 from cloning.files import write
-from cloning.recordings.images import FRAME
+from cloning.recordings.format import FRAME
 
 FORMAT, VERSION = "behavioral-cloning", 1  # of model.pt
 CROP = (60, 25)  # rows cut off the top and the bottom

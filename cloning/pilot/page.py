@@ -73,7 +73,7 @@ def newer(trail, until: float) -> list[Row]:
 
 def image(server, session, with_attention: bool) -> str:
     """The last frame with the steering drawn on it, as a data URL."""
-    mask = attention.look(server.network, session.frame)[1] if with_attention else None
-    picture = attention.draw(session.frame, session.trail[-1].steering, mask)
+    mask = attention.visual_backprop(server.network, session.frame)[1] if with_attention else None
+    picture = attention.overlay(session.frame, session.trail[-1].steering, mask)
     jpeg = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()

@@ -5,7 +5,7 @@ import struct
 import cv2
 import numpy as np
 
-FRAME = (160, 320, 3)  # rows, columns, RGB: what the simulator records and sends
+from cloning.recordings.format import FRAME
 
 
 def jpeg_size(jpeg: bytes) -> tuple[int, int]:

@@ -13,12 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from cloning.errors import RecordingError
+from cloning.recordings.format import CAMERAS, COLUMNS, LOG, RANGES, SAMPLE_RATE
 
-LOG = "driving_log.csv"
-CAMERAS = ("center", "left", "right")
-COLUMNS = (*CAMERAS, "steering", "throttle", "brake", "speed")
 WRITTEN = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE)  # a number as the simulator writes it
-RANGES = {"steering": (-1, 1), "throttle": (-1, 1), "brake": (-1, 1), "speed": (-100, 100)}  # the car does 30 mph
 
 
 WHERE_TO_GET_RECORDINGS = ("Record some in the simulator (training mode, button R), or unpack the public sample data "
@@ -140,7 +137,7 @@ def read_recording(folder) -> Recording:
     columns = np.ascontiguousarray(np.array(parser.numbers, np.float32).reshape(-1, 4).T)
     time = _time_stamps(names[images[:, 0]])
     if np.isnan(time).any():
-        time = lines / 15.0  # the simulator's rate
+        time = lines / float(SAMPLE_RATE)
     recording = Recording(folder, names, images, *columns, time, lines, parser.read, parser.repairs, parser.rejected)
     recording.keep(np.lexsort((lines, time)))  # sessions are merged out of date order in the wild
     return recording

@@ -7,22 +7,21 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from cloning.errors import SimulatorError
+from cloning.recordings.format import CAMERAS, LOG, SAMPLE_RATE
 
-RATE = 15  # samples a second of simulated time
-NAMES = ("center", "left", "right")  # in the order of the csv
 EPOCH = datetime(
     2018, 1, 1, 12
 )  # when a recording with seed 0 begins: file names must not depend on the day they are made
 
 
-def number(value: float) -> str:
+def csharp_number(value: float) -> str:
     """A number as C# writes a float: seven digits, 6.9E-05."""
     return (
         re.sub(r"E([+-]\d)$", r"E\g<1>", f"{value:.7G}").replace("-0", "0") if value == 0 else f"{value:.7G}"
     )
 
 
-class Recording:
+class RecordingWriter:
     """Writes samples into a folder. A row follows its three whole images, so a kill at any time leaves a
     readable folder."""
 
@@ -33,7 +32,7 @@ class Recording:
         """
         self.folder = Path(folder).absolute()
         self.images = self.folder / "IMG"
-        log = self.folder / "driving_log.csv"
+        log = self.folder / LOG
         if log.exists():
             raise SimulatorError(f"{log} exists already: give another folder, or delete this one")
         try:
@@ -54,8 +53,8 @@ class Recording:
         Raises SimulatorError, with nothing half-written, if the disk is full.
         """
         moment = (self.begin + timedelta(seconds=time)).strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
-        paths = [self.images / f"{name}_{moment}.jpg" for name in NAMES]
-        row = ",".join([*map(str, paths), *map(number, (steering, throttle, brake, speed))]) + "\n"
+        paths = [self.images / f"{name}_{moment}.jpg" for name in CAMERAS]
+        row = ",".join([*map(str, paths), *map(csharp_number, (steering, throttle, brake, speed))]) + "\n"
         size = os.fstat(self.log.fileno()).st_size
         try:
             for path, image in zip(paths, images, strict=True):
@@ -86,10 +85,10 @@ class Clock:
 
     def __init__(self, start: float = 0.0):
         """start: simulated seconds; the first sample is due at once."""
-        self.taken = math.ceil(start * RATE - 1e-9)
+        self.taken = math.ceil(start * SAMPLE_RATE - 1e-9)
 
     def due(self, time: float) -> bool:
-        if time * RATE < self.taken - 1e-9:
+        if time * SAMPLE_RATE < self.taken - 1e-9:
             return False
         self.taken += 1
         return True

@@ -4,10 +4,10 @@ from cloning.errors import SimulatorError
 from cloning.recordings.images import decode
 from cloning.replay.replay import Moment
 from cloning.wire.client import Gone, telemetry
-from cloning.wire.session import Session
+from cloning.wire.session import ClientSession
 
 
-class Served(Session):
+class Served(ClientSession):
     """drive.py steers, and is told what the simulator would tell it."""
 
     def __init__(self, host: str, port: int, wait: float):

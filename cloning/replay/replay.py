@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 
 from cloning.recordings.check import check_images
+from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording, read_recording
 from cloning.replay.autonomy import autonomy
 from cloning.replay.views import Views
-from cloning.road.camera import VIEW_QUALITY
-from cloning.road.motion import MPH, OFF_ROAD, RATE, REAR_AXLE, TRUSTED, Stretch, curvature, follow, stretches
+from cloning.road.camera import VIEW_JPEG_QUALITY
+from cloning.road.motion import MIN_TRUSTED, MPH, OFF_ROAD, REAR_AXLE, Stretch, curvature, lagged_curvature, stretches
 
 LIMITS = (1.0, 2.5)  # m off the lane's centre: NVIDIA's, and where the car's side touches the edge line
 
@@ -84,7 +85,7 @@ def references(recording: Recording, by_lane: bool = True) -> list[Reference]:
     for stretch in whole:
         rows = stretch.rows
         sure = np.asarray(trusted[rows], bool)
-        if sure.mean() < TRUSTED:
+        if sure.mean() < MIN_TRUSTED:
             n = len(stretch)
             found.append(Reference(stretch, np.zeros(n), np.zeros(n), lane=False))
             continue
@@ -93,7 +94,7 @@ def references(recording: Recording, by_lane: bool = True) -> list[Reference]:
         on_road = np.r_[False, np.abs(filled[0]) < OFF_ROAD, False]
         starts, ends = (np.flatnonzero(np.diff(on_road.astype(int)) == sign) for sign in (1, -1))
         for a, b in zip(starts.tolist(), ends.tolist(), strict=True):
-            if b - a >= 2 * RATE:
+            if b - a >= 2 * SAMPLE_RATE:
                 part = stretch
                 if b - a < len(stretch):
                     part = Stretch.of(recording, slice(rows.start + a, rows.start + b))
@@ -136,8 +137,8 @@ class Course:
     def go_on(self, at: int, steering: float) -> None:
         """To the next row. The car keeps abreast of the human, so that on the inside of a bend it is slower."""
         pause = float(self.pause[at])
-        self.humans = follow(self.humans, float(curvature(self.human[at])), pause)
-        self.own = follow(self.own, float(curvature(steering)), pause)
+        self.humans = lagged_curvature(self.humans, float(curvature(self.human[at])), pause)
+        self.own = lagged_curvature(self.own, float(curvature(steering)), pause)
         step = self.speed[at] * pause
         own = step * (1 - self.humans * self.right) / np.cos(self.yaw)
         turned = self.own * own - self.humans * step
@@ -169,7 +170,7 @@ class Moment:
         if not any(self.pose):
             return self.views.jpeg(self.at)
         picture = cv2.cvtColor(self.seen, cv2.COLOR_RGB2BGR)
-        return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, VIEW_QUALITY])[1].tobytes()
+        return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, VIEW_JPEG_QUALITY])[1].tobytes()
 
 
 def drive(recording: Recording, references: list[Reference], limit: float, steer: Callable[[Moment], float],

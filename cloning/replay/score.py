@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 
 from cloning.errors import SimulatorError
-from cloning.film import Film
+from cloning.film import FilmWriter
+from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 from cloning.replay.replay import Drive, Moment, Reference, drive
-from cloning.road.motion import RATE
 from simulator.report import put
 
 SMOOTHED = 9  # rows over which steering is averaged before it is compared
@@ -125,7 +125,7 @@ class SideBySide:
     def __init__(self, path: str):
         """Raises SimulatorError."""
         try:
-            self.film = Film(Path(path), RATE, quality=24, preset="veryfast")
+            self.film = FilmWriter(Path(path), SAMPLE_RATE, quality=24, preset="veryfast")
         except OSError as error:
             raise SimulatorError(f"{path}: no film can be written there ({error.strerror})") from error
 
@@ -143,8 +143,8 @@ class SideBySide:
 
 def captioned(frame: np.ndarray, steering: float, said: str) -> np.ndarray:
     """A frame at twice its size, uint8 (320, 640, 3), RGB, with the way that the steering takes and a line of text."""
-    from cloning.pilot.attention import draw  # which loads torch, and only films need it
+    from cloning.pilot.attention import overlay  # which loads torch, and only films need it
 
-    shown = draw(frame, steering)
+    shown = overlay(frame, steering)
     cv2.putText(shown, said, (10, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
     return shown

@@ -6,8 +6,8 @@ import numpy as np
 
 from cloning.recordings.images import decode
 from cloning.recordings.log import Recording
-from cloning.road.camera import EARLIER, HIDDEN, SIDES, warp
-from cloning.road.motion import ARM, Stretch
+from cloning.road.camera import BONNET_ROW, CAMERA_OFFSETS, EARLIER_FRAME, warp
+from cloning.road.motion import AXLE_TO_CAMERA, Stretch
 
 
 class Views:
@@ -36,24 +36,24 @@ class Views:
         uint8 (160, 320, 3), RGB.
         """
         heading = self.heading[at]
-        eye = np.array([self.right[at] + right * np.cos(heading) + ARM * np.sin(heading + yaw),
-                        self.forward[at] - right * np.sin(heading) + ARM * np.cos(heading + yaw)])
-        beside = right + ARM * np.sin(yaw)
-        camera = int(np.argmin([abs(beside - side) for side in SIDES.values()]))
+        eye = np.array([self.right[at] + right * np.cos(heading) + AXLE_TO_CAMERA * np.sin(heading + yaw),
+                        self.forward[at] - right * np.sin(heading) + AXLE_TO_CAMERA * np.cos(heading + yaw)])
+        beside = right + AXLE_TO_CAMERA * np.sin(yaw)
+        camera = int(np.argmin([abs(beside - side) for side in CAMERA_OFFSETS.values()]))
         made, seen = self._warped(at, camera, eye, heading + yaw)
-        earlier = int(np.searchsorted(self.driven, self.driven[at] - EARLIER, "right")) - 1
-        missing = (~seen[:HIDDEN]).nonzero()
+        earlier = int(np.searchsorted(self.driven, self.driven[at] - EARLIER_FRAME, "right")) - 1
+        missing = (~seen[:BONNET_ROW]).nonzero()
         if earlier >= 0 and len(missing[0]):
             top, left, bottom, end = *np.min(missing, axis=1), *(np.max(missing, axis=1) + 1)
             before, _ = self._warped(earlier, camera, eye, heading + yaw, (top, bottom, left, end))
             part = made[top:bottom, left:end]
             np.copyto(part, before, where=~seen[top:bottom, left:end, None])
-        made[HIDDEN:] = self.frame(at, 0)[HIDDEN:]
+        made[BONNET_ROW:] = self.frame(at, 0)[BONNET_ROW:]
         return made
 
     def _warped(self, at: int, camera: int, eye: np.ndarray, heading: float, *box):
         s, c = np.sin(self.heading[at]), np.cos(self.heading[at])
-        side = list(SIDES.values())[camera]
-        stands = np.array([self.right[at] + ARM * s + side * c, self.forward[at] + ARM * c - side * s])
+        side = list(CAMERA_OFFSETS.values())[camera]
+        stands = np.array([self.right[at] + AXLE_TO_CAMERA * s + side * c, self.forward[at] + AXLE_TO_CAMERA * c - side * s])
         away = eye - stands
         return warp(self.frame(at, camera), away @ (c, -s), away @ (s, c), heading - self.heading[at], *box)

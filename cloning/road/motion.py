@@ -5,21 +5,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 
 MPH = 0.44704  # m/s
 FULL_LOCK = 25.0  # degrees of the front wheels at steering 1
 WHEELBASE = 2.87  # m
 REAR_AXLE = 1.6  # m behind the car's middle
-CAMERA = 1.0  # m before the car's middle: all three cameras
-ARM = REAR_AXLE + CAMERA  # m from the rear axle's middle, about which the car turns, to the cameras
-RATE = 15  # samples a second that the simulator records
-PAUSE = 0.4  # s: rows further apart are not one drive
-JERK = 30.0  # m/s²: the car neither brakes nor speeds up like this; it was set back, or a crash stopped it
-LAG = 0.15  # s: the car turns as its wheels stand with this time constant, on three recordings alike
+CAMERA_FORWARD = 1.0  # m before the car's middle: all three cameras
+AXLE_TO_CAMERA = REAR_AXLE + CAMERA_FORWARD  # m from the rear axle's middle, about which the car turns, to the cameras
+MAX_GAP = 0.4  # s: rows further apart are not one drive
+MAX_ACCELERATION = 30.0  # m/s²: the car neither brakes nor speeds up like this; it was set back, or a crash stopped it
+YAW_LAG = 0.15  # s: the car turns as its wheels stand with this time constant, on three recordings alike
 OFF_ROAD = 4.5  # m from the lane's centre at which whoever drives is no longer on the road, and shows no lane
-TRUSTED = 0.7  # of a stretch's rows, from which on the lane's centre is known there; else the human's way stands for it
-STANDS = 1.0  # m/s: slower than walking, the frames say nothing about steering
+MIN_TRUSTED = 0.7  # share of a stretch's rows whose lane is trusted; below it, the human's path is the reference
+MIN_SPEED = 1.0  # m/s: slower than walking, the frames say nothing about steering
 
 
 def curvature(steering):
@@ -36,13 +36,13 @@ def steering_for(bend):
     return np.clip(np.degrees(np.arctan(WHEELBASE * bend)) / FULL_LOCK, -1, 1)
 
 
-def follow(turning: float, bend: float, pause: float) -> float:
+def lagged_curvature(turning: float, bend: float, pause: float) -> float:
     """The curvature that the car drives `pause` seconds later, 1/m, while its wheels stand for the curvature `bend`.
 
     The yaw seen in the far background of successive frames fits a lag of the first order with 0.15 s on all three real
     recordings, and halves what is left of the differences on the one that was driven by keys.
     """
-    return turning + (bend - turning) * (1 - math.exp(-pause / LAG))
+    return turning + (bend - turning) * (1 - math.exp(-pause / YAW_LAG))
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Stretch:
         step, bends = speed[:-1] * pause, curvature(recording.steering[rows].astype(float))
         turning = [float(bends[0])]
         for bend, seconds in zip(bends[:-1].tolist(), pause.tolist(), strict=True):
-            turning.append(follow(turning[-1], bend, seconds))
+            turning.append(lagged_curvature(turning[-1], bend, seconds))
         turn = np.array(turning[1:]) * step
         heading = np.r_[0.0, np.cumsum(turn)]
         middle = heading[:-1] + turn / 2
@@ -84,10 +84,10 @@ def stretches(recording: Recording) -> list[Stretch]:
     """The drives between a recording's breaks: gaps in time, jumps in speed, standing. Each at least two seconds."""
     speed = np.abs(recording.speed.astype(float)) * MPH
     pause = np.diff(recording.time)
-    whole = (pause > 0) & (pause < PAUSE) & (np.abs(np.diff(speed)) < JERK * np.maximum(pause, 1 / RATE))
-    moving = speed > STANDS
+    whole = (pause > 0) & (pause < MAX_GAP) & (np.abs(np.diff(speed)) < MAX_ACCELERATION * np.maximum(pause, 1 / SAMPLE_RATE))
+    moving = speed > MIN_SPEED
     joined = whole & moving[1:] & moving[:-1]
     starts = np.flatnonzero(np.r_[True, ~joined])
     ends = np.r_[starts[1:], len(speed)]
     return [Stretch.of(recording, slice(a, b)) for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
-            if b - a >= 2 * RATE]
+            if b - a >= 2 * SAMPLE_RATE]

@@ -59,9 +59,12 @@ ROADS = {
 class Track:
     """A track in one direction, as points about 1 m apart; s is the distance driven from the first, in metres.
 
-    Arrays of n points: points (n, 3) in metres, heading (n,) in radians, continuous, normal (n, 2) to the left,
-    curvature (n,) in 1/m, positive to the left, grade (n,), edges (n, 2): where the surface ends to the left and right,
-    in metres.
+    points     float64 (n, 3): m
+    heading    float64 (n,): radians, continuous
+    rightward  float64 (n, 2): unit vectors to the right
+    curvature  float64 (n,): 1/m, right positive
+    grade      float64 (n,): dz/ds
+    edges      float64 (n, 2): m to the left and to the right at which the surface ends
     """
 
     def __init__(self, name: str, direction: str | None = None):
@@ -91,12 +94,12 @@ class Track:
         around = np.roll(self.points, -1, axis=0) - np.roll(self.points, 1, axis=0)
         flat = np.linalg.norm(around[:, :2], axis=1)
         tangent = around[:, :2] / flat[:, None]
-        self.normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+        self.rightward = np.column_stack([tangent[:, 1], -tangent[:, 0]])
         self.grade = around[:, 2] / flat
         self.heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
         turn = np.diff(np.r_[self.heading, self.heading[0] + self.turns()])
         kernel = np.ones(5) / 5
-        self.curvature = np.convolve(np.r_[turn[-3:], turn, turn[:2]], kernel, "valid")[:n] / self.step
+        self.curvature = -np.convolve(np.r_[turn[-3:], turn, turn[:2]], kernel, "valid")[:n] / self.step
         self.starts = {
             mode: self.locate(*where)[0] if where else 0.0
             for mode, where in (("training", road.training), ("autonomous", road.autonomous))
@@ -111,8 +114,8 @@ class Track:
         negative."""
         return np.arange(round(start / self.step), round(end / self.step) + 1) % len(self.points)
 
-    def at(self, s: float, offset: float = 0.0) -> Place:
-        """The pose at s metres along the track and `offset` metres to the left of the centre line."""
+    def at(self, s: float, right: float = 0.0) -> Place:
+        """The pose at s metres along the track and `right` metres to the right of the centre line."""
         n = len(self.points)
         i, part = divmod(s / self.step, 1)
         i = int(i) % n
@@ -121,10 +124,10 @@ class Track:
         turn = (self.heading[j] - self.heading[i] + np.pi) % (2 * np.pi) - np.pi
         heading = self.heading[i] + part * turn
         grade = self.grade[i] * (1 - part) + self.grade[j] * part
-        return Place(x - np.sin(heading) * offset, y + np.cos(heading) * offset, z, heading, grade)
+        return Place(x + np.sin(heading) * right, y - np.cos(heading) * right, z, heading, grade)
 
     def locate(self, x: float, y: float, near: float | None = None) -> tuple[float, float]:
-        """(s, offset to the left) of the point of the centre line nearest to (x, y), in metres.
+        """(s, metres to the right) of the point of the centre line nearest to (x, y), in metres.
 
         near: an earlier s; only 30 m around it are looked at, which is fast and tells a road from one it crosses.
         """
@@ -136,12 +139,12 @@ class Track:
         away = self.points[indices, :2] - (x, y)
         i = int(indices[np.argmin(np.einsum("ij,ij->i", away, away))])
         dx, dy = x - self.points[i, 0], y - self.points[i, 1]
-        left_x, left_y = self.normal[i]
-        ahead = dx * left_y - dy * left_x  # the tangent is the normal turned right
-        bend = 1 - self.curvature[i] * (dx * left_x + dy * left_y)
+        right_x, right_y = self.rightward[i]
+        ahead = dy * right_x - dx * right_y  # the tangent is the vector to the right, turned left
+        bend = 1 - self.curvature[i] * (dx * right_x + dy * right_y)
         s = (i * self.step + ahead / max(bend, 0.2)) % self.length
         there = self.at(s)
-        return s, float(-(x - there.x) * np.sin(there.heading) + (y - there.y) * np.cos(there.heading))
+        return s, float((x - there.x) * np.sin(there.heading) - (y - there.y) * np.cos(there.heading))
 
     def listed(self, s: float) -> float:
         """s, driven in this direction, as the distance along the file's order, which features are given

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from cloning.pilot.network import CROP
-from cloning.recordings.log import CAMERAS
+from cloning.recordings.format import CAMERAS
 from cloning.road.motion import FULL_LOCK
 
 

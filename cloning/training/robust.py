@@ -13,10 +13,10 @@ import numpy as np
 
 from cloning.lane.place import read_lane
 from cloning.pilot.network import CROP
-from cloning.recordings.images import FRAME
+from cloning.recordings.format import FRAME
 from cloning.recordings.log import Recording
-from cloning.road.camera import CAMERA_MATRIX, EARLIER, FAR, HEIGHT, HIDDEN, SIDES
-from cloning.road.motion import ARM, OFF_ROAD, REAR_AXLE, TRUSTED, steering_for, stretches
+from cloning.road.camera import BONNET_ROW, CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, EARLIER_FRAME, FAR_SLOPE
+from cloning.road.motion import AXLE_TO_CAMERA, MIN_TRUSTED, OFF_ROAD, REAR_AXLE, steering_for, stretches
 
 AHEAD = 6.0  # m along the lane's centre: the point that the car is steered for
 STEEP = 1.0  # m: from further off the car comes back no steeper than from here, at up to STEEP / AHEAD radians
@@ -28,7 +28,7 @@ REACH = 2.4  # m from the human's way: further to the side too little was seen
 NEARBY = 1.7  # m: a camera within this distance from a pose may show it
 TINTED = 0.5  # of the views
 STRENGTH, TINTS = (0.1, 1.5), (0.85, 1.15)  # of their colours, and factors of red, green and blue
-ROWS = slice(45, HIDDEN)  # of a recorded frame: what is needed for the rows that the network sees
+ROWS = slice(45, BONNET_ROW)  # of a recorded frame: what is needed for the rows that the network sees
 HORIZON = 6  # rows of what the network sees that may show what is above the horizon
 
 
@@ -39,7 +39,7 @@ class Lanes:
     offset, yaw  float32 (n,): the recorded car's pose
     goal         float32 (n, 2): metres to the right and forward, in the lane's frame, of the lane's centre `AHEAD` on
     known        bool (n,): whether all this is known; what else stands there means nothing where it is not
-    before       int32 (n,): the recording's row that was `EARLIER` metres earlier, or this one
+    before       int32 (n,): the recording's row that was `EARLIER_FRAME` metres earlier, or this one
     moved        float32 (n, 3): the earlier row's rear axle as seen from this one: right, forward in metres, heading
     """
 
@@ -67,7 +67,7 @@ class Lanes:
             axle = np.stack([stretch.right, stretch.forward], axis=1)
             place, centre, beside = driven, axle, np.zeros(len(driven))
             sure = np.flatnonzero(read.trusted[rows])
-            if len(sure) >= TRUSTED * len(driven):
+            if len(sure) >= MIN_TRUSTED * len(driven):
                 beside = np.interp(np.arange(len(driven)), sure, read.offset[rows][sure])
                 place = driven + REAR_AXLE  # the reading is that of the car's middle
                 centre = axle + REAR_AXLE * ahead(heading) - beside[:, None] * across(np.interp(place, driven, heading))
@@ -84,7 +84,7 @@ class Lanes:
             goal = np.stack([(goal * across(along)).sum(1), (goal * ahead(along)).sum(1)], axis=1)
             known = (driven >= 2 * CHORD) & (driven + AHEAD <= driven[-1]) & (np.abs(beside) < OFF_ROAD)
             lanes.goal[rows], lanes.known[rows] = np.where(known[:, None], goal, lanes.goal[rows]), known
-            before = np.maximum(np.searchsorted(driven, driven - EARLIER, "right") - 1, 0)
+            before = np.maximum(np.searchsorted(driven, driven - EARLIER_FRAME, "right") - 1, 0)
             lanes.before[rows] = rows.start + before
             back = axle[before] - axle
             lanes.moved[rows] = np.stack([(back * across(heading)).sum(1), (back * ahead(heading)).sum(1),
@@ -112,7 +112,7 @@ class Lanes:
 
     def beside_cameras(self, row: int) -> np.ndarray:
         """The steering back from where each camera stands, as if it were the centre one: float32 (3,)."""
-        one, sides = self.take(np.array([row])), np.array(list(SIDES.values()))
+        one, sides = self.take(np.array([row])), np.array(list(CAMERA_OFFSETS.values()))
         return one.steering(one.offset + sides, one.yaw)
 
     def drawn(self, rng: np.random.Generator, mirrored: np.ndarray) -> "Poses":
@@ -123,8 +123,8 @@ class Lanes:
         n = len(self.yaw)
         right = np.clip(rng.uniform(-RIGHT, RIGHT, n), self.offset - REACH, self.offset + REACH)
         yaw = np.clip(rng.normal(0, YAW, n), -FURTHEST, FURTHEST)
-        eye = right - self.offset + ARM * (np.sin(yaw) - np.sin(self.yaw))
-        distance = np.abs(eye[:, None] - list(SIDES.values()))
+        eye = right - self.offset + AXLE_TO_CAMERA * (np.sin(yaw) - np.sin(self.yaw))
+        distance = np.abs(eye[:, None] - list(CAMERA_OFFSETS.values()))
         near = distance <= np.maximum(NEARBY, distance.min(1, keepdims=True))
         poses = Poses.of(self, right, yaw, np.argmax(near * rng.uniform(1, 2, (n, 3)), axis=1), mirrored)
         poses.colours = np.where((rng.random(n) < TINTED)[:, None, None], other_colours(rng, n), poses.colours)
@@ -153,9 +153,9 @@ class Poses:
     def of(lanes: Lanes, right, yaw, camera: np.ndarray, mirrored: np.ndarray) -> "Poses":
         turn = yaw - lanes.yaw
         # Of the camera, from the recorded rear axle, along the recorded car.
-        eye = np.stack([(right - lanes.offset) * np.cos(lanes.yaw) + ARM * np.sin(turn),
-                        (right - lanes.offset) * np.sin(lanes.yaw) + ARM * np.cos(turn)], axis=1)
-        side = np.array(list(SIDES.values()))[camera]
+        eye = np.stack([(right - lanes.offset) * np.cos(lanes.yaw) + AXLE_TO_CAMERA * np.sin(turn),
+                        (right - lanes.offset) * np.sin(lanes.yaw) + AXLE_TO_CAMERA * np.cos(turn)], axis=1)
+        side = np.array(list(CAMERA_OFFSETS.values()))[camera]
         warps = [warps_between(eye, turn, moved, side, mirrored) for moved in (np.zeros_like(lanes.moved), lanes.moved)]
         steering = lanes.steering(right, yaw)
         colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
@@ -210,10 +210,10 @@ def warps_between(eye, turn, stood, side, mirrored) -> np.ndarray:
     forward, heading of the recorded rear axle; side: (n,), metres from there to the right, the recording camera.
     """
     s, c = np.sin(stood[:, 2]), np.cos(stood[:, 2])
-    away = eye - stood[:, :2] - np.stack([ARM * s + side * c, ARM * c - side * s], axis=1)
+    away = eye - stood[:, :2] - np.stack([AXLE_TO_CAMERA * s + side * c, AXLE_TO_CAMERA * c - side * s], axis=1)
     moved = np.tile(np.eye(3), (len(turn), 2, 1, 1))
-    moved[:, 0, 0, 1] = -(away[:, 0] * c - away[:, 1] * s) / HEIGHT
-    moved[:, 0, 2, 1] = -(away[:, 0] * s + away[:, 1] * c) / HEIGHT
+    moved[:, 0, 0, 1] = -(away[:, 0] * c - away[:, 1] * s) / CAMERA_HEIGHT
+    moved[:, 0, 2, 1] = -(away[:, 0] * s + away[:, 1] * c) / CAMERA_HEIGHT
     s, c, o = np.sin(turn - stood[:, 2]), np.cos(turn - stood[:, 2]), np.zeros(len(turn))
     turned = np.stack([c, o, -s, o, o + 1, o, s, o, c], axis=1).reshape(-1, 1, 3, 3)
     return _INTO[mirrored.astype(int)][:, None] @ turned @ moved @ _FROM
@@ -223,7 +223,7 @@ def _sky(mirrored: bool) -> np.ndarray:
     """uint8 (HORIZON, 320): 255 where a view does not show ground near enough to move with the camera."""
     columns, rows = np.meshgrid(np.arange(SEEN[1]), np.arange(HORIZON))
     directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(_INTO[int(mirrored)]).T
-    return np.where(directions[..., 1] > FAR * directions[..., 2], 0, 255).astype(np.uint8)
+    return np.where(directions[..., 1] > FAR_SLOPE * directions[..., 2], 0, 255).astype(np.uint8)
 
 
 _SKY = _sky(False), _sky(True)

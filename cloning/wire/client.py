@@ -82,7 +82,7 @@ def telemetry(steering: float, throttle: float, speed: float, jpeg: bytes) -> st
 MANUAL = '42["telemetry",null]'  # a person is steering
 
 
-class Wire:
+class Connection:
     """One connection. Packets are Engine.IO's, as text."""
 
     def __init__(self, host: str, port: int, patient: bool):

@@ -4,30 +4,33 @@ import sys
 import time
 
 from cloning.errors import SimulatorError
-from cloning.wire.client import RETRY, Answer, Gone, Wire, read
+from cloning.wire.client import RETRY, Answer, Connection, Gone, read
 
 OPENS = 2  # telemetry is sent twice at the start, since the real client's "open" fires twice
 GREETING = 1.0  # s for a server to give its first command
 
 
-class Session:
+class ClientSession:
     """Sends telemetry and takes the answers, connecting again when the server goes away."""
 
     def __init__(self, host: str, port: int, wait: float, patient: bool = False):
-        """wait: seconds of patience with a server that is not there or does not answer usably; patient: see Wire."""
+        """wait: seconds of patience with a server that is not there or does not answer usably.
+
+        patient: see Connection.
+        """
         self.address, self.wait, self.patient = (host, port), wait, patient
         self.round_trips: list[float] = []  # s
         self.dropped = self.reconnections = 0
-        self.wire: Wire | None = None
+        self.wire: Connection | None = None
         self.tokens = 1  # frames under way
 
-    def connect(self) -> Wire:
+    def connect(self) -> Connection:
         """Try until the server is there and has opened a session. Raises SimulatorError when patience is
         at its end."""
         until, said = time.monotonic() + self.wait, False
         while True:
             try:
-                return Wire(*self.address, patient=self.patient)
+                return Connection(*self.address, patient=self.patient)
             except Gone as error:
                 if time.monotonic() > until:
                     raise SimulatorError(f"{error}; is `python drive.py model.pt` running?") from None

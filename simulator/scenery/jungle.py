@@ -8,7 +8,7 @@ from cloning.road.track import Track
 from simulator.scenery import looks, textures
 from simulator.scenery.looks import Look
 from simulator.scenery.parts import Scenery, body, bonnet, dome
-from simulator.scenery.shapes import Light, Mesh, around, beside, box, grid, lit, plants, ribbon, stretch, together
+from simulator.scenery.shapes import Light, Mesh, around, box, grid, lit, plants, ribbon, roadside, stretch, together
 
 LINE, ROAD = 4.1, 4.45  # m from the centre line: the white edge line, the asphalt's end
 DASH, GAP = 6.0, 6.0  # m
@@ -136,7 +136,7 @@ def road(land: Land, random, look: Look) -> list[Mesh]:
     for start, end in ((0.0, BRIDGE[0]), (BRIDGE[1], track.length)):
         for side in (1, -1):
             shape = (track, stretch(start, end, 2.5), side, (ROAD, 6.2, 9.8), (-0.01, -0.08, -0.75))
-            meshes.append(lit(beside(*shape, palette["grass"], soil, 9.0), light, faced_up=True))
+            meshes.append(lit(roadside(*shape, palette["grass"], soil, 9.0), light, faced_up=True))
     out = ROAD + 0.25
     for side in (1, -1):
         for offsets, heights in (
@@ -145,7 +145,7 @@ def road(land: Land, random, look: Look) -> list[Mesh]:
             ((0, out), (-1.3, -1.3)),
         ):
             shape = (track, stretch(*BRIDGE), side, offsets, heights)
-            meshes.append(beside(*shape, palette["deck"], plain, 4.0, (0, 1)))
+            meshes.append(roadside(*shape, palette["deck"], plain, 4.0, (0, 1)))
     return [shadowed(mesh, land, light, 0.68) for mesh in meshes]
 
 
@@ -167,7 +167,7 @@ def furniture(track: Track, light: Light, palette: dict) -> list[Mesh]:
                 )
             )
         for s in np.arange(start, end, 4.0):
-            place = track.at(s, side * 5.35)
+            place = track.at(s, -side * 5.35)
             made.append(
                 box(
                     (place.x, place.y, place.z - 0.2),
@@ -178,13 +178,13 @@ def furniture(track: Track, light: Light, palette: dict) -> list[Mesh]:
                 )
             )
     bends = [
-        (int(-np.sign(track.curvature[i])), i * track.step)
+        (int(np.sign(track.curvature[i])), i * track.step)
         for i in range(0, len(track.points), 9)
         if abs(track.curvature[i]) > 1 / 18
     ]
     posts = bends + [(side, s) for side, start, end in MARKED for s in np.arange(start, end, 7.0)]
     for side, s in posts:
-        place = track.at(s, side * 5.2)
+        place = track.at(s, -side * 5.2)
         made.append(
             box((place.x, place.y, place.z - 0.5), (0.09, 0.09, 3.1), place.heading, palette["post"], white)
         )
@@ -193,7 +193,7 @@ def furniture(track: Track, light: Light, palette: dict) -> list[Mesh]:
         )
     for s in np.arange(BRIDGE[0] + 6, BRIDGE[1], 18.0):
         for side in (1, -1):
-            place = track.at(s, side * 4.6)
+            place = track.at(s, -side * 4.6)
             made.append(
                 box((place.x, place.y, place.z - 26), (0.7, 0.7, 25.0), place.heading, palette["deck"], white)
             )
@@ -228,7 +228,7 @@ def palms(land: Land, random, light: Light, palette: dict) -> list[Mesh]:
 
 def scenery(look: int) -> Scenery:
     random = np.random.default_rng(look)
-    chosen = looks.look(look, LIGHT, PALETTE)
+    chosen = looks.make_look(look, LIGHT, PALETTE)
     light, palette = chosen.light, chosen.palette
     land = Land(Track("jungle"), random)
     meshes = [

@@ -11,7 +11,7 @@ from simulator.scenery import looks, textures
 from simulator.scenery import planting as lakeside
 from simulator.scenery.looks import Look
 from simulator.scenery.parts import Haze, Scenery, body, bonnet, dome
-from simulator.scenery.shapes import Light, Mesh, around, beside, grid, lit, ribbon, stretch
+from simulator.scenery.shapes import Light, Mesh, around, grid, lit, ribbon, roadside, stretch
 
 ASPHALT, EDGE = 4.95, 7.0  # m from the centre line: where the asphalt ends, and the concrete beside it
 BRIDGE = (674, 783)
@@ -127,15 +127,15 @@ class Land:
         self.tree = cKDTree(track.points[:, :2])
         self.rolling = textures.clouds(random, 256, 24, 5)  # one metre of height a unit, 4 m a pixel
 
-    def beside(self, places: np.ndarray):
+    def nearest_road(self, places: np.ndarray):
         """Of places (n, 2): distance to the centre line, s as the land's tables have it, and side (+1 left)."""
         away, nearest = self.tree.query(places)
-        across = np.einsum("ij,ij->i", places - self.track.points[nearest, :2], self.track.normal[nearest])
-        return away, (nearest * self.track.step + self.moved) % self.track.length, np.where(across > 0, 1, -1)
+        right = np.einsum("ij,ij->i", places - self.track.points[nearest, :2], self.track.rightward[nearest])
+        return away, (nearest * self.track.step + self.moved) % self.track.length, np.where(right < 0, 1, -1)
 
     def height(self, places: np.ndarray) -> np.ndarray:
         """Metres above the road's level, which is the lake's zero; the water stands at -1.2."""
-        away, s, side = self.beside(places)
+        away, s, side = self.nearest_road(places)
         length = self.track.length
         near = np.where(side > 0, around_lap(LEFT, s, length), around_lap(RIGHT, s, length))
         near = np.where(near > 0, self.relief * near, near)
@@ -163,7 +163,7 @@ def ground(land: Land, random, light: Light, palette: dict, soil) -> list[Mesh]:
     for cell, nearest, farthest, lower in ((CELL, 0, 66, 0.0), (2.5 * CELL, 48, 400, 0.4)):
         xs, ys = (np.arange(a, b, cell) for a, b in zip(low, high, strict=True))
         places = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
-        away, s, side = land.beside(places)
+        away, s, side = land.nearest_road(places)
         points = np.c_[places, land.height(places) - lower]
         sheet = Mesh(points, np.ones_like(points), places / 14.0, grid(len(ys), len(xs)), soil)
         facing = lit(sheet, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), faced_up=True).colours[:, :1]
@@ -217,12 +217,12 @@ def road(track: Track, random, look: Look, soil, shadows) -> list[Mesh]:
             shape = (track, stretch(begin, start, 3.0), side, (ASPHALT, 5.9, EDGE, EDGE + 0.2))
             paint = (palette["slab"], slab, 3.0, (0, 0.5, 0.9, 1))
             # lit as if it rose steeply, which is how the real ones look, white or blue, though their edges lie low
-            bright = lit(beside(*shape, (0, 0.9, 1.9, 2.0), *paint), hard, faced_up=True)
-            meshes.append(replace(bright, points=beside(*shape, (0.01, 0.05, 0.08, -0.5), *paint).points))
+            bright = lit(roadside(*shape, (0, 0.9, 1.9, 2.0), *paint), hard, faced_up=True)
+            meshes.append(replace(bright, points=roadside(*shape, (0.01, 0.05, 0.08, -0.5), *paint).points))
             begin = end
         for start, end in verges:
             shape = (track, stretch(start, end, 2.0), side, (3.35, 3.8, 6.0, 12.0), (0.012, 0.016, 0.02, 0.1))
-            meshes.append(lit(beside(*shape, palette["earth"], soil, 9.0), light, faced_up=True))
+            meshes.append(lit(roadside(*shape, palette["earth"], soil, 9.0), light, faced_up=True))
     for side, start, end in KERBS:
         kerb = (
             track,
@@ -235,7 +235,7 @@ def road(track: Track, random, look: Look, soil, shadows) -> list[Mesh]:
             look.stripes,
             (0, 1),
         )
-        meshes.append(beside(*kerb))
+        meshes.append(roadside(*kerb))
     deck = stretch(*BRIDGE)
     meshes.append(ribbon(track, deck, across, 0.02, palette["cobbles"], textures.cobbles(random), 4.5))
     for side in (1, -1):
@@ -244,7 +244,7 @@ def road(track: Track, random, look: Look, soil, shadows) -> list[Mesh]:
             ((4.9, 5.5), (0.75, 0.75)),
             ((5.5, 5.5), (0.75, -2)),
         ):
-            meshes.append(beside(track, deck, side, offsets, heights, (0.02, 0.02, 0.02), black, 4.0, (0, 1)))
+            meshes.append(roadside(track, deck, side, offsets, heights, (0.02, 0.02, 0.02), black, 4.0, (0, 1)))
     return meshes
 
 
@@ -288,7 +288,7 @@ def cast(random, length: float, count: int) -> list[tuple]:
 
 def scenery(look: int) -> Scenery:
     random = np.random.default_rng(look)
-    track, chosen = Track("lake"), looks.look(look, LIGHT, PALETTE)
+    track, chosen = Track("lake"), looks.make_look(look, LIGHT, PALETTE)
     light, palette = chosen.light, chosen.palette
     land = Land(track, random, chosen.relief, chosen.moved)
     side = np.linspace(-760, 760, 27)

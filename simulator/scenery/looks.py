@@ -32,7 +32,7 @@ class Look:
     tone: np.ndarray | None = None
 
 
-def look(number: int, light: Light, palette: dict) -> Look:
+def make_look(number: int, light: Light, palette: dict) -> Look:
     """A track's look of this number from its real light and colours; number 0 changes nothing."""
     if not number:
         return Look(light, palette)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cloning.road.camera import height_seen
+from cloning.road.camera import height_at_rows
 from simulator.scenery.shapes import Light, Mesh, box, grid, lit, together
 
 
@@ -52,7 +52,7 @@ def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
         [-0.70, -0.67, -0.60, -0.53, -0.36, -0.22, 0.11, 0.32, 0.49, 0.605, 0.63],
         [175, 159, 154, 147, 142.7, 137.7, 137, 141.7, 150, 158, 172],
     )
-    edge = height_seen(rows, aside, front)
+    edge = height_at_rows(rows, aside, front)
     bands = np.array([0.0, 0.015, 0.03, 0.12, 0.2, 0.24, 0.28, 0.6, 1.0])  # of the way back from the edge
     shade = np.array([0.55, 0.85, 1.0, 0.95, 0.80, 0.45, 0.95, 1.15, 1.2])
     y = front + (1.40 - front) * bands[:, None]

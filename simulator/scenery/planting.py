@@ -30,7 +30,7 @@ def pines(land, random, palette: dict, many: float) -> list[Mesh]:
     track, length = land.track, land.track.length
     low, high = track.points[:, :2].min(axis=0) - 210, track.points[:, :2].max(axis=0) + 210
     places = random.uniform(low, high, (round(5200 * many), 2))
-    away, s, side = land.beside(places)
+    away, s, side = land.nearest_road(places)
     z = land.height(places)
     forest = (side < 0) & ((s > 120) & (s < 545))
     chance = np.where(forest, 0.9, 0.22) * np.clip((away - 11) / 20, 0, 1) * np.clip((z + 0.6) * 2, 0, 1)
@@ -61,9 +61,9 @@ def pines(land, random, palette: dict, many: float) -> list[Mesh]:
         along = (along // 22) * 22 + random.normal(0, 4, count)  # in clumps
         left = random.choice((-1, 1), count) * random.uniform(near, far, count)
         index = np.floor(along / track.step).astype(int) % len(track.points)
-        spot = track.points[index, :2] + track.normal[index] * left[:, None]
+        spot = track.points[index, :2] - track.rightward[index] * left[:, None]
         z = land.height(spot)
-        clear = (land.beside(spot)[0] > near - 0.5) & (z > land.WATER)
+        clear = (land.nearest_road(spot)[0] > near - 0.5) & (z > land.WATER)
         spot, z = spot[clear], z[clear]
         size = random.uniform(0.5, 1.0, len(spot)) * tallest
         colours = np.clip(np.array(colour) * random.uniform(0.7, 1.15, (len(spot), 1)), 0, 1)
@@ -107,9 +107,9 @@ def rocks(land, random, light: Light, palette: dict) -> Mesh:
     track, texture = land.track, textures.rock(random)
     made = []
     for side, s, away, wide, tall in BOULDERS:
-        place = track.at(s - land.moved, side * away)
+        place = track.at(s - land.moved, -side * away)
         here = np.array([[place.x, place.y]])
-        if land.beside(here)[0] < wide + 12:  # moved onto the road
+        if land.nearest_road(here)[0] < wide + 12:  # moved onto the road
             continue
         z = float(land.height(here)[0])
         made.append(

@@ -75,7 +75,7 @@ def ribbon(track: Track, s, offsets, heights, colour, texture, metres: float, ac
     n, k = len(s), len(offsets)
     index = np.round(s / track.step).astype(int) % len(track.points)
     points = np.empty((n, k, 3))
-    points[:, :, :2] = track.points[index, None, :2] + track.normal[index, None] * offsets[None, :, None]
+    points[:, :, :2] = track.points[index, None, :2] - track.rightward[index, None] * offsets[None, :, None]
     points[:, :, 2] = track.points[index, None, 2] + np.broadcast_to(heights, (n, k))
     across = -offsets / metres if across is None else np.asarray(across, float)
     uv = np.stack(np.broadcast_arrays(across[None, :], (s / metres)[:, None]), axis=-1)
@@ -83,7 +83,7 @@ def ribbon(track: Track, s, offsets, heights, colour, texture, metres: float, ac
     return Mesh(points.reshape(-1, 3), colours.reshape(-1, 3).copy(), uv.reshape(-1, 2), grid(n, k), texture)
 
 
-def beside(track: Track, s, side: int, offsets, heights, colour, texture, metres: float, across=None) -> Mesh:
+def roadside(track: Track, s, side: int, offsets, heights, colour, texture, metres: float, across=None) -> Mesh:
     """A ribbon beside the road, on its left (side 1) or mirrored to its right (-1); offsets from the road
     outwards."""
     offsets, heights = side * np.array(offsets, float), np.array(heights, float)
