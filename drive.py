@@ -1,7 +1,7 @@
 """Drive the Udacity simulator with a trained model.
 
-    python drive.py model.pt              # then start the simulator in autonomous mode
-    python drive.py model.pt run1         # also save each frame in run1/, for `python video.py run1`
+python drive.py model.pt              # then start the simulator in autonomous mode
+python drive.py model.pt run1         # also save each frame in run1/, for `python video.py run1`
 """
 
 import argparse
@@ -140,8 +140,9 @@ class Session:
             if self.server.saver:
                 self.folder = self.folder or self.server.saver.folder()
                 self.folder.save(jpeg)
-            self.trail.append(page.Row(time.time(), float(steering), speed, float(throttle),
-                                       (time.perf_counter() - arrived) * 1000))
+            self.trail.append(
+                page.Row(time.time(), float(steering), speed, float(throttle), (time.perf_counter() - arrived) * 1000)
+            )
         answer = {"steering_angle": self.steering, "throttle": throttle}
         return {key: value.replace(".", ",") for key, value in answer.items()} if self.comma else answer
 
@@ -218,8 +219,10 @@ class OncePerKind(logging.Filter):
 
 def status(session: Session, rate: float) -> str:
     row = session.trail[-1]
-    line = (f"{rate:5.1f} frames/s, round trip {session.round_trip * 1000:5.1f} ms, steering {row.steering:+.2f}, "
-            f"{row.speed:4.1f} mph, {session.served} frames")
+    line = (
+        f"{rate:5.1f} frames/s, round trip {session.round_trip * 1000:5.1f} ms, steering {row.steering:+.2f}, "
+        f"{row.speed:4.1f} mph, {session.served} frames"
+    )
     return f"{line}, {session.unusable} unusable" if session.unusable else line
 
 
@@ -253,11 +256,18 @@ def main() -> None:
     parser.add_argument("model", help="a model file that model.py wrote")
     parser.add_argument("folder", nargs="?", type=Path, help="where to save the frames; emptied first")
     parser.add_argument("--speed", type=float, default=9, help="set speed in mph, at most 30 (default %(default)s)")
-    parser.add_argument("--host", default="127.0.0.1",
-                        help="address to listen on (default %(default)s: this machine alone; 0.0.0.0: everyone)")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to listen on (default %(default)s: this machine alone; 0.0.0.0: everyone)",
+    )
     parser.add_argument("--port", type=int, default=4567, help="the simulator's is %(default)s")
-    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"],
-                        help="where the network runs (default %(default)s, which is fast enough)")
+    parser.add_argument(
+        "--device",
+        default="cpu",
+        choices=["cpu", "cuda"],
+        help="where the network runs (default %(default)s, which is fast enough)",
+    )
     args = parser.parse_args()
     if args.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch finds no GPU here; leave it out")
@@ -278,15 +288,21 @@ def main() -> None:
         try:
             listener = wire.listen(args.host, args.port)
         except (OSError, OverflowError) as error:
-            sys.exit(f"drive.py: can't listen on {args.host}:{args.port} ({getattr(error, 'strerror', error)}); "
-                     "is another server running? Stop it, or choose another --port")
+            sys.exit(
+                f"drive.py: can't listen on {args.host}:{args.port} ({getattr(error, 'strerror', error)}); "
+                "is another server running? Stop it, or choose another --port"
+            )
         if args.folder:
             server.saver = saver = frames.Saver(args.folder)  # empties the folder, so it comes last
     except (ModelError, frames.FolderError, OSError) as error:
         sys.exit(f"drive.py: {error}")
     port = listener.getsockname()[1]
-    print(f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
-          f"Watch at http://127.0.0.1:{port}/ . Ctrl-C ends.", file=sys.stderr, flush=True)
+    print(
+        f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
+        f"Watch at http://127.0.0.1:{port}/ . Ctrl-C ends.",
+        file=sys.stderr,
+        flush=True,
+    )
     try:
         run(server, listener)
     finally:

@@ -112,9 +112,15 @@ class Observations:
         return len(self.steering)
 
     def take(self, rows: np.ndarray, steering=None) -> "Observations":
-        return Observations(self.recordings, self.recording[rows], self.images[rows],
-                            self.steering[rows] if steering is None else steering, self.frame[rows], self.time[rows],
-                            self.lanes and self.lanes.take(rows))
+        return Observations(
+            self.recordings,
+            self.recording[rows],
+            self.images[rows],
+            self.steering[rows] if steering is None else steering,
+            self.frame[rows],
+            self.time[rows],
+            self.lanes and self.lanes.take(rows),
+        )
 
     def shuffled(self, rng: np.random.Generator) -> np.ndarray:
         """All of them once in a random order; with --robust as many, by lot, of bends more often: int (n,)."""
@@ -154,7 +160,7 @@ class Observations:
 
     def center(self, rows: np.ndarray) -> np.ndarray:
         """The centre images of these rows as the network sees them: uint8 (len(rows), 75, 320, 3), RGB."""
-        return np.stack([self.read_cropped(at, 0)[sum(CROP) - FRAME[0]:] for at in rows])
+        return np.stack([self.read_cropped(at, 0)[sum(CROP) - FRAME[0] :] for at in rows])
 
     def views(self, rows: np.ndarray, poses: list[Poses]) -> list[np.ndarray]:
         """What the network sees of these rows from each of the poses: uint8 (len(rows), 75, 320, 3), RGB, each."""
@@ -166,8 +172,9 @@ class Observations:
         return made
 
 
-def read_observations(folders: list[Path], throttle_threshold: float, strict: bool,
-                      rejected_file: Path, robust: bool = False) -> Observations:
+def read_observations(
+    folders: list[Path], throttle_threshold: float, strict: bool, rejected_file: Path, robust: bool = False
+) -> Observations:
     """Steps 2 to 4 of the report: read each csv, drop rows off throttle, rewrite the images' paths; print the counts.
 
     robust: drop the rows where it is not known how the lane goes on, instead of those off throttle.
@@ -204,12 +211,16 @@ def read_observations(folders: list[Path], throttle_threshold: float, strict: bo
     for name, read, unusable, off, kept in table:
         print(f"{name:{width}}  {read:9,}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
     joined = Lanes.joined(lanes) if robust else None
-    steering = (joined.steering(joined.offset, joined.yaw) if robust
-                else np.concatenate([r.steering for r in recordings]))
+    steering = (
+        joined.steering(joined.offset, joined.yaw) if robust else np.concatenate([r.steering for r in recordings])
+    )
     observations = Observations(
-        recordings, np.repeat(np.arange(len(recordings), dtype=np.int16), [len(r) for r in recordings]),
-        np.concatenate([r.images for r in recordings]), steering,
-        np.concatenate([r.digests[r.images[:, 0]] for r in recordings]), np.concatenate([r.time for r in recordings]),
+        recordings,
+        np.repeat(np.arange(len(recordings), dtype=np.int16), [len(r) for r in recordings]),
+        np.concatenate([r.images for r in recordings]),
+        steering,
+        np.concatenate([r.digests[r.images[:, 0]] for r in recordings]),
+        np.concatenate([r.time for r in recordings]),
         joined,
     )
     if robust:
@@ -331,21 +342,24 @@ class Generator:
     draw the same ones. Images are made by the pool's threads, `ahead` batches before they are needed.
     """
 
-    def __init__(self, observations: Observations, batch_size: int, side_correction: float, seed: int, pool,
-                 ahead: int):
+    def __init__(
+        self, observations: Observations, batch_size: int, side_correction: float, seed: int, pool, ahead: int
+    ):
         self.observations, self.batch_size, self.seed = observations, batch_size, seed
         self.corrections = np.array([0, side_correction, -side_correction], np.float32)  # centre, left, right
         self.pool, self.ahead = pool, ahead
         self.shuffled = functools.lru_cache(2)(
-            lambda turn: observations.shuffled(np.random.default_rng([seed, 2, turn])))
+            lambda turn: observations.shuffled(np.random.default_rng([seed, 2, turn]))
+        )
 
     def draw(self, number: int) -> dict[str, np.ndarray]:
         """All that chance decides in a batch; one entry an observation, but `keep` one an image."""
         rng, n = np.random.default_rng([self.seed, 3, number]), self.batch_size
         at = np.arange(number * n, (number + 1) * n)
         turns = at // len(self.observations)
-        chosen = np.concatenate([self.shuffled(int(turn))[at[turns == turn] % len(self.observations)]
-                                 for turn in np.unique(turns)])
+        chosen = np.concatenate(
+            [self.shuffled(int(turn))[at[turns == turn] % len(self.observations)] for turn in np.unique(turns)]
+        )
         camera = rng.integers(3, size=n)
         kinds = np.stack([np.ones(n, bool), rng.random(n) < FLIP, np.ones(n, bool), rng.random(n) < SHADOW], axis=1)
         total = int(kinds.sum())
@@ -355,9 +369,14 @@ class Generator:
         angles = np.stack([angle, -angle, angle, angle], axis=1)
         bits = np.unpackbits(np.frombuffer(rng.bytes(total * UNITS // 8), np.uint8))
         drawn = {
-            "observation": chosen, "camera": camera, "places": places, "angles": angles,
-            "brightness": rng.uniform(*BRIGHTNESS, n), "darkness": rng.uniform(*DARKNESS, n),
-            "line": rng.uniform(0, FRAME[1], (n, 2)), "left": rng.random(n) < 0.5,
+            "observation": chosen,
+            "camera": camera,
+            "places": places,
+            "angles": angles,
+            "brightness": rng.uniform(*BRIGHTNESS, n),
+            "darkness": rng.uniform(*DARKNESS, n),
+            "line": rng.uniform(0, FRAME[1], (n, 2)),
+            "left": rng.random(n) < 0.5,
             "keep": bits.view(bool).reshape(total, UNITS),
         }
         if self.observations.lanes:  # every kind from a pose of its own, half of them in the mirror world
@@ -370,8 +389,12 @@ class Generator:
         """What each kind is made of, for these of the batch's observations: uint8 (len(part), 75, 320, 3) each."""
         if self.observations.lanes:
             return self.observations.views(drawn["observation"][part], [poses.take(part) for poses in drawn["poses"]])
-        images = np.stack([self.observations.read_cropped(at, camera) for at, camera in
-                           zip(drawn["observation"][part], drawn["camera"][part], strict=True)])
+        images = np.stack(
+            [
+                self.observations.read_cropped(at, camera)
+                for at, camera in zip(drawn["observation"][part], drawn["camera"][part], strict=True)
+            ]
+        )
         return of_each_kind(images)
 
     def augment(self, drawn: dict, part: np.ndarray, images: list[np.ndarray], first_row: int):
@@ -384,13 +407,17 @@ class Generator:
         some, shadowed = (np.flatnonzero(drawn["places"][part, kind] >= 0) for kind in (1, 3))
         shade_at = part[shadowed]
         shadow = drawn["line"][shade_at], drawn["left"][shade_at], drawn["darkness"][shade_at]
-        return ((part, plain), (part[some], flipped[some]), (part, brighten(bright, drawn["brightness"][part])),
-                (shade_at, shade(dark[shadowed], *shadow, first_row)))
+        return (
+            (part, plain),
+            (part[some], flipped[some]),
+            (part, brighten(bright, drawn["brightness"][part])),
+            (shade_at, shade(dark[shadowed], *shadow, first_row)),
+        )
 
     def begin(self, number: int):
         """Start making this rank's share of a batch; the returned call waits for it."""
         drawn = self.draw(number)
-        mine = np.arange(self.batch_size)[rank()::world()]
+        mine = np.arange(self.batch_size)[rank() :: world()]
         places = drawn["places"][mine]
         order = np.sort(places[places >= 0])  # this rank's images among all, in the batch's order
         images = np.empty((len(order), FRAME[0] - sum(CROP), *FRAME[1:]), np.uint8)
@@ -401,7 +428,7 @@ class Generator:
                 at = np.searchsorted(order, drawn["places"][which, kind])
                 images[at], angles[at] = made, drawn["angles"][which, kind]
 
-        parts = [self.pool.submit(make, mine[start:start + PIECE]) for start in range(0, len(mine), PIECE)]
+        parts = [self.pool.submit(make, mine[start : start + PIECE]) for start in range(0, len(mine), PIECE)]
 
         def wait() -> Batch:
             for part in parts:
@@ -447,8 +474,14 @@ class TrainingRun:
         if dist.is_initialized():
             self.errors = DistributedDataParallel(self.errors)
         self.optimizer = torch.optim.Adam(self.network.parameters(), arguments.learning_rate, fused=True)
-        self.generator = Generator(training, arguments.batch_size, arguments.side_correction, arguments.seed,
-                                   self.pool, ahead=1 if self.device.type == "cpu" else 4)
+        self.generator = Generator(
+            training,
+            arguments.batch_size,
+            arguments.side_correction,
+            arguments.seed,
+            self.pool,
+            ahead=1 if self.device.type == "cpu" else 4,
+        )
         self.number = 0  # of the next batch, over all epochs
         self.images, self.loss, self.seconds = 0, 0.0, 0.0  # so far in this epoch
         self.history: list[dict] = []  # a finished epoch each
@@ -469,17 +502,28 @@ class TrainingRun:
             more = {"arguments": vars(self.arguments), "history": self.history}
             for path in models:
                 save_model(path, self.network, **more)
-            save_model(self.resume_file, self.network, **more, training={
-                "optimizer": self.optimizer.state_dict(), "number": self.number, "images": self.images,
-                "loss": self.loss, "seconds": self.seconds, "fingerprint": self.fingerprint})
+            save_model(
+                self.resume_file,
+                self.network,
+                **more,
+                training={
+                    "optimizer": self.optimizer.state_dict(),
+                    "number": self.number,
+                    "images": self.images,
+                    "loss": self.loss,
+                    "seconds": self.seconds,
+                    "fingerprint": self.fingerprint,
+                },
+            )
         self.saved_at = time.monotonic()
 
     def resume(self, saved: dict) -> None:
         """Go on from a checkpoint. Raises ModelError if the recordings are not those that it was trained on."""
         state = saved["training"]
         if state["fingerprint"] != self.fingerprint:
-            raise ModelError(f"{self.resume_file}: its recordings were others; restore them, or begin anew without "
-                             "--resume")
+            raise ModelError(
+                f"{self.resume_file}: its recordings were others; restore them, or begin anew without --resume"
+            )
         self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.number, self.images, self.loss, self.seconds = (state[k] for k in ("number", "images", "loss", "seconds"))
@@ -494,24 +538,38 @@ class TrainingRun:
             loss = self.validate()
             self.seconds += time.monotonic() - started
             is_best = loss < min((row["val_loss"] for row in self.history), default=float("inf"))
-            row = {"epoch": len(self.history) + 1, "images": self.images, "seconds": round(self.seconds, 3),
-                   "loss": self.loss / self.images, "val_loss": loss}
+            row = {
+                "epoch": len(self.history) + 1,
+                "images": self.images,
+                "seconds": round(self.seconds, 3),
+                "loss": self.loss / self.images,
+                "val_loss": loss,
+            }
             self.history.append(row)
             self.images, self.loss, self.seconds = 0, 0.0, 0.0
             if rank() == 0:
                 self.write_log()  # before the checkpoint, from which a killed run would not write this epoch's again
             self.save(self.last_file, *[self.best_file] * is_best)
             if rank() == 0:
-                print("{images}/{0} [{1}] - {seconds:.0f}s - loss: {loss:.4f} - val_loss: {val_loss:.4f}".format(
-                    self.arguments.samples_per_epoch, "=" * 30, **row), flush=True)
+                print(
+                    "{images}/{0} [{1}] - {seconds:.0f}s - loss: {loss:.4f} - val_loss: {val_loss:.4f}".format(
+                        self.arguments.samples_per_epoch, "=" * 30, **row
+                    ),
+                    flush=True,
+                )
 
     def epoch(self, batches) -> None:
         """Batches until `samples_per_epoch` images are reached (as Keras counted), from where the epoch stands."""
         arguments, started = self.arguments, time.monotonic() - self.seconds
         if rank() == 0:
             print(f"Epoch {len(self.history) + 1}/{arguments.epochs}", flush=True)
-        with tqdm(total=arguments.samples_per_epoch, initial=self.images, unit="image", leave=False,
-                  disable=None if rank() == 0 else True) as bar:
+        with tqdm(
+            total=arguments.samples_per_epoch,
+            initial=self.images,
+            unit="image",
+            leave=False,
+            disable=None if rank() == 0 else True,
+        ) as bar:
             while self.images < arguments.samples_per_epoch:
                 self.draw_pictures()
                 batch = next(batches)
@@ -549,13 +607,14 @@ class TrainingRun:
         With --robust, as many views from other poses count as much.
         """
         count = min(len(self.validation), self.arguments.samples_per_epoch // 5)
-        chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[:max(count, 1)]
-        mine = chosen[rank()::world()]
+        chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[: max(count, 1)]
+        mine = chosen[rank() :: world()]
         errors = torch.tensor(self.squared_errors(self.validation.center, mine, self.validation.steering))
         if self.validation.lanes:
             poses = self.validation_poses
-            errors += self.squared_errors(lambda rows: self.validation.views(rows, [poses.take(rows)])[0], mine,
-                                          poses.steering)
+            errors += self.squared_errors(
+                lambda rows: self.validation.views(rows, [poses.take(rows)])[0], mine, poses.steering
+            )
             errors /= 2
         if dist.is_initialized():
             errors = errors.to(self.device)
@@ -593,8 +652,14 @@ class TrainingRun:
         truth = self.validation.steering
         guesses = {"steer 0": np.zeros_like(truth), "steer mean": np.full_like(truth, self.training.steering.mean())}
         for path in (self.last_file, self.best_file):
-            guesses[path.name] = predict(load_model(path, self.device), self.validation.center, np.arange(len(truth)),
-                                         self.device, self.precision, self.pool)
+            guesses[path.name] = predict(
+                load_model(path, self.device),
+                self.validation.center,
+                np.arange(len(truth)),
+                self.device,
+                self.precision,
+                self.pool,
+            )
         lines = ["\n" + f"{'validation: mean squared error':32} {'rows':>6}" + "".join(f"{n:>15}" for n in guesses)]
         size = np.abs(truth)
         for low, high in [(0, STRAIGHT), (STRAIGHT, TURN[0]), TURN, (TURN[1], 1.001), (0, 1.001)]:
@@ -613,12 +678,14 @@ class TrainingRun:
 
 def predict(network, frames: Callable, rows: np.ndarray, device, precision, pool) -> np.ndarray:
     """Steering for these rows, float32 (len(rows),); frames gives what the network sees of some of them."""
+
     def part(chosen):
         with torch.inference_mode(), in_precision(precision, device):
             return network(torch.from_numpy(frames(chosen)).to(device)).cpu().numpy()
 
-    return np.concatenate([np.empty(0, np.float32),
-                           *pool.map(part, [rows[i:i + PIECE] for i in range(0, len(rows), PIECE)])])
+    return np.concatenate(
+        [np.empty(0, np.float32), *pool.map(part, [rows[i : i + PIECE] for i in range(0, len(rows), PIECE)])]
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -632,14 +699,17 @@ def prepare(arguments: argparse.Namespace, given: dict) -> tuple[Observations, O
     (output.parent / "diagnostic_images").mkdir(parents=True, exist_ok=True)
     folders = find_folders(arguments.recordings)
     arguments.recordings = [str(folder.resolve()) for folder in folders]
-    observations = read_observations(folders, arguments.throttle_threshold, arguments.strict,
-                                     output.with_name("rejected_rows.csv"), arguments.robust)
+    observations = read_observations(
+        folders, arguments.throttle_threshold, arguments.strict, output.with_name("rejected_rows.csv"), arguments.robust
+    )
     train, validation = split(observations, arguments.seed)
     training = observations.take(train)
     if not arguments.robust:
         training = resample(training, arguments.seed)
-    print(f"\ntraining: {len(train):,} rows, {len(training):,} observations after resampling; "
-          f"validation: {len(validation):,} rows\n")
+    print(
+        f"\ntraining: {len(train):,} rows, {len(training):,} observations after resampling; "
+        f"validation: {len(validation):,} rows\n"
+    )
     return training, observations.take(validation), saved
 
 
@@ -661,14 +731,18 @@ def run(arguments: argparse.Namespace, given: dict) -> None:
         one.resume(saved)
     if rank() == 0:
         print(layer_table(one.network))
-        print(f"\n{one.device}, {str(one.precision).removeprefix('torch.')}, {threads()} threads"
-              + (f", {world()} processes" if world() > 1 else ""))
+        print(
+            f"\n{one.device}, {str(one.precision).removeprefix('torch.')}, {threads()} threads"
+            + (f", {world()} processes" if world() > 1 else "")
+        )
         if saved:
             print(f"resumed in epoch {len(one.history) + 1} at image {one.images:,}")
         else:
             set_aside(one.last_file, one.best_file, one.resume_file)
-        write(one.folder / "training_arguments.json", json.dumps(
-            {**vars(arguments), "precision": str(one.precision), "versions": versions()}, indent=2).encode())
+        write(
+            one.folder / "training_arguments.json",
+            json.dumps({**vars(arguments), "precision": str(one.precision), "versions": versions()}, indent=2).encode(),
+        )
     if not saved:
         one.save()
 
@@ -703,8 +777,13 @@ def main(argv: list[str] | None = None) -> int:
     except (RecordingError, ModelError) as error:
         status, message = 2, f"error: {error}"
     except OSError as error:
-        status, message = 1, (f"error: {error.filename}: {error.strerror}. What was written before stays; mend this "
-                              "and go on with --resume")
+        status, message = (
+            1,
+            (
+                f"error: {error.filename}: {error.strerror}. What was written before stays; mend this "
+                "and go on with --resume"
+            ),
+        )
     except Interrupted as error:
         status, message = 128 + error.args[0], "stopped and saved; go on with --resume"
     except KeyboardInterrupt:

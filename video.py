@@ -1,8 +1,8 @@
 """Make a film of the frames that drive.py saved.
 
-    python video.py run1                        # run1.mp4, at the rate at which the frames were taken
-    python video.py run1 --fps 60
-    python video.py run1 --overlay model.pt     # with the steering and what the network looks at
+python video.py run1                        # run1.mp4, at the rate at which the frames were taken
+python video.py run1 --fps 60
+python video.py run1 --overlay model.pt     # with the steering and what the network looks at
 """
 
 import argparse
@@ -42,8 +42,10 @@ def find(folder: Path) -> list[tuple[datetime, Path]]:
         else:
             foreign.append(path.name)
     if not found:
-        raise FilmError(f"{folder}: no frames, which have names like 2018_07_16_17_11_43_382.jpg; "
-                        f"`python drive.py model.pt {folder}` saves some")
+        raise FilmError(
+            f"{folder}: no frames, which have names like 2018_07_16_17_11_43_382.jpg; "
+            f"`python drive.py model.pt {folder}` saves some"
+        )
     if foreign:
         print(f"left out, no frames: {listed(sorted(foreign))}", file=sys.stderr)
     return sorted(found)
@@ -113,6 +115,7 @@ def overlay_of(model_file: str):
     from cloning.errors import ModelError
     from cloning.pilot import attention  # which loads torch, and that takes longer than a short film
     from cloning.pilot.network import load_model
+
     try:
         network = load_model(model_file)
     except ModelError as error:
@@ -120,9 +123,12 @@ def overlay_of(model_file: str):
 
     def overlay(frame: np.ndarray) -> np.ndarray:
         if frame.shape != FRAME:
-            raise FilmError(f"the frames are {frame.shape[1]}x{frame.shape[0]} where a model sees "
-                            f"{FRAME[1]}x{FRAME[0]}; leave out --overlay")
+            raise FilmError(
+                f"the frames are {frame.shape[1]}x{frame.shape[0]} where a model sees "
+                f"{FRAME[1]}x{FRAME[0]}; leave out --overlay"
+            )
         return attention.overlay(frame, *attention.visual_backprop(network, frame))
+
     return overlay
 
 

@@ -26,7 +26,7 @@ class FilmWriter:
     def add(self, frame: np.ndarray) -> None:
         """A frame, uint8 (rows, columns, 3), RGB, of the first one's size."""
         # yuv420p halves the colour's resolution, so both sides are even
-        frame = np.ascontiguousarray(frame[:frame.shape[0] // 2 * 2, :frame.shape[1] // 2 * 2])
+        frame = np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
         if self.stream is None:
             self.stream = self.container.add_stream("libx264", self.rate, options=self.options)
             self.stream.pix_fmt, self.stream.height, self.stream.width = "yuv420p", *frame.shape[:2]

@@ -42,9 +42,7 @@ def add_record(commands) -> argparse.ArgumentParser:
 
 
 def add_drive(commands) -> argparse.ArgumentParser:
-    parser = commands.add_parser(
-        "drive", help="the client of drive.py; exit status 1 if the car left the road"
-    )
+    parser = commands.add_parser("drive", help="the client of drive.py; exit status 1 if the car left the road")
     parser.set_defaults(run=drive)
     parser.add_argument("--laps", type=positive, default=1, help="default 1")
     add_server(parser)
@@ -67,12 +65,21 @@ def add_replay(commands) -> None:
     parser.set_defaults(run=replay)
     parser.add_argument("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
     parser.add_argument("--model", metavar="model.pt", help="drive by it in this process, not by drive.py's answers")
-    parser.add_argument("--limit", type=positive, nargs="+", default=[1.0, 2.5],
-                        help="m off-centre at which a human would take over (default 1 2.5: NVIDIA's, and where the "
-                        "car's side touches the edge line)")
-    parser.add_argument("--reference", choices=("lane", "human"), default="lane",
-                        help="what off-centre is counted from: the lane's centre as read from the frames (default), or "
-                        "the way that the human drove")
+    parser.add_argument(
+        "--limit",
+        type=positive,
+        nargs="+",
+        default=[1.0, 2.5],
+        help="m off-centre at which a human would take over (default 1 2.5: NVIDIA's, and where the "
+        "car's side touches the edge line)",
+    )
+    parser.add_argument(
+        "--reference",
+        choices=("lane", "human"),
+        default="lane",
+        help="what off-centre is counted from: the lane's centre as read from the frames (default), or "
+        "the way that the human drove",
+    )
     add_server(parser)
     add_wait(parser)
     parser.add_argument("--report", metavar="FILE", help="write the figures as JSON, a list with one entry a recording")

@@ -29,9 +29,7 @@ GRIP = 2500.0  # N a wheel: what a locked wheel brakes with
 # of the first and as near to the second as that allows, and as v/L tan(angle) at walking pace.
 CHARACTERISTIC_SPEED = 2.45 * TOP_SPEED  # m/s
 BRAKES_ABOVE = 5 * MPH  # below, a negative throttle reverses
-REST_HEIGHT = (
-    0.2175  # m: the hubs sit this much higher in Bullet, which fixes its spring's rest length, than in Unity
-)
+REST_HEIGHT = 0.2175  # m: the hubs sit this much higher in Bullet, which fixes its spring's rest length, than in Unity
 
 
 class Car:
@@ -104,9 +102,7 @@ class Car:
             self.vehicle.set_steering_value(-math.degrees(math.atan(angle)), front)
         rolling_forward = self.vehicle.get_current_speed_km_hour() / 3.6 > 0
         self.torque = (
-            min(TORQUE, self.torque + TORQUE_A_STEP)
-            if throttle > 0
-            else max(0.0, self.torque - TORQUE_A_STEP)
+            min(TORQUE, self.torque + TORQUE_A_STEP) if throttle > 0 else max(0.0, self.torque - TORQUE_A_STEP)
         )
         drive, brake = self.torque * max(0.0, min(1.0, throttle)), 0.0
         if throttle < 0:

@@ -109,9 +109,7 @@ class Client(ClientSession):
             answer = self.usable(packet) if packet else None
             if answer is None:
                 if time.monotonic() - usable > self.wait:
-                    raise SimulatorError(
-                        f"no usable answer in {self.wait:.0f} s ({self.dropped} unusable ones so far)"
-                    )
+                    raise SimulatorError(f"no usable answer in {self.wait:.0f} s ({self.dropped} unusable ones so far)")
                 continue
             usable = time.monotonic()
             if sent:
@@ -142,9 +140,7 @@ class Remote:
                     continue
                 if answer.steering is not None:
                     self.steering, self.throttle = answer.steering, answer.throttle
-                self.wire.send(
-                    MANUAL if by_hand else picture(run, self.cameras, self.steering, self.throttle)
-                )
+                self.wire.send(MANUAL if by_hand else picture(run, self.cameras, self.steering, self.throttle))
         except Gone as error:
             self.wire, self.state = None, str(error)
             self.steering = self.throttle = 0.0

@@ -65,9 +65,7 @@ class Expert:
         limit = self.limits[int((run.s + 0.1 * speed) / self.track.step) % len(self.limits)]
         if limit >= self.top:
             return self.steering, 1.0  # the car's own limiter holds the set speed
-        return self.steering, max(
-            -1.0, min(1.0, 0.6 * (limit - speed) + 0.3 * run.track.at(run.s).grade * 9.81 / 4)
-        )
+        return self.steering, max(-1.0, min(1.0, 0.6 * (limit - speed) + 0.3 * run.track.at(run.s).grade * 9.81 / 4))
 
 
 class Recovery(Expert):
@@ -92,9 +90,7 @@ class Recovery(Expert):
                 self.goal, self.recording = 0.0, True
         elif run.time > self.until:
             side = self.random.choice((-1, 1))
-            room = self.track.edges[
-                int(run.s / self.track.step) % len(self.track.edges), 0 if side < 0 else 1
-            ]
+            room = self.track.edges[int(run.s / self.track.step) % len(self.track.edges), 0 if side < 0 else 1]
             self.goal = side * self.random.uniform(*self.SHARE) * (room - self.MARGIN)
             self.until = run.time + 6.0
         pace = (self.BACK if self.recording else self.OUT) * 0.02

@@ -77,15 +77,18 @@ def record(
                 run.step(*expert.drive(run))
                 if clock.due(run.time) and (not recovery or expert.recording):
                     images = drawers.submit(_draw, track.name, look, run.car.node.get_transform())
-                    rows.append((run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle),
-                                 run.speed_mph))
+                    rows.append(
+                        (run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph)
+                    )
                     if len(rows) > 2 * DRAWERS:
                         write()
                     progress.show(max(0.0, run.travelled) / track.length, run.time)
             while rows:
                 write()
         except BrokenExecutor as error:
-            raise SimulatorError(f"{folder}: a process that draws was killed (out of memory?); the {recording.rows} "
-                                 "rows before are whole") from error
+            raise SimulatorError(
+                f"{folder}: a process that draws was killed (out of memory?); the {recording.rows} "
+                "rows before are whole"
+            ) from error
     progress.finish(laps, run.time)
     return run

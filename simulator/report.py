@@ -72,8 +72,7 @@ def text(report: dict) -> str:
         for d in report["departures"]
     ]
     lines.append(
-        f"distance from the centre line: mean {report['offset_mean_m']:.2f} m, "
-        f"largest {report['offset_max_m']:.2f} m"
+        f"distance from the centre line: mean {report['offset_mean_m']:.2f} m, largest {report['offset_max_m']:.2f} m"
     )
     lines.append(f"steering: mean absolute change {report['steering_roughness_per_s']:.2f} per second")
     if "frames" in report:
@@ -83,9 +82,7 @@ def text(report: dict) -> str:
             f"round trip {trip['median']:.1f} ms (95 %: {trip['p95']:.1f}, largest {trip['max']:.1f})"
         )
         if report["unusable_answers"] or report["reconnections"]:
-            lines.append(
-                f"unusable answers: {report['unusable_answers']}, reconnections: {report['reconnections']}"
-            )
+            lines.append(f"unusable answers: {report['unusable_answers']}, reconnections: {report['reconnections']}")
     return "\n".join(lines)
 
 

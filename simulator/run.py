@@ -95,9 +95,7 @@ class Run:
     def off_road(self) -> str:
         """The side on which a wheel stands beyond the road's surface; empty while none does."""
         at = int(self.s / self.track.step)
-        if abs(self.offset) + REACH < self.track.edges[at - 3 : at + 3].min(
-            initial=REACH if at < 3 else np.inf
-        ):
+        if abs(self.offset) + REACH < self.track.edges[at - 3 : at + 3].min(initial=REACH if at < 3 else np.inf):
             return ""  # no wheel can reach so far: most of the time
         matrix = self.car.node.get_mat()
         for aside, forward, _, _ in WHEELS:
@@ -116,6 +114,4 @@ class Run:
 
     def roughness(self) -> float:
         """Mean absolute change of the steering per second."""
-        return (
-            float(np.abs(np.diff(self.path.steering)).mean() / STEP) if len(self.path.steering) > 1 else 0.0
-        )
+        return float(np.abs(np.diff(self.path.steering)).mean() / STEP) if len(self.path.steering) > 1 else 0.0

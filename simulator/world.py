@@ -29,9 +29,7 @@ from cloning.road.track import Track
 from simulator.scenery.parts import Haze, Scenery
 from simulator.scenery.shapes import Mesh, together
 
-GROUND_HALF_WIDTH = (
-    8.0  # m of ground to each side of a climbing road; the car is set back before it gets there
-)
+GROUND_HALF_WIDTH = 8.0  # m of ground to each side of a climbing road; the car is set back before it gets there
 CELL = 120.0  # m: meshes are cut into cells so that the engine can leave out what is out of sight
 INSIDE, OUTSIDE = BitMask32.bit(0), BitMask32.bit(1)  # what the car's own cameras see, and what others do
 HAZE_STEP, SHEEN_STEP = 25.0, 2.0  # m: haze, and sheen, are drawn anew when the camera has moved so far
@@ -79,12 +77,8 @@ def texture(image: np.ndarray, repeat: bool, mipmaps: bool) -> Texture:
     """The engine's texture of an image (rows, columns, 3 RGB or 4 RGBA)."""
     rows, columns, channels = image.shape
     made = Texture()
-    made.setup_2d_texture(
-        columns, rows, Texture.T_unsigned_byte, Texture.F_rgba if channels == 4 else Texture.F_rgb
-    )
-    made.set_ram_image(
-        np.ascontiguousarray(image[::-1][..., [2, 1, 0, 3][:channels]]).tobytes()
-    )  # from below, BGR(A)
+    made.setup_2d_texture(columns, rows, Texture.T_unsigned_byte, Texture.F_rgba if channels == 4 else Texture.F_rgb)
+    made.set_ram_image(np.ascontiguousarray(image[::-1][..., [2, 1, 0, 3][:channels]]).tobytes())  # from below, BGR(A)
     wrap = SamplerState.WM_repeat if repeat else SamplerState.WM_clamp
     made.set_wrap_u(wrap)
     made.set_wrap_v(wrap)
@@ -100,9 +94,7 @@ class Part:
         self.used, faces = np.unique(faces, return_inverse=True)
         self.data = GeomVertexData("part", _format(), Geom.UH_static)
         self.data.unclean_set_num_rows(len(self.used))
-        memoryview(self.data.modify_array(0)).cast("B")[:] = (
-            mesh.points[self.used].astype(np.float32).tobytes()
-        )
+        memoryview(self.data.modify_array(0)).cast("B")[:] = mesh.points[self.used].astype(np.float32).tobytes()
         memoryview(self.data.modify_array(2)).cast("B")[:] = mesh.uv[self.used].astype(np.float32).tobytes()
         self.paint(_bytes(mesh.colours[self.used] * 255))
         triangles = GeomTriangles(Geom.UH_static)
@@ -175,9 +167,7 @@ class Scene:
             textures.setdefault(id(mesh.texture), []).append(mesh)
         self.batches = [MeshGroup(together(meshes), self.root) for meshes in textures.values()]
         for i, batch in enumerate(self.batches):
-            batch.root.set_bin(
-                "fixed", i
-            )  # else the engine sorts by memory addresses, which differ from run to run
+            batch.root.set_bin("fixed", i)  # else the engine sorts by memory addresses, which differ from run to run
         self.sky = MeshGroup(scenery.sky, self.root).root
         self.sky.set_bin("background", 0)
         self.sky.set_depth_write(False)

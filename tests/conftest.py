@@ -28,13 +28,13 @@ def draw_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarr
     frame[60:] = (120, 130, 60)
     rows = np.arange(60, 160)
     far = (160 - rows) / 100
-    middle = 160 + 120 * bend * far ** 2 - offset * (rows - 60) * 1.2
+    middle = 160 + 120 * bend * far**2 - offset * (rows - 60) * 1.2
     half = 3.5 * (rows - 60) * 1.2 + 4
     for row, centre, width in zip(rows, middle, half, strict=True):
         left, right = int(centre - width), int(centre + width)
-        frame[row, max(left, 0):max(right, 0)] = (110, 110, 105)
+        frame[row, max(left, 0) : max(right, 0)] = (110, 110, 105)
         for edge in (left, right):
-            frame[row, max(edge - 3, 0):max(edge + 3, 0)] = (210, 180, 60)
+            frame[row, max(edge - 3, 0) : max(edge + 3, 0)] = (210, 180, 60)
     return np.clip(frame + rng.normal(0, 6, frame.shape), 0, 255).astype(np.uint8)
 
 
@@ -73,8 +73,14 @@ def copied(tmp_path) -> Path:
 def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
     """The real command line, with its output."""
     command = command or [sys.executable, str(ROOT / "model.py")]
-    return subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, timeout=300,
-                          env={**os.environ, **more.pop("env", {})}, **more)
+    return subprocess.run(
+        [*command, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, **more.pop("env", {})},
+        **more,
+    )
 
 
 def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.CompletedProcess, Path]:

@@ -27,8 +27,13 @@ def jpeg() -> bytes:
 
 
 def telemetry(jpeg, speed="0.0000", **more):
-    return {"steering_angle": "0.0000", "throttle": "0.0000", "speed": speed,
-            "image": base64.b64encode(jpeg).decode(), **more}
+    return {
+        "steering_angle": "0.0000",
+        "throttle": "0.0000",
+        "speed": speed,
+        "image": base64.b64encode(jpeg).decode(),
+        **more,
+    }
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +93,7 @@ def test_frames_are_seen_in_rgb_and_alike_on_disk_and_in_telemetry(session, netw
 def huge(jpeg: bytes) -> bytes:
     """The JPEG with 30,000 x 30,000 in its header."""
     at = jpeg.index(b"\xff\xc0") + 5
-    return jpeg[:at] + (30000).to_bytes(2, "big") * 2 + jpeg[at + 4:]
+    return jpeg[:at] + (30000).to_bytes(2, "big") * 2 + jpeg[at + 4 :]
 
 
 def png(jpeg: bytes) -> bytes:
@@ -140,6 +145,7 @@ def test_a_failing_network_is_answered(session, jpeg, failure):
             if failure == "raises":
                 raise RuntimeError("out of memory")
             return torch.full((1,), float("nan"))
+
     session.server.network = Failing()
     assert session.answer(telemetry(jpeg)) == {"steering_angle": before["steering_angle"], "throttle": "0"}
 
@@ -149,6 +155,7 @@ def test_a_warning_is_logged_once_per_kind():
 
     def passes(message):
         return once.filter(logging.LogRecord("drive", logging.WARNING, "", 0, message, None, None))
+
     assert passes("30000x30000 pixels") and not passes("20000x100 pixels") and passes("not base64")
 
 
@@ -237,5 +244,6 @@ def test_the_line_bends_to_the_side_of_the_steering():
 
     def middle(steering):
         return (attention.overlay(frame, steering)[..., 1] > 128)[:180].nonzero()[1].mean()
+
     assert middle(-0.3) < 300 < 340 < middle(0.3)
     assert abs(middle(0.0) - 320) < 6  # the camera is turned by 0.7 degrees and rolled by 1.2

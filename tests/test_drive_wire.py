@@ -32,7 +32,11 @@ class Process:
     def __init__(self, *arguments, port=0, cwd=None):
         self.process = subprocess.Popen(
             [sys.executable, str(ROOT / "drive.py"), *map(str, arguments), "--port", str(port)],
-            cwd=cwd, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            cwd=cwd,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         self.lines, self.listening = [], threading.Event()
         self.reader = threading.Thread(target=self._read)
         self.reader.start()
@@ -104,9 +108,11 @@ def steering(model_file, jpegs) -> list[np.float32]:
 def test_the_recorded_session_byte_by_byte(server, jpegs, steering):
     """The transcript of the real simulator's session: its handshake, its ping, driving, the driver's hand, its end."""
     raw = socket.create_connection(("127.0.0.1", server.port), 10)
-    raw.sendall(b"GET /socket.io/?EIO=4&transport=websocket HTTP/1.1\r\nUser-Agent: websocket-sharp/1.0\r\n"
-                b"Host: 127.0.0.1:%d\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-                b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n" % server.port)
+    raw.sendall(
+        b"GET /socket.io/?EIO=4&transport=websocket HTTP/1.1\r\nUser-Agent: websocket-sharp/1.0\r\n"
+        b"Host: 127.0.0.1:%d\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n" % server.port
+    )
     stream = raw.makefile("rb")
 
     def frame() -> bytes:
@@ -119,6 +125,7 @@ def test_the_recorded_session_byte_by_byte(server, jpegs, steering):
     def send(message):
         for fragment in fragments(message):
             raw.sendall(fragment)
+
     head = b"".join(iter(stream.readline, b"\r\n"))
     assert head.startswith(b"HTTP/1.1 101 ")
     assert b"Sec-WebSocket-Accept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo=\r\n" in head  # RFC 6455's own example
@@ -143,8 +150,13 @@ def test_the_recorded_session_byte_by_byte(server, jpegs, steering):
 
 
 BROKEN = [
-    '42["telemetry",{"steering_angle":"0.0000"', '42["telemetry"', '42["telemetry",' + "[" * 50000,
-    '42["telemetry",{}]', '42["telemetry",{"speed":"fast"}]', '42["telemetry",7]', '42["telemetry",{},{},{}]',
+    '42["telemetry",{"steering_angle":"0.0000"',
+    '42["telemetry"',
+    '42["telemetry",' + "[" * 50000,
+    '42["telemetry",{}]',
+    '42["telemetry",{"speed":"fast"}]',
+    '42["telemetry",7]',
+    '42["telemetry",{},{},{}]',
     '42["telemetry",{"image":"' + "A" * 20_000_000 + '"}]',
 ]
 
@@ -163,9 +175,26 @@ def test_every_telemetry_gets_exactly_one_answer(server, jpegs, message):
         assert simulator.drive(telemetry(jpegs[0]))["steering_angle"] == last
 
 
-@pytest.mark.parametrize("message", [
-    "", "4", "9", "42", "42{", '42["connect"]', '42["disconnect"]', '42["unknown",{}]', "42" + "1" * 900_000,
-    '42/other,["telemetry",{}]', "451-[", "43[]", "\x00", "ä" * 1000, "42[" * 30000])
+@pytest.mark.parametrize(
+    "message",
+    [
+        "",
+        "4",
+        "9",
+        "42",
+        "42{",
+        '42["connect"]',
+        '42["disconnect"]',
+        '42["unknown",{}]',
+        "42" + "1" * 900_000,
+        '42/other,["telemetry",{}]',
+        "451-[",
+        "43[]",
+        "\x00",
+        "ä" * 1000,
+        "42[" * 30000,
+    ],
+)
 def test_driving_goes_on_after_what_is_no_telemetry(server, jpegs, steering, message):
     with Simulator(server.port) as simulator:
         simulator.open()
@@ -254,6 +283,7 @@ def test_ten_thousand_malformed_messages_leave_the_other_driving_untouched(serve
                     answers.append(stranger.receive())
                 except OSError:
                     return
+
         stopped = threading.Event()
         threads = [threading.Thread(target=stranger.socket.sendall, args=(flood,)), threading.Thread(target=drain)]
         for thread in threads:
@@ -273,10 +303,17 @@ def test_ten_thousand_malformed_messages_leave_the_other_driving_untouched(serve
 # Strangers and mistakes
 
 
-@pytest.mark.parametrize("header, status", [
-    ("Origin: http://evil.example\r\n", 403), ("Origin: null\r\n", 403), ("Origin: http://127.0.0.1:1\r\n", 403),
-    ("Sec-Fetch-Site: cross-site\r\n", 403), ("Origin: http://127.0.0.1:{port}\r\n", 101), ("", 101),
-])
+@pytest.mark.parametrize(
+    "header, status",
+    [
+        ("Origin: http://evil.example\r\n", 403),
+        ("Origin: null\r\n", 403),
+        ("Origin: http://127.0.0.1:1\r\n", 403),
+        ("Sec-Fetch-Site: cross-site\r\n", 403),
+        ("Origin: http://127.0.0.1:{port}\r\n", 101),
+        ("", 101),
+    ],
+)
 def test_another_origin_can_not_connect(server, header, status):
     with Simulator(server.port, headers=header.format(port=server.port)) as stranger:
         assert stranger.status == status
@@ -290,14 +327,18 @@ def test_a_name_that_was_made_to_point_here_is_refused(server, path):
 
 
 def test_it_listens_on_loopback_alone(server):
-    listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]
-                 if line.split()[1].endswith(f":{server.port:04X}") and line.split()[3] == "0A"]
+    listening = [
+        line.split()[1]
+        for line in Path("/proc/net/tcp").read_text().splitlines()[1:]
+        if line.split()[1].endswith(f":{server.port:04X}") and line.split()[3] == "0A"
+    ]
     assert listening == [f"0100007F:{server.port:04X}"]
 
 
 def failing(*arguments) -> str:
-    process = subprocess.run([sys.executable, str(ROOT / "drive.py"), *map(str, arguments)], timeout=60,
-                             capture_output=True, text=True)
+    process = subprocess.run(
+        [sys.executable, str(ROOT / "drive.py"), *map(str, arguments)], timeout=60, capture_output=True, text=True
+    )
     assert process.returncode == 1 and "Traceback" not in process.stderr
     return process.stderr
 
@@ -354,10 +395,26 @@ def test_the_page_in_a_real_browser(server, jpegs, tmp_path):
         simulator.open()
         simulator.drive(telemetry(jpegs[0], speed="8.5000"))
         subprocess.run(
-            ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-             "--disable-background-networking", "--disable-component-update", "--disable-sync", "--timeout=4000",
-             "--window-size=1000,800", f"--screenshot={tmp_path}/page.png", f"--user-data-dir={tmp_path}/profile",
-             f"http://127.0.0.1:{server.port}/"], capture_output=True, timeout=60, check=True)
+            [
+                "chromium",
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--disable-quic",
+                "--no-first-run",
+                "--disable-background-networking",
+                "--disable-component-update",
+                "--disable-sync",
+                "--timeout=4000",
+                "--window-size=1000,800",
+                f"--screenshot={tmp_path}/page.png",
+                f"--user-data-dir={tmp_path}/profile",
+                f"http://127.0.0.1:{server.port}/",
+            ],
+            capture_output=True,
+            timeout=60,
+            check=True,
+        )
     sky = cv2.resize(cv2.imdecode(np.frombuffer(jpegs[0], np.uint8), cv2.IMREAD_COLOR), None, fx=2, fy=2)[:130]
     match = cv2.matchTemplate(cv2.imread(f"{tmp_path}/page.png"), sky, cv2.TM_SQDIFF_NORMED)
     assert match.min() < 0.01, "the page shows the camera's image; the upper part, on which no line is drawn"
@@ -381,8 +438,13 @@ def node_client(tmp_path_factory) -> Path:
         pytest.skip("no node here")
     folder = tmp_path_factory.mktemp("node")
     try:
-        subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"], cwd=folder,
-                       check=True, timeout=40, capture_output=True)
+        subprocess.run(
+            ["npm", "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"],
+            cwd=folder,
+            check=True,
+            timeout=40,
+            capture_output=True,
+        )
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
         pytest.skip("npm can't install socket.io-client here")
     (folder / "client.js").write_text(CLIENT)
@@ -394,7 +456,12 @@ def test_the_independent_client(server, node_client, jpegs, steering, transports
     (node_client / "telemetry.json").write_text(json.dumps(telemetry(jpegs[3], speed="9.0000")))
     output = subprocess.run(
         ["node", "client.js", str(server.port), json.dumps({"transports": transports}), "telemetry.json"],
-        cwd=node_client, capture_output=True, text=True, timeout=30, env=dict(os.environ)).stdout
+        cwd=node_client,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        env=dict(os.environ),
+    ).stdout
     session = json.loads(output)
     assert session["answers"][0] == {"steering_angle": "0", "throttle": "0"} and session["data"] == {}
     for answer in session["answers"][1:]:

@@ -18,24 +18,37 @@ from tools.bench_training import one_by_one
 
 def recording(n, name="lake", seconds=0.0714, first=0):
     """n rows of a recording that has no files."""
-    return Recording(Path(name), np.array([], "S9"), np.zeros((n, 3), np.int32), *np.zeros((4, n), np.float32),
-                     first + np.arange(n) * seconds, np.arange(1, n + 1, dtype=np.int32), n)
+    return Recording(
+        Path(name),
+        np.array([], "S9"),
+        np.zeros((n, 3), np.int32),
+        *np.zeros((4, n), np.float32),
+        first + np.arange(n) * seconds,
+        np.arange(1, n + 1, dtype=np.int32),
+        n,
+    )
 
 
 def observations(steering, recordings=None, frame=None):
     n = len(steering)
     recordings = recordings or [recording(n)]
     which = np.repeat(np.arange(len(recordings)), [len(r) for r in recordings])
-    return Observations(recordings, which, np.zeros((n, 3), np.int32), np.asarray(steering, np.float32),
-                        np.arange(n, dtype=np.uint64) if frame is None else frame,
-                        np.concatenate([r.time for r in recordings]))
+    return Observations(
+        recordings,
+        which,
+        np.zeros((n, 3), np.int32),
+        np.asarray(steering, np.float32),
+        np.arange(n, dtype=np.uint64) if frame is None else frame,
+        np.concatenate([r.time for r in recordings]),
+    )
 
 
 def loaded(folder):
     found = read_recording(folder)
     check_images(found)
-    return Observations([found], np.zeros(len(found), int), found.images, found.steering,
-                        found.digests[found.images[:, 0]], found.time)
+    return Observations(
+        [found], np.zeros(len(found), int), found.images, found.steering, found.digests[found.images[:, 0]], found.time
+    )
 
 
 @pytest.fixture
@@ -131,7 +144,7 @@ def test_chances_and_ranges_over_many_draws(generator):
         values = np.concatenate([d[name] for d in draws])
         assert low <= values.min() and values.max() <= high
         assert values.mean() == pytest.approx((low + high) / 2, rel=0.01)
-        assert values.std() == pytest.approx((high - low) / 12 ** 0.5, rel=0.02)
+        assert values.std() == pytest.approx((high - low) / 12**0.5, rel=0.02)
     assert np.concatenate([d["left"] for d in draws]).mean() == pytest.approx(0.5, abs=0.01)
     assert np.mean([d["keep"].mean() for d in draws]) == pytest.approx(0.5, abs=0.001)
     assert np.mean([len(d["keep"]) for d in draws]) == pytest.approx(473.6, rel=0.005)  # the original log's batches
@@ -140,7 +153,7 @@ def test_chances_and_ranges_over_many_draws(generator):
 def test_a_pass_takes_every_observation_once_and_the_next_one_in_another_order(generator):
     size = len(generator.observations)
     seen = np.concatenate([generator.draw(number)["observation"] for number in range(size)])  # 128 passes
-    first, second = seen[:size], seen[size:2 * size]
+    first, second = seen[:size], seen[size : 2 * size]
     assert sorted(first) == sorted(second) == list(range(size))
     assert list(first) != list(second)
 
@@ -157,11 +170,12 @@ def test_images_and_angles_of_an_observation(generator):
         angle = everything.steering[at] + {"center": 0, "left": 0.2, "right": -0.2}[name]
         places = drawn["places"][i]
         np.testing.assert_array_equal(batch.images[places[0]], jpeg)
-        np.testing.assert_allclose(batch.angles[places[places >= 0]],
-                                   np.array([angle, -angle, angle, angle])[places >= 0], rtol=1e-6)
+        np.testing.assert_allclose(
+            batch.angles[places[places >= 0]], np.array([angle, -angle, angle, angle])[places >= 0], rtol=1e-6
+        )
         if places[1] >= 0:
             np.testing.assert_array_equal(cv2.flip(batch.images[places[1]], 1), jpeg)  # twice is the identity
-        np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], drawn["brightness"][i:i + 1])[0])
+        np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], drawn["brightness"][i : i + 1])[0])
 
 
 def test_the_yardsticks_batch_is_the_generators(generator):

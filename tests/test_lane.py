@@ -163,8 +163,12 @@ def test_a_drawn_drive(drive):
 
 def test_the_side_cameras_stand_where_they_are_mounted(drive):
     recording, _ = drive
-    strips = np.stack([[strip(decode((recording.folder / "IMG" / recording.names[image].decode()).read_bytes()))
-                        for image in row] for row in recording.images[::4]])
+    strips = np.stack(
+        [
+            [strip(decode((recording.folder / "IMG" / recording.names[image].decode()).read_bytes())) for image in row]
+            for row in recording.images[::4]
+        ]
+    )
     seen = estimate(strips.reshape(-1, *STRIP)).reshape(-1, 3, len(AHEAD))
     for camera in (1, 2):
         assert (seen[:, 0] - seen[:, camera])[:, :3].mean(0) == pytest.approx(MOUNT_OFFSETS[camera], abs=0.15)
@@ -206,8 +210,25 @@ def test_real_side_cameras():
 
 def test_training_leaves_weights_that_load(tmp_path, drawn):
     output = tmp_path / "lane.pt"
-    done = subprocess.run([sys.executable, "-m", "tools.train_lane", drawn, "--looks", "1", "--frames", "6", "--steps",
-                           "2", "--output", output], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "tools.train_lane",
+            drawn,
+            "--looks",
+            "1",
+            "--frames",
+            "6",
+            "--steps",
+            "2",
+            "--output",
+            output,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert done.returncode == 0, done.stderr
     assert "step 2/2" in done.stdout
     network = load(output)
@@ -222,6 +243,7 @@ def test_bad_files_are_named(tmp_path):
     Path(tmp_path / "bad.pt").write_bytes(b"nothing")
     with pytest.raises(ModelError, match="no weights"):
         load(tmp_path / "bad.pt")
-    done = subprocess.run([sys.executable, "-m", "tools.train_lane", tmp_path / "nowhere"], capture_output=True,
-                          text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.train_lane", tmp_path / "nowhere"], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 2 and "nowhere" in done.stderr

@@ -75,8 +75,12 @@ def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):
 
 def test_pieces_give_the_gradient_of_the_whole_batch(network):
     rng = np.random.default_rng(1)
-    batch = Batch(rng.integers(0, 256, (45, 75, 320, 3), np.uint8), rng.normal(0, 0.2, 45).astype(np.float32),
-                  rng.random((45, 4224)) < 0.5, 45)
+    batch = Batch(
+        rng.integers(0, 256, (45, 75, 320, 3), np.uint8),
+        rng.normal(0, 0.2, 45).astype(np.float32),
+        rng.random((45, 4224)) < 0.5,
+        45,
+    )
     cpu = torch.device("cpu")
     squared_errors(network, torch.float32, cpu, batch.images, batch.angles, batch.keep).backward()
     whole = [parameter.grad.clone() for parameter in network.parameters()]
@@ -112,12 +116,18 @@ def test_model_file_carries_what_driving_needs(network, frames, tmp_path):
     torch.testing.assert_close(load_model(path)(frames), network(frames))
 
 
-@pytest.mark.parametrize("content, words", [
-    (None, "no such file"), (b"", "damaged"), (b"\x89HDF\r\n", "damaged"),
-    ({"format": "other"}, "not a model of this project"), (torch.zeros(3), "not a model of this project"),
-    ({"format": "behavioral-cloning", "version": 99}, "version 99"),
-    ({"format": "behavioral-cloning", "version": 1}, "do not fit"),
-])
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (None, "no such file"),
+        (b"", "damaged"),
+        (b"\x89HDF\r\n", "damaged"),
+        ({"format": "other"}, "not a model of this project"),
+        (torch.zeros(3), "not a model of this project"),
+        ({"format": "behavioral-cloning", "version": 99}, "version 99"),
+        ({"format": "behavioral-cloning", "version": 1}, "do not fit"),
+    ],
+)
 def test_other_files_are_refused_clearly(tmp_path, content, words):
     path = tmp_path / "model.pt"
     if isinstance(content, bytes):

@@ -38,25 +38,38 @@ def lines(before="", numbers=PLAIN, between=","):
     return [row(stamp, rest, before, between) for stamp, rest in zip(STAMPS, numbers, strict=True)]
 
 
-@pytest.mark.parametrize("text", [
-    lines("/Users/driver/data/IMG/"),  # 1
-    lines(WINDOWS),  # 2
-    lines("/data/IMG/", SPACED, ", "),  # 3
-    ["center,left,right,steering,throttle,brake,speed", *lines("IMG/", SPACED, ", ")],  # 4
-    [line + "\r" for line in lines("IMG/", between=", ")],  # 5
-    ["Center,Left,Right,SteeringAngle,Throttle,Brake,Speed", *lines("IMG/")],  # 6
-    ["camera_center, camera_left, camera_right,steering,0,0,speed", *lines("IMG/")],
-    ["ct_path,lt_path,rt_path,steer,throttle,brake,speed,high_level_control", *[x + ",3" for x in lines("IMG/")]],
-    [",center,left,right,steering,throttle,brake,speed", *[f"{i + 17},{x}" for i, x in enumerate(lines("IMG/"))]],  # 7
-    lines(),  # 8
-    lines("./IMG/"), lines("/IMG/"), lines("IMG_Ori\\"), lines("D:\\montravail\\IMG\\IMG\\"),  # 9
-    lines("/home/driver/Behavioral Cloning/data rev/IMG/"),  # 10
-    [lines(WINDOWS)[2], lines("/home/a b/IMG/")[0], lines("IMG/", SPACED, ", ")[1]],  # 11: mixed, out of date order
-    lines("C:\\Users\\Doe, John\\IMG\\"), [x.replace("E-05", "e-05") for x in lines()],
-    ["\ufeff" + lines()[0], *lines()[1:]], ['"' + x.replace(",", '","') + '"' for x in lines()],
-    ["steering,center,left,right,speed,brake,throttle", *[
-        ",".join([r[3], *r[:3], r[6], r[5], r[4]]) for r in (x.split(",") for x in lines("IMG/"))]],
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        lines("/Users/driver/data/IMG/"),  # 1
+        lines(WINDOWS),  # 2
+        lines("/data/IMG/", SPACED, ", "),  # 3
+        ["center,left,right,steering,throttle,brake,speed", *lines("IMG/", SPACED, ", ")],  # 4
+        [line + "\r" for line in lines("IMG/", between=", ")],  # 5
+        ["Center,Left,Right,SteeringAngle,Throttle,Brake,Speed", *lines("IMG/")],  # 6
+        ["camera_center, camera_left, camera_right,steering,0,0,speed", *lines("IMG/")],
+        ["ct_path,lt_path,rt_path,steer,throttle,brake,speed,high_level_control", *[x + ",3" for x in lines("IMG/")]],
+        [
+            ",center,left,right,steering,throttle,brake,speed",
+            *[f"{i + 17},{x}" for i, x in enumerate(lines("IMG/"))],
+        ],  # 7
+        lines(),  # 8
+        lines("./IMG/"),
+        lines("/IMG/"),
+        lines("IMG_Ori\\"),
+        lines("D:\\montravail\\IMG\\IMG\\"),  # 9
+        lines("/home/driver/Behavioral Cloning/data rev/IMG/"),  # 10
+        [lines(WINDOWS)[2], lines("/home/a b/IMG/")[0], lines("IMG/", SPACED, ", ")[1]],  # 11: mixed, out of date order
+        lines("C:\\Users\\Doe, John\\IMG\\"),
+        [x.replace("E-05", "e-05") for x in lines()],
+        ["\ufeff" + lines()[0], *lines()[1:]],
+        ['"' + x.replace(",", '","') + '"' for x in lines()],
+        [
+            "steering,center,left,right,speed,brake,throttle",
+            *[",".join([r[3], *r[:3], r[6], r[5], r[4]]) for r in (x.split(",") for x in lines("IMG/"))],
+        ],
+    ],
+)
 def test_formats_that_are_read_right(tmp_path, text):
     found = log(tmp_path, *text)
     np.testing.assert_allclose(numbers(found), EXPECTED, rtol=1e-6)
@@ -66,13 +79,18 @@ def test_formats_that_are_read_right(tmp_path, text):
     np.testing.assert_allclose(np.diff(found.time), 0.071, atol=1e-4)
 
 
-@pytest.mark.parametrize("text, kind", [
-    (lines(numbers=["-0,0597,0,98,0,30,18", "0,1,0,6,9E-05", "0,25,0,3,0,22,14829"]), "decimal commas"),  # 12
-    (lines(numbers=["-0.0597,0.98,0,30.18,1", "0,1,0,6.9E-05", "0.25,0.3,0,22.14829,Lake: turning left"]),
-     "extra columns ignored"),  # 13
-    ([x.replace(",", "\t") for x in lines()], "tab-separated"),  # 15
-    ([x.replace(",", ";").replace(".", ",").replace(",jpg", ".jpg") for x in lines()], "decimal commas"),
-])
+@pytest.mark.parametrize(
+    "text, kind",
+    [
+        (lines(numbers=["-0,0597,0,98,0,30,18", "0,1,0,6,9E-05", "0,25,0,3,0,22,14829"]), "decimal commas"),  # 12
+        (
+            lines(numbers=["-0.0597,0.98,0,30.18,1", "0,1,0,6.9E-05", "0.25,0.3,0,22.14829,Lake: turning left"]),
+            "extra columns ignored",
+        ),  # 13
+        ([x.replace(",", "\t") for x in lines()], "tab-separated"),  # 15
+        ([x.replace(",", ";").replace(".", ",").replace(",jpg", ".jpg") for x in lines()], "decimal commas"),
+    ],
+)
 def test_formats_that_are_repaired_and_told(tmp_path, text, kind):
     found = log(tmp_path, *text)
     np.testing.assert_allclose(numbers(found), EXPECTED, rtol=1e-6)
@@ -88,27 +106,41 @@ def test_the_facts_own_decimal_commas(tmp_path):
     assert "2 ways" in detail
 
 
-@pytest.mark.parametrize("bad, words", [
-    (row(STAMPS[1], "0,0.38,0,19647"), "speed 19647"),  # 14
-    ("=======", "merge"), ("<<<<<<< HEAD", "merge"),  # 16
-    ("IMG/center_x.jpg, 0.0", "1 image name"),  # 18
-    (row(STAMPS[1], "1.2,0,0,9"), "steering 1.2"), (row(STAMPS[1], "nan,0,0,9"), "steering nan"),  # 19
-    (row(STAMPS[1], "0.1,left,0,9"), "0.1,left"), (row(STAMPS[1], "0.1,0.2"), "2 numbers"), ("\0\0\0\0", "cut off"),
-    (row(STAMPS[1], ",1,0,9"), ",1,0,9"), (row(STAMPS[1], "0,inf,0,9"), "throttle inf"),
-])
+@pytest.mark.parametrize(
+    "bad, words",
+    [
+        (row(STAMPS[1], "0,0.38,0,19647"), "speed 19647"),  # 14
+        ("=======", "merge"),
+        ("<<<<<<< HEAD", "merge"),  # 16
+        ("IMG/center_x.jpg, 0.0", "1 image name"),  # 18
+        (row(STAMPS[1], "1.2,0,0,9"), "steering 1.2"),
+        (row(STAMPS[1], "nan,0,0,9"), "steering nan"),  # 19
+        (row(STAMPS[1], "0.1,left,0,9"), "0.1,left"),
+        (row(STAMPS[1], "0.1,0.2"), "2 numbers"),
+        ("\0\0\0\0", "cut off"),
+        (row(STAMPS[1], ",1,0,9"), ",1,0,9"),
+        (row(STAMPS[1], "0,inf,0,9"), "throttle inf"),
+    ],
+)
 def test_rows_that_are_left_out_and_told(tmp_path, bad, words):
     found = log(tmp_path, lines()[0], bad, lines()[2])
     np.testing.assert_allclose(numbers(found), [EXPECTED[0], EXPECTED[2]], rtol=1e-6)
-    (line, _, detail), = found.rejected
+    ((line, _, detail),) = found.rejected
     assert line == 2
     assert words in detail
 
 
-@pytest.mark.parametrize("content, words", [
-    (b"PK\x03\x04rest", "Excel"), (b"\x00\x05\x16\x07rest", "AppleDouble"), (b"", "no usable row"),
-    (b"IMG/center_x.jpg, 0.0\n", "1 image name"), (b"some words\n", "neither a row nor a header"),
-    (b"center,left,right,throttle,brake,speed\n", "steering"),
-])
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (b"PK\x03\x04rest", "Excel"),
+        (b"\x00\x05\x16\x07rest", "AppleDouble"),
+        (b"", "no usable row"),
+        (b"IMG/center_x.jpg, 0.0\n", "1 image name"),
+        (b"some words\n", "neither a row nor a header"),
+        (b"center,left,right,throttle,brake,speed\n", "steering"),
+    ],
+)
 def test_files_that_are_refused(tmp_path, content, words):
     path = tmp_path / "driving_log.csv"
     path.write_bytes(content)
@@ -132,15 +164,20 @@ def test_images_are_checked_named_and_left_out(copied):
     whole = images[4].read_bytes()
     images[1].unlink()
     images[2].write_bytes(b"")
-    images[3].write_bytes(whole[:len(whole) // 2])
+    images[3].write_bytes(whole[: len(whole) // 2])
     images[4].write_bytes(whole[:-2000] + bytes(2000))  # what a crash leaves: the end is zeros
     images[5].write_bytes(b"not an image")
     cv2.imwrite(str(images[6]), np.zeros((480, 640, 3), np.uint8))
     found = read_recording(copied)
     check_images(found)
     assert {(line, kind) for line, kind, _ in found.rejected} == {
-        (2, "image missing"), (3, "image empty"), (4, "image cut short"), (5, "image cut short"),
-        (6, "image not a JPEG"), (7, "image 640x480 pixels where 320x160 are expected")}
+        (2, "image missing"),
+        (3, "image empty"),
+        (4, "image cut short"),
+        (5, "image cut short"),
+        (6, "image not a JPEG"),
+        (7, "image 640x480 pixels where 320x160 are expected"),
+    }
     assert all(f"IMG/{images[line - 1].name}" in detail for line, _, detail in found.rejected)
     assert len(found) == 60 - 6
     assert set(found.lines) == set(range(1, 61)) - set(range(2, 8))

@@ -55,8 +55,11 @@ def test_an_echo_of_the_human_is_exactly_right(recording):
 @pytest.mark.parametrize("driver", ["nothing", "noise", "the other way"])
 def test_bad_drivers_score_badly(recording, driver):
     random = np.random.default_rng(0)
-    steering = {"nothing": lambda moment: 0.0, "noise": lambda moment: random.uniform(-1, 1),
-                "the other way": lambda moment: -moment.human}[driver]
+    steering = {
+        "nothing": lambda moment: 0.0,
+        "noise": lambda moment: random.uniform(-1, 1),
+        "the other way": lambda moment: -moment.human,
+    }[driver]
     done = replay.drive(recording, human(recording), 1.0, steering)
     assert done.autonomy() < 0
     assert done.autonomy() == pytest.approx(1 - 6 * len(done.interventions) / sum(done.time))
@@ -122,13 +125,20 @@ def test_errors_and_correlations_are_what_they_say():
     human = np.sin(np.arange(200) / 9)
     assert against(human, human) == {"error": 0, "correlation": 1}
     assert against(-human, human)["correlation"] == -1
-    assert against(np.zeros(200), human) == {"error": pytest.approx(np.sqrt(np.mean(human**2)), abs=1e-4),
-                                             "correlation": None}
+    assert against(np.zeros(200), human) == {
+        "error": pytest.approx(np.sqrt(np.mean(human**2)), abs=1e-4),
+        "correlation": None,
+    }
 
 
 def run(*arguments) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-m", "simulator", "replay", *map(str, arguments)], cwd=ROOT,
-                          capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, "-m", "simulator", "replay", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_path):
@@ -136,8 +146,9 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     outputs = "--picture", tmp_path / "way.png", "--film", tmp_path / "seen.mp4"
     alone = run(*folder, "--model", model, "--report", tmp_path / "a.json", *outputs)
     assert alone.returncode == 0, alone.stderr
-    server = subprocess.Popen([sys.executable, "drive.py", model, "--port", "0"], cwd=ROOT, text=True,
-                              stderr=subprocess.PIPE)
+    server = subprocess.Popen(
+        [sys.executable, "drive.py", model, "--port", "0"], cwd=ROOT, text=True, stderr=subprocess.PIPE
+    )
     try:
         port = re.search(r":(\d+)\.", server.stderr.readline())[1]
         served = run(*folder, "--port", port, "--report", tmp_path / "b.json")
@@ -153,8 +164,12 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     one = report["limits"]["1"]
     assert one["interventions"] == len(one["where"]) and one["autonomy_percent"] < 100
     assert (folder[-1] / "IMG" / one["where"][0]["image"]).is_file()
-    assert one["compared"]["the human"] == {"autonomy_percent": 100, "interventions": 0, "distance_mean_m": 0,
-                                            "distance_p95_m": 0}
+    assert one["compared"]["the human"] == {
+        "autonomy_percent": 100,
+        "interventions": 0,
+        "distance_mean_m": 0,
+        "distance_p95_m": 0,
+    }
     assert (tmp_path / "way.png").read_bytes()[:4] == b"\x89PNG"
     probe = __import__("av").open(str(tmp_path / "seen.mp4"))
     assert sum(1 for _ in probe.decode(video=0)) == 300
@@ -183,12 +198,15 @@ def test_the_same_answer_in_process_as_by_the_network(recording, model):
     assert done.steering == answers
 
 
-@pytest.mark.parametrize(("arguments", "said"), [
-    (["nowhere"], "no such folder"),
-    (["FOLDER", "--model", "nothing.pt"], "no such file"),
-    (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
-    (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere"], "no such folder"),
+        (["FOLDER", "--model", "nothing.pt"], "no such file"),
+        (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
+        (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
+    ],
+)
 def test_unusable_arguments_are_said(folder, model, arguments, said):
     known = {"FOLDER": folder, "MODEL": model}
     done = run(*[known.get(argument, argument) for argument in arguments])
@@ -210,13 +228,31 @@ def test_stretches_are_joined_in_one_report(folder, tmp_path):
 def test_the_score_board_keeps_what_it_has(tmp_path, model):
     folder = draw_recording(tmp_path / "lake", rows=40)
     for name, extra in (("one", ["--what", "untrained"]), ("two", [])):
-        done = subprocess.run([sys.executable, "-m", "tools.scoreboard", model, "--name", name, "--recordings", folder,
-                               "--tracks", "--table", tmp_path / "table.md", *extra], cwd=ROOT, capture_output=True,
-                              text=True, timeout=200)
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "tools.scoreboard",
+                model,
+                "--name",
+                name,
+                "--recordings",
+                folder,
+                "--tracks",
+                "--table",
+                tmp_path / "table.md",
+                *extra,
+            ],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=200,
+        )
         assert done.returncode == 0, done.stderr
     lines = (tmp_path / "table.md").read_text().splitlines()
     assert "| course | one | two |" in lines
     rows = [line.split("|")[1:-1] for line in lines if line.startswith("| real lake, 1 m from")]
     assert len(rows) == 1 and rows[0][1] == rows[0][2] and "%" in rows[0][1]
     assert lines[lines.index("* one: untrained") + 1] == (
-        "  * `python -m tools.scoreboard model.pt --name one --recordings lake --tracks --table table.md`")
+        "  * `python -m tools.scoreboard model.pt --name one --recordings lake --tracks --table table.md`"
+    )

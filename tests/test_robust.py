@@ -28,9 +28,16 @@ def recording(steering, pause_after=None):
     columns = [np.full(N, value, np.float32) for value in (steering, 1, 0, SPEED)]
     time = np.arange(N) / 15
     if pause_after is not None:
-        time[pause_after + 1:] += 2
-    return Recording(Path("drive"), np.array([], "S9"), np.zeros((N, 3), np.int32), *columns, time,
-                     np.arange(1, N + 1, dtype=np.int32), N)
+        time[pause_after + 1 :] += 2
+    return Recording(
+        Path("drive"),
+        np.array([], "S9"),
+        np.zeros((N, 3), np.int32),
+        *columns,
+        time,
+        np.arange(1, N + 1, dtype=np.int32),
+        N,
+    )
 
 
 def lanes(monkeypatch, steering=0.0, offset=0.0, **more) -> Lanes:
@@ -83,7 +90,7 @@ def test_the_further_off_the_harder_back(monkeypatch):
 @pytest.mark.parametrize("offset", [1.0, -1.5])
 def test_the_lane_is_beside_the_human_as_far_as_was_read(monkeypatch, bend, offset):
     """The human keeps `offset` metres right of the lane's centre, round the same middle."""
-    human = 1 / np.sqrt((1 / bend - offset) ** 2 - REAR_AXLE ** 2) * np.sign(bend) if bend else 0.0
+    human = 1 / np.sqrt((1 / bend - offset) ** 2 - REAR_AXLE**2) * np.sign(bend) if bend else 0.0
     found = lanes(monkeypatch, float(steering_for(human)), offset)
     assert found.offset[found.known] == pytest.approx(1 / bend - 1 / human if bend else offset, abs=1e-2)
     assert found.steering(0.0, 0.0)[found.known] == pytest.approx(float(steering_for(bend)), abs=0.01)
@@ -133,18 +140,24 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
     side = list(robust.SIDES.values())[camera]
 
     def stood(x, z, heading):  # in the lane's frame
-        return plane(x + AXLE_TO_CAMERA * np.sin(heading) + side * np.cos(heading),
-                     z + AXLE_TO_CAMERA * np.cos(heading) - side * np.sin(heading), heading)[ROWS]
+        return plane(
+            x + AXLE_TO_CAMERA * np.sin(heading) + side * np.cos(heading),
+            z + AXLE_TO_CAMERA * np.cos(heading) - side * np.sin(heading),
+            heading,
+        )[ROWS]
 
     def read(_, before):
         offset, turned = float(one.offset[0]), float(one.yaw[0])
         if not before:
             return stood(offset, 0, turned)
         x, z, heading = one.moved[0].astype(float)
-        return stood(offset + x * np.cos(turned) + z * np.sin(turned), -x * np.sin(turned) + z * np.cos(turned),
-                     turned + heading)
+        return stood(
+            offset + x * np.cos(turned) + z * np.sin(turned), -x * np.sin(turned) + z * np.cos(turned), turned + heading
+        )
 
-    expected = plane(right + AXLE_TO_CAMERA * np.sin(yaw), AXLE_TO_CAMERA * np.cos(yaw), yaw, mirrored)[CROP[0]:BONNET_ROW]
+    expected = plane(right + AXLE_TO_CAMERA * np.sin(yaw), AXLE_TO_CAMERA * np.cos(yaw), yaw, mirrored)[
+        CROP[0] : BONNET_ROW
+    ]
     wrong = np.abs(poses.view(0, read).astype(int) - expected).max(2)
     assert np.percentile(wrong[12:], 95) < 12
     assert np.median(wrong[12:]) < 3

@@ -85,9 +85,7 @@ def test_yaws_as_the_real_car_at_thirty_mph(steering):
     for _ in range(25):
         run.step(steering, 1)
     turned = (before - run.car.heading + math.pi) % (2 * math.pi) - math.pi
-    assert turned / 0.5 == pytest.approx(
-        0.8 * 30 * MPH / 2.87 * math.tan(math.radians(25 * steering)), rel=0.1
-    )
+    assert turned / 0.5 == pytest.approx(0.8 * 30 * MPH / 2.87 * math.tan(math.radians(25 * steering)), rel=0.1)
     assert turned / 0.5 == pytest.approx(1.75 * steering, rel=0.1)
 
 
@@ -139,15 +137,11 @@ def in_bends(run):
     """Steering a recording would hold, 15 a second, where the road's radius is under 60 m."""
     track, step = run.track, round(1 / 15 / 0.02)
     places = [track.locate(x, y)[0] for x, y in zip(run.path.x[::step], run.path.y[::step], strict=True)]
-    bend = (
-        np.abs(track.curvature[(np.array(places) / track.step).astype(int) % len(track.curvature)]) > 1 / 60
-    )
+    bend = np.abs(track.curvature[(np.array(places) / track.step).astype(int) % len(track.curvature)]) > 1 / 60
     return np.array(run.path.steering[::step])[bend]
 
 
-@pytest.mark.parametrize(
-    ("name", "direction"), [("lake", "ccw"), ("lake", "cw"), ("jungle", "ccw"), ("jungle", "cw")]
-)
+@pytest.mark.parametrize(("name", "direction"), [("lake", "ccw"), ("lake", "cw"), ("jungle", "ccw"), ("jungle", "cw")])
 def test_expert_drives_a_lap_on_the_road(name, direction):
     run = Run(Track(name, direction))
     expert = Expert(run.track, seed=3)
@@ -176,9 +170,7 @@ def test_numbers_are_written_as_the_simulators(value, text):
 def digest(folder):
     """Of the images and of the rows without the folder's own path."""
     log = (folder / "driving_log.csv").read_text().replace(str(folder), "")
-    images = b"".join(
-        hashlib.sha256(path.read_bytes()).digest() for path in sorted((folder / "IMG").iterdir())
-    )
+    images = b"".join(hashlib.sha256(path.read_bytes()).digest() for path in sorted((folder / "IMG").iterdir()))
     return hashlib.sha256(log.encode() + images).hexdigest()
 
 
@@ -192,26 +184,20 @@ def test_recordings_are_as_the_simulators_and_the_same_in_two_processes(tmp_path
     for row in rows:
         assert len(row) == 7
         for path, camera in zip(row[:3], ("center", "left", "right"), strict=True):
-            match = re.fullmatch(
-                rf"{tmp_path}/a/IMG/{camera}_\d{{4}}(_\d\d){{4}}_(\d\d)_(\d{{3}})\.jpg", path
-            )
+            match = re.fullmatch(rf"{tmp_path}/a/IMG/{camera}_\d{{4}}(_\d\d){{4}}_(\d\d)_(\d{{3}})\.jpg", path)
             assert match, path
             assert cv2.imread(path).shape == (160, 320, 3)
         times.append(int(match[2]) + int(match[3]) / 1000)
         assert -1 <= float(row[3]) <= 1
     assert np.median(np.diff(times) % 60) == pytest.approx(1 / 15, abs=0.015)
-    quality_75 = bytes(
-        [8, 6, 6, 7, 6, 5, 8, 7]
-    )  # how the JPEG standard's luminance table at quality 75 begins
+    quality_75 = bytes([8, 6, 6, 7, 6, 5, 8, 7])  # how the JPEG standard's luminance table at quality 75 begins
     assert quality_75 in (tmp_path / "a" / "IMG" / rows[0][0]).read_bytes()[:64]
     assert len(rows) == pytest.approx(0.1 * 1138 / 12.4 * 15, rel=0.2)
 
 
 def test_a_kill_leaves_a_readable_folder(tmp_path):
     folder = tmp_path / "killed"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "simulator", "record", str(folder)], stderr=subprocess.DEVNULL
-    )
+    process = subprocess.Popen([sys.executable, "-m", "simulator", "record", str(folder)], stderr=subprocess.DEVNULL)
     log = folder / "driving_log.csv"
     while not log.exists() or log.stat().st_size < 3000:
         assert process.poll() is None
@@ -247,8 +233,10 @@ for i in range(1000):
 
 def test_a_frame_depends_on_the_place_alone():
     few, many = (
-        subprocess.run([sys.executable, "-c", DRAW, step], capture_output=True, text=True, check=True, cwd=ROOT)
-        .stdout.splitlines() for step in ("8", "4")
+        subprocess.run(
+            [sys.executable, "-c", DRAW, step], capture_output=True, text=True, check=True, cwd=ROOT
+        ).stdout.splitlines()
+        for step in ("8", "4")
     )
     assert len(few) == 125
     assert few == many[::2]

@@ -62,8 +62,7 @@ def test_the_side_cameras_see_from_the_sides():
     moved = view("lake", 0, offset=0.806)[0]
     road = np.s_[70:130]
     assert (
-        np.abs(moved[road].astype(int) - left[road]).mean()
-        < 0.6 * np.abs(centre[road].astype(int) - left[road]).mean()
+        np.abs(moved[road].astype(int) - left[road]).mean() < 0.6 * np.abs(centre[road].astype(int) - left[road]).mean()
     )
     assert np.abs(left[road].astype(int) - right[road]).mean() > 5
 

@@ -284,9 +284,7 @@ def test_a_server_that_is_no_websocket_is_said():
         thread.start()
         run = Run(Track("lake"), "autonomous")
         with pytest.raises(SimulatorError, match="404"):
-            Client(run, Blank(), "127.0.0.1", listener.getsockname()[1], 0.0, False).drive(
-                1, Progress(1, "laps")
-            )
+            Client(run, Blank(), "127.0.0.1", listener.getsockname()[1], 0.0, False).drive(1, Progress(1, "laps"))
         thread.join(5)
 
 

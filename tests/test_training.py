@@ -19,8 +19,11 @@ from PIL import Image
 import model
 
 # The same command, but it saves after every batch: kills then strike at every place of an epoch, and while writing.
-SAVING = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}); import model; model.SAVE_SECONDS = 0; "
-          "sys.exit(model.main())"]
+SAVING = [
+    sys.executable,
+    "-c",
+    f"import sys; sys.path.insert(0, {str(ROOT)!r}); import model; model.SAVE_SECONDS = 0; sys.exit(model.main())",
+]
 
 
 def log(folder):
@@ -52,8 +55,14 @@ def test_what_a_run_prints(finished, drawn):
 def test_what_a_run_leaves(finished):
     folder = finished[1]
     assert {path.name for path in folder.iterdir()} == {
-        "model.pt", "model-best.pt", "model-resume.pt", "training_loss.png", "training_log.csv",
-        "training_arguments.json", "diagnostic_images"}
+        "model.pt",
+        "model-best.pt",
+        "model-resume.pt",
+        "training_loss.png",
+        "training_log.csv",
+        "training_arguments.json",
+        "diagnostic_images",
+    }
     rows = log(folder)
     assert [row["epoch"] for row in rows] == ["1", "2"]
     assert all(int(row["images"]) >= 150 and float(row["loss"]) > 0 < float(row["val_loss"]) for row in rows)
@@ -77,8 +86,11 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, drawn,
     output, chance = tmp_path / "model.pt", random.Random(5)
     kills = 0
     while True:
-        run = subprocess.Popen([*SAVING, str(drawn), *map(str, SHORT), "--output", str(output), "--resume"],
-                               stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        run = subprocess.Popen(
+            [*SAVING, str(drawn), *map(str, SHORT), "--output", str(output), "--resume"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+        )
         if kills == 4:
             break
         resume = tmp_path / "model-resume.pt"
@@ -94,15 +106,21 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, drawn,
     assert run.wait() == 0, run.stderr.read()
     assert same(weights(output), weights(finished[1] / "model.pt"))
     assert same(weights(tmp_path / "model-best.pt"), weights(finished[1] / "model-best.pt"))
-    ours, theirs = ([{name: row[name] for name in ("images", "loss", "val_loss")} for row in log(folder)]
-                    for folder in (tmp_path, finished[1]))
+    ours, theirs = (
+        [{name: row[name] for name in ("images", "loss", "val_loss")} for row in log(folder)]
+        for folder in (tmp_path, finished[1])
+    )
     assert ours == theirs
 
 
 def test_killed_when_an_epoch_was_just_saved_loses_nothing_of_its_log(finished, drawn, tmp_path):
-    killed = [sys.executable, "-c", f"import os, sys; sys.path.insert(0, {str(ROOT)!r}); import model; "
-              "save = model.Run.save; "
-              "model.Run.save = lambda run, *models: (save(run, *models), models and os._exit(9)); model.main()"]
+    killed = [
+        sys.executable,
+        "-c",
+        f"import os, sys; sys.path.insert(0, {str(ROOT)!r}); import model; "
+        "save = model.Run.save; "
+        "model.Run.save = lambda run, *models: (save(run, *models), models and os._exit(9)); model.main()",
+    ]
     arguments = (drawn, *SHORT, "--output", tmp_path / "model.pt", "--resume")
     assert [run_model(*arguments, command=killed).returncode for _ in range(2)] == [9, 9]
     done = run_model(*arguments)
@@ -135,8 +153,14 @@ def test_disk_full_is_clear_and_the_last_checkpoint_stays(finished, drawn, tmp_p
     before = {path: path.read_bytes() for path in tmp_path.glob("*.pt")}
     limit = 3_000_000  # the state is 6.7 MB
 
-    full = run_model("--output", output, "--resume", "--epochs", 2,
-                     preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)))
+    full = run_model(
+        "--output",
+        output,
+        "--resume",
+        "--epochs",
+        2,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
     assert full.returncode == 1
     assert "model-resume.pt: File too large" in full.stderr
     assert "Traceback" not in full.stderr
@@ -172,10 +196,15 @@ def test_no_recordings(tmp_path):
         assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (["--epochs", "0"], "--epochs"), (["--learning-rate", "nan"], "--learning-rate"),
-    (["--throttle-threshold", "2"], "--throttle-threshold drops"), (["--batch-size", "x"], "int"),
-])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--epochs", "0"], "--epochs"),
+        (["--learning-rate", "nan"], "--learning-rate"),
+        (["--throttle-threshold", "2"], "--throttle-threshold drops"),
+        (["--batch-size", "x"], "int"),
+    ],
+)
 def test_arguments_that_cannot_be(drawn, tmp_path, arguments, words):
     done = run_model(drawn, *arguments, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
@@ -206,8 +235,15 @@ def test_default_is_every_recording_under_data(tmp_path):
     assert (tmp_path / "model.pt").exists()
 
 
-TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0", "--standalone",
-            str(ROOT / "model.py")]
+TORCHRUN = [
+    sys.executable,
+    "-m",
+    "torch.distributed.run",
+    "--nproc_per_node=2",
+    "--master_port=0",
+    "--standalone",
+    str(ROOT / "model.py"),
+]
 
 
 def test_two_processes_go_on_with_the_runs_own_arguments(finished, drawn, tmp_path):
@@ -222,14 +258,20 @@ def test_two_processes_go_on_with_the_runs_own_arguments(finished, drawn, tmp_pa
 def test_two_processes_train_as_one(drawn, tmp_path):
     """Two ranks with half of every batch each end where one process ends, up to rounding; rank 0 alone prints."""
     one = run_model(drawn, *SHORT, "--output", tmp_path / "one.pt")
-    two = run_model(drawn, *SHORT, "--output", tmp_path / "two.pt",
-                    command=TORCHRUN)
+    two = run_model(drawn, *SHORT, "--output", tmp_path / "two.pt", command=TORCHRUN)
     assert (one.returncode, two.returncode) == (0, 0), one.stderr + two.stderr
     a, b = weights(tmp_path / "one.pt"), weights(tmp_path / "two.pt")
     for name in a:  # Adam moves a weight by up to 1e-4 a step, of which there were 12
         assert (a[name] - b[name]).abs().mean() < 2e-6
-    logs = [[float(number) for line in run.stdout.splitlines() if "val_loss" in line
-             for number in re.findall(r"loss: ([\d.]+)", line)] for run in (one, two)]
+    logs = [
+        [
+            float(number)
+            for line in run.stdout.splitlines()
+            if "val_loss" in line
+            for number in re.findall(r"loss: ([\d.]+)", line)
+        ]
+        for run in (one, two)
+    ]
     assert len(logs[0]) == 4 and logs[1] == pytest.approx(logs[0], abs=2e-4)  # the global losses; bfloat16 rounds
 
 
@@ -239,7 +281,8 @@ def test_a_given_value_counts_as_given_also_when_it_is_the_default():
 
 
 def test_importing_does_nothing(tmp_path):
-    done = run_model(command=[sys.executable, "-c", "import model, recordings, network"], cwd=tmp_path,
-                     env={"PYTHONPATH": str(ROOT)})
+    done = run_model(
+        command=[sys.executable, "-c", "import model, recordings, network"], cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert not os.listdir(tmp_path)

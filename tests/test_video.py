@@ -33,6 +33,7 @@ def save(folder: Path, count=30, gap=0.05, rows=160, columns=320, begin=datetime
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
     """The command, in this process and in tmp_path: its exit status and what it says."""
+
     def run(*arguments) -> tuple[int, str]:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", ["video.py", *arguments])
@@ -41,6 +42,7 @@ def run(tmp_path, monkeypatch, capsys):
         except SystemExit as exit:
             return (exit.code, capsys.readouterr().err) if isinstance(exit.code, int) else (1, exit.code)
         return 0, "".join(capsys.readouterr())
+
     return run
 
 
@@ -53,8 +55,9 @@ def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
 
 def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
     save(tmp_path / "run1")
-    result = subprocess.run([sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True,
-                            text=True, timeout=60)
+    result = subprocess.run(
+        [sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
     assert result.returncode == 0 and "run1.mp4: 30 frames at 20 frames/s" in result.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run1", "run1.mp4"]
     fps, seen = frames_of(tmp_path / "run1.mp4")
@@ -74,7 +77,7 @@ def test_what_a_person_would_wish(run, tmp_path):
     (folder / "notes.txt").write_text("mine")
     (folder / "2018_07_16_17_11_44_900.jpg").write_bytes(b"")
     whole = (folder / "2018_07_16_17_11_43_000.jpg").read_bytes()
-    (folder / "2018_07_16_17_11_44_901.jpg").write_bytes(whole[:len(whole) // 2])
+    (folder / "2018_07_16_17_11_44_901.jpg").write_bytes(whole[: len(whole) // 2])
     status, said = run("run.1", "--fps", "60")
     assert status == 0
     assert "no frames: notes.txt" in said
@@ -92,8 +95,10 @@ def test_odd_sizes_lose_a_row_and_a_column(run, tmp_path):
     assert frames_of(tmp_path / "odd.mp4")[1][0].shape == (120, 160, 3)
 
 
-@pytest.mark.parametrize("name, content, said", [
-    (None, None, "no such folder"), ("notes.txt", b"", "no frames"), ("2018_07_16_17_11_43_382.jpg", b"", "readable")])
+@pytest.mark.parametrize(
+    "name, content, said",
+    [(None, None, "no such folder"), ("notes.txt", b"", "no frames"), ("2018_07_16_17_11_43_382.jpg", b"", "readable")],
+)
 def test_no_film_is_a_clear_error(run, tmp_path, name, content, said):
     if name:
         (tmp_path / "run1").mkdir()

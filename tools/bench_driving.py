@@ -82,9 +82,14 @@ class Server:
 @contextmanager
 def page_open(port: int):
     """A reader of the page's events, with the attention, as a browser would be."""
-    reader = subprocess.Popen([sys.executable, "-c", "import sys, urllib.request\n"
-                               "for line in urllib.request.urlopen(sys.argv[1]): pass",
-                               f"http://127.0.0.1:{port}/live?attention"])
+    reader = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "import sys, urllib.request\nfor line in urllib.request.urlopen(sys.argv[1]): pass",
+            f"http://127.0.0.1:{port}/live?attention",
+        ]
+    )
     time.sleep(1)
     yield
     reader.kill()
@@ -117,10 +122,12 @@ def main() -> None:
     network, floors, per_turn = load_model(args.model), [], 100
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         drive = [ROOT / "drive.py", args.model]
-        servers = [Server("drive.py", [*drive, "--port", 0]),
-                   Server("drive.py, saving frames", [*drive, Path(folder) / "run1", "--port", 0]),
-                   Server("drive.py, page open", [*drive, "--port", 0]),
-                   Server("classic", ["-m", "tools.classic_server", args.model])]
+        servers = [
+            Server("drive.py", [*drive, "--port", 0]),
+            Server("drive.py, saving frames", [*drive, Path(folder) / "run1", "--port", 0]),
+            Server("drive.py, page open", [*drive, "--port", 0]),
+            Server("classic", ["-m", "tools.classic_server", args.model]),
+        ]
         for server in servers:
             stack.callback(server.close)
             server.drive(messages[:50], count=False)
@@ -137,13 +144,16 @@ def main() -> None:
                 if "drive" in server.name:
                     server.ask_inside(per_turn)
     best = np.median(floors)
-    print(f"{len(floors)} frames each; times in ms\n"
-          f"{'':25} median      p99  /floor  frames/s  CPU/frame  MB first  last")
+    print(
+        f"{len(floors)} frames each; times in ms\n{'':25} median      p99  /floor  frames/s  CPU/frame  MB first  last"
+    )
     print(f"{'floor: decode + forward':24} {milliseconds(floors)}    1.00")
     for server in servers:
-        print(f"{server.name:24} {milliseconds(server.round_trips)} {np.median(server.round_trips) / best:7.2f} "
-              f"{len(server.round_trips) / server.seconds:9.1f} {server.cpu / len(server.round_trips) * 1e3:10.2f} "
-              f"{server.memory[0]:9.0f} {server.memory[-1]:5.0f}")
+        print(
+            f"{server.name:24} {milliseconds(server.round_trips)} {np.median(server.round_trips) / best:7.2f} "
+            f"{len(server.round_trips) / server.seconds:9.1f} {server.cpu / len(server.round_trips) * 1e3:10.2f} "
+            f"{server.memory[0]:9.0f} {server.memory[-1]:5.0f}"
+        )
         if server.inside:
             print(f"{'  in the server':24} {milliseconds(server.inside)} {np.median(server.inside) / best:7.2f}")
 

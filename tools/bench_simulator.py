@@ -79,9 +79,7 @@ def lockstep(track: str, frames: int) -> tuple[float, float]:
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--laps", type=float, default=1.0, help="to record of each track (default 1)")
     parser.add_argument("--repeat", type=int, default=3, help="recordings of each track (default 3)")
     args = parser.parse_args()
@@ -97,9 +95,7 @@ def main():
             f"{sorted(cpu)[len(cpu) // 2]:.1f} ({min(cpu):.1f})        "
             f"{max(run['memory'] for run in runs):.0f}      {step[0]:.1f}   {step[1]:.1f}"
         )
-    print(
-        f"memory of this process at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB"
-    )
+    print(f"memory of this process at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 
 if __name__ == "__main__":

@@ -27,8 +27,13 @@ from cloning.compute import keep_freed_memory
 from cloning.road.track import Track
 
 PARTS = ("bound", "ab", "c", "k")
-NAMES = {"bound": "bound by the matrix product", "a": "(a) model.py's epoch", "b": "(b) bare step",
-         "c": "(c) what people write today", "k": "(k) Keras, classic generator"}
+NAMES = {
+    "bound": "bound by the matrix product",
+    "a": "(a) model.py's epoch",
+    "b": "(b) bare step",
+    "c": "(c) what people write today",
+    "k": "(k) Keras, classic generator",
+}
 
 
 def begin(folders: list[str], samples: int, output: Path):
@@ -90,7 +95,7 @@ def one_by_one(generator, number: int):
 
     drawn, images, angles = generator.draw(number), [], []
     for i, (at, camera) in enumerate(zip(drawn["observation"], drawn["camera"], strict=True)):
-        cropped = generator.observations.read(at, camera)[None, CROP[0]:FRAME[0] - CROP[1]]
+        cropped = generator.observations.read(at, camera)[None, CROP[0] : FRAME[0] - CROP[1]]
         for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), of_each_kind(cropped), CROP[0])):
             images += list(made)
             angles += [drawn["angles"][i, kind]] * len(which)
@@ -126,15 +131,22 @@ def part_k(run, steps):
     import keras
 
     layers = keras.layers
-    network = keras.Sequential([
-        layers.Input((75, 320, 3)), layers.Rescaling(1 / 127.5, -1),
-        *[layers.Conv2D(filters, size, stride, activation="elu")
-          for filters, size, stride in ((24, 5, 2), (36, 5, 2), (48, 5, 2), (64, 3, 1), (64, 3, 1))],
-        layers.Flatten(), layers.Dropout(0.5), *[layers.Dense(n, activation="elu") for n in (100, 50, 10)],
-        layers.Dense(1)])
+    network = keras.Sequential(
+        [
+            layers.Input((75, 320, 3)),
+            layers.Rescaling(1 / 127.5, -1),
+            *[
+                layers.Conv2D(filters, size, stride, activation="elu")
+                for filters, size, stride in ((24, 5, 2), (36, 5, 2), (48, 5, 2), (64, 3, 1), (64, 3, 1))
+            ],
+            layers.Flatten(),
+            layers.Dropout(0.5),
+            *[layers.Dense(n, activation="elu") for n in (100, 50, 10)],
+            layers.Dense(1),
+        ]
+    )
     network.compile(optimizer=keras.optimizers.Adam(1e-4), loss="mse")
     numbers = iter(range(1000))
-
 
     def step():
         network.train_on_batch(*one_by_one(run.generator, next(numbers)))
@@ -149,7 +161,7 @@ def part_bound(run, _):
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     size = 2048 if run.device.type == "cpu" else 8192
     a, b = (torch.randn(size, size, device=run.device).to(run.precision) for _ in "ab")
-    return {"bound": max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size ** 3 / flops(run.network)}
+    return {"bound": max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size**3 / flops(run.network)}
 
 
 def rate(step, images: int, steps: int, device) -> float:
@@ -185,8 +197,18 @@ def main():
                 keep_freed_memory()  # as model.py's main does
             run = begin(arguments.recordings, arguments.samples, Path(folder) / "model.pt")
             rates = globals()[f"part_{arguments.part}"](run, arguments.steps)
-            print("\n" + json.dumps({"rates": rates, "gb": peak_memory(), "device": str(run.device),
-                                     "precision": str(run.precision), "flops": flops(run.network)}))
+            print(
+                "\n"
+                + json.dumps(
+                    {
+                        "rates": rates,
+                        "gb": peak_memory(),
+                        "device": str(run.device),
+                        "precision": str(run.precision),
+                        "flops": flops(run.network),
+                    }
+                )
+            )
             return
         if not arguments.recordings:
             from simulator.record import record
@@ -209,16 +231,28 @@ def report(arguments) -> None:
     memory: dict[str, float] = {}
     for number in range(arguments.rounds):
         for part in parts:
-            command = [sys.executable, "-m", "tools.bench_training", *arguments.recordings, "--part", part, "--samples",
-                       str(arguments.samples), "--steps", str(arguments.steps)]
+            command = [
+                sys.executable,
+                "-m",
+                "tools.bench_training",
+                *arguments.recordings,
+                "--part",
+                part,
+                "--samples",
+                str(arguments.samples),
+                "--steps",
+                str(arguments.steps),
+            ]
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             found = json.loads(done.stdout.splitlines()[-1])
             for name, value in found["rates"].items():
                 rates.setdefault(name, []).append(value)
                 memory[name] = max(memory.get(name, 0), found["gb"])
                 print(f"round {number + 1}: {NAMES[name]}: {value:.0f}", file=sys.stderr, flush=True)
-    print(f"\n{found['device']}, {found['precision'].removeprefix('torch.')}, {arguments.rounds} rounds, "
-          f"{found['flops'] / 1e6:.0f} MFLOP an image\n")
+    print(
+        f"\n{found['device']}, {found['precision'].removeprefix('torch.')}, {arguments.rounds} rounds, "
+        f"{found['flops'] / 1e6:.0f} MFLOP an image\n"
+    )
     print("| training images/s | median | least | most | peak memory GB |\n|---|---|---|---|---|")
     for name, values in rates.items():
         values = sorted(values)

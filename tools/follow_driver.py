@@ -33,7 +33,7 @@ def predict(network, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     paths = [recording.path(row) for row in range(len(recording))]
     predicted = []
     for start in range(0, len(paths), PIECE):
-        frames = np.stack([decode(path.read_bytes()) for path in paths[start:start + PIECE]])
+        frames = np.stack([decode(path.read_bytes()) for path in paths[start : start + PIECE]])
         with torch.inference_mode():
             predicted.append(network(torch.from_numpy(frames)).numpy())
     return np.concatenate(predicted), recording.steering

@@ -36,10 +36,16 @@ def places(network) -> None:
         drawn = [draw(name, look, 150, 1) for look in UNSEEN]
         true = np.concatenate([centres for _, centres in drawn])
         found = estimate(np.concatenate([strips for strips, _ in drawn]), network)
-        slopes = [np.polyfit(t[known], f[known], 1)[0]
-                  for t, f in zip(true.T, found.T, strict=True) for known in [~np.isnan(t)]]
-        for figure, values in (("mean absolute error, m", np.nanmean(abs(found - true), 0)),
-                               ("bias, m", np.nanmean(found - true, 0)), ("slope", slopes)):
+        slopes = [
+            np.polyfit(t[known], f[known], 1)[0]
+            for t, f in zip(true.T, found.T, strict=True)
+            for known in [~np.isnan(t)]
+        ]
+        for figure, values in (
+            ("mean absolute error, m", np.nanmean(abs(found - true), 0)),
+            ("bias, m", np.nanmean(found - true, 0)),
+            ("slope", slopes),
+        ):
             print(f"{f'{name}, {figure}':34}" + "".join(f"{value:8.2f}" for value in values))
 
 
@@ -54,9 +60,11 @@ def drives(network, laps: float) -> None:
             step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
             true = np.array(run.path.offset)[step]
             error = found.offset - true
-            print(f"{f'drawn drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
-                  f"95th percentile {np.quantile(np.abs(error), 0.95):.2f}, bias {error.mean():+.2f}, "
-                  f"slope {np.polyfit(true, found.offset, 1)[0]:.2f}; trusted {found.trusted.mean():.1%}")
+            print(
+                f"{f'drawn drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
+                f"95th percentile {np.quantile(np.abs(error), 0.95):.2f}, bias {error.mean():+.2f}, "
+                f"slope {np.polyfit(true, found.offset, 1)[0]:.2f}; trusted {found.trusted.mean():.1%}"
+            )
 
 
 def real(folder: str, network) -> None:
@@ -72,11 +80,15 @@ def real(folder: str, network) -> None:
     print(f"{folder}, {len(recording)} rows")
     for side, name in enumerate(("left", "right")):
         cells = [f"{np.mean(beside[:, side, k]):+.2f} ± {np.std(beside[:, side, k]):.2f}" for k in range(3)]
-        print(f"  {name + ' camera stands at':32}{', '.join(cells)} m, seen {AHEAD[0]:g}, {AHEAD[1]:g}, {AHEAD[2]:g} m "
-              f"ahead (mounted at {MOUNT_OFFSETS[side + 1]:+.2f})")
-    print(f"  {'off the centre':32}{np.abs(found.offset).mean():.2f} m, 95th percentile "
-          f"{np.quantile(np.abs(found.offset), 0.95):.2f}, mean {found.offset.mean():+.2f}; "
-          f"yaw {np.degrees(found.yaw).std():.1f} degrees; trusted {found.trusted.mean():.1%}")
+        print(
+            f"  {name + ' camera stands at':32}{', '.join(cells)} m, seen {AHEAD[0]:g}, {AHEAD[1]:g}, {AHEAD[2]:g} m "
+            f"ahead (mounted at {MOUNT_OFFSETS[side + 1]:+.2f})"
+        )
+    print(
+        f"  {'off the centre':32}{np.abs(found.offset).mean():.2f} m, 95th percentile "
+        f"{np.quantile(np.abs(found.offset), 0.95):.2f}, mean {found.offset.mean():+.2f}; "
+        f"yaw {np.degrees(found.yaw).std():.1f} degrees; trusted {found.trusted.mean():.1%}"
+    )
     spent = np.diff([started, decoded, estimated, finished]) / len(recording) * 1e3
     print(f"  {'ms a row':32}{spent.sum():.2f}: decode {spent[0]:.2f}, network {spent[1]:.2f}, together {spent[2]:.2f}")
 
@@ -117,7 +129,7 @@ def main() -> None:
             edge = EDGES["jungle" if "jungle" in folder else "lake"]
             rows = np.linspace(30, len(recording) - 30, 12).astype(int)
             frames = [drawn_in(recording, found, row, edge) for row in rows]
-            pictures += [np.hstack(frames[k:k + 4]) for k in range(0, 12, 4)]
+            pictures += [np.hstack(frames[k : k + 4]) for k in range(0, 12, 4)]
     if pictures:
         cv2.imwrite(args.picture, np.vstack(pictures))
 

@@ -72,9 +72,7 @@ def line_profile(frames: np.ndarray, columns: list[np.ndarray], rows: range) -> 
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path, help="a real recording of the lake or the jungle")
     parser.add_argument("--frames", type=int, default=120, help="places to compare (default 120)")
     parser.add_argument("--picture", help="write frames side by side: real above, drawn below")
@@ -119,8 +117,10 @@ def main():
                 for band in BANDS:
                     columns = [line_columns(track, found.place[i], aside, camera, band) for i in chosen]
                     pair = [line_profile(frames[:, c], columns, band) for frames in (real, drawn)]
-                    print(f"{f'{camera}, {side} line, row {band[len(band) // 2]}':28}"
-                          + "".join(f"{at:>+15.1f} (n={n:4})" for at, n in pair))
+                    print(
+                        f"{f'{camera}, {side} line, row {band[len(band) // 2]}':28}"
+                        + "".join(f"{at:>+15.1f} (n={n:4})" for at, n in pair)
+                    )
     if args.picture:
         strips = []
         for i in np.linspace(0, len(chosen) - 1, 8).astype(int):

@@ -35,8 +35,13 @@ ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
 def report(folder: str, *command: str) -> tuple[object | None, str]:
     """The JSON that a simulator command reports, or None, and what it said on stderr."""
     file = Path(folder) / "report.json"
-    done = subprocess.run([sys.executable, "-m", "simulator", *command, "--report", str(file)], cwd=ROOT,
-                          env=ONE_THREAD, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "simulator", *command, "--report", str(file)],
+        cwd=ROOT,
+        env=ONE_THREAD,
+        capture_output=True,
+        text=True,
+    )
     return (json.loads(file.read_text()) if file.exists() else None), done.stderr
 
 
@@ -48,30 +53,51 @@ def replay(model: Path, recording: Path) -> dict[str, str]:
         raise SystemExit(f"{recording}: {said}")
     limits, reference = found[0]["limits"], found[0]["reference"]
     centre = "the lane's centre" if reference["lane centre"] else "the human's way"
-    return {f"real {recording.name}, {limit} m from {centre}":
-            f"{one['autonomy_percent']:.1f} % ({one['interventions']}), {one['distance_mean_m']:.2f} m"
-            for limit, one in limits.items()}
+    figures = {}
+    for limit, one in limits.items():
+        driven = f"{one['autonomy_percent']:.1f} % ({one['interventions']}), {one['distance_mean_m']:.2f} m"
+        figures[f"real {recording.name}, {limit} m from {centre}"] = driven
+    return figures
 
 
 def lap(model: Path, track: str, direction: str, mph: int, look: int, laps: float) -> dict[str, str]:
     """Course -> what laps of the stand-in came to."""
-    server = subprocess.Popen([sys.executable, "drive.py", str(model), "--speed", str(mph), "--port", "0"], cwd=ROOT,
-                              env=ONE_THREAD, stderr=subprocess.PIPE, text=True)
+    server = subprocess.Popen(
+        [sys.executable, "drive.py", str(model), "--speed", str(mph), "--port", "0"],
+        cwd=ROOT,
+        env=ONE_THREAD,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         port = re.search(r":(\d+)\.", server.stderr.readline())[1]
         with tempfile.TemporaryDirectory() as folder:
-            found, said = report(folder, "drive", "--track", track, "--direction", direction, "--look", str(look),
-                                 "--laps", str(laps), "--port", port)
+            found, said = report(
+                folder,
+                "drive",
+                "--track",
+                track,
+                "--direction",
+                direction,
+                "--look",
+                str(look),
+                "--laps",
+                str(laps),
+                "--port",
+                port,
+            )
     finally:
         server.terminate()
         server.communicate()
     if found is None:
         raise SystemExit(f"{track} {direction}: {said}")
     unfinished = "" if found["laps"] >= laps else f", {found['laps']} of {laps:g} laps"
-    return {f"{track} {direction}, {mph} mph, look {look}":
-            f"{len(found['departures'])} departures in {found['distance_m'] / 1000:.1f} km{unfinished}, "
-            f"{found['offset_mean_m']:.2f} m, at most {found['offset_max_m']:.2f}, "
-            f"roughness {found['steering_roughness_per_s']:.2f}"}
+    driven = (
+        f"{len(found['departures'])} departures in {found['distance_m'] / 1000:.1f} km{unfinished}, "
+        f"{found['offset_mean_m']:.2f} m, at most {found['offset_max_m']:.2f}, "
+        f"roughness {found['steering_roughness_per_s']:.2f}"
+    )
+    return {f"{track} {direction}, {mph} mph, look {look}": driven}
 
 
 HEAD = """# How models drive
@@ -85,10 +111,11 @@ steering's mean absolute change a second. Looks from 101 on were never trained o
 def table(results: dict) -> str:
     """The table as Markdown."""
     courses = sorted({course for one in results.values() for course in one["courses"]}, key=order)
-    lines = [HEAD,
-             "| course | " + " | ".join(results) + " |", "|---" * (len(results) + 1) + "|"]
-    lines += [f"| {course} | " + " | ".join(one["courses"].get(course, "-") for one in results.values()) + " |"
-              for course in courses]
+    lines = [HEAD, "| course | " + " | ".join(results) + " |", "|---" * (len(results) + 1) + "|"]
+    lines += [
+        f"| {course} | " + " | ".join(one["courses"].get(course, "-") for one in results.values()) + " |"
+        for course in courses
+    ]
     lines += ["", "Made by:"]
     for name, one in results.items():
         lines += ["", f"* {name}: {one['what']}", *(f"  * `{command}`" for command in one["commands"])]
@@ -114,8 +141,13 @@ def main() -> None:
     args = parser.parse_args()
     model = args.model.resolve()
     jobs = [(replay, model, folder) for folder in (find_folders(args.recordings) if args.recordings else [])]
-    jobs += [(lap, model, track, direction, mph, look, args.laps) for track in args.tracks for direction in DIRECTIONS
-             for mph in args.speeds for look in args.looks]
+    jobs += [
+        (lap, model, track, direction, mph, look, args.laps)
+        for track in args.tracks
+        for direction in DIRECTIONS
+        for mph in args.speeds
+        for look in args.looks
+    ]
     with ThreadPoolExecutor(threads()) as pool:
         found: dict[str, str] = {}
         for one in pool.map(lambda job: job[0](*job[1:]), jobs):

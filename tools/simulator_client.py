@@ -20,7 +20,8 @@ class Simulator:
             f"GET /socket.io/?EIO=4&transport=websocket HTTP/1.1\r\nUser-Agent: websocket-sharp/1.0\r\n"
             f"Host: {host}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
             f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}\r\nSec-WebSocket-Version: 13\r\n"
-            f"{headers}\r\n".encode())
+            f"{headers}\r\n".encode()
+        )
         while b"\r\n\r\n" not in self._buffer:
             self._fill()
         head, self._buffer = self._buffer.split(b"\r\n\r\n", 1)
@@ -56,7 +57,7 @@ class Simulator:
             raise ConnectionError("the server has closed the websocket")
         assert opcode == 0x81, f"the simulator expects unfragmented text, not {opcode:#x}"
         if length == 126:
-            length, = struct.unpack(">H", self._take(2))
+            (length,) = struct.unpack(">H", self._take(2))
         return self._take(length).decode()
 
     def open(self) -> list[str]:
@@ -75,16 +76,20 @@ def fragments(message: str | bytes, opcode: int = 1) -> list[bytes]:
     payload = message.encode() if isinstance(message, str) else message
     frames = []
     for at in range(0, max(len(payload), 1), FRAGMENT):
-        part = payload[at:at + FRAGMENT]
+        part = payload[at : at + FRAGMENT]
         final = 0x80 if at + FRAGMENT >= len(payload) else 0
         size = struct.pack(">B", 0x80 | len(part)) if len(part) < 126 else struct.pack(">BH", 0x80 | 126, len(part))
         key = os.urandom(4)
-        mask = (key * (len(part) // 4 + 1))[:len(part)]
+        mask = (key * (len(part) // 4 + 1))[: len(part)]
         masked = (int.from_bytes(part, "big") ^ int.from_bytes(mask, "big")).to_bytes(len(part), "big")
         frames.append(bytes([final | (opcode if at == 0 else 0)]) + size + key + masked)
     return frames
 
 
 def telemetry(jpeg: bytes, steering_angle="0.0000", throttle="0.0000", speed="0.0000") -> dict:
-    return {"steering_angle": steering_angle, "throttle": throttle, "speed": speed,
-            "image": base64.b64encode(jpeg).decode()}
+    return {
+        "steering_angle": steering_angle,
+        "throttle": throttle,
+        "speed": speed,
+        "image": base64.b64encode(jpeg).decode(),
+    }

@@ -79,8 +79,9 @@ def draw(track_name: str, look: int, frames: int, seed: int) -> tuple[np.ndarray
         heading = place.heading - np.radians(yaw)
         nod = np.degrees(np.arctan(place.grade)) + rng.normal(0.1, 0.5)
         pose = Vec3(np.degrees(heading) - 90, nod, rng.normal(0, 0.6))
-        frame = cameras.frames(TransformState.make_pos_hpr(
-            Point3(place.x, place.y, place.z + rng.normal(0.025, 0.03)), pose))[0]
+        frame = cameras.frames(
+            TransformState.make_pos_hpr(Point3(place.x, place.y, place.z + rng.normal(0.025, 0.03)), pose)
+        )[0]
         strips[k] = strip(decode(jpeg(frame)))
         eye = place.x + CAMERA_FORWARD * np.cos(heading), place.y + CAMERA_FORWARD * np.sin(heading)
         centres[k] = centre_ahead(track, s, *eye, heading)
@@ -89,8 +90,9 @@ def draw(track_name: str, look: int, frames: int, seed: int) -> tuple[np.ndarray
 
 def draw_many(looks: range, frames: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """`draw` of both tracks in these looks, by several processes; of look 0, as the real one, three times as many."""
-    jobs = [(track, look, frames * share * (1 if look else 3), seed) for look in looks
-            for track, share in TRACKS.items()]
+    jobs = [
+        (track, look, frames * share * (1 if look else 3), seed) for look in looks for track, share in TRACKS.items()
+    ]
     with ProcessPoolExecutor(threads(), mp_context=multiprocessing.get_context("spawn")) as pool:
         strips, centres = zip(*pool.map(draw, *zip(*jobs, strict=True)), strict=True)
     return np.concatenate(strips), np.concatenate(centres)
@@ -129,8 +131,9 @@ class Photographs:
                 shadow *= np.where((into > 0) & (into < wide), rng.uniform(0.35, 0.95), 1)[..., None]
             shadow[:] = cv2.GaussianBlur(shadow, (0, 0), rng.uniform(0.3, 2))
         turns = np.radians(rng.normal(0, 4, 512))
-        self.wedges = [in_sight(seen_from(right, yaw))
-                       for right, yaw in zip(rng.normal(0, 0.8, 512), turns, strict=True)]
+        self.wedges = [
+            in_sight(seen_from(right, yaw)) for right, yaw in zip(rng.normal(0, 0.8, 512), turns, strict=True)
+        ]
         self.whole = np.ones((rows, columns, 1), np.uint8)
 
     def wedge(self, rng: np.random.Generator, share: float) -> np.ndarray:
@@ -145,7 +148,9 @@ class Photographs:
             picture = picture.copy()
             for _ in range(rng.integers(1, 4)):
                 down, across = rng.integers(0, STRIP[0]), rng.integers(0, STRIP[1])
-                picture[down:down + rng.integers(1, 12), across:across + rng.integers(2, 28)] = rng.integers(0, 256, 3)
+                picture[down : down + rng.integers(1, 12), across : across + rng.integers(2, 28)] = rng.integers(
+                    0, 256, 3
+                )
         if rng.random() < 0.7:  # paler or stronger colours
             strength = rng.uniform(0.2, 1.5)
             picture = cv2.transform(picture, np.eye(3) * strength + (1 - strength) / 3)
@@ -205,8 +210,12 @@ class Batches:
             masks.append(mask)
             poses.append(pose)
         pictures, seen = pictures + firsts + seconds, seen + masks + masks
-        entered = np.stack([normal(self.photographs.another(picture, rng)) * mask
-                            for picture, mask in zip(pictures, seen, strict=True)])
+        entered = np.stack(
+            [
+                normal(self.photographs.another(picture, rng)) * mask
+                for picture, mask in zip(pictures, seen, strict=True)
+            ]
+        )
         mirrored = rng.random(len(entered)) < 0.5
         entered[mirrored] = entered[mirrored, :, ::-1]
         signs = np.where(mirrored, -1, 1)[:, None].astype(np.float32)
@@ -229,14 +238,26 @@ class Batches:
             one, other = rng.integers(0, 3, 2)
             views = recording.strips[row, one], recording.strips[later, other]
             c, s = np.cos(pose[2]), np.sin(pose[2])
-            pose = pose[0] + MOUNT_OFFSETS[other] * c - MOUNT_OFFSETS[one], pose[1] - MOUNT_OFFSETS[other] * s, pose[2], np.inf
+            pose = (
+                pose[0] + MOUNT_OFFSETS[other] * c - MOUNT_OFFSETS[one],
+                pose[1] - MOUNT_OFFSETS[other] * s,
+                pose[2],
+                np.inf,
+            )
             return views, self.photographs.wedge(rng, 0.3), pose
         views, mask, poses = [], self.photographs.wedge(rng, 0.5), []
         for camera in rng.integers(0, 3, 2):
             right, yaw = rng.normal(0, WARP[0]), np.radians(rng.normal(0, WARP[1]))
             view = seen_from(right, yaw)
-            views.append(cv2.warpPerspective(recording.strips[row, camera], view, STRIP[1::-1], flags=cv2.INTER_LINEAR,
-                                             borderMode=cv2.BORDER_REFLECT))
+            views.append(
+                cv2.warpPerspective(
+                    recording.strips[row, camera],
+                    view,
+                    STRIP[1::-1],
+                    flags=cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_REFLECT,
+                )
+            )
             mask = mask & in_sight(view)
             poses.append((MOUNT_OFFSETS[camera] + right, yaw))
         (right, yaw), (other, turned) = poses
@@ -303,8 +324,11 @@ def train(batches: Batches, steps: int, rate: float = 4e-3) -> LaneNetwork:
             sums += float(drawn.detach()), float(real.detach())
             if step % 250 == 249 or step + 1 == steps:
                 count = step % 250 + 1
-                print(f"step {step + 1}/{steps} - {time.monotonic() - started:.0f}s - drawn: {sums[0] / count:.3f}"
-                      f" - real: {sums[1] / count:.3f}", flush=True)
+                print(
+                    f"step {step + 1}/{steps} - {time.monotonic() - started:.0f}s - drawn: {sums[0] / count:.3f}"
+                    f" - real: {sums[1] / count:.3f}",
+                    flush=True,
+                )
                 sums[:] = 0
     return network.eval()
 
@@ -314,8 +338,9 @@ def train(batches: Batches, steps: int, rate: float = 4e-3) -> LaneNetwork:
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0],
-                                     formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__.split("\n\n")[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
     parser.add_argument("recordings", nargs="*", help="real recordings: folders with a driving_log.csv")
     parser.add_argument("--looks", type=int, default=24, help="looks of either track that are drawn")
     parser.add_argument("--frames", type=int, default=200, help="of the lake in each look; of the jungle twice that")
@@ -334,8 +359,13 @@ def main(argv: list[str] | None = None) -> int:
         strips, centres = draw_many(range(arguments.looks), arguments.frames, arguments.seed)
         network = train(Batches(strips, centres, recordings, arguments.seed), arguments.steps)
         buffer = io.BytesIO()
-        torch.save({name: value.half() if value.is_floating_point() else value
-                    for name, value in network.state_dict().items()}, buffer)
+        torch.save(
+            {
+                name: value.half() if value.is_floating_point() else value
+                for name, value in network.state_dict().items()
+            },
+            buffer,
+        )
         write(arguments.output, buffer.getvalue())
     except (RecordingError, OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -27,7 +27,7 @@ BEGIN = ((8, 150), (2, 600))  # how many of the places found so are followed ove
 APART = 4.0  # m: the standard deviation of such a place
 # Variances: of where a drive begins; and standard deviations by which a row's way is unsure, by metre driven and radian
 # turned: along, beside and of the yaw. A car that turns hard slides.
-BEGINS = np.diag([APART ** 2, 4.0, 0.05])
+BEGINS = np.diag([APART**2, 4.0, 0.05])
 BY_METRE, BY_TURN, ALWAYS = np.array([0.03, 0.02, 0]), np.array([0, 0.4, 0.2]), np.array([0, 0, 0.003])
 
 
@@ -82,9 +82,13 @@ class Filter:
         on = step * np.cos(yaw + turn / 2) / slower
         headings = self.track.at(s).heading - self.track.at(s + on).heading
         road = (headings + np.pi) % (2 * np.pi) - np.pi
-        by = np.array([[1, on * bend / slower, -step * np.sin(yaw)],
-                       [0, 1, step],
-                       [bend - self.bend(s + on), -bend * on * bend / slower, 1]])
+        by = np.array(
+            [
+                [1, on * bend / slower, -step * np.sin(yaw)],
+                [0, 1, step],
+                [bend - self.bend(s + on), -bend * on * bend / slower, 1],
+            ]
+        )
         moved = s + on, right + step * np.sin(yaw + (turn - road) / 2), yaw + turn - road
         return np.array(moved), by
 
@@ -110,7 +114,7 @@ class Filter:
             if at:
                 x, f = self.move(at - 1, x)
                 unsure = BY_METRE * self.step[at - 1] + BY_TURN * abs(self.turn[at - 1]) + ALWAYS
-                p = f @ p @ f.T + np.diag(unsure ** 2)
+                p = f @ p @ f.T + np.diag(unsure**2)
             predicted.append((x, p, f))
             expected, by = self.view(x)
             sight = ~np.isnan(by).any(1)
@@ -119,7 +123,7 @@ class Filter:
                 h = by[k]
                 off = self.seen[at, k] - expected[k] - h @ (x - predicted[-1][0])
                 expecting = h @ p @ h
-                far = max(1.0, off ** 2 / (expecting + BLUR[k] ** 2) / CLEAR ** 2)
+                far = max(1.0, off**2 / (expecting + BLUR[k] ** 2) / CLEAR**2)
                 gain = p @ h / (expecting + BLUR[k] ** 2 * far)
                 x, p = x + gain * off, p - np.outer(gain, h @ p)
             filtered.append((x, p))

@@ -48,14 +48,15 @@ def strip(frame: np.ndarray) -> np.ndarray:
     At half the resolution, and turned as if the camera looked straight ahead and stood upright: the mirror image of a
     strip is the strip of the mirrored world.
     """
-    return cv2.warpPerspective(frame, TO_FRAME, STRIP[1::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                               borderMode=cv2.BORDER_REPLICATE)
+    return cv2.warpPerspective(
+        frame, TO_FRAME, STRIP[1::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
+    )
 
 
 def normal(picture: np.ndarray) -> np.ndarray:
     """A strip, uint8, with each colour's mean 0 and a common deviation of 1: float32 (32, 160, 3)."""
     mean, deviation = cv2.meanStdDev(picture)
-    scale = 1 / (np.sqrt(np.mean(deviation ** 2)) + 4)  # so that a plain picture's noise is not blown up
+    scale = 1 / (np.sqrt(np.mean(deviation**2)) + 4)  # so that a plain picture's noise is not blown up
     table = (np.arange(256)[:, None] - mean.T) * scale
     return cv2.LUT(picture, table.astype(np.float32)[None])
 
@@ -69,10 +70,17 @@ class LaneNetwork(nn.Module):
     def __init__(self):
         super().__init__()
         shapes = [(3, 24, 5, 2), (24, 32, 3, 2), (32, 48, 3, 2), (48, 64, 3, (1, 2))]
-        self.convolutions = nn.Sequential(*(
-            layer for into, out, kernel, stride in shapes
-            for layer in (nn.Conv2d(into, out, kernel, stride, kernel // 2, bias=False), nn.BatchNorm2d(out), nn.ReLU())
-        ))
+        self.convolutions = nn.Sequential(
+            *(
+                layer
+                for into, out, kernel, stride in shapes
+                for layer in (
+                    nn.Conv2d(into, out, kernel, stride, kernel // 2, bias=False),
+                    nn.BatchNorm2d(out),
+                    nn.ReLU(),
+                )
+            )
+        )
         self.dense = nn.Sequential(nn.Linear(64 * 4 * 10, 96), nn.ReLU(), nn.Linear(96, len(AHEAD)))
 
     def forward(self, strips: torch.Tensor) -> torch.Tensor:
@@ -82,7 +90,7 @@ class LaneNetwork(nn.Module):
     def both_ways(self, strips: torch.Tensor) -> torch.Tensor:
         """The mean of what the strips and, turned back, their mirror images say: a road has no preferred side."""
         both = self(torch.cat([strips, strips.flip(2)]))
-        return (both[:len(strips)] - both[len(strips):]) / 2
+        return (both[: len(strips)] - both[len(strips) :]) / 2
 
 
 @functools.cache
@@ -109,7 +117,7 @@ def estimate(strips: np.ndarray, network: LaneNetwork | None = None) -> np.ndarr
     precision = choose_precision(device)
 
     def part(at: int) -> np.ndarray:
-        entered = torch.from_numpy(np.stack([normal(one) for one in strips[at:at + BATCH]]))
+        entered = torch.from_numpy(np.stack([normal(one) for one in strips[at : at + BATCH]]))
         with torch.inference_mode(), in_precision(precision, device):
             return network.both_ways(entered).numpy()
 
@@ -178,7 +186,7 @@ def _stretch(recording: Recording, rows: slice, seen: np.ndarray):
     there = np.stack([right[:, None] + ahead * s + centre * c, forward[:, None] + ahead * c - centre * s], axis=-1)
     offset, yaw, scatter = np.empty((3, len(seen)), np.float32)
     for at in range(len(seen)):
-        away = there[max(0, at - BEHIND):at + 1].reshape(-1, 2) - (right[at], forward[at])
+        away = there[max(0, at - BEHIND) : at + 1].reshape(-1, 2) - (right[at], forward[at])
         x = away @ (c[at, 0], -s[at, 0])
         z = away @ (s[at, 0], c[at, 0]) - REAR_AXLE
         # Quadratic, by least squares: what was seen near the car's middle counts most, what was seen from near by more.
@@ -200,6 +208,6 @@ def _smoothed(values: np.ndarray) -> np.ndarray:
     shape = (-1,) + (1,) * (values.ndim - 1)
     padded = np.pad(values, [(WINDOW // 2, WINDOW // 2)] + [(0, 0)] * (values.ndim - 1))
     here = np.pad(np.ones(len(values), np.float32), WINDOW // 2)
-    total = sum(weight * padded[k:k + len(values)] for k, weight in enumerate(weights))
-    share = sum(weight * here[k:k + len(values)] for k, weight in enumerate(weights))
+    total = sum(weight * padded[k : k + len(values)] for k, weight in enumerate(weights))
+    share = sum(weight * here[k : k + len(values)] for k, weight in enumerate(weights))
     return total / share.reshape(shape)

@@ -21,8 +21,10 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
     """
     maps = []
     # The positive part is what ReLU, which the method is made for, would have left; ELU's negative part is below 1.
-    hooks = [layer.register_forward_hook(lambda _, __, out: maps.append(out.relu().mean(1, keepdim=True)))
-             for layer in network.convolutions]
+    hooks = [
+        layer.register_forward_hook(lambda _, __, out: maps.append(out.relu().mean(1, keepdim=True)))
+        for layer in network.convolutions
+    ]
     try:
         with torch.inference_mode():
             device = next(network.parameters()).device
@@ -43,7 +45,7 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
             mask = nn.functional.conv_transpose2d(mask, ones, stride=layer.stride, output_padding=padding)
             mask = mask / mask.max().clamp(min=1e-12)
     whole = np.zeros(FRAME[:2], np.float32)
-    whole[top:FRAME[0] - bottom] = mask[0, 0].cpu().numpy()
+    whole[top : FRAME[0] - bottom] = mask[0, 0].cpu().numpy()
     return steering, whole
 
 

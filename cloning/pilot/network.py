@@ -30,13 +30,20 @@ class Network(nn.Module):
         super().__init__()
         self.crop, self.scale, self.offset = tuple(crop), scale, offset
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(into, out, kernel, stride) for into, out, kernel, stride in
-            [(3, 24, 5, 2), (24, 36, 5, 2), (36, 48, 5, 2), (48, 64, 3, 1), (64, 64, 3, 1)])
+            nn.Conv2d(into, out, kernel, stride)
+            for into, out, kernel, stride in [
+                (3, 24, 5, 2),
+                (24, 36, 5, 2),
+                (36, 48, 5, 2),
+                (48, 64, 3, 1),
+                (64, 64, 3, 1),
+            ]
+        )
         self.dense = nn.ModuleList(nn.Linear(into, out) for into, out in [(UNITS, 100), (100, 50), (50, 10), (10, 1)])
 
     def forward(self, frames: torch.Tensor, keep: torch.Tensor | None = None) -> torch.Tensor:
         if frames.shape[1] == FRAME[0]:
-            frames = frames[:, self.crop[0]:FRAME[0] - self.crop[1]]
+            frames = frames[:, self.crop[0] : FRAME[0] - self.crop[1]]
         x = frames.permute(0, 3, 1, 2).float().div_(self.scale).sub_(self.offset)  # in memory still channels last
         for convolution in self.convolutions:
             x = nn.functional.elu(convolution(x), inplace=True)
@@ -60,7 +67,7 @@ def layer_table(network: Network) -> str:
         before = name
 
     row("lambda_1", "Lambda", x)
-    x = x[:, :, network.crop[0]:FRAME[0] - network.crop[1]]
+    x = x[:, :, network.crop[0] : FRAME[0] - network.crop[1]]
     row("cropping2d_1", "Cropping2D", x)
     with torch.no_grad():
         for i, convolution in enumerate(network.convolutions, 1):
@@ -81,18 +88,33 @@ def layer_table(network: Network) -> str:
 def save_model(path: Path, network: Network, **more) -> None:
     """Write a model file: weights, what driving needs to use them, and `more` (plain values and tensors)."""
     buffer = io.BytesIO()
-    torch.save({
-        "format": FORMAT, "version": VERSION, "network": network.state_dict(),
-        "recipe": {"frame": FRAME, "colour": "RGB", "crop": network.crop, "scale": network.scale,
-                   "offset": network.offset},
-        "versions": versions(), **more,
-    }, buffer)
+    torch.save(
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "network": network.state_dict(),
+            "recipe": {
+                "frame": FRAME,
+                "colour": "RGB",
+                "crop": network.crop,
+                "scale": network.scale,
+                "offset": network.offset,
+            },
+            "versions": versions(),
+            **more,
+        },
+        buffer,
+    )
     write(path, buffer.getvalue())
 
 
 def versions() -> dict[str, str]:
-    return {"python": platform.python_version(), "torch": str(torch.__version__), "opencv": cv2.__version__,
-            "numpy": np.__version__}
+    return {
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "opencv": cv2.__version__,
+        "numpy": np.__version__,
+    }
 
 
 def load_checkpoint(path) -> dict:
@@ -106,8 +128,10 @@ def load_checkpoint(path) -> dict:
     if not isinstance(saved, dict) or saved.get("format") != FORMAT:
         raise ModelError(f"{path}: not a model of this project; `python model.py` trains one")
     if saved.get("version") != VERSION:
-        raise ModelError(f"{path}: version {saved.get('version')} of the model file where this program reads "
-                         f"version {VERSION}; train it again with `python model.py`")
+        raise ModelError(
+            f"{path}: version {saved.get('version')} of the model file where this program reads "
+            f"version {VERSION}; train it again with `python model.py`"
+        )
     return saved
 
 

@@ -34,7 +34,8 @@ def create_app(server) -> flask.Flask:
     def closed(response):
         response.headers["Content-Security-Policy"] = (
             "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
-            "connect-src 'self'; frame-ancestors 'none'")
+            "connect-src 'self'; frame-ancestors 'none'"
+        )
         response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
         return response
 
@@ -45,8 +46,11 @@ def create_app(server) -> flask.Flask:
     @app.get("/live")
     def live():
         """Server-sent events: {"session", "rows": [[time, steering, speed, throttle, latency], …], "image"}."""
-        return flask.Response(events(server, "attention" in flask.request.args), mimetype="text/event-stream",
-                              headers={"Cache-Control": "no-store"})
+        return flask.Response(
+            events(server, "attention" in flask.request.args),
+            mimetype="text/event-stream",
+            headers={"Cache-Control": "no-store"},
+        )
 
     return app
 

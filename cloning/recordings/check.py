@@ -26,6 +26,7 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
     reasons[states[:, 0] < 0] = b"missing"
     todo = np.flatnonzero(fresh & (states[:, 0] >= 0))
     if len(todo):
+
         def examine(at):
             try:
                 jpeg = (folder / os.fsdecode(names[at])).read_bytes()
@@ -34,9 +35,16 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
                 return str(error).encode()[:80], 0
             return b"", int.from_bytes(hashlib.blake2b(jpeg, digest_size=8).digest(), "big")
 
-        with ThreadPoolExecutor(threads) as pool, tqdm(
-                total=len(todo), desc=f"checking images of {recording.folder.name}", unit="image", leave=False,
-                disable=None if show_progress else True) as bar:
+        with (
+            ThreadPoolExecutor(threads) as pool,
+            tqdm(
+                total=len(todo),
+                desc=f"checking images of {recording.folder.name}",
+                unit="image",
+                leave=False,
+                disable=None if show_progress else True,
+            ) as bar,
+        ):
             todo_left = iter(todo)
             while part := list(islice(todo_left, 4096)):  # in pieces: a future for each of millions is too many
                 for at, (reason, digest) in zip(part, pool.map(examine, part), strict=True):
@@ -49,8 +57,13 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
     for row in np.flatnonzero(unusable.any(1)):
         image = recording.images[row][unusable[row]][0]
         reason = reasons[image].decode()
-        recording.rejected.append((int(recording.lines[row]), f"image {reason}", f"IMG/{os.fsdecode(names[image])}: "
-                                   f"{reason}; copy it again, or delete the row"))
+        recording.rejected.append(
+            (
+                int(recording.lines[row]),
+                f"image {reason}",
+                f"IMG/{os.fsdecode(names[image])}: {reason}; copy it again, or delete the row",
+            )
+        )
     recording.keep(~unusable.any(1))
 
 

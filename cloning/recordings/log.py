@@ -18,8 +18,10 @@ from cloning.recordings.format import CAMERAS, COLUMNS, LOG, RANGES, SAMPLE_RATE
 WRITTEN = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE)  # a number as the simulator writes it
 
 
-WHERE_TO_GET_RECORDINGS = ("Record some in the simulator (training mode, button R), or unpack the public sample data "
-                           "there: data/README.md says how. A recording is a folder with driving_log.csv and IMG/.")
+WHERE_TO_GET_RECORDINGS = (
+    "Record some in the simulator (training mode, button R), or unpack the public sample data "
+    "there: data/README.md says how. A recording is a folder with driving_log.csv and IMG/."
+)
 
 
 @dataclass
@@ -200,7 +202,7 @@ class _Parser:
         self.read += 1
         if delimiter != ",":
             self.repair("tab-separated" if delimiter == "\t" else "separated by semicolons", line)
-            if any("," in value for value in fields[images[-1] + 1:] if images):
+            if any("," in value for value in fields[images[-1] + 1 :] if images):
                 self.repair("decimal commas", line)
                 fields = [value.replace(",", ".") for value in fields]
         if self.columns and len(fields) == len(self.columns):
@@ -208,17 +210,25 @@ class _Parser:
             return self.row(line, [_base_name(by_name[name]) for name in CAMERAS], [by_name[n] for n in COLUMNS[3:]])
         if len(images) != 3:
             found = "1 image name" if len(images) == 1 else f"{len(images)} image names"
-            return self.reject(line, "not a row", f"{found} where center, left and right are expected; record again, "
-                               "or add the columns")
-        names, tokens = [names[at] for at in images], fields[images[-1] + 1:]
+            return self.reject(
+                line,
+                "not a row",
+                f"{found} where center, left and right are expected; record again, or add the columns",
+            )
+        names, tokens = [names[at] for at in images], fields[images[-1] + 1 :]
         self.points = self.points or any("." in token for token in tokens)
-        self.commas = self.commas or any(token.isdigit() and (len(token) > 3 or token[0] == "0" < token[1:])
-                                         for token in tokens[1:])
+        self.commas = self.commas or any(
+            token.isdigit() and (len(token) > 3 or token[0] == "0" < token[1:]) for token in tokens[1:]
+        )
         if len(tokens) == 4:
             return self.row(line, names, tokens)
         if len(tokens) < 4:
-            return self.reject(line, "columns missing", f"{len(tokens)} numbers where steering, throttle, brake, "
-                               "speed are expected; record again, or add the columns")
+            return self.reject(
+                line,
+                "columns missing",
+                f"{len(tokens)} numbers where steering, throttle, brake, "
+                "speed are expected; record again, or add the columns",
+            )
         self.waiting.append((line, names, tokens))
         return None
 
@@ -227,11 +237,13 @@ class _Parser:
         columns = tuple(_column(value) or f"{value} ({at})" for at, value in enumerate(fields))
         known = [name for name in columns if name in COLUMNS]
         if known != list(dict.fromkeys(known)) or "center" not in known or "steering" not in known:
-            raise RecordingError(f"{self.path}: line {line}: neither a row nor a header with center and steering: "
-                                 f"{','.join(fields)[:80]!r}; a header is {','.join(COLUMNS)}")
+            raise RecordingError(
+                f"{self.path}: line {line}: neither a row nor a header with center and steering: "
+                f"{','.join(fields)[:80]!r}; a header is {','.join(COLUMNS)}"
+            )
         if len(set(known)) < len(COLUMNS):  # some are not named: their places must be the usual ones
             start = columns.index("center")
-            usual = (*columns[:start], *COLUMNS, *columns[start + 7:])
+            usual = (*columns[:start], *COLUMNS, *columns[start + 7 :])
             if len(columns) < start + 7 or any(a != b for a, b in zip(columns, usual, strict=True) if a in COLUMNS):
                 missing = [name for name in COLUMNS if name not in known]
                 raise RecordingError(f"{self.path}: line {line}: the header lacks {', '.join(missing)}; add them")
@@ -251,11 +263,17 @@ class _Parser:
             self.numbers += numbers
             self.lines.append(line)
             return None
-        name, value = next((name, value) for name, value in zip(RANGES, numbers, strict=True)
-                           if not RANGES[name][0] <= value <= RANGES[name][1])  # nan is in no range
+        name, value = next(
+            (name, value)
+            for name, value in zip(RANGES, numbers, strict=True)
+            if not RANGES[name][0] <= value <= RANGES[name][1]
+        )  # nan is in no range
         lost = " (has its decimal point been lost?)" if name == "speed" else ""
-        return self.reject(line, f"{name} out of range", f"{name} {value:g} is not in {RANGES[name][0]}.."
-                           f"{RANGES[name][1]}{lost}; correct or delete the row")
+        return self.reject(
+            line,
+            f"{name} out of range",
+            f"{name} {value:g} is not in {RANGES[name][0]}..{RANGES[name][1]}{lost}; correct or delete the row",
+        )
 
     def finish(self) -> None:
         """Decide the rows with more than four numbers, now that it is known how the file writes fractions."""
@@ -270,8 +288,12 @@ class _Parser:
                 self.repair("decimal commas", line)
                 self.row(line, names, readings[0])
             else:
-                self.reject(line, "ambiguous columns", f"{','.join(tokens)!r} can be read in {len(readings)} ways; "
-                            "write decimal points, or delete the extra columns")
+                self.reject(
+                    line,
+                    "ambiguous columns",
+                    f"{','.join(tokens)!r} can be read in {len(readings)} ways; "
+                    "write decimal points, or delete the extra columns",
+                )
 
     def reject(self, line: int, kind: str, detail: str) -> None:
         self.rejected.append((line, kind, detail))
@@ -317,8 +339,8 @@ def _time_stamps(names: np.ndarray) -> np.ndarray:
     """Seconds since 1970 from names like center_2018_07_16_17_11_43_382.jpg, nan for others: float64 (m,)."""
     stamps = np.full((len(names), 23), ord(" "), np.uint8)
     for start in range(0, len(names), 65536):  # in pieces: a name is 36 bytes, a Python string of it 90
-        part = [name.rsplit(b".", 1)[0][-23:].rjust(23) for name in names[start:start + 65536].tolist()]
-        stamps[start:start + len(part)] = np.frombuffer(b"".join(part), np.uint8).reshape(-1, 23)
+        part = [name.rsplit(b".", 1)[0][-23:].rjust(23) for name in names[start : start + 65536].tolist()]
+        stamps[start : start + len(part)] = np.frombuffer(b"".join(part), np.uint8).reshape(-1, 23)
     separators = [4, 7, 10, 13, 16, 19]
     digits = np.delete(stamps, separators, axis=1)
     good = ((digits >= ord("0")) & (digits <= ord("9"))).all(1) & (stamps[:, separators] == ord("_")).all(1)

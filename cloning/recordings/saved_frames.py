@@ -35,8 +35,10 @@ def check(folder: Path) -> None:
     for entry in folder.iterdir():
         saved = taken_at(entry.name) and not entry.name.startswith("center_")  # which is a recording's
         if not entry.is_file() or not (saved or entry.name == BESIDE):
-            raise FolderError(f"{folder}: holds {entry.name}, which is no frame, so it is not emptied; "
-                              "name another folder or move that away")
+            raise FolderError(
+                f"{folder}: holds {entry.name}, which is no frame, so it is not emptied; "
+                "name another folder or move that away"
+            )
 
 
 def empty(folder: Path) -> None:

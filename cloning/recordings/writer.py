@@ -16,9 +16,7 @@ EPOCH = datetime(
 
 def csharp_number(value: float) -> str:
     """A number as C# writes a float: seven digits, 6.9E-05."""
-    return (
-        re.sub(r"E([+-]\d)$", r"E\g<1>", f"{value:.7G}").replace("-0", "0") if value == 0 else f"{value:.7G}"
-    )
+    return re.sub(r"E([+-]\d)$", r"E\g<1>", f"{value:.7G}").replace("-0", "0") if value == 0 else f"{value:.7G}"
 
 
 class RecordingWriter:
@@ -39,9 +37,7 @@ class RecordingWriter:
             self.images.mkdir(parents=True, exist_ok=True)
             self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
         except OSError as error:
-            raise SimulatorError(
-                f"{self.folder}: {error.strerror}; give a folder that can be written"
-            ) from error
+            raise SimulatorError(f"{self.folder}: {error.strerror}; give a folder that can be written") from error
         self.begin = begin
         self.rows = 0
 
@@ -65,9 +61,7 @@ class RecordingWriter:
             for path in paths:
                 path.unlink(missing_ok=True)
             os.ftruncate(self.log.fileno(), size)
-            raise SimulatorError(
-                f"{self.folder}: {error.strerror}; the {self.rows} rows before are whole"
-            ) from error
+            raise SimulatorError(f"{self.folder}: {error.strerror}; the {self.rows} rows before are whole") from error
         self.rows += 1
 
     def close(self) -> None:

@@ -173,8 +173,13 @@ class Moment:
         return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, VIEW_JPEG_QUALITY])[1].tobytes()
 
 
-def drive(recording: Recording, references: list[Reference], limit: float, steer: Callable[[Moment], float],
-          watch: Callable[[Moment, Drive], None] | None = None) -> Drive:
+def drive(
+    recording: Recording,
+    references: list[Reference],
+    limit: float,
+    steer: Callable[[Moment], float],
+    watch: Callable[[Moment, Drive], None] | None = None,
+) -> Drive:
     """Drive a recording by `steer`, which gives the steering, -1..1; `watch` is called after each row, if given."""
     done = Drive(limit)
     for reference in references:

@@ -34,8 +34,11 @@ def figures(recording: Recording, references: list[Reference], drives: list[Driv
     """
     human = np.array(drives[0].human)
     mean = float(recording.steering.mean())
-    blind = {"steering 0": lambda moment: 0.0, "mean steering": lambda moment: mean,
-             "the human": lambda moment: moment.human}
+    blind = {
+        "steering 0": lambda moment: 0.0,
+        "mean steering": lambda moment: mean,
+        "the human": lambda moment: moment.human,
+    }
     rows = sum(len(reference.stretch) for reference in references)
     by_lane = sum(len(reference.stretch) for reference in references if reference.lane)
     return {
@@ -47,16 +50,27 @@ def figures(recording: Recording, references: list[Reference], drives: list[Driv
         "reference_asked": asked,
         "reference": {"lane centre": by_lane, "human's way": rows - by_lane},
         "limits": {
-            f"{done.limit:g}": percentages(done) | {
+            f"{done.limit:g}": percentages(done)
+            | {
                 "steering": against(np.array(done.steering), human),
-                "where": [{"image": recording.name(done.row[at]), "seconds": round(sum(done.time[:at + 1]), 2),
-                           "metres": round(off, 2)} for at, off in done.interventions.items()],
-                "compared": {who: percentages(drive(recording, references, done.limit, steer))
-                             for who, steer in blind.items()},
-            } for done in drives
+                "where": [
+                    {
+                        "image": recording.name(done.row[at]),
+                        "seconds": round(sum(done.time[: at + 1]), 2),
+                        "metres": round(off, 2),
+                    }
+                    for at, off in done.interventions.items()
+                ],
+                "compared": {
+                    who: percentages(drive(recording, references, done.limit, steer)) for who, steer in blind.items()
+                },
+            }
+            for done in drives
         },
-        "steering_compared": {"steering 0": against(np.zeros_like(human), human),
-                              "mean steering": against(np.full_like(human, mean), human)},
+        "steering_compared": {
+            "steering 0": against(np.zeros_like(human), human),
+            "mean steering": against(np.full_like(human, mean), human),
+        },
     }
 
 
@@ -65,29 +79,39 @@ def against(steering: np.ndarray, human: np.ndarray) -> dict:
     correlation (None where one is constant)."""
     smooth = [np.convolve(values, np.ones(SMOOTHED) / SMOOTHED, "valid") for values in (steering, human)]
     varies = all(np.ptp(values) > 0 for values in smooth)
-    return {"error": round(float(np.sqrt(np.mean((steering - human) ** 2))), 4),
-            "correlation": round(float(np.corrcoef(*smooth)[0, 1]), 3) if varies else None}
+    return {
+        "error": round(float(np.sqrt(np.mean((steering - human) ** 2))), 4),
+        "correlation": round(float(np.corrcoef(*smooth)[0, 1]), 3) if varies else None,
+    }
 
 
 def text(report: dict) -> str:
     reference = " and ".join(f"the {what} in {rows} rows" for what, rows in report["reference"].items() if rows)
-    lines = [f"{report['recording']}: {report['seconds']:.1f} s driven in {report['stretches']} stretches "
-             f"({report['rows_driven']} of {report['rows']} rows); off-centre is counted from {reference}"]
+    lines = [
+        f"{report['recording']}: {report['seconds']:.1f} s driven in {report['stretches']} stretches "
+        f"({report['rows_driven']} of {report['rows']} rows); off-centre is counted from {reference}"
+    ]
     if report["reference_asked"] == "lane" and report["reference"]["human's way"]:
         lines.append("the lane's centre is not trusted where the human's way stands for it: an unknown road?")
     for limit, one in report["limits"].items():
-        lines.append(f"at {limit} m: autonomy {one['autonomy_percent']:.1f} %, {one['interventions']} interventions; "
-                     f"off-centre {one['distance_mean_m']:.2f} m on average, 95 %: {one['distance_p95_m']:.2f} m")
-        others = (f"{who} {other['autonomy_percent']:.0f} % ({other['interventions']})"
-                  for who, other in one["compared"].items())
+        lines.append(
+            f"at {limit} m: autonomy {one['autonomy_percent']:.1f} %, {one['interventions']} interventions; "
+            f"off-centre {one['distance_mean_m']:.2f} m on average, 95 %: {one['distance_p95_m']:.2f} m"
+        )
+        others = (
+            f"{who} {other['autonomy_percent']:.0f} % ({other['interventions']})"
+            for who, other in one["compared"].items()
+        )
         lines.append("  for comparison: " + ", ".join(others))
         lines += [f"  {at['seconds']:.1f} s: {at['metres']:+.2f} m, {at['image']}" for at in one["where"][:10]]
         if len(one["where"]) > 10:
             lines.append(f"  … and {len(one['where']) - 10} more")
     first, others = next(iter(report["limits"].values()))["steering"], report["steering_compared"]
     errors = ", ".join(f"{who}: {other['error']:.3f}" for who, other in others.items())
-    lines.append(f"steering: error {first['error']:.3f} ({errors}), correlation with the human's, both averaged over "
-                 f"{SMOOTHED} rows: {first['correlation']}")
+    lines.append(
+        f"steering: error {first['error']:.3f} ({errors}), correlation with the human's, both averaged over "
+        f"{SMOOTHED} rows: {first['correlation']}"
+    )
     return "\n".join(lines)
 
 
@@ -105,8 +129,11 @@ def picture(path: str, recording: Recording, drives: list[Drive]) -> None:
         ax.plot(seconds, np.array(done.distance) - done.beside, linewidth=0.7, color="0.5", label="the human")
         for at in done.interventions:
             ax.axvline(seconds[at], color="tab:red", linewidth=0.8)
-        ax.set(ylabel="m right of the centre", title=f"{len(done.interventions)} interventions at {done.limit:g} m: "
-               f"autonomy {100 * done.autonomy():.1f} %")
+        ax.set(
+            ylabel="m right of the centre",
+            title=f"{len(done.interventions)} interventions at {done.limit:g} m: "
+            f"autonomy {100 * done.autonomy():.1f} %",
+        )
         ax.legend(loc="upper right", fontsize=8)
     seconds = np.cumsum(drives[-1].time)
     axes[-1].plot(seconds, drives[-1].steering, linewidth=0.8, label="the model")
@@ -133,8 +160,10 @@ class SideBySide:
         said = f"{done.distance[-1]:+.2f} m   steering {done.steering[-1]:+.3f}   limit {done.limit:g} m"
         if done.interventions:
             said += f"   interventions {len(done.interventions)}"
-        pictures = [captioned(moment.seen, done.steering[-1], said),
-                    captioned(moment.recorded, moment.human, f"the human   steering {moment.human:+.3f}")]
+        pictures = [
+            captioned(moment.seen, done.steering[-1], said),
+            captioned(moment.recorded, moment.human, f"the human   steering {moment.human:+.3f}"),
+        ]
         self.film.add(np.hstack(pictures))
 
     def close(self) -> None:

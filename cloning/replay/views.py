@@ -20,7 +20,11 @@ class Views:
     def __init__(self, recording: Recording, stretch: Stretch):
         self.recording, self.first = recording, stretch.rows.start
         self.right, self.forward, self.heading, self.driven = (
-            stretch.right, stretch.forward, stretch.heading, stretch.driven)
+            stretch.right,
+            stretch.forward,
+            stretch.heading,
+            stretch.driven,
+        )
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - lives as long as the stretch is driven
     def frame(self, at: int, camera: int) -> np.ndarray:
@@ -36,8 +40,12 @@ class Views:
         uint8 (160, 320, 3), RGB.
         """
         heading = self.heading[at]
-        eye = np.array([self.right[at] + right * np.cos(heading) + AXLE_TO_CAMERA * np.sin(heading + yaw),
-                        self.forward[at] - right * np.sin(heading) + AXLE_TO_CAMERA * np.cos(heading + yaw)])
+        eye = np.array(
+            [
+                self.right[at] + right * np.cos(heading) + AXLE_TO_CAMERA * np.sin(heading + yaw),
+                self.forward[at] - right * np.sin(heading) + AXLE_TO_CAMERA * np.cos(heading + yaw),
+            ]
+        )
         beside = right + AXLE_TO_CAMERA * np.sin(yaw)
         camera = int(np.argmin([abs(beside - side) for side in CAMERA_OFFSETS.values()]))
         made, seen = self._warped(at, camera, eye, heading + yaw)
@@ -54,6 +62,8 @@ class Views:
     def _warped(self, at: int, camera: int, eye: np.ndarray, heading: float, *box):
         s, c = np.sin(self.heading[at]), np.cos(self.heading[at])
         side = list(CAMERA_OFFSETS.values())[camera]
-        stands = np.array([self.right[at] + AXLE_TO_CAMERA * s + side * c, self.forward[at] + AXLE_TO_CAMERA * c - side * s])
+        stands = np.array(
+            [self.right[at] + AXLE_TO_CAMERA * s + side * c, self.forward[at] + AXLE_TO_CAMERA * c - side * s]
+        )
         away = eye - stands
         return warp(self.frame(at, camera), away @ (c, -s), away @ (s, c), heading - self.heading[at], *box)

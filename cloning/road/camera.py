@@ -33,7 +33,12 @@ def _turn(right: float = 0.0, down: float = 0.0, forward: float = 0.0) -> np.nda
 
 INTRINSICS = np.array([[FOCAL_LENGTH, 0, (FRAME[1] - 1) / 2], [0, FOCAL_LENGTH, (FRAME[0] - 1) / 2], [0, 0, 1]])
 # From directions in the car's level frame (right, down, forward) to pixels.
-CAMERA_MATRIX = INTRINSICS @ _turn(forward=np.radians(CAMERA_ROLL)) @ _turn(right=np.radians(CAMERA_PITCH)) @ _turn(down=-np.radians(CAMERA_YAW))
+CAMERA_MATRIX = (
+    INTRINSICS
+    @ _turn(forward=np.radians(CAMERA_ROLL))
+    @ _turn(right=np.radians(CAMERA_PITCH))
+    @ _turn(down=-np.radians(CAMERA_YAW))
+)
 _BACK = np.linalg.inv(CAMERA_MATRIX)
 
 
@@ -82,15 +87,16 @@ def warp(frame: np.ndarray, right: float, forward: float, yaw: float, box=(0, FR
     seen = np.ones(made.shape[:2], bool)
     if top < FIRST_ROW_WITHOUT_SKY:
         end = min(bottom, FIRST_ROW_WITHOUT_SKY)
-        made[:end - top] = cv2.warpPerspective(frame, _moved(far, top, left), (width, end - top),
-                                               borderMode=cv2.BORDER_REFLECT_101)
+        made[: end - top] = cv2.warpPerspective(
+            frame, _moved(far, top, left), (width, end - top), borderMode=cv2.BORDER_REFLECT_101
+        )
     first = max(top, FIRST_GROUND_ROW)
     if first < bottom:
         matrix, size = _moved(near, first, left), (width, bottom - first)
         below = cv2.warpPerspective(frame, matrix, size, borderMode=cv2.BORDER_REPLICATE)
-        mask = ground_mask()[first:bottom, left:left + width]
-        cv2.copyTo(below, mask, made[first - top:])
-        seen[first - top:] = (cv2.warpPerspective(road_mask(), matrix, size) == 255) | (mask == 0)
+        mask = ground_mask()[first:bottom, left : left + width]
+        cv2.copyTo(below, mask, made[first - top :])
+        seen[first - top :] = (cv2.warpPerspective(road_mask(), matrix, size) == 255) | (mask == 0)
     return made, seen
 
 

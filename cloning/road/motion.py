@@ -84,10 +84,17 @@ def stretches(recording: Recording) -> list[Stretch]:
     """The drives between a recording's breaks: gaps in time, jumps in speed, standing. Each at least two seconds."""
     speed = np.abs(recording.speed.astype(float)) * MPH
     pause = np.diff(recording.time)
-    whole = (pause > 0) & (pause < MAX_GAP) & (np.abs(np.diff(speed)) < MAX_ACCELERATION * np.maximum(pause, 1 / SAMPLE_RATE))
+    whole = (
+        (pause > 0)
+        & (pause < MAX_GAP)
+        & (np.abs(np.diff(speed)) < MAX_ACCELERATION * np.maximum(pause, 1 / SAMPLE_RATE))
+    )
     moving = speed > MIN_SPEED
     joined = whole & moving[1:] & moving[:-1]
     starts = np.flatnonzero(np.r_[True, ~joined])
     ends = np.r_[starts[1:], len(speed)]
-    return [Stretch.of(recording, slice(a, b)) for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
-            if b - a >= 2 * SAMPLE_RATE]
+    return [
+        Stretch.of(recording, slice(a, b))
+        for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
+        if b - a >= 2 * SAMPLE_RATE
+    ]

@@ -81,9 +81,7 @@ class Track:
         self.length = float(along[-1])
         n = round(self.length)
         self.step = self.length / n
-        self.points = np.column_stack(
-            [np.interp(np.arange(n) * self.step, along, fine[:, i]) for i in range(3)]
-        )
+        self.points = np.column_stack([np.interp(np.arange(n) * self.step, along, fine[:, i]) for i in range(3)])
         self.edges = np.full((n, 2), road.edge)
         for side, start, end, edge in road.kerbs:
             self.edges[self._stretch(start, end), 0 if side > 0 else 1] = edge

@@ -60,7 +60,8 @@ def batch_pictures(generator, number: int) -> dict[str, bytes]:
     return {
         "training_generator_LRC_{}.png": side_by_side([left, center, right]),
         "training_generator_augmented-{}.png": side_by_side(
-            [panel(*one) for one in zip(augmented, titles, angle, strict=True)]),
+            [panel(*one) for one in zip(augmented, titles, angle, strict=True)]
+        ),
     }
 
 
@@ -71,8 +72,13 @@ def loss_picture(history: list[dict]) -> bytes:
     epochs, best = [row["epoch"] for row in history], min(history, key=lambda row: row["val_loss"])
     axes.plot(epochs, [row["loss"] for row in history], "o-", label="training (augmented, with dropout)")
     axes.plot(epochs, [row["val_loss"] for row in history], "o-", label="validation")
-    axes.annotate(f"best {best['val_loss']:.4f}", (best["epoch"], best["val_loss"]), (0, 10), ha="center",
-                  textcoords="offset points")
+    axes.annotate(
+        f"best {best['val_loss']:.4f}",
+        (best["epoch"], best["val_loss"]),
+        (0, 10),
+        ha="center",
+        textcoords="offset points",
+    )
     axes.margins(x=0.08)
     axes.set(title="Mean squared error of the steering", xlabel="epoch", ylabel="mean squared error", ylim=(0, None))
     axes.xaxis.get_major_locator().set_params(integer=True)

@@ -27,8 +27,9 @@ class PieceByPiece(torch.autograd.Function):
         def piece(start):
             part = slice(start, start + PIECE)
             with torch.enable_grad():
-                loss = squared_errors(network, precision, torch.device("cpu"), batch.images[part], batch.angles[part],
-                                      batch.keep[part])
+                loss = squared_errors(
+                    network, precision, torch.device("cpu"), batch.images[part], batch.angles[part], batch.keep[part]
+                )
             return loss.detach(), torch.autograd.grad(loss, parameters)
 
         pieces = pool.map(piece, range(0, len(batch.angles), PIECE))

@@ -53,8 +53,14 @@ class Lanes:
     @staticmethod
     def empty(n: int) -> "Lanes":
         goal = np.tile(np.float32([0, AHEAD]), (n, 1))
-        return Lanes(np.zeros(n, np.float32), np.zeros(n, np.float32), goal, np.zeros(n, bool),
-                     np.arange(n, dtype=np.int32), np.zeros((n, 3), np.float32))
+        return Lanes(
+            np.zeros(n, np.float32),
+            np.zeros(n, np.float32),
+            goal,
+            np.zeros(n, bool),
+            np.arange(n, dtype=np.int32),
+            np.zeros((n, 3), np.float32),
+        )
 
     @staticmethod
     def beside(recording: Recording) -> "Lanes":
@@ -87,8 +93,9 @@ class Lanes:
             before = np.maximum(np.searchsorted(driven, driven - EARLIER_FRAME, "right") - 1, 0)
             lanes.before[rows] = rows.start + before
             back = axle[before] - axle
-            lanes.moved[rows] = np.stack([(back * across(heading)).sum(1), (back * ahead(heading)).sum(1),
-                                          heading[before] - heading], axis=1)
+            lanes.moved[rows] = np.stack(
+                [(back * across(heading)).sum(1), (back * ahead(heading)).sum(1), heading[before] - heading], axis=1
+            )
         return lanes
 
     @staticmethod
@@ -102,7 +109,7 @@ class Lanes:
         """What leads each row's car from a pose onto the lane's centre: float32 (n,), -1..1 (pure pursuit)."""
         away = self.goal[:, 0] - np.clip(right, -STEEP, STEEP)
         beside = away * np.cos(yaw) - self.goal[:, 1] * np.sin(yaw)
-        return steering_for(2 * beside / (away ** 2 + self.goal[:, 1] ** 2)).astype(np.float32)
+        return steering_for(2 * beside / (away**2 + self.goal[:, 1] ** 2)).astype(np.float32)
 
     def weights(self) -> np.ndarray:
         """How often each row is to be drawn, float64 (n,), sum 1: the more, the harder the lane turns there."""
@@ -153,8 +160,13 @@ class Poses:
     def of(lanes: Lanes, right, yaw, camera: np.ndarray, mirrored: np.ndarray) -> "Poses":
         turn = yaw - lanes.yaw
         # Of the camera, from the recorded rear axle, along the recorded car.
-        eye = np.stack([(right - lanes.offset) * np.cos(lanes.yaw) + AXLE_TO_CAMERA * np.sin(turn),
-                        (right - lanes.offset) * np.sin(lanes.yaw) + AXLE_TO_CAMERA * np.cos(turn)], axis=1)
+        eye = np.stack(
+            [
+                (right - lanes.offset) * np.cos(lanes.yaw) + AXLE_TO_CAMERA * np.sin(turn),
+                (right - lanes.offset) * np.sin(lanes.yaw) + AXLE_TO_CAMERA * np.cos(turn),
+            ],
+            axis=1,
+        )
         side = np.array(list(CAMERA_OFFSETS.values()))[camera]
         warps = [warps_between(eye, turn, moved, side, mirrored) for moved in (np.zeros_like(lanes.moved), lanes.moved)]
         steering = lanes.steering(right, yaw)
@@ -237,8 +249,9 @@ def warp(frame: np.ndarray, warps: np.ndarray, mirrored: bool) -> tuple[np.ndarr
     size = SEEN[::-1]
     made = cv2.warpPerspective(frame, warps[0], size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen = cv2.warpPerspective(_ROAD, warps[0], size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-    far = cv2.warpPerspective(frame, warps[1], (size[0], HORIZON), flags=cv2.INTER_LINEAR,
-                              borderMode=cv2.BORDER_REFLECT_101)
+    far = cv2.warpPerspective(
+        frame, warps[1], (size[0], HORIZON), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+    )
     cv2.copyTo(far, _SKY[mirrored], made[:HORIZON])
     seen[:HORIZON] |= _SKY[mirrored]
     return made, seen

@@ -160,8 +160,7 @@ class Connection:
         last = len(pieces) - 1
         try:
             frames = [
-                self.protocol.send(TextMessage(piece, message_finished=i == last))
-                for i, piece in enumerate(pieces)
+                self.protocol.send(TextMessage(piece, message_finished=i == last)) for i, piece in enumerate(pieces)
             ]
             for frame in frames if self.patient else [b"".join(frames)]:
                 self.socket.sendall(frame)

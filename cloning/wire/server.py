@@ -42,7 +42,7 @@ class QuickSocket:
             if QUICKACK is not None:
                 self.sock.setsockopt(socket.IPPROTO_TCP, QUICKACK, 1)
         start, self.at = self.at, min(self.at + size, len(self.buffer))
-        return self.buffer[start:self.at]
+        return self.buffer[start : self.at]
 
 
 class WebSocket(eventlet.websocket.RFC6455WebSocket):
@@ -82,7 +82,7 @@ class WebSocket(eventlet.websocket.RFC6455WebSocket):
     def _apply_mask(data, mask, length=None, offset=0):
         """XOR in one go where eventlet loops over the bytes in Python (3.5 ms a telemetry message)."""
         mask = bytes(mask[(offset + i) % 4] for i in range(4)) * (len(data) // 4 + 1)
-        both = int.from_bytes(data, "little") ^ int.from_bytes(mask[:len(data)], "little")
+        both = int.from_bytes(data, "little") ^ int.from_bytes(mask[: len(data)], "little")
         return both.to_bytes(len(data), "little")
 
 
@@ -119,9 +119,17 @@ class Server(socketio.Server):
     def __init__(self, **options):
         driver._async["websocket"] = WebSocketWSGI
         super().__init__(
-            async_mode="eventlet", async_handlers=False, json=Json, max_http_buffer_size=MAX_MESSAGE,
+            async_mode="eventlet",
+            async_handlers=False,
+            json=Json,
+            max_http_buffer_size=MAX_MESSAGE,
             # The simulator announces itself every 25 s; a minute more of patience outlasts a suspended laptop.
-            ping_timeout=60, ping_interval=(25, 60), cookie=None, cors_allowed_origins=[], **options)
+            ping_timeout=60,
+            ping_interval=(25, 60),
+            cookie=None,
+            cors_allowed_origins=[],
+            **options,
+        )
 
     def _handle_eio_message(self, sid, data):
         # What is no message is dropped here: python-socketio takes quadratic time over the digits of a long header.
@@ -135,14 +143,19 @@ def closed_to_strangers(app):
     A page of another origin names itself in Origin (websocket, fetch) or in Sec-Fetch-Site (image, script); one
     that had its own name point here (DNS rebinding) names itself in Host.
     """
+
     def guard(environ, start_response):
         host, origin = environ.get("HTTP_HOST", ""), environ.get("HTTP_ORIGIN")
         site = environ.get("HTTP_SEC_FETCH_SITE", "none")
-        if (_is_address(host) and origin in (None, f"http://{host}")
-                and (site in ("none", "same-origin") or environ["PATH_INFO"] == "/")):
+        if (
+            _is_address(host)
+            and origin in (None, f"http://{host}")
+            and (site in ("none", "same-origin") or environ["PATH_INFO"] == "/")
+        ):
             return app(environ, start_response)
         start_response("403 Forbidden", [("Content-Type", "text/plain"), ("Connection", "close")])
         return [b"This server drives for programs on its own machine and for its own page.\n"]
+
     return guard
 
 

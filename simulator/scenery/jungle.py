@@ -185,18 +185,12 @@ def furniture(track: Track, light: Light, palette: dict) -> list[Mesh]:
     posts = bends + [(side, s) for side, start, end in MARKED for s in np.arange(start, end, 7.0)]
     for side, s in posts:
         place = track.at(s, -side * 5.2)
-        made.append(
-            box((place.x, place.y, place.z - 0.5), (0.09, 0.09, 3.1), place.heading, palette["post"], white)
-        )
-        made.append(
-            box((place.x, place.y, place.z + 2.3), (0.10, 0.55, 0.30), place.heading, palette["board"], white)
-        )
+        made.append(box((place.x, place.y, place.z - 0.5), (0.09, 0.09, 3.1), place.heading, palette["post"], white))
+        made.append(box((place.x, place.y, place.z + 2.3), (0.10, 0.55, 0.30), place.heading, palette["board"], white))
     for s in np.arange(BRIDGE[0] + 6, BRIDGE[1], 18.0):
         for side in (1, -1):
             place = track.at(s, -side * 4.6)
-            made.append(
-                box((place.x, place.y, place.z - 26), (0.7, 0.7, 25.0), place.heading, palette["deck"], white)
-            )
+            made.append(box((place.x, place.y, place.z - 26), (0.7, 0.7, 25.0), place.heading, palette["deck"], white))
     return [lit(together(made), light)]
 
 
@@ -220,9 +214,7 @@ def palms(land: Land, random, light: Light, palette: dict) -> list[Mesh]:
         mine = np.arange(len(places)) % 4 == kind
         texture = textures.palm(random) if kind < 3 else textures.bush(random)
         height = tall[mine] * (1.0 if kind < 3 else 0.3)
-        meshes.append(
-            plants(places[mine], height, (0.9 if kind < 3 else 2.0) * height, colours[mine], texture, random)
-        )
+        meshes.append(plants(places[mine], height, (0.9 if kind < 3 else 2.0) * height, colours[mine], texture, random))
     return meshes
 
 
@@ -238,6 +230,4 @@ def scenery(look: int) -> Scenery:
         *palms(land, random, light, palette),
     ]
     sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
-    return Scenery(
-        meshes, sky, bonnet(palette["bonnet"], light), body(palette["bonnet"], light), tone=chosen.tone
-    )
+    return Scenery(meshes, sky, bonnet(palette["bonnet"], light), body(palette["bonnet"], light), tone=chosen.tone)

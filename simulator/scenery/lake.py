@@ -148,9 +148,7 @@ class Land:
         beyond = self.relief * np.where(near > 2.5, 14 + 9 * roll, 1.5 + 4 * roll) if len(places) else roll
         lake = (side > 0) & (away > 40)
         beyond = np.where(lake, -3 + 2.2 * roll, beyond)
-        z = near * rise * (1 + 0.15 * roll) + np.where(
-            lake, (beyond - near) * far, np.maximum(beyond, 0) * far * 0.8
-        )
+        z = near * rise * (1 + 0.15 * roll) + np.where(lake, (beyond - near) * far, np.maximum(beyond, 0) * far * 0.8)
         z = np.where(near < 0, np.where(away > 60, z + 2.2 * far * (side < 0), z), z)
         return np.where(away < 8.5, -0.15, z + 0.02)
 

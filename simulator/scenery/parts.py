@@ -31,9 +31,7 @@ class Scenery:
 def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
     """A sky around the viewer, its texture's bottom row at the horizon."""
     turn, rise = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.radians([-8, 0, 5, 10, 20, 40, 88]))
-    points = radius * np.stack(
-        [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1
-    )
+    points = radius * np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1)
     height = np.clip(rise / np.radians(40), 0.01, 0.99)
     uv = np.stack([turn, height], axis=-1).reshape(-1, 2)
     return Mesh(points.reshape(-1, 3), np.ones((turn.size, 3)), uv, grid(*turn.shape), texture)
@@ -81,7 +79,5 @@ def body(colour: tuple[float, float, float], light: Light) -> Mesh:
         box((0, -0.45, 1.26), (1.30, 1.8, 0.06), 0.0, colour, plain),
         box((0, -2.35, 0.65), (1.5, 0.08, 0.12), 0.0, (0.75, 0.10, 0.08), plain),
     ]
-    boxes += [
-        box((x, y, 0.0), (0.25, 0.68, 0.68), 0.0, dark, plain) for x in (-0.88, 0.88) for y in (1.27, -1.60)
-    ]
+    boxes += [box((x, y, 0.0), (0.25, 0.68, 0.68), 0.0, dark, plain) for x in (-0.88, 0.88) for y in (1.27, -1.60)]
     return lit(together(boxes), light)

@@ -102,9 +102,7 @@ def stretch(start: float, end: float, every: float = 1.0) -> np.ndarray:
     return np.linspace(start, end, max(2, round((end - start) / every) + 1))
 
 
-def plants(
-    places: np.ndarray, heights: np.ndarray, widths: np.ndarray, colours: np.ndarray, texture, random
-) -> Mesh:
+def plants(places: np.ndarray, heights: np.ndarray, widths: np.ndarray, colours: np.ndarray, texture, random) -> Mesh:
     """Two crossed upright pictures at each of the places (n, 3); heights and widths (n,) in metres, colours
     (n, 3)."""
     turn = random.uniform(0, np.pi, len(places))[:, None] + np.array([0, np.pi / 2])
@@ -113,9 +111,7 @@ def plants(
     )  # (n, 2, 3)
     foot, up = places[:, None], np.zeros((len(places), 1, 3))
     up[:, 0, 2] = heights
-    corners = np.stack(
-        [foot - aside, foot + aside, foot + aside + up, foot - aside + up], axis=2
-    )  # (n, 2, 4, 3)
+    corners = np.stack([foot - aside, foot + aside, foot + aside + up, foot - aside + up], axis=2)  # (n, 2, 4, 3)
     quads = 2 * len(places)
     faces = np.arange(quads)[:, None, None] * 4 + np.array([[0, 1, 2], [0, 2, 3]])
     uv = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), (quads, 1))
@@ -124,9 +120,7 @@ def plants(
 
 def boulder(centre, size, random, colour, texture, lumps: float = 0.15, detail: int = 9) -> Mesh:
     """A lumpy ellipsoid; size: its half axes in metres."""
-    polar, turn = np.meshgrid(
-        np.linspace(0, np.pi, detail), np.linspace(0, 2 * np.pi, 2 * detail), indexing="ij"
-    )
+    polar, turn = np.meshgrid(np.linspace(0, np.pi, detail), np.linspace(0, 2 * np.pi, 2 * detail), indexing="ij")
     waves = sum(
         random.normal() * np.cos(random.integers(1, 4) * turn + random.uniform(0, 6)) * np.sin(polar) ** 2
         for _ in range(5)
@@ -142,9 +136,7 @@ def boulder(centre, size, random, colour, texture, lumps: float = 0.15, detail: 
 def box(centre, size, heading: float, colour, texture) -> Mesh:
     """An upright box: centre of its foot, (length, width, height) in metres, its length along `heading`."""
     length, width, height = size
-    corner = np.array(
-        [[x, y, z] for z in (0, 1) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
-    )
+    corner = np.array([[x, y, z] for z in (0, 1) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))])
     sides = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7))
     points = corner[np.array(sides).ravel()] * (length, width, height)
     cos, sin = np.cos(heading), np.sin(heading)

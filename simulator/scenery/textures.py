@@ -90,9 +90,7 @@ def pine(random, size: int = 128, low: float = 0.62) -> np.ndarray:
         y = random.uniform(0.03, low)
         width = 0.05 + 0.30 * (y / low) ** 0.7
         x = middle + random.normal() * width * size * 0.42
-        level = int(
-            255 * np.clip(random.uniform(0.45, 0.85) + 0.25 * (1 - y / low) + 0.1 * (x > middle), 0, 1)
-        )
+        level = int(255 * np.clip(random.uniform(0.45, 0.85) + 0.25 * (1 - y / low) + 0.1 * (x > middle), 0, 1))
         cv2.ellipse(
             texture,
             (int(x), int(y * size)),
@@ -116,9 +114,7 @@ def bush(random, size: int = 64) -> np.ndarray:
             x, y = middle + random.normal() * wide * 0.6, 1 - abs(random.normal()) * tall * 0.45
             level = int(random.uniform(120, 250))
             centre = (int(np.clip(x, 0.04, 0.96) * size), int(max(0.1, y) * size))
-            cv2.circle(
-                texture, centre, int(random.integers(1, 4)), (level, level, int(0.85 * level), 255), -1
-            )
+            cv2.circle(texture, centre, int(random.integers(1, 4)), (level, level, int(0.85 * level), 255), -1)
     return texture
 
 
@@ -144,9 +140,7 @@ def palm(random, size: int = 128) -> np.ndarray:
     texture[:, :, :3] = 150
     crown = np.array([size * 0.52, size * 0.26])
     bend = random.uniform(-0.14, 0.14) * size
-    trunk = np.array(
-        [[size * 0.5 + bend * (1 - t) ** 2, size - t * size * 0.74] for t in np.linspace(0, 1, 12)]
-    )
+    trunk = np.array([[size * 0.5 + bend * (1 - t) ** 2, size - t * size * 0.74] for t in np.linspace(0, 1, 12)])
     crown[0] = trunk[-1][0]
     cv2.polylines(texture, [trunk.astype(np.int32)], False, (120, 100, 80, 255), max(3, size // 30))
     for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False) + random.uniform(0, 0.5):
