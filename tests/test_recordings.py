@@ -187,7 +187,7 @@ def test_unchanged_images_are_not_looked_at_again(copied, monkeypatch):
     first = read_recording(copied)
     check_images(first)
     looked_at = []
-    monkeypatch.setattr("images.decode", lambda jpeg: looked_at.append(jpeg) or decode(jpeg))
+    monkeypatch.setattr("cloning.recordings.check.decode", lambda jpeg: looked_at.append(jpeg) or decode(jpeg))
     changed = copied / "IMG" / os.fsdecode(first.names[7])
     changed.write_bytes(changed.read_bytes()[:100])
     again = read_recording(copied)

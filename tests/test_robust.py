@@ -230,7 +230,7 @@ def test_the_recipes_options_do_not_go_with_robust(drawn, tmp_path):
 
 
 def test_drives_too_short_are_named(tmp_path):
-    done = run_model(draw_recording(tmp_path / "short", rows=20), *SHORT, "--output", tmp_path / "model.pt")
+    done = run_model(draw_recording(tmp_path / "short", rows=20), *ROBUST, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
     assert "too short" in done.stderr
 

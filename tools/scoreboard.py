@@ -159,7 +159,7 @@ def main() -> None:
     mine["what"] = args.what or mine["what"]
     words = [word for before, word in pairwise(sys.argv) if "--what" not in (before, word)]
     words = [Path(word).name if "/" in word else word for word in words]
-    command = shlex.join(["python", "-m tools.scoreboard", *words])
+    command = shlex.join(["python", "-m", "tools.scoreboard", *words])
     mine["commands"] = [*(one for one in mine["commands"] if one != command), command]
     mine["courses"] |= found
     write(file, json.dumps(results, indent=1).encode() + b"\n")
