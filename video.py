@@ -8,6 +8,7 @@ python video.py run1 --overlay model.pt     # with the steering and what the net
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Callable
 from datetime import datetime
 from fractions import Fraction
 from itertools import pairwise
@@ -19,53 +20,64 @@ from tqdm import tqdm
 
 from cloning.errors import UserError
 from cloning.film import FilmWriter
-from cloning.recordings import saved_frames as frames
-from cloning.recordings.format import FRAME
+from cloning.recordings import saved_frames
+from cloning.recordings.format import FRAME, SAMPLE_RATE
 from cloning.recordings.images import jpeg_size
 
-PAUSE = 1.0  # seconds between two frames from which it is a pause, which says nothing about the rate
+PAUSE = 1.0  # s: a longer gap between two frames is a pause, which says nothing about the rate
+MAX_RATE = 240.0  # frames/s of a film
+
+Overlay = Callable[[np.ndarray], np.ndarray]
 
 
 class FilmError(UserError):
     """A film that cannot be made; the message names the folder and the remedy."""
 
 
-def find(folder: Path) -> list[tuple[datetime, Path]]:
+def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
     """The folder's frames and their times, in order. Raises FilmError if there are none."""
     if not folder.is_dir():
         raise FilmError(f"{folder}: no such folder; `python drive.py model.pt {folder}` saves frames in it")
-    found, foreign = [], []
+    frames: list[tuple[datetime, Path]] = []
+    others: list[str] = []
     for path in folder.iterdir():
-        time = frames.taken_at(path.name)
+        time = saved_frames.taken_at(path.name)
         if time and path.is_file():
-            found.append((time, path))
+            frames.append((time, path))
         else:
-            foreign.append(path.name)
-    if not found:
+            others.append(path.name)
+    if not frames:
         raise FilmError(
             f"{folder}: no frames, which have names like 2018_07_16_17_11_43_382.jpg; "
             f"`python drive.py model.pt {folder}` saves some"
         )
-    if foreign:
-        print(f"left out, no frames: {listed(sorted(foreign))}", file=sys.stderr)
-    return sorted(found)
+    if others:
+        report(f"left out, not frames: {abbreviated(sorted(others))}")
+    return sorted(frames)
 
 
-def listed(names: list[str]) -> str:
+def abbreviated(names: list[str]) -> str:
+    """The first three names and how many more there are."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def rate(times: list[datetime]) -> Fraction:
-    """Frames per second by the frames' times, pauses left out, between 1 and 240; 15, a recording's, for one frame.
+def report(message: str) -> None:
+    """Print a message that is not the result."""
+    print(f"video.py: {message}", file=sys.stderr)
 
-    The mean, for frames arrive two or three at once: the median gap would be that within such a bunch.
+
+def frame_rate(times: list[datetime]) -> Fraction:
+    """Frames per second from the frames' times, without pauses, between 1 and 240; a single frame has a recording's.
+
+    The mean rather than the median gap: frames arrive in bunches of two or three.
     """
     gaps = [(after - before).total_seconds() for before, after in pairwise(times)]
     gaps = [gap for gap in gaps if gap < PAUSE]
-    return Fraction(min(240.0, max(1.0, len(gaps) / sum(gaps))) if sum(gaps) else 15).limit_denominator(1000)
+    rate = min(MAX_RATE, max(1.0, len(gaps) / sum(gaps))) if sum(gaps) else SAMPLE_RATE
+    return Fraction(rate).limit_denominator(1000)
 
 
-def read(path: Path) -> np.ndarray | None:
+def read_frame(path: Path) -> np.ndarray | None:
     """A frame of any size, uint8 (rows, columns, 3), RGB; None if it is unreadable or cut short."""
     try:
         jpeg = path.read_bytes()
@@ -75,64 +87,65 @@ def read(path: Path) -> np.ndarray | None:
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
 
 
-def film(folder: Path, fps: Fraction | None = None, overlay=None) -> Path:
-    """Write `folder`.mp4 beside the folder.
+def film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = None) -> Path:
+    """Write `folder`.mp4 next to the folder, and return its path.
 
-    overlay: a function from a frame to its picture. Raises FilmError.
+    fps: frames/s; None: from the frames' times. overlay: from a frame, uint8 (rows, columns, 3), RGB, to its picture,
+    one size for all. Raises FilmError and OSError.
     """
-    found = find(folder)
-    fps = fps or rate([time for time, _ in found])
+    frames = find_frames(folder)
+    fps = fps or frame_rate([time for time, _ in frames])
     path = folder.with_name(folder.name + ".mp4")
-    unreadable, sizes = [], Counter()
-    made = FilmWriter(path, fps)
+    unreadable: list[str] = []
+    sizes: Counter[tuple[int, ...]] = Counter()
+    writer = FilmWriter(path, fps)
     try:
-        for _, frame_path in tqdm(found, unit="frame", disable=None):
-            frame = read(frame_path)
+        for _, frame_path in tqdm(frames, unit="frame", disable=None):
+            frame = read_frame(frame_path)
             if frame is None:
                 unreadable.append(frame_path.name)
                 continue
             sizes[frame.shape] += 1
-            shape = next(iter(sizes))
-            if frame.shape != shape:
-                frame = cv2.resize(frame, shape[1::-1], interpolation=cv2.INTER_AREA)
-            made.add(overlay(frame) if overlay else frame)
-        made.close()
+            first = next(iter(sizes))
+            if frame.shape != first:
+                frame = cv2.resize(frame, (first[1], first[0]), interpolation=cv2.INTER_AREA)
+            writer.add(overlay(frame) if overlay else frame)
+        writer.close()
     finally:
-        made.discard()
+        writer.discard()
     if not sizes:
-        raise FilmError(f"{folder}: none of its {len(found)} frames is readable")
+        raise FilmError(f"{folder}: none of its {len(frames)} frames is readable; save new ones with drive.py")
     if unreadable:
-        print(f"left out, unreadable: {listed(unreadable)}", file=sys.stderr)
+        report(f"left out, unreadable: {abbreviated(unreadable)}")
     if len(sizes) > 1:
-        others = sum(list(sizes.values())[1:])
-        print(f"{others} frames of another size were scaled to {shape[1]}x{shape[0]}", file=sys.stderr)
-    print(f"{path}: {sum(sizes.values())} frames at {float(fps):.4g} frames/s")
+        report(f"{sizes.total() - sizes[first]} frames of another size were scaled to {first[1]}x{first[0]}")
+    print(f"{path}: {sizes.total()} frames at {float(fps):.4g} frames/s")
     return path
 
 
-def overlay_of(model_file: str):
-    """The overlay with the network's own steering and what it looks at. Raises FilmError."""
-    from cloning.errors import ModelError
-    from cloning.pilot import attention  # which loads torch, and that takes longer than a short film
+def load_overlay(model_file: Path) -> Overlay:
+    """The overlay with a model's own steering and what it looks at. Raises UserError."""
+    from cloning.pilot import attention  # loads torch, which takes longer than a short film
     from cloning.pilot.network import load_model
 
-    try:
-        network = load_model(model_file)
-    except ModelError as error:
-        raise FilmError(error) from None
+    network = load_model(model_file)
 
     def overlay(frame: np.ndarray) -> np.ndarray:
         if frame.shape != FRAME:
             raise FilmError(
-                f"the frames are {frame.shape[1]}x{frame.shape[0]} where a model sees "
+                f"the frames have {frame.shape[1]}x{frame.shape[0]} pixels, but a model reads "
                 f"{FRAME[1]}x{FRAME[0]}; leave out --overlay"
             )
-        return attention.overlay(frame, *attention.visual_backprop(network, frame))
+        try:
+            return attention.overlay(frame, *attention.visual_backprop(network, frame))
+        except ArithmeticError as error:
+            raise FilmError(f"{model_file}: {error}; train the model again with `python model.py`") from None
 
     return overlay
 
 
-def frame_rate(text: str) -> Fraction:
+def parse_rate(text: str) -> Fraction:
+    """A rate of the command line. Raises ValueError unless it is above 0 and at most 1000."""
     rate = Fraction(text)
     if not 0 < rate <= 1000:
         raise ValueError
@@ -140,15 +153,18 @@ def frame_rate(text: str) -> Fraction:
 
 
 def main() -> None:
+    """Make the film that the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="the frames; its film is FOLDER.mp4")
-    parser.add_argument("--fps", type=frame_rate, help="frames per second, up to 1000 (default: by the frames' times)")
-    parser.add_argument("--overlay", metavar="MODEL", help="draw this model's steering and what it looks at")
+    parser.add_argument("folder", type=Path, help="the folder with the frames; the film is FOLDER.mp4")
+    parser.add_argument(
+        "--fps", type=parse_rate, help="frames per second, up to 1000 (default: from the frames' times)"
+    )
+    parser.add_argument("--overlay", metavar="MODEL", type=Path, help="draw this model's steering and attention")
     args = parser.parse_args()
-    folder = args.folder if args.folder.name not in ("", "..") else args.folder.resolve()  # "." has a name, too
+    folder = args.folder if args.folder.name not in ("", "..") else args.folder.resolve()  # so that "." has a name too
     try:
-        film(folder, args.fps, overlay_of(args.overlay) if args.overlay else None)
-    except (FilmError, OSError) as error:
+        film(folder, args.fps, load_overlay(args.overlay) if args.overlay else None)
+    except (UserError, OSError) as error:
         sys.exit(f"video.py: {error}")
     except KeyboardInterrupt:
         sys.exit("video.py: stopped; no film was written")

@@ -1,7 +1,8 @@
-"""drive.py without a network socket: the speed controller, telemetry of every kind, saved frames, the attention."""
+"""drive.py without a network socket: speed controller, answers, status line, saved frames, attention."""
 
 import base64
 import logging
+import time
 from pathlib import Path
 
 import cv2
@@ -12,9 +13,11 @@ from conftest import draw_frame
 from PIL import Image
 
 import drive
+from cloning.errors import UserError
 from cloning.pilot import attention
-from cloning.pilot.network import Network
+from cloning.pilot.network import SHIPPED, Network
 from cloning.recordings import saved_frames as frames
+from cloning.recordings.images import decode
 
 
 def jpeg_of(frame: np.ndarray) -> bytes:
@@ -86,7 +89,7 @@ def test_frames_are_seen_in_rgb_and_alike_on_disk_and_in_telemetry(session, netw
         swapped = network(torch.from_numpy(np.array(Image.open(path))[..., ::-1].copy())[None])[0].item()
     answered = float(session.answer(telemetry(path.read_bytes()))["steering_angle"])
     assert abs(answered - oracle) < 0.02 * abs(answered - swapped)
-    on_disk = drive.steer(network, drive.decode(path.read_bytes()))
+    on_disk = drive.steer(network, decode(path.read_bytes()))
     assert np.float32(answered) == on_disk
 
 
@@ -112,7 +115,6 @@ BROKEN = {
     "null for speed": lambda good: {**good, "speed": None},
     "NaN for speed": lambda good: {**good, "speed": "NaN"},
     "infinite speed": lambda good: {**good, "speed": "1e999"},
-    "a list for the angle": lambda good: {**good, "steering_angle": [0]},
     "null for the image": lambda good: {**good, "image": None},
     "a number for the image": lambda good: {**good, "image": 5},
     "empty image": lambda good: {**good, "image": ""},
@@ -132,7 +134,7 @@ def test_unusable_telemetry_gets_the_last_steering_and_no_throttle(session, jpeg
     with caplog.at_level(logging.WARNING, "drive"):
         assert session.answer(BROKEN[kind](good)) == {"steering_angle": before["steering_angle"], "throttle": "0"}
     assert "can't be used" in caplog.text
-    assert (session.served, session.unusable) == (1, 1)
+    assert (session.driven, session.unusable) == (1, 1)
     assert session.answer(good)["steering_angle"] == before["steering_angle"]
 
 
@@ -150,6 +152,24 @@ def test_a_failing_network_is_answered(session, jpeg, failure):
     assert session.answer(telemetry(jpeg)) == {"steering_angle": before["steering_angle"], "throttle": "0"}
 
 
+NOT_NEEDED = {
+    "a list for the angle": {"steering_angle": [0]},
+    "text for the angle": {"steering_angle": "left"},
+    "null for the throttle": {"throttle": None},
+    "more than the simulator sends": {"cte": "-0.5", "hit": "none", "lap": 1},
+}
+
+
+@pytest.mark.parametrize("kind", [*NOT_NEEDED, "no angle", "no throttle"])
+def test_only_the_image_and_the_speed_are_needed(session, jpeg, kind):
+    expected = drive.Session(session.server, {}).answer(telemetry(jpeg))
+    message = {**telemetry(jpeg), **NOT_NEEDED.get(kind, {})}
+    if kind.startswith("no "):
+        del message[{"no angle": "steering_angle", "no throttle": "throttle"}[kind]]
+    assert session.answer(message) == expected
+    assert (session.driven, session.unusable) == (1, 0)
+
+
 def test_a_warning_is_logged_once_per_kind():
     once = drive.OncePerKind()
 
@@ -157,6 +177,16 @@ def test_a_warning_is_logged_once_per_kind():
         return once.filter(logging.LogRecord("drive", logging.WARNING, "", 0, message, None, None))
 
     assert passes("30000x30000 pixels") and not passes("20000x100 pixels") and passes("not base64")
+
+
+def test_each_session_logs_its_own_warnings(session, caplog):
+    once, other = drive.OncePerKind(), drive.Session(session.server, {})
+    with caplog.at_level(logging.WARNING, "drive"):
+        for each in (session, other, session, other):
+            each.answer({})
+            each.answer([])
+    assert len(caplog.records) == 8
+    assert [once.filter(record) for record in caplog.records] == [True] * 4 + [False] * 4
 
 
 def test_decimal_commas_are_read_and_answered_with_commas(session, jpeg):
@@ -167,10 +197,23 @@ def test_decimal_commas_are_read_and_answered_with_commas(session, jpeg):
     assert "." not in session.answer({})["steering_angle"], "an unusable frame is answered in kind too"
 
 
-@pytest.mark.parametrize("value", [1e-7, -3e-5, 0.1, -1.0, 123456.0])
-def test_numbers_are_written_without_exponent_and_exactly(value):
-    written = drive.text(np.float32(value))
-    assert "e" not in written and np.float32(written) == np.float32(value)
+@pytest.mark.parametrize(
+    "angle, throttle, speed, separator",
+    [
+        ("12.3456-", "0.2000", "6.5000", "."),  # ar-SA
+        ("- 12.3456", "0.2000", "6.5000", "."),  # km-KH
+        ("- 12,3456", "0,2000", "6,5000", ","),  # hr-HR
+        ("12/3456-", "0/2000", "6/5000", "/"),  # fa-IR
+        ("\u221212,3456", "0,2000", "6,5000", ","),
+        ("\u200e\u221212\u066b3456", "0\u066b2000", "6\u066b5000", "\u066b"),
+    ],
+)
+def test_a_left_bend_is_driven_in_every_culture(session, jpeg, angle, throttle, speed, separator):
+    expected = drive.Session(session.server, {}).answer(telemetry(jpeg, speed="6.5000"))
+    answer = session.answer(telemetry(jpeg, speed=speed, steering_angle=angle, throttle=throttle))
+    assert answer == {key: value.replace(".", separator) for key, value in expected.items()}
+    assert separator in answer["throttle"]
+    assert (session.driven, session.unusable) == (1, 0)
 
 
 @pytest.mark.parametrize("bias", [-7, 7])
@@ -179,6 +222,79 @@ def test_steering_stays_within_its_range(jpeg, bias):
     torch.nn.init.constant_(network.dense[-1].bias, bias)
     answer = drive.Session(drive.DriveServer(network), {}).answer(telemetry(jpeg))
     assert answer["steering_angle"] == ("-1" if bias < 0 else "1")
+
+
+# --------------------------------------------------------------------------------------------------
+# Status line and command line
+
+
+class Arrived:
+    """A websocket whose message arrived `ms` milliseconds ago."""
+
+    def __init__(self, ms: float):
+        self.ms = ms
+
+    @property
+    def arrived(self) -> float:
+        return time.perf_counter() - self.ms / 1000
+
+
+def test_the_latency_is_the_time_in_the_server_however_many_frames_are_in_flight(session, jpeg):
+    """Three telemetries circulate, and the simulator takes half a second to send the next one."""
+    session.environ["drive.websocket"] = Arrived(ms=40)
+    for _ in range(3):
+        session.answer(telemetry(jpeg))
+    status = drive.StatusLine(session.server, terminal=False)
+    shown = [float(part.split()[1]) for part in status.text(session, time.perf_counter()).split(", ") if "ms" in part]
+    on_the_page = [frame.latency for frame in session.history]
+    assert shown == [pytest.approx(np.mean(on_the_page), abs=0.06)]
+    assert all(40 <= latency < 540 for latency in on_the_page)
+
+
+def test_the_first_rate_of_a_session_counts_from_its_start(session, jpeg, capsys):
+    status = drive.StatusLine(session.server, terminal=False)
+    status.time -= 3600  # an hour of waiting for a simulator
+    session.server.sessions["sid"] = session
+    for _ in range(20):
+        session.answer(telemetry(jpeg))
+    session.began = time.perf_counter() - 2.0
+    status.update()
+    assert float(capsys.readouterr().err.split()[0]) == pytest.approx(10, rel=0.05)
+    status.time, status.session = time.perf_counter() - 61, session  # the next line counts from the last one
+    session.driven += 610
+    status.update()
+    assert float(capsys.readouterr().err.split()[0]) == pytest.approx(10, rel=0.05)
+
+
+def test_escape_sequences_are_for_terminals_only(session, jpeg, capsys):
+    session.server.sessions["sid"] = session
+    session.answer(telemetry(jpeg))
+    for terminal in (True, False):
+        status = drive.StatusLine(session.server, terminal)
+        status.time -= 3600
+        status.update()
+        assert ("\033" in capsys.readouterr().err) is terminal
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["model.pt", "run1", "--port", "1"], ["model.pt", "--port", "1", "run1"], ["--port", "1", "model.pt", "run1"]],
+)
+def test_the_folder_may_follow_options(arguments):
+    args = drive.parse_arguments(arguments)
+    assert (str(args.model), str(args.folder), args.port) == ("model.pt", "run1", 1)
+
+
+def test_which_model_drives(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert drive.choose_model(None, None) == SHIPPED
+    (tmp_path / "model.pt").touch()
+    assert drive.choose_model(None, None) == Path("model.pt")
+    assert drive.choose_model(Path("none.pt"), None) == Path("none.pt"), "whose loading tells that it is missing"
+    (tmp_path / "run1").mkdir()
+    for folder in ("run1", "run2"):
+        with pytest.raises(UserError, match=f"`python drive.py model.pt {folder}`"):
+            drive.choose_model(Path(folder), None)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -239,11 +355,26 @@ def test_attention_is_where_the_network_can_see_anything():
     assert mask[:, :140].max() == 0
 
 
+def middle(picture: np.ndarray) -> float:
+    """The mean column of the line in an overlay, above the bonnet."""
+    return (picture[..., 1] > 128)[:180].nonzero()[1].mean()
+
+
 def test_the_line_bends_to_the_side_of_the_steering():
     frame = np.zeros((160, 320, 3), np.uint8)
+    left, straight, right = (middle(attention.overlay(frame, steering)) for steering in (-0.3, 0.0, 0.3))
+    assert left < 300 < 340 < right
+    assert abs(straight - 320) < 6  # the camera is turned by 0.7 degrees and rolled by 1.2
 
-    def middle(steering):
-        return (attention.overlay(frame, steering)[..., 1] > 128)[:180].nonzero()[1].mean()
 
-    assert middle(-0.3) < 300 < 340 < middle(0.3)
-    assert abs(middle(0.0) - 320) < 6  # the camera is turned by 0.7 degrees and rolled by 1.2
+@pytest.mark.parametrize("output", [-4.9, 4.9])
+def test_what_is_drawn_is_what_is_sent(output, jpeg):
+    network = Network().eval()
+    for parameter in network.dense[-1].parameters():
+        torch.nn.init.zeros_(parameter)
+    torch.nn.init.constant_(network.dense[-1].bias, output)
+    sent = float(drive.Session(drive.DriveServer(network), {}).answer(telemetry(jpeg))["steering_angle"])
+    frame = np.zeros((160, 320, 3), np.uint8)
+    steering, _ = attention.visual_backprop(network, frame)
+    assert steering == sent == np.sign(output)
+    assert np.sign(middle(attention.overlay(frame, steering)) - 320) == np.sign(output)

@@ -1,4 +1,4 @@
-"""drive.py as a process, spoken to over real sockets as the simulator does and as strangers would."""
+"""drive.py as a process: over real sockets the simulator's conversation, strangers' requests and mistakes."""
 
 import json
 import os
@@ -21,17 +21,19 @@ import pytest
 import torch
 from conftest import ROOT, draw_frame
 
-from cloning.pilot.network import Network, load_model, save_model
+from cloning.errors import UserError
+from cloning.pilot.network import SHIPPED, Network, load_model, save_model, steer
 from cloning.recordings.images import decode
+from cloning.wire.versions import check_versions
 from tools.simulator_client import Simulator, fragments, telemetry
 
 
 class Process:
-    """A drive.py process."""
+    """A drive.py process; first: Python code to run before it."""
 
-    def __init__(self, *arguments, port=0, cwd=None):
+    def __init__(self, *arguments, port=0, cwd=None, first=""):
         self.process = subprocess.Popen(
-            [sys.executable, str(ROOT / "drive.py"), *map(str, arguments), "--port", str(port)],
+            [*script("drive.py", first), *map(str, arguments), "--port", str(port)],
             cwd=cwd,
             stderr=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -60,9 +62,19 @@ class Process:
         return code
 
     def memory(self) -> float:
-        """Resident MB."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        """Resident MB; 0 where the system does not tell it like Linux."""
+        if not Path("/proc/self/status").exists():
+            return 0.0
+        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="utf-8")
         return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
+
+
+def script(name: str, first: str = "") -> list[str]:
+    """The command of a script at the top; first: Python code to run before it."""
+    if not first:
+        return [sys.executable, str(ROOT / name)]
+    run = f"import runpy, sys; sys.path.insert(0, {str(ROOT)!r}); sys.argv = sys.argv[1:]"
+    return [sys.executable, "-c", f"{first}\n{run}\nrunpy.run_path(sys.argv[0], run_name='__main__')", str(ROOT / name)]
 
 
 @contextmanager
@@ -71,7 +83,8 @@ def serving(*arguments, **more):
     try:
         yield process
     finally:
-        process.stop(signal.SIGKILL)
+        process.process.kill()
+        process.stop()
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +111,7 @@ def server(model_file):
 
 @pytest.fixture(scope="module")
 def steering(model_file, jpegs) -> list[np.float32]:
-    """What the network says of the frames on disk, by itself."""
+    """The network's steering for the same JPEGs, without drive.py."""
     torch.set_num_threads(1)
     network = load_model(model_file)
     with torch.inference_mode():
@@ -106,7 +119,7 @@ def steering(model_file, jpegs) -> list[np.float32]:
 
 
 def test_the_recorded_session_byte_by_byte(server, jpegs, steering):
-    """The transcript of the real simulator's session: its handshake, its ping, driving, the driver's hand, its end."""
+    """The transcript of the real simulator's session: handshake, ping, driving, a human's intervention, end."""
     raw = socket.create_connection(("127.0.0.1", server.port), 10)
     raw.sendall(
         b"GET /socket.io/?EIO=4&transport=websocket HTTP/1.1\r\nUser-Agent: websocket-sharp/1.0\r\n"
@@ -215,12 +228,12 @@ def test_each_kind_of_unusable_frame_is_logged_once(model_file, jpegs):
                 simulator.drive({**telemetry(jpegs[0]), "speed": "fast"})
                 simulator.drive(telemetry(jpegs[0][:3000]))
         deadline = time.monotonic() + 20
-        while not any("has left" in line for line in process.lines) and time.monotonic() < deadline:
+        while not any("session ended" in line for line in process.lines) and time.monotonic() < deadline:
             time.sleep(0.05)
         process.stop()
     text = "".join(process.lines)
     assert text.count("can't be used") == 3
-    assert all(reason in text for reason in ("steering_angle is missing", "speed is not a number", "cut short"))
+    assert all(reason in text for reason in ("speed is missing", "speed is not a number", "cut short"))
     assert "1 frames driven, 150 unusable" in text
 
 
@@ -326,20 +339,35 @@ def test_a_name_that_was_made_to_point_here_is_refused(server, path):
         urllib.request.urlopen(request, timeout=10)
 
 
+def answers(address: str, port: int) -> bool:
+    """Whether a server on this machine accepts a connection to this address of it."""
+    try:
+        socket.create_connection((address, port), 2).close()
+    except OSError:
+        return False
+    return True
+
+
 def test_it_listens_on_loopback_alone(server):
-    listening = [
-        line.split()[1]
-        for line in Path("/proc/net/tcp").read_text().splitlines()[1:]
-        if line.split()[1].endswith(f":{server.port:04X}") and line.split()[3] == "0A"
-    ]
-    assert listening == [f"0100007F:{server.port:04X}"]
+    others = ["127.0.0.2", "::1"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing; the system chooses the address that faces the network
+            others.append(probe.getsockname()[0])
+        except OSError:
+            pass  # no network here
+    assert answers("127.0.0.1", server.port)
+    assert not any(answers(address, server.port) for address in others)
+    with socket.create_server(("0.0.0.0", 0)) as everywhere:
+        assert any(answers(address, everywhere.getsockname()[1]) for address in others), "the addresses tell"
 
 
-def failing(*arguments) -> str:
+def failing(*arguments, first="") -> str:
     process = subprocess.run(
-        [sys.executable, str(ROOT / "drive.py"), *map(str, arguments)], timeout=60, capture_output=True, text=True
+        [*script("drive.py", first), *map(str, arguments)], timeout=60, capture_output=True, text=True
     )
     assert process.returncode == 1 and "Traceback" not in process.stderr
+    assert process.stderr.splitlines()[-1].startswith("drive.py: ")
     return process.stderr
 
 
@@ -355,7 +383,57 @@ def test_mistakes_are_told(server, model_file, tmp_path):
     frame = tmp_path / "run1" / "2018_07_16_17_11_43_382.jpg"
     frame.write_bytes(b"frame")
     assert f"127.0.0.1:{server.port}" in failing(model_file, tmp_path / "run1", "--port", server.port)
-    assert frame.exists(), "what can't be served deletes nothing"
+    assert frame.exists(), "a server that cannot start deletes nothing"
+
+
+def test_other_versions_of_the_socket_libraries_are_refused():
+    said = failing(first="import importlib.metadata; importlib.metadata.version = lambda name: '5.18.1'")
+    assert "python-socketio is 5.18.1 and must be 4.6.1" in said and "pip install -r requirements.txt" in said
+
+
+def test_the_versions_come_from_requirements_txt(tmp_path):
+    check_versions(tmp_path / "none.txt")  # an installed package, whose versions pip has seen to
+    (tmp_path / "requirements.txt").write_text("eventlet==0.0.1  # older\npython-socketio==4.6.1\n")
+    with pytest.raises(UserError, match=r"^eventlet is [\d.]+ and must be 0\.0\.1: .*pip install -r requirements.txt"):
+        check_versions(tmp_path / "requirements.txt")
+
+
+def test_without_a_model_it_takes_model_pt_or_the_shipped_one_and_says_so(model_file, jpegs, steering, tmp_path):
+    with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
+        simulator.open()
+        answer = np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"])
+        assert answer == steer(load_model(SHIPPED), decode(jpegs[0]))
+        assert f"Driving with {SHIPPED} (the model that comes with the project).\n" in process.lines
+    shutil.copy(model_file, tmp_path / "model.pt")
+    with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
+        simulator.open()
+        assert np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"]) == steering[0]
+        assert "Driving with model.pt.\n" in process.lines
+
+
+# Takes away what other systems do not have, after torch, whose Linux build needs some of it.
+ELSEWHERE = """
+import os, signal, socket, torch
+for module, name in [(socket, "TCP_QUICKACK"), (signal, "SIGTERM"), (os, "fork"), (os, "sched_getaffinity")]:
+    vars(module).pop(name, None)
+"""
+
+
+def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, steering, tmp_path):
+    folder = tmp_path / "run1"
+    with serving(model_file, folder, first=ELSEWHERE) as process, Simulator(process.port) as simulator:
+        simulator.open()
+        for n in range(8):
+            assert np.float32(simulator.drive(telemetry(jpegs[n]))["steering_angle"]) == steering[n]
+        assert process.stop() == 0
+    assert len(list(folder.iterdir())) == 8
+    film = subprocess.run(
+        [*script("video.py", ELSEWHERE), str(folder), "--overlay", str(model_file)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert film.returncode == 0 and "run1.mp4: 8 frames" in film.stdout, film.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -364,7 +442,9 @@ def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path, number)
         simulator.open()
         for n in range(200):
             simulator.drive(telemetry(jpegs[n % 8]))
+        simulator.drive({})
         assert process.stop(number) == 0
+    assert process.lines[-1] == "drive.py: session ended: 200 frames driven, 1 unusable; driven frames saved in run1\n"
     saved = sorted((tmp_path / "run1").iterdir())
     assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(200)]
     assert all(re.fullmatch(r"\d{4}(_\d\d){5}_\d{3}\.jpg", path.name) for path in saved)

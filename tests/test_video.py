@@ -1,4 +1,4 @@
-"""video.py as it is called, its films read back by OpenCV's own FFmpeg."""
+"""video.py as a user calls it, with the films decoded by OpenCV's own FFmpeg."""
 
 import subprocess
 import sys
@@ -16,8 +16,8 @@ import video
 from cloning.pilot.network import Network, save_model
 
 
-def draw(number: int, rows=160, columns=320) -> np.ndarray:
-    """A red frame whose brightness counts: BGR."""
+def red_frame(number: int, rows=160, columns=320) -> np.ndarray:
+    """A red frame whose brightness tells its number: BGR."""
     frame = np.zeros((rows, columns, 3), np.uint8)
     frame[..., 2] = 40 + 6 * number
     return frame
@@ -27,7 +27,7 @@ def save(folder: Path, count=30, gap=0.05, rows=160, columns=320, begin=datetime
     folder.mkdir(exist_ok=True)
     for number in range(count):
         name = (begin + timedelta(seconds=gap * number)).strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
-        cv2.imwrite(str(folder / f"{name}.jpg"), draw(first + number, rows, columns))
+        cv2.imwrite(str(folder / f"{name}.jpg"), red_frame(first + number, rows, columns))
 
 
 @pytest.fixture
@@ -63,14 +63,14 @@ def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
     fps, seen = frames_of(tmp_path / "run1.mp4")
     assert fps == pytest.approx(20) and len(seen) == 30
     for number, frame in enumerate(seen):
-        assert np.abs(frame.mean((0, 1)) - draw(number).mean((0, 1))).max() < 4, "in order, red still red"
+        assert np.abs(frame.mean((0, 1)) - red_frame(number).mean((0, 1))).max() < 4, "in order, red still red"
     with av.open(str(tmp_path / "run1.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
 
 
 def test_what_a_person_would_wish(run, tmp_path):
-    """Foreign files and unreadable frames are left out and told, other sizes scaled; the given rate is taken."""
+    """Other files and unreadable frames are left out and reported, other sizes scaled; --fps is used."""
     folder = tmp_path / "run.1"
     save(folder, 10)
     save(folder, 2, rows=80, columns=160, begin=datetime(2018, 7, 16, 17, 11, 44), first=10)
@@ -80,8 +80,8 @@ def test_what_a_person_would_wish(run, tmp_path):
     (folder / "2018_07_16_17_11_44_901.jpg").write_bytes(whole[: len(whole) // 2])
     status, said = run("run.1", "--fps", "60")
     assert status == 0
-    assert "no frames: notes.txt" in said
-    assert "unreadable: 2018_07_16_17_11_44_900.jpg, 2018_07_16_17_11_44_901.jpg" in said
+    assert "video.py: left out, not frames: notes.txt" in said
+    assert "video.py: left out, unreadable: 2018_07_16_17_11_44_900.jpg, 2018_07_16_17_11_44_901.jpg" in said
     assert "2 frames of another size were scaled to 320x160" in said
     fps, seen = frames_of(tmp_path / "run.1.mp4")
     assert fps == pytest.approx(60) and len(seen) == 12
@@ -109,7 +109,7 @@ def test_no_film_is_a_clear_error(run, tmp_path, name, content, said):
 
 
 @pytest.mark.parametrize("fps", ["0", "-5", "fast", "nan"])
-def test_a_rate_that_is_none_is_refused(run, tmp_path, fps):
+def test_an_impossible_rate_is_refused(run, tmp_path, fps):
     save(tmp_path / "run1", 2)
     status, said = run("run1", "--fps", fps)
     assert status == 2 and "--fps" in said
@@ -120,7 +120,7 @@ def test_a_pause_and_bunches_leave_the_rate_alone():
     for bunch in range(100):  # three frames within two milliseconds, ten times a second, and a minute's pause
         at = begin + timedelta(seconds=bunch / 10 + (60 if bunch >= 50 else 0))
         times += [at, at + timedelta(milliseconds=1), at + timedelta(milliseconds=2)]
-    assert float(video.rate(times)) == pytest.approx(30, rel=0.02)
+    assert float(video.frame_rate(times)) == pytest.approx(30, rel=0.02)
 
 
 def test_the_overlay_draws_steering_and_attention(run, tmp_path):
@@ -136,4 +136,9 @@ def test_the_overlay_draws_steering_and_attention(run, tmp_path):
     assert len(green) > 200 and green.min() < 280 and green.max() < 330, "the line bends to the left"
     save(tmp_path / "small", 3, rows=80, columns=160)
     assert "320x160" in run("small", "--overlay", "model.pt")[1]
-    assert "no such file" in run("run1", "--overlay", "none.pt")[1]
+    assert "video.py: none.pt: no such file" in run("run1", "--overlay", "none.pt")[1]
+    torch.nn.init.constant_(network.dense[-1].bias, float("nan"))
+    save_model(tmp_path / "broken.pt", network)
+    said = run("run1", "--overlay", "broken.pt")[1]
+    assert "video.py: broken.pt: the network's steering is not finite; train the model again" in said
+    assert not list(tmp_path.glob(".*"))

@@ -1,13 +1,14 @@
-"""The usual shape of a server for the simulator, as the yardstick: Pillow, a broadcast, the libraries as they are."""
+"""The usual server for the simulator, as the benchmark's baseline: Pillow, a broadcast, the libraries' defaults."""
 
 import base64
 import io
 import logging
 import sys
 import warnings
+from typing import Any
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")
+    warnings.simplefilter("ignore")  # eventlet advises against its use in new projects
     import eventlet
     import eventlet.wsgi
 import flask
@@ -16,32 +17,43 @@ import socketio
 import torch
 from PIL import Image
 
-from cloning.pilot.network import load_model
+from cloning.pilot.network import Network, load_model
 
-logging.disable()
-torch.set_num_threads(1)  # as in drive.py, so that the wire makes the difference
-network = load_model(sys.argv[1])
-server = socketio.Server()
+SET_SPEED, PROPORTIONAL = 9.0, 0.1  # mph, throttle per mph
 
 
-@server.on("connect")
-def connect(sid, environ):
-    send(0, 0)
+def create_server(network: Network) -> socketio.Server:
+    """A server that answers each telemetry with the network's steering, to every client."""
+    server = socketio.Server()
+
+    def send(steering: float, throttle: float) -> None:
+        server.emit("steer", {"steering_angle": str(steering), "throttle": str(throttle)}, skip_sid=True)
+
+    def connect(sid: str, environ: dict[str, Any]) -> None:
+        send(0, 0)
+
+    def telemetry(sid: str, data: dict[str, str]) -> None:
+        image = Image.open(io.BytesIO(base64.b64decode(data["image"])))
+        with torch.no_grad():
+            steering = float(network(torch.from_numpy(np.array(image)[None]))[0])
+        send(steering, PROPORTIONAL * (SET_SPEED - float(data["speed"])))
+
+    server.on("connect", connect)
+    server.on("telemetry", telemetry)
+    return server
 
 
-@server.on("telemetry")
-def telemetry(sid, data):
-    image = Image.open(io.BytesIO(base64.b64decode(data["image"])))
-    with torch.no_grad():
-        steering = float(network(torch.from_numpy(np.array(image)[None]))[0])
-    send(steering, 0.1 * (9 - float(data["speed"])))
-
-
-def send(steering, throttle):
-    server.emit("steer", {"steering_angle": str(steering), "throttle": str(throttle)}, skip_sid=True)
+def main() -> None:
+    """Serve with the model file that the command line names, on a free port."""
+    logging.disable()
+    torch.set_num_threads(1)  # as in drive.py, so that only the wire differs
+    server = create_server(load_model(sys.argv[1]))
+    listener = eventlet.listen(("127.0.0.1", 0))
+    print(
+        f"Listening on 127.0.0.1:{listener.getsockname()[1]}.\nThere is no page to watch.", file=sys.stderr, flush=True
+    )
+    eventlet.wsgi.server(listener, socketio.WSGIApp(server, flask.Flask(__name__)), log_output=False)
 
 
 if __name__ == "__main__":
-    listener = eventlet.listen(("127.0.0.1", 0))
-    print(f"Listening on 127.0.0.1:{listener.getsockname()[1]}.\nWatch at nothing.", file=sys.stderr, flush=True)
-    eventlet.wsgi.server(listener, socketio.WSGIApp(server, flask.Flask(__name__)), log_output=False)
+    main()

@@ -1,18 +1,23 @@
-"""A client on a raw socket that speaks as the Udacity simulator does, for the tests and the benchmark."""
+"""A client on a raw socket that sends the bytes of the Udacity simulator, for the tests and the benchmark."""
 
 import base64
 import json
 import os
 import socket
 import struct
+from types import TracebackType
 
-FRAGMENT = 1016  # bytes of payload that the simulator puts into one websocket frame
+from cloning.wire.client import FRAGMENT
 
 
 class Simulator:
     """The simulator's side of the wire: blocking, without TCP_NODELAY, fragments masked with a random key each."""
 
     def __init__(self, port: int, host: str = "127.0.0.1", headers: str = "", timeout: float = 20):
+        """Connect and shake hands.
+
+        headers: further HTTP headers, each with its line end. timeout: s, of each wait.
+        """
         self.socket = socket.create_connection((host, port), timeout)
         self.socket.settimeout(timeout)
         self._buffer = b""
@@ -27,13 +32,15 @@ class Simulator:
         head, self._buffer = self._buffer.split(b"\r\n\r\n", 1)
         self.status = int(head.split()[1])
 
-    def __enter__(self):
+    def __enter__(self) -> "Simulator":
         return self
 
-    def __exit__(self, *_):
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.socket.close()
 
-    def _fill(self):
+    def _fill(self) -> None:
         data = self.socket.recv(65536)
         if not data:
             raise ConnectionError("the server has closed the connection")
@@ -46,7 +53,7 @@ class Simulator:
         return taken
 
     def send(self, message: str | bytes, opcode: int = 1) -> None:
-        """Send a message in the simulator's fragments, each handed to the kernel by itself as it does."""
+        """Send a message in the simulator's fragments, one system call each, as it does."""
         for fragment in fragments(message, opcode):
             self.socket.sendall(fragment)
 
@@ -61,10 +68,10 @@ class Simulator:
         return self._take(length).decode()
 
     def open(self) -> list[str]:
-        """Receive what the server says first: 0{…}, the first steer, 40."""
+        """The server's first three packets: 0{…}, the first steer, 40."""
         return [self.receive() for _ in range(3)]
 
-    def drive(self, telemetry) -> dict:
+    def drive(self, telemetry: object) -> dict[str, str]:
         """Send a telemetry and receive its answer: the data of `steer`."""
         self.send("42" + json.dumps(["telemetry", telemetry], separators=(",", ":")))
         event, data = json.loads(self.receive()[2:])
@@ -73,6 +80,7 @@ class Simulator:
 
 
 def fragments(message: str | bytes, opcode: int = 1) -> list[bytes]:
+    """A message as masked websocket frames of at most 1016 bytes of payload; opcode: 1 text, 2 binary, 8 close."""
     payload = message.encode() if isinstance(message, str) else message
     frames = []
     for at in range(0, max(len(payload), 1), FRAGMENT):
@@ -86,7 +94,10 @@ def fragments(message: str | bytes, opcode: int = 1) -> list[bytes]:
     return frames
 
 
-def telemetry(jpeg: bytes, steering_angle="0.0000", throttle="0.0000", speed="0.0000") -> dict:
+def telemetry(
+    jpeg: bytes, steering_angle: str = "0.0000", throttle: str = "0.0000", speed: str = "0.0000"
+) -> dict[str, str]:
+    """The data of a telemetry message: degrees, -1..1, mph, and the image in base64."""
     return {
         "steering_angle": steering_angle,
         "throttle": throttle,

@@ -1,11 +1,11 @@
-"""What the network looks at: VisualBackProp (arXiv 1611.05418), and its picture for the page and the film."""
+"""What the network looks at: VisualBackProp (arXiv 1611.05418), and the overlay for the page and the film."""
 
 import cv2
 import numpy as np
 import torch
 from torch import nn
 
-from cloning.pilot.network import Network
+from cloning.pilot.network import Network, steer
 from cloning.recordings.format import FRAME
 from cloning.road.camera import project
 from cloning.road.motion import curvature
@@ -14,50 +14,54 @@ GREEN, MAGENTA = (60, 255, 60), (255, 0, 200)  # RGB
 
 
 def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndarray]:
-    """Steering -1..1 for a frame, uint8 (160, 320, 3), RGB, and what it rests on, float32 (160, 320), 0..1.
+    """Steering -1..1 for a frame, uint8 (160, 320, 3), RGB, and the attention mask, float32 (160, 320), 0..1.
 
     VisualBackProp: the feature maps of each layer are averaged; from the last layer to the first, the average is
     scaled up to the layer below (a transposed convolution with ones) and multiplied with that layer's average.
+    Raises ArithmeticError if the network's output is not finite.
     """
-    maps = []
-    # The positive part is what ReLU, which the method is made for, would have left; ELU's negative part is below 1.
-    hooks = [
-        layer.register_forward_hook(lambda _, __, out: maps.append(out.relu().mean(1, keepdim=True)))
-        for layer in network.convolutions
-    ]
+    maps: list[torch.Tensor] = []
+
+    def keep_average(_: nn.Module, __: object, output: torch.Tensor) -> None:
+        # The positive part is what ReLU, which the method is made for, would pass; ELU's negative part is above -1.
+        maps.append(output.relu().mean(1, keepdim=True))
+
+    layers = [layer for layer in network.convolutions if isinstance(layer, nn.Conv2d)]
+    hooks = [layer.register_forward_hook(keep_average) for layer in layers]
     try:
-        with torch.inference_mode():
-            device = next(network.parameters()).device
-            steering = float(network(torch.from_numpy(frame)[None].to(device))[0])
+        steering = float(steer(network, frame))
     finally:
         for hook in hooks:
             hook.remove()
     top, bottom = network.crop
-    rows = FRAME[0] - top - bottom
-    sizes = [(rows, FRAME[1]), *(average.shape[2:] for average in maps[:-1])]  # of what each layer reads
+    cropped = (FRAME[0] - top - bottom, FRAME[1])
+    sizes = [cropped, *(tuple(average.shape[2:]) for average in maps[:-1])]  # rows, columns of each layer's input
     with torch.inference_mode():
         mask = torch.ones_like(maps[-1])
-        for layer, average, size in reversed(list(zip(network.convolutions, maps, sizes, strict=True))):
+        for layer, average, size in reversed(list(zip(layers, maps, sizes, strict=True))):
             mask = mask * average
-            ones = torch.ones(1, 1, *layer.kernel_size, device=device)
-            covered = [(n - 1) * s + k for n, s, k in zip(mask.shape[2:], layer.stride, layer.kernel_size, strict=True)]
+            kernel, stride = layer.kernel_size, layer.stride
+            ones = torch.ones(1, 1, *kernel, device=mask.device)
+            covered = [(n - 1) * s + k for n, s, k in zip(mask.shape[2:], stride, kernel, strict=True)]
             padding = [whole - part for whole, part in zip(size, covered, strict=True)]
-            mask = nn.functional.conv_transpose2d(mask, ones, stride=layer.stride, output_padding=padding)
+            mask = nn.functional.conv_transpose2d(mask, ones, stride=stride, output_padding=padding)
             mask = mask / mask.max().clamp(min=1e-12)
-    whole = np.zeros(FRAME[:2], np.float32)
-    whole[top : FRAME[0] - bottom] = mask[0, 0].cpu().numpy()
-    return steering, whole
+    whole_frame = np.zeros(FRAME[:2], np.float32)
+    whole_frame[top : FRAME[0] - bottom] = mask[0, 0].cpu().numpy()
+    return steering, whole_frame
 
 
 def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> np.ndarray:
-    """A frame at twice its size, uint8 (320, 640, 3), RGB, with the way that the steering takes in green and, in
-    magenta, the mask of `visual_backprop`."""
+    """A frame at twice its size, uint8 (320, 640, 3), RGB, with the path ahead at this steering in green.
+
+    steering: -1..1. mask: that of `visual_backprop`, shown in magenta.
+    """
     picture = frame.astype(np.float32)
     if mask is not None:
-        strength = np.sqrt(mask)[..., None] * 0.7  # the root brings out what is weak
-        picture = picture * (1 - strength) + np.float32(MAGENTA) * strength
-    picture = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+        strength = np.sqrt(mask)[..., None] * 0.7  # the root makes weak attention visible
+        picture = picture * (1 - strength) + np.asarray(MAGENTA, np.float32) * strength
+    enlarged = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides what is nearer
     points = project(curvature(steering) * ahead**2 / 2, ahead) * 2
-    cv2.polylines(picture, [np.round(points).astype(np.int32)], False, GREEN, 3, cv2.LINE_AA)
-    return picture
+    cv2.polylines(enlarged, [np.round(points).astype(np.int32)], False, GREEN, 3, cv2.LINE_AA)
+    return enlarged

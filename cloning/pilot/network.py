@@ -1,8 +1,9 @@
-"""NVIDIA's network, and the file that it is kept in: all that driving needs of training."""
+"""NVIDIA's network and the model file that stores it: everything that driving needs of training."""
 
 import io
 import platform
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,9 +14,10 @@ from cloning.errors import ModelError
 from cloning.files import write
 from cloning.recordings.format import FRAME
 
-FORMAT, VERSION = "behavioral-cloning", 1  # of model.pt
+FORMAT, VERSION = "behavioral-cloning", 1  # of the model file
+SHIPPED = Path(__file__).with_name("shipped.pt")  # the trained model that comes with the project
 CROP = (60, 25)  # rows cut off the top and the bottom
-UNITS = 4224  # of the flattened layer, half of which dropout leaves
+UNITS = 4224  # of the flattened layer; dropout keeps half of them
 
 
 class Network(nn.Module):
@@ -25,10 +27,14 @@ class Network(nn.Module):
     -1..1 is the simulator's -25°..25°, positive to the right. keep: bool (N, 4224), what dropout leaves, in training.
     """
 
-    def __init__(self, crop=CROP, scale=127.5, offset=1.0):
-        """crop: rows cut off the top and the bottom; a pixel value x enters as x / scale - offset."""
+    def __init__(self, crop: tuple[int, int] = CROP, scale: float = 127.5, offset: float = 1.0):
+        """Make the layers with random weights.
+
+        crop: rows cut off the top and the bottom; a pixel value x enters as x / scale - offset.
+        """
         super().__init__()
-        self.crop, self.scale, self.offset = tuple(crop), scale, offset
+        top, bottom = crop
+        self.crop, self.scale, self.offset = (top, bottom), scale, offset
         self.convolutions = nn.ModuleList(
             nn.Conv2d(into, out, kernel, stride)
             for into, out, kernel, stride in [
@@ -42,6 +48,7 @@ class Network(nn.Module):
         self.dense = nn.ModuleList(nn.Linear(into, out) for into, out in [(UNITS, 100), (100, 50), (50, 10), (10, 1)])
 
     def forward(self, frames: torch.Tensor, keep: torch.Tensor | None = None) -> torch.Tensor:
+        """Steering for frames; the class describes shapes and ranges."""
         if frames.shape[1] == FRAME[0]:
             frames = frames[:, self.crop[0] : FRAME[0] - self.crop[1]]
         x = frames.permute(0, 3, 1, 2).float().div_(self.scale).sub_(self.offset)  # in memory still channels last
@@ -57,36 +64,37 @@ class Network(nn.Module):
 
 def layer_table(network: Network) -> str:
     """The report's table of layers, with the shapes and counts of this network."""
-    rows, before, x = [], "lambda_input_1", torch.zeros(1, FRAME[2], *FRAME[:2])
+    rows: list[str] = []
+    previous, x = "lambda_input_1", torch.zeros(1, FRAME[2], *FRAME[:2])
 
-    def row(name, kind, x, module=None):
-        nonlocal before
-        shape = (None, *x.shape[2:], x.shape[1]) if x.dim() == 4 else (None, *x.shape[1:])
+    def add(name: str, kind: str, output: torch.Tensor, module: nn.Module | None = None) -> None:
+        nonlocal previous
+        shape = (None, *output.shape[2:], output.shape[1]) if output.dim() == 4 else (None, *output.shape[1:])
         count = sum(p.numel() for p in module.parameters()) if module else 0
-        rows.append(f"{f'{name} ({kind})':32} {shape!s:22} {count:<11} {before}[0][0]")
-        before = name
+        rows.append(f"{f'{name} ({kind})':32} {shape!s:22} {count:<11} {previous}[0][0]")
+        previous = name
 
-    row("lambda_1", "Lambda", x)
+    add("lambda_1", "Lambda", x)
     x = x[:, :, network.crop[0] : FRAME[0] - network.crop[1]]
-    row("cropping2d_1", "Cropping2D", x)
+    add("cropping2d_1", "Cropping2D", x)
     with torch.no_grad():
         for i, convolution in enumerate(network.convolutions, 1):
-            row(f"convolution2d_{i}", "Convolution2D", x := convolution(x), convolution)
-        row("flatten_1", "Flatten", x := x.flatten(1))
-        row("dropout_1", "Dropout", x)
+            add(f"convolution2d_{i}", "Convolution2D", x := convolution(x), convolution)
+        add("flatten_1", "Flatten", x := x.flatten(1))
+        add("dropout_1", "Dropout", x)
         for i, layer in enumerate(network.dense, 1):
-            row(f"dense_{i}", "Dense", x := layer(x), layer)
+            add(f"dense_{i}", "Dense", x := layer(x), layer)
     title = f"{'Layer (type)':32} {'Output Shape':22} {'Param #':11} Connected to"
     total = f"Total params: {sum(p.numel() for p in network.parameters()):,}"
     return "\n".join(["_" * 90, title, "=" * 90, f"\n{'_' * 90}\n".join(rows), "=" * 90, total])
 
 
-# --------------------------------------------------------------------------------------------------
-# model.pt
+# ----------------------------------------------------------------------------------------------------------------------
+# Model file
 
 
-def save_model(path: Path, network: Network, **more) -> None:
-    """Write a model file: weights, what driving needs to use them, and `more` (plain values and tensors)."""
+def save_model(path: Path, network: Network, **more: object) -> None:
+    """Write a model file: the weights, what driving needs to use them, and `more` (plain values and tensors)."""
     buffer = io.BytesIO()
     torch.save(
         {
@@ -109,6 +117,7 @@ def save_model(path: Path, network: Network, **more) -> None:
 
 
 def versions() -> dict[str, str]:
+    """The versions of Python and of the libraries that the weights and the frames depend on."""
     return {
         "python": platform.python_version(),
         "torch": str(torch.__version__),
@@ -117,25 +126,27 @@ def versions() -> dict[str, str]:
     }
 
 
-def load_checkpoint(path) -> dict:
+def load_checkpoint(path: str | Path) -> dict[str, Any]:
     """The contents of a model file, read with weights_only=True. Raises ModelError."""
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
-        raise ModelError(f"{path}: no such file; `python model.py` trains one") from None
-    except Exception as error:
-        raise ModelError(f"{path}: not a model of this project, or damaged ({type(error).__name__})") from error
+        raise ModelError(f"{path}: no such file; `python model.py` trains a model") from None
+    except Exception as error:  # torch.load and pickle raise many kinds for a foreign or damaged file
+        raise ModelError(
+            f"{path}: not a model of this project, or damaged ({type(error).__name__}); `python model.py` trains one"
+        ) from error
     if not isinstance(saved, dict) or saved.get("format") != FORMAT:
         raise ModelError(f"{path}: not a model of this project; `python model.py` trains one")
     if saved.get("version") != VERSION:
         raise ModelError(
-            f"{path}: version {saved.get('version')} of the model file where this program reads "
-            f"version {VERSION}; train it again with `python model.py`"
+            f"{path}: the model file has version {saved.get('version')}, but this program reads version {VERSION}; "
+            "train the model again with `python model.py`"
         )
     return saved
 
 
-def load_model(path, device="cpu") -> Network:
+def load_model(path: str | Path, device: str | torch.device = "cpu") -> Network:
     """The network of a model file, ready to drive. Raises ModelError."""
     saved = load_checkpoint(path)
     try:
@@ -143,12 +154,18 @@ def load_model(path, device="cpu") -> Network:
         network = Network(recipe["crop"], recipe["scale"], recipe["offset"])
         network.load_state_dict(saved["network"])
     except (KeyError, RuntimeError) as error:
-        raise ModelError(f"{path}: its contents do not fit this project's network ({error})") from None
-    return network.to(device, memory_format=torch.channels_last).eval()
+        raise ModelError(
+            f"{path}: its contents do not fit this project's network ({error}); train it again with `python model.py`"
+        ) from None
+    network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
+    return network.eval()
 
 
 def steer(network: Network, frame: np.ndarray) -> np.float32:
-    """Steering -1..1 for a frame, uint8 (160, 320, 3), RGB. Raises ArithmeticError if the network gives none."""
+    """Steering for a frame, uint8 (160, 320, 3), RGB: -1..1, the number that is sent, shown and drawn.
+
+    Raises ArithmeticError if the network's output is not finite.
+    """
     with torch.inference_mode():
         steering = network(torch.from_numpy(frame)[None].to(next(network.parameters()).device)).cpu().numpy()[0]
     if not np.isfinite(steering):

@@ -1,37 +1,59 @@
-"""The page on which to watch the driving, served by Flask."""
+"""The page on which to watch the car drive, served by Flask."""
 
 import base64
 import itertools
 import json
 import time
-from typing import NamedTuple
+from collections import deque
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol
 
 import cv2
 import flask
+import numpy as np
 
 from cloning.pilot import attention
+from cloning.pilot.network import Network
 from cloning.wire import server as wire
 
-TRAIL = 60 * 120  # rows: a minute at 120 frames/s
-EVERY = 0.1  # seconds between two pictures
+HISTORY = 60 * 120  # frames: a minute at 120 frames/s
+SHOWN = 60  # s of driving in the graphs
+PERIOD = 0.1  # s between two pictures
 
 
-class Row(NamedTuple):
-    """One driven frame."""
+class DrivenFrame(NamedTuple):
+    """The figures of one driven frame."""
 
     time: float  # seconds since 1970
     steering: float  # -1..1
     speed: float  # mph
     throttle: float  # -1..1
-    latency: float  # ms from the telemetry's first fragment to its answer
+    latency: float  # ms in drive.py, from reading the telemetry's first fragment until its answer is ready
 
 
-def create_app(server) -> flask.Flask:
-    """server: a drive.DriveServer."""
+class Session(Protocol):
+    """What the page shows of a connected simulator."""
+
+    history: deque[DrivenFrame]
+    frame: np.ndarray | None  # the last one: uint8 (160, 320, 3), RGB
+
+
+class Server(Protocol):
+    """What the page needs of the server that drives."""
+
+    network: Network
+    set_speed: float  # mph
+
+    def watched(self) -> Session | None:
+        """The session to show."""
+
+
+def create_app(server: Server) -> flask.Flask:
+    """The page's web application: `/`, and `/live` with the figures and the picture as server-sent events."""
     app = flask.Flask(__name__)
 
     @app.after_request
-    def closed(response):
+    def restrict(response: flask.Response) -> flask.Response:
         response.headers["Content-Security-Policy"] = (
             "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
             "connect-src 'self'; frame-ancestors 'none'"
@@ -40,12 +62,11 @@ def create_app(server) -> flask.Flask:
         return response
 
     @app.get("/")
-    def index():
+    def index() -> str:
         return flask.render_template("index.html", set_speed=server.set_speed)
 
     @app.get("/live")
-    def live():
-        """Server-sent events: {"session", "rows": [[time, steering, speed, throttle, latency], …], "image"}."""
+    def live() -> flask.Response:
         return flask.Response(
             events(server, "attention" in flask.request.args),
             mimetype="text/event-stream",
@@ -55,29 +76,32 @@ def create_app(server) -> flask.Flask:
     return app
 
 
-def events(server, with_attention: bool):
-    shown, until = None, 0.0
+def events(server: Server, with_attention: bool) -> Iterator[str]:
+    """Server-sent events: {"session", "rows": [[time, steering, speed, throttle, latency], …], "image"}."""
+    shown, last = None, 0.0
     while True:
         session = server.watched()
-        until = until if session is shown else 0.0
-        rows = newer(session.trail, until) if session else []
-        if rows:
-            shown, until = session, rows[-1].time
-            live = {"session": id(session), "rows": rows, "image": image(server, session, with_attention)}
-            yield f"data: {json.dumps(live)}\n\n"
+        last = last if session is shown else 0.0
+        rows = frames_since(session.history, last) if session else []
+        if session and rows:
+            shown, last = session, rows[-1].time
+            event = {"session": id(session), "rows": rows, "image": image(server, session, with_attention)}
+            yield f"data: {json.dumps(event)}\n\n"
         else:
-            yield ":\n\n"  # a comment, so that a page that has been closed is noticed
-        wire.eventlet.sleep(EVERY)
+            yield ":\n\n"  # a comment; writing it fails, and so ends this loop, once the page is closed
+        wire.eventlet.sleep(PERIOD)
 
 
-def newer(trail, until: float) -> list[Row]:
-    rows = list(itertools.takewhile(lambda row: row.time > until, reversed(trail)))
-    return [row for row in reversed(rows) if row.time > time.time() - 60]
+def frames_since(history: deque[DrivenFrame], last: float) -> list[DrivenFrame]:
+    """The frames of the last minute that are later than `last`, in seconds since 1970."""
+    first = max(last, time.time() - SHOWN)
+    return list(itertools.takewhile(lambda frame: frame.time > first, reversed(history)))[::-1]
 
 
-def image(server, session, with_attention: bool) -> str:
-    """The last frame with the steering drawn on it, as a data URL."""
+def image(server: Server, session: Session, with_attention: bool) -> str:
+    """The session's last frame with its overlay, as a data URL."""
+    assert session.frame is not None, "a session with driven frames has a last one"
     mask = attention.visual_backprop(server.network, session.frame)[1] if with_attention else None
-    picture = attention.overlay(session.frame, session.trail[-1].steering, mask)
+    picture = attention.overlay(session.frame, session.history[-1].steering, mask)
     jpeg = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode()

@@ -1,0 +1,116 @@
+"""The simulator's telemetry: the image, the speed, and numbers as every .NET culture writes them."""
+
+import base64
+import math
+import re
+import unicodedata
+from dataclasses import dataclass
+
+import numpy as np
+
+from cloning.recordings.images import decode
+from cloning.wire.server import MAX_MESSAGE, UNREADABLE
+
+NUMBERS = ("steering_angle", "throttle", "speed")  # degrees, -1..1, mph; the first two are what the car does now
+
+# The simulator formats with "N4" of the machine's culture. Mono 6.8 writes -12.3456 as `12.3456-` in 16 Arabic cultures
+# (ar-SA), `- 12.3456` in km-KH and pa-Arab-PK, `- 12,3456` in hr-HR, and 30.5 as `30/5000` in fa-IR. Newer runtimes
+# also use U+2212 as minus sign and U+066B as decimal separator. "N4" always writes decimals: the last separator is the
+# decimal one, and a separator before it groups digits.
+NUMBER = re.compile(
+    r"(?P<before>[-+(\u2212]?) ?"
+    r"(?P<whole>\d+(?:[.,'\s\u2019\u066c]\d{2,3})*?)"
+    r"(?:(?P<separator>[.,/\u066b])(?P<decimals>\d+))?(?P<exponent>[eE][-+]?\d+)?"
+    r" ?(?P<after>[-)\u2212]?)"
+)
+SIGNS = {"": 1, "+": 1, "-": -1, "()": -1}  # what stands before and after a number
+MAX_LENGTH = 40  # characters of a number
+
+
+class Unusable(ValueError):
+    """Telemetry that the car cannot be driven with; the message is the reason."""
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """The part of a telemetry message that driving needs.
+
+    jpeg   the image as received
+    image  the image decoded: uint8 (160, 320, 3), RGB
+    speed  mph
+    """
+
+    jpeg: bytes
+    image: np.ndarray
+    speed: float
+
+
+def parse_telemetry(message: object) -> Telemetry:
+    """Read the image and the speed out of a telemetry message.
+
+    message: the decoded JSON, or UNREADABLE. Raises Unusable. Further fields, readable or not, do not matter.
+    """
+    if message is UNREADABLE:
+        raise Unusable(f"its JSON is incomplete, or it is longer than {MAX_MESSAGE} bytes")
+    if not isinstance(message, dict):
+        raise Unusable("it is not a JSON object")
+    for key in ("speed", "image"):
+        if key not in message:
+            raise Unusable(f"{key} is missing")
+    try:
+        speed, _ = parse_number(message["speed"])
+    except ValueError as error:
+        raise Unusable("speed is not a number") from error
+    try:
+        jpeg = base64.b64decode(message["image"], validate=True)
+    except (TypeError, ValueError) as error:
+        raise Unusable("the image is not base64") from error
+    try:
+        return Telemetry(jpeg, decode(jpeg), speed)
+    except ValueError as error:
+        raise Unusable(f"the image is unusable: {error}") from error
+
+
+def parse_number(written: object) -> tuple[float, str]:
+    """A finite number and its decimal separator ("" if it has no decimals).
+
+    Raises ValueError for anything that no .NET culture writes for a finite number.
+    """
+    text = str(written)
+    if len(text) > MAX_LENGTH:
+        raise ValueError("too long for a number")
+    # Arabic, Hebrew and Persian cultures put invisible marks of the writing direction beside the minus sign.
+    match = NUMBER.fullmatch("".join(character for character in text if unicodedata.category(character) != "Cf"))
+    if not match:
+        raise ValueError("not a number")
+    sign = SIGNS.get((match["before"] + match["after"]).replace("\u2212", "-"))
+    separator = match["separator"] or ""
+    if sign is None or (separator and separator in match["whole"]):  # -1-, 1,000,000
+        raise ValueError("not a number")
+    whole = re.sub(r"\D", "", match["whole"])
+    value = sign * float(f"{whole}.{match['decimals'] or 0}{match['exponent'] or ''}")
+    if not math.isfinite(value):
+        raise ValueError("not finite")
+    return value, separator
+
+
+def decimal_separator(message: object, previous: str) -> str:
+    """The decimal separator of a telemetry message, which is the only one that this simulator reads.
+
+    previous: the result for a message whose numbers cannot be read or have no decimals.
+    """
+    if not isinstance(message, dict):
+        return previous
+    for key in NUMBERS:
+        try:
+            _, separator = parse_number(message.get(key))
+        except ValueError:
+            continue
+        if separator:
+            return separator
+    return previous
+
+
+def format_number(value: float | np.floating, separator: str = ".") -> str:
+    """A number as the simulator reads it: without exponent, and exact for a float32."""
+    return np.format_float_positional(np.float32(value), trim="-").replace(".", separator)
