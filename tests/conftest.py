@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from cloning.pilot.network import Network, load_model, save_model
+from cloning.recordings.images import decode
+
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
 
@@ -68,6 +71,33 @@ def drawn(tmp_path_factory) -> Path:
 def copied(tmp_path) -> Path:
     """A recording of 60 rows that a test may change."""
     return draw_recording(tmp_path / "data" / "lake")
+
+
+@pytest.fixture(scope="session")
+def model_file(tmp_path_factory) -> Path:
+    """A model file with random weights."""
+    torch.manual_seed(3)
+    network = Network()
+    torch.nn.init.normal_(network.dense[-1].weight, std=3)  # so that the frames' steering differs
+    path = tmp_path_factory.mktemp("model") / "model.pt"
+    save_model(path, network)
+    return path
+
+
+@pytest.fixture(scope="session")
+def jpegs() -> list[bytes]:
+    """Eight frames as the simulator sends them."""
+    rng = np.random.default_rng(0)
+    return [cv2.imencode(".jpg", draw_frame(np.sin(n), 0, rng))[1].tobytes() for n in range(8)]
+
+
+@pytest.fixture(scope="session")
+def steering(model_file, jpegs) -> list[np.float32]:
+    """The network's steering for the same JPEGs, without drive.py."""
+    torch.set_num_threads(1)
+    network = load_model(model_file)
+    with torch.inference_mode():
+        return [network(torch.from_numpy(decode(jpeg))[None])[0].clamp(-1, 1).numpy()[()] for jpeg in jpegs]
 
 
 def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:

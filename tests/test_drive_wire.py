@@ -1,4 +1,4 @@
-"""drive.py as a process: over real sockets the simulator's conversation, strangers' requests and mistakes."""
+"""drive.py as a process, over real sockets: the simulator's conversation, strangers' requests, other clients."""
 
 import json
 import os
@@ -6,116 +6,30 @@ import re
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import torch
-from conftest import ROOT, draw_frame
+from drive_process import serving
 
-from cloning.errors import UserError
-from cloning.pilot.network import SHIPPED, Network, load_model, save_model, steer
-from cloning.recordings.images import decode
-from cloning.wire.versions import check_versions
 from tools.simulator_client import Simulator, fragments, telemetry
 
 
-class Process:
-    """A drive.py process; first: Python code to run before it."""
-
-    def __init__(self, *arguments, port=0, cwd=None, first=""):
-        self.process = subprocess.Popen(
-            [*script("drive.py", first), *map(str, arguments), "--port", str(port)],
-            cwd=cwd,
-            stderr=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self.lines, self.listening = [], threading.Event()
-        self.reader = threading.Thread(target=self._read)
-        self.reader.start()
-        assert self.listening.wait(60)
-        self.port = int(re.search(r"Listening on [\d.]+:(\d+)", "".join(self.lines))[1])
-
-    def _read(self):
-        for line in self.process.stderr:
-            self.lines.append(line)
-            if "Watch at" in line:
-                self.listening.set()
-        self.listening.set()
-
-    def stop(self, number=signal.SIGINT) -> int:
-        if self.process.poll() is None:
-            self.process.send_signal(number)
-        code = self.process.wait(30)
-        self.reader.join()
-        self.process.stdout.close()
-        self.process.stderr.close()
-        return code
-
-    def memory(self) -> float:
-        """Resident MB; 0 where the system does not tell it like Linux."""
-        if not Path("/proc/self/status").exists():
-            return 0.0
-        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="utf-8")
-        return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
-
-
-def script(name: str, first: str = "") -> list[str]:
-    """The command of a script at the top; first: Python code to run before it."""
-    if not first:
-        return [sys.executable, str(ROOT / name)]
-    run = f"import runpy, sys; sys.path.insert(0, {str(ROOT)!r}); sys.argv = sys.argv[1:]"
-    return [sys.executable, "-c", f"{first}\n{run}\nrunpy.run_path(sys.argv[0], run_name='__main__')", str(ROOT / name)]
-
-
-@contextmanager
-def serving(*arguments, **more):
-    process = Process(*arguments, **more)
-    try:
-        yield process
-    finally:
-        process.process.kill()
-        process.stop()
-
-
-@pytest.fixture(scope="module")
-def model_file(tmp_path_factory) -> Path:
-    torch.manual_seed(3)
-    network = Network()
-    torch.nn.init.normal_(network.dense[-1].weight, std=3)  # so that the frames' steering differs
-    path = tmp_path_factory.mktemp("model") / "model.pt"
-    save_model(path, network)
-    return path
-
-
-@pytest.fixture(scope="module")
-def jpegs() -> list[bytes]:
-    rng = np.random.default_rng(0)
-    return [cv2.imencode(".jpg", draw_frame(np.sin(n), 0, rng))[1].tobytes() for n in range(8)]
+LINGER = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)  # close without waiting: struct linger
 
 
 @pytest.fixture(scope="module")
 def server(model_file):
     with serving(model_file) as process:
         yield process
-
-
-@pytest.fixture(scope="module")
-def steering(model_file, jpegs) -> list[np.float32]:
-    """The network's steering for the same JPEGs, without drive.py."""
-    torch.set_num_threads(1)
-    network = load_model(model_file)
-    with torch.inference_mode():
-        return [network(torch.from_numpy(decode(jpeg))[None])[0].clamp(-1, 1).numpy()[()] for jpeg in jpegs]
 
 
 def test_the_recorded_session_byte_by_byte(server, jpegs, steering):
@@ -272,7 +186,7 @@ def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering
             gone.open()
             for fragment in fragments("42" + json.dumps(["telemetry", telemetry(jpegs[0])]))[:5]:
                 gone.socket.sendall(fragment)
-            gone.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # it goes with a reset
+            gone.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER)  # it goes with a reset
             gone.socket.close()
             with Simulator(port) as simulator:
                 simulator.open()
@@ -313,7 +227,7 @@ def test_ten_thousand_malformed_messages_leave_the_other_driving_untouched(serve
 
 
 # --------------------------------------------------------------------------------------------------
-# Strangers and mistakes
+# Strangers
 
 
 @pytest.mark.parametrize(
@@ -360,94 +274,6 @@ def test_it_listens_on_loopback_alone(server):
     assert not any(answers(address, server.port) for address in others)
     with socket.create_server(("0.0.0.0", 0)) as everywhere:
         assert any(answers(address, everywhere.getsockname()[1]) for address in others), "the addresses tell"
-
-
-def failing(*arguments, first="") -> str:
-    process = subprocess.run(
-        [*script("drive.py", first), *map(str, arguments)], timeout=60, capture_output=True, text=True
-    )
-    assert process.returncode == 1 and "Traceback" not in process.stderr
-    assert process.stderr.splitlines()[-1].startswith("drive.py: ")
-    return process.stderr
-
-
-def test_mistakes_are_told(server, model_file, tmp_path):
-    assert "no such file" in failing(tmp_path / "none.pt")
-    torch.save({"weights": [1]}, tmp_path / "foreign.pt")
-    assert "not a model of this project" in failing(tmp_path / "foreign.pt")
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "thesis.txt").write_text("words")
-    assert "thesis.txt" in failing(model_file, mine)
-    (tmp_path / "run1").mkdir()
-    frame = tmp_path / "run1" / "2018_07_16_17_11_43_382.jpg"
-    frame.write_bytes(b"frame")
-    assert f"127.0.0.1:{server.port}" in failing(model_file, tmp_path / "run1", "--port", server.port)
-    assert frame.exists(), "a server that cannot start deletes nothing"
-
-
-def test_other_versions_of_the_socket_libraries_are_refused():
-    said = failing(first="import importlib.metadata; importlib.metadata.version = lambda name: '5.18.1'")
-    assert "python-socketio is 5.18.1 and must be 4.6.1" in said and "pip install -r requirements.txt" in said
-
-
-def test_the_versions_come_from_requirements_txt(tmp_path):
-    check_versions(tmp_path / "none.txt")  # an installed package, whose versions pip has seen to
-    (tmp_path / "requirements.txt").write_text("eventlet==0.0.1  # older\npython-socketio==4.6.1\n")
-    with pytest.raises(UserError, match=r"^eventlet is [\d.]+ and must be 0\.0\.1: .*pip install -r requirements.txt"):
-        check_versions(tmp_path / "requirements.txt")
-
-
-def test_without_a_model_it_takes_model_pt_or_the_shipped_one_and_says_so(model_file, jpegs, steering, tmp_path):
-    with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
-        simulator.open()
-        answer = np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"])
-        assert answer == steer(load_model(SHIPPED), decode(jpegs[0]))
-        assert f"Driving with {SHIPPED} (the model that comes with the project).\n" in process.lines
-    shutil.copy(model_file, tmp_path / "model.pt")
-    with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
-        simulator.open()
-        assert np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"]) == steering[0]
-        assert "Driving with model.pt.\n" in process.lines
-
-
-# Takes away what other systems do not have, after torch, whose Linux build needs some of it.
-ELSEWHERE = """
-import os, signal, socket, torch
-for module, name in [(socket, "TCP_QUICKACK"), (signal, "SIGTERM"), (os, "fork"), (os, "sched_getaffinity")]:
-    vars(module).pop(name, None)
-"""
-
-
-def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, steering, tmp_path):
-    folder = tmp_path / "run1"
-    with serving(model_file, folder, first=ELSEWHERE) as process, Simulator(process.port) as simulator:
-        simulator.open()
-        for n in range(8):
-            assert np.float32(simulator.drive(telemetry(jpegs[n]))["steering_angle"]) == steering[n]
-        assert process.stop() == 0
-    assert len(list(folder.iterdir())) == 8
-    film = subprocess.run(
-        [*script("video.py", ELSEWHERE), str(folder), "--overlay", str(model_file)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert film.returncode == 0 and "run1.mp4: 8 frames" in film.stdout, film.stderr
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path, number):
-    with serving(model_file, "run1", cwd=tmp_path) as process, Simulator(process.port) as simulator:
-        simulator.open()
-        for n in range(200):
-            simulator.drive(telemetry(jpegs[n % 8]))
-        simulator.drive({})
-        assert process.stop(number) == 0
-    assert process.lines[-1] == "drive.py: session ended: 200 frames driven, 1 unusable; driven frames saved in run1\n"
-    saved = sorted((tmp_path / "run1").iterdir())
-    assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(200)]
-    assert all(re.fullmatch(r"\d{4}(_\d\d){5}_\d{3}\.jpg", path.name) for path in saved)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -514,12 +340,13 @@ socket.on('manual', data => { console.log(JSON.stringify({answers, data})); sock
 
 @pytest.fixture(scope="module")
 def node_client(tmp_path_factory) -> Path:
-    if not shutil.which("npm"):
+    npm = shutil.which("npm")
+    if not npm:
         pytest.skip("no node here")
     folder = tmp_path_factory.mktemp("node")
     try:
         subprocess.run(
-            ["npm", "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"],
+            [npm, "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"],
             cwd=folder,
             check=True,
             timeout=40,
