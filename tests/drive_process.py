@@ -10,7 +10,6 @@ from pathlib import Path
 
 from conftest import ROOT
 
-
 # What Ctrl-C sends; Windows sends it to a whole console, and Ctrl-Break to one process group.
 STOP = signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGINT
 

@@ -57,7 +57,7 @@ def test_the_versions_come_from_requirements_txt(tmp_path):
         check_versions(tmp_path / "requirements.txt")
 
 
-def test_without_a_model_it_takes_model_pt_or_the_shipped_one_and_says_so(model_file, jpegs, steering, tmp_path):
+def test_without_a_model_it_names_and_takes_model_pt_or_the_shipped_one(model_file, jpegs, steering, tmp_path):
     with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
         simulator.open()
         answer = np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"])

@@ -22,7 +22,6 @@ from drive_process import serving
 
 from tools.simulator_client import Simulator, fragments, telemetry
 
-
 LINGER = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)  # close without waiting: struct linger
 
 
@@ -122,12 +121,12 @@ def test_every_telemetry_gets_exactly_one_answer(server, jpegs, message):
         "42[" * 30000,
     ],
 )
-def test_driving_goes_on_after_what_is_no_telemetry(server, jpegs, steering, message):
+def test_driving_continues_after_other_messages(server, jpegs, steering, message):
     with Simulator(server.port) as simulator:
         simulator.open()
         simulator.send(message)
         simulator.send("2")
-        while simulator.receive() != "3":  # a steer may come of "connect"
+        while simulator.receive() != "3":  # "connect" may be answered with a steer
             pass
         assert np.float32(simulator.drive(telemetry(jpegs[1]))["steering_angle"]) == steering[1]
 
@@ -151,7 +150,7 @@ def test_each_kind_of_unusable_frame_is_logged_once(model_file, jpegs):
     assert "1 frames driven, 150 unusable" in text
 
 
-def test_two_simulators_are_driven_each_by_itself(server, jpegs, steering):
+def test_two_simulators_are_driven_independently(server, jpegs, steering):
     with Simulator(server.port) as slow, Simulator(server.port) as fast:
         slow.open()
         fast.open()
@@ -178,7 +177,7 @@ def test_frames_in_flight_are_answered_in_order(server, jpegs, steering):
 def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    with pytest.raises(ConnectionRefusedError):  # the simulator tries on and on before the server is there
+    with pytest.raises(ConnectionRefusedError):  # as for the simulator, before the server has started
         Simulator(port)
     for _ in range(2):
         with serving(model_file, port=port) as process:
@@ -186,7 +185,7 @@ def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering
             gone.open()
             for fragment in fragments("42" + json.dumps(["telemetry", telemetry(jpegs[0])]))[:5]:
                 gone.socket.sendall(fragment)
-            gone.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER)  # it goes with a reset
+            gone.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER)  # so that closing resets the connection
             gone.socket.close()
             with Simulator(port) as simulator:
                 simulator.open()
@@ -247,7 +246,7 @@ def test_another_origin_can_not_connect(server, header, status):
 
 
 @pytest.mark.parametrize("path", ["/", "/live", "/socket.io/?EIO=3&transport=polling"])
-def test_a_name_that_was_made_to_point_here_is_refused(server, path):
+def test_a_host_name_that_resolves_to_this_machine_is_refused(server, path):
     request = urllib.request.Request(f"http://127.0.0.1:{server.port}{path}", headers={"Host": "evil.example"})
     with pytest.raises(urllib.error.HTTPError, match="403"):
         urllib.request.urlopen(request, timeout=10)
@@ -273,7 +272,7 @@ def test_it_listens_on_loopback_alone(server):
     assert answers("127.0.0.1", server.port)
     assert not any(answers(address, server.port) for address in others)
     with socket.create_server(("0.0.0.0", 0)) as everywhere:
-        assert any(answers(address, everywhere.getsockname()[1]) for address in others), "the addresses tell"
+        assert any(answers(address, everywhere.getsockname()[1]) for address in others), "these addresses can be reached"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -323,7 +322,7 @@ def test_the_page_in_a_real_browser(server, jpegs, tmp_path):
         )
     sky = cv2.resize(cv2.imdecode(np.frombuffer(jpegs[0], np.uint8), cv2.IMREAD_COLOR), None, fx=2, fy=2)[:130]
     match = cv2.matchTemplate(cv2.imread(f"{tmp_path}/page.png"), sky, cv2.TM_SQDIFF_NORMED)
-    assert match.min() < 0.01, "the page shows the camera's image; the upper part, on which no line is drawn"
+    assert match.min() < 0.01, "the page shows the camera's image, whose upper part has no line"
 
 
 CLIENT = """
