@@ -187,20 +187,20 @@ def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
     for section in RAILS:
         s = distances(section.start, section.end, 2.0)
         meshes.append(ribbon(track, s, (section.side * 5.3, section.side * 5.3), (0.45, 0.8), rail))
-        for post in np.arange(section.start, section.end, 4.0):
-            add_box(post, section.side * 5.35, -0.2, (0.12, 0.25, 1.1), "post")
+        for post_s in np.arange(section.start, section.end, 4.0):
+            add_box(post_s, section.side * 5.35, -0.2, (0.12, 0.25, 1.1), "post")
     bends = [
         (-int(np.sign(track.curvature[i])), i * track.step)
         for i in range(0, len(track.points), 9)
         if abs(track.curvature[i]) > MARKED_CURVATURE
     ]
     marked = [(section.side, s) for section in MARKED for s in np.arange(section.start, section.end, 7.0)]
-    for side, s in bends + marked:
-        add_box(s, side * 5.2, -0.5, (0.09, 0.09, 3.1), "post")
-        add_box(s, side * 5.2, 2.3, (0.10, 0.55, 0.30), "board")
-    for s in np.arange(ROAD.bridge[0] + 6, ROAD.bridge[1], 18.0):
+    for side, post_s in bends + marked:
+        add_box(post_s, side * 5.2, -0.5, (0.09, 0.09, 3.1), "post")
+        add_box(post_s, side * 5.2, 2.3, (0.10, 0.55, 0.30), "board")
+    for pier_s in np.arange(ROAD.bridge[0] + 6, ROAD.bridge[1], 18.0):
         for side in (LEFT, RIGHT):
-            add_box(s, side * 4.6, -26, (0.7, 0.7, 25.0), "deck")
+            add_box(pier_s, side * 4.6, -26, (0.7, 0.7, 25.0), "deck")
     return [illuminate(merge(meshes), light)]
 
 

@@ -12,7 +12,7 @@ from simulator.scenery.shapes import Colour
 
 def noise(random: Generator, shape: tuple[int, int], blur: float) -> np.ndarray:
     """Return Gaussian noise of unit variance, smoothed over `blur` pixels, that tiles seamlessly."""
-    grain = random.standard_normal(shape).astype(np.float32)
+    grain: np.ndarray = random.standard_normal(shape).astype(np.float32)
     if blur:
         edge = int(3 * blur) + 1
         grain = cv2.GaussianBlur(np.pad(grain, edge, mode="wrap"), (0, 0), blur)[edge:-edge, edge:-edge]
