@@ -44,10 +44,9 @@ class ChaseFilm:
         if not self.clock.due(run.time):
             return
         transform = run.car.node.get_transform()
-        self.scene.car.set_transform(transform)
-        self.scene.look_from(*transform.get_pos())
+        self.scene.move_car(transform)
         place_chase_camera(self.camera, transform)
-        self.film.add(caption(self.buffer.draw()[0], run))
+        self.film.add(caption(self.buffer.render()[0], run))
 
     def close(self) -> None:
         """Put the finished film in its place."""

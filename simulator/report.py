@@ -16,7 +16,7 @@ from simulator.run import Run
 def figures(run: Run, client=None) -> dict:
     """The lap report; seconds, metres, mph, steering as -1..1. client: whose frames and round trips belong
     to it."""
-    offset = np.abs(run.path.offset) if run.path.offset else np.zeros(1)
+    offset = np.abs(run.trajectory.offset) if run.trajectory.offset else np.zeros(1)
     lap_times = np.diff([0.0, *run.lap_times])
     report = {
         "track": run.track.name,
@@ -118,13 +118,13 @@ def write_picture(path: str, run: Run) -> None:
         edge = track.points[ring, :2] + side * track.rightward[ring] * track.edges[ring, column, None]
         axes.plot(*edge.T, color="0.6", linewidth=0.7)
     every = max(1, round(0.1 / STEP))
-    way = np.column_stack([run.path.x, run.path.y])[::every]
+    way = np.column_stack([run.trajectory.x, run.trajectory.y])[::every]
     if len(way) > 1:
         pieces = np.stack([way[:-1], way[1:]], axis=1)
         pieces = pieces[np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1) < 3]
         lines = LineCollection(pieces, cmap="viridis", norm=colors.Normalize(0, 4), linewidth=1.8)
         jump = np.linalg.norm(np.diff(way, axis=0), axis=1) < 3
-        lines.set_array(np.abs(run.path.offset)[::every][:-1][jump])
+        lines.set_array(np.abs(run.trajectory.offset)[::every][:-1][jump])
         axes.add_collection(lines)
         figure.colorbar(lines, ax=axes, label="distance from the centre line, m", shrink=0.7)
     start = track.at(track.starts["autonomous"])
