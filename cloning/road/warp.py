@@ -124,5 +124,5 @@ class CroppedView:
         size = self.columns, self.sky_rows
         far = cv2.warpPerspective(rows, sky, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         cv2.copyTo(far, self.sky[mirrored], view[: self.sky_rows])
-        seen[: self.sky_rows] |= self.sky[mirrored]
+        np.bitwise_or(seen[: self.sky_rows], self.sky[mirrored], out=seen[: self.sky_rows])
         return view, seen

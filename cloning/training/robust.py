@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import cv2
 import numpy as np
 
-from cloning.lane.place import read_lane
+from cloning.lane.place import estimate_lane_position
 from cloning.pilot.network import CROP
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
@@ -74,7 +74,7 @@ class Lanes:
     def beside(recording: Recording) -> "Lanes":
         """Of a recording's every row, from what is read of its frames."""
         whole = stretches(recording)
-        read = read_lane(recording, whole)
+        read = estimate_lane_position(recording, whole)
         lanes = Lanes.empty(len(recording))
         for stretch in whole:
             rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
@@ -82,7 +82,7 @@ class Lanes:
             place, centre, beside = driven, axle, np.zeros(len(driven))
             sure = np.flatnonzero(read.trusted[rows])
             if len(sure) >= MIN_TRUSTED * len(driven):
-                beside = np.interp(np.arange(len(driven)), sure, read.offset[rows][sure])
+                beside = np.interp(np.arange(len(driven)), sure, read.lateral_offset[rows][sure])
                 place = driven + REAR_AXLE  # the reading is that of the car's middle
                 centre = axle + REAR_AXLE * ahead(heading) - beside[:, None] * across(np.interp(place, driven, heading))
 
