@@ -11,12 +11,13 @@ import torch
 from conftest import ROOT, SHORT, draw_recording, finished_run, run_model, weights
 
 import model
-from cloning.lane.reader import Lane
+from cloning.lane.reader import LanePosition
 from cloning.pilot.network import CROP
 from cloning.recordings.format import FRAME
 from cloning.recordings.log import Recording
-from cloning.road.camera import BONNET_ROW, CAMERA_HEIGHT, CAMERA_MATRIX, FAR_SLOPE, ground_mask
+from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
+from cloning.road.warp import ground_mask
 from cloning.training import robust
 from cloning.training.robust import ROWS, Lanes, Poses
 
@@ -41,8 +42,8 @@ def recording(steering, pause_after=None):
 
 
 def lanes(monkeypatch, steering=0.0, offset=0.0, **more) -> Lanes:
-    reading = Lane(np.full(N, offset), np.zeros(N), np.ones(N, bool))
-    monkeypatch.setattr(robust, "read_lane", lambda *_: reading)
+    reading = LanePosition(np.full(N, offset), np.zeros(N), np.ones(N, bool))
+    monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
     return Lanes.beside(recording(steering, **more))
 
 
@@ -97,8 +98,8 @@ def test_the_lane_is_beside_the_human_as_far_as_was_read(monkeypatch, bend, offs
 
 
 def test_where_most_is_not_trusted_the_humans_way_stands_for_the_lane(monkeypatch):
-    reading = Lane(np.ones(N), np.ones(N), np.arange(N) % 2 == 0)
-    monkeypatch.setattr(robust, "read_lane", lambda *_: reading)
+    reading = LanePosition(np.ones(N), np.ones(N), np.arange(N) % 2 == 0)
+    monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
     found = Lanes.beside(recording(0.2))
     assert not found.offset.any()
     assert found.steering(found.offset, found.yaw)[found.known] == pytest.approx(0.2, abs=1e-3)
@@ -156,7 +157,7 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
         )
 
     expected = plane(right + AXLE_TO_CAMERA * np.sin(yaw), AXLE_TO_CAMERA * np.cos(yaw), yaw, mirrored)[
-        CROP[0] : BONNET_ROW
+        CROP[0] : FIRST_BONNET_ROW
     ]
     wrong = np.abs(poses.view(0, read).astype(int) - expected).max(2)
     assert np.percentile(wrong[12:], 95) < 12

@@ -201,7 +201,7 @@ class Observations(ABC):
 
     def read(self, at: int, camera: int) -> np.ndarray:
         """An observation's whole frame: uint8 (160, 320, 3), RGB. Raises RecordingError."""
-        return read_frame(self.path(at, camera))
+        return read_checked(self.path(at, camera))
 
     def read_cropped(self, at: int, camera: int) -> np.ndarray:
         """The `cached_rows` of an observation's frame: uint8, RGB, not to be changed. Raises RecordingError."""
@@ -211,7 +211,7 @@ class Observations(ABC):
         """The `cached_rows` of the frame of any row of recording `number`: uint8, RGB, not to be changed."""
         recording = self.recordings[number]
         key = number, recording.images[row, camera]  # rows may share an image
-        return self.cache.get(key, lambda: read_frame(recording.path(row, camera))[self.cached_rows])
+        return self.cache.get(key, lambda: read_checked(recording.path(row, camera))[self.cached_rows])
 
     def center(self, rows: np.ndarray) -> np.ndarray:
         """The centre images of these observations as the network sees them: uint8 (len(rows), 75, 320, 3), RGB."""
@@ -225,7 +225,7 @@ def center_digests(recording: Recording, rows: np.ndarray) -> np.ndarray:
     return recording.digests[recording.images[rows, 0]]
 
 
-def read_frame(path: Path) -> np.ndarray:
+def read_checked(path: Path) -> np.ndarray:
     """A frame: uint8 (160, 320, 3), RGB. Raises RecordingError if the file is not the one that was checked."""
     try:
         return decode(path.read_bytes())

@@ -17,12 +17,24 @@ import cv2
 import numpy as np
 
 from cloning.errors import RecordingError
-from cloning.lane.place import read_lane
+from cloning.lane.place import estimate_lane_position
 from cloning.pilot.network import CROP
-from cloning.recordings.format import CAMERAS, FRAME
+from cloning.recordings.format import CAMERAS
 from cloning.recordings.log import Recording
-from cloning.road.camera import BONNET_ROW, CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, EARLIER_FRAME, FAR_SLOPE
-from cloning.road.motion import AXLE_TO_CAMERA, MIN_TRUSTED, OFF_ROAD, REAR_AXLE, Stretch, steering_for, stretches
+from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
+from cloning.road.motion import (
+    AXLE_TO_CAMERA,
+    MIN_TRUSTED,
+    OFF_ROAD,
+    REAR_AXLE,
+    Stretch,
+    components,
+    forward_vector,
+    right_of,
+    steering_for,
+    stretches,
+)
+from cloning.road.warp import SOURCE_ROWS, CroppedView
 from cloning.training.observations import SEEN_SHAPE, Example, Observations, ValidationSet, Views, center_digests
 from cloning.training.options import Arguments
 
@@ -36,10 +48,8 @@ CAMERA_REACH = 1.7  # m: a camera within this distance of a pose may supply its 
 STRAIGHT_WEIGHT = 0.2  # of an observation whose label is 0; |label| is added to it
 TINTED_SHARE = 0.5  # of the images
 SATURATION, TINT = (0.1, 1.5), (0.85, 1.15)  # ranges of their factors; TINT of red, green and blue each
-SOURCE_ROWS = slice(45, BONNET_ROW)  # of a recorded frame: what the rows that the network sees are warped from
 MIRRORED_SHARE = 0.5  # of the images in a batch
-ROWS = SOURCE_ROWS
-HORIZON = 6  # rows of what the network sees that may show what is above the horizon
+VIEW = CroppedView(CROP)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -84,12 +94,12 @@ class Lanes:
         """The lane at every row of a recording, estimated from its frames. Raises RecordingError, ModelError."""
         whole = stretches(recording)
         try:
-            estimated = read_lane(recording, whole)
+            estimated = estimate_lane_position(recording, whole)
         except (OSError, ValueError) as error:
             raise RecordingError(f"{recording.folder}: {error}; restore the image, and run again") from error
         lanes = Lanes.unknown(len(recording))
         for stretch in whole:
-            lanes._fill(stretch, estimated.offset[stretch.rows], estimated.trusted[stretch.rows])
+            lanes._fill(stretch, estimated.lateral_offset[stretch.rows], estimated.trusted[stretch.rows])
         return lanes
 
     def _fill(self, stretch: Stretch, offset: np.ndarray, trusted: np.ndarray) -> None:
@@ -102,27 +112,26 @@ class Lanes:
         if len(sure) >= MIN_TRUSTED * len(driven):
             to_centre = np.interp(np.arange(len(driven)), sure, offset[sure])
             passed = driven + REAR_AXLE  # the estimate holds at the car's middle
-            side = rightward(np.interp(passed, driven, heading))
-            centre = axle + REAR_AXLE * forward(heading) - to_centre[:, None] * side
+            side = right_of(forward_vector(np.interp(passed, driven, heading)))
+            centre = axle + REAR_AXLE * forward_vector(heading) - to_centre[:, None] * side
 
         def centre_at(metres: np.ndarray) -> np.ndarray:
             return np.stack([np.interp(metres, passed, centre[:, i]) for i in (0, 1)], axis=1)
 
         # The heading of the estimated centre line agrees with the driven trajectory; the estimated yaw would not.
-        along = np.arctan2(*(centre_at(driven + HEADING_CHORD) - centre_at(driven - HEADING_CHORD)).T)
-        away = axle - centre_at(driven)
-        self.offset[rows] = (away * rightward(along)).sum(1)
-        self.yaw[rows] = np.angle(np.exp(1j * (heading - along)))
-        goal = centre_at(driven + LOOKAHEAD) - axle + self.offset[rows, None] * rightward(along)
-        goal = np.stack([(goal * rightward(along)).sum(1), (goal * forward(along)).sum(1)], axis=1)
+        chord = centre_at(driven + HEADING_CHORD) - centre_at(driven - HEADING_CHORD)
+        lane_heading = np.arctan2(*chord.T)
+        along = forward_vector(lane_heading)
+        self.offset[rows] = components(axle - centre_at(driven), along)[:, 0]
+        self.yaw[rows] = np.angle(np.exp(1j * (heading - lane_heading)))
+        goal = centre_at(driven + LOOKAHEAD) - axle + self.offset[rows, None] * right_of(along)
+        goal = components(goal, along)
         known = (driven >= 2 * HEADING_CHORD) & (driven + LOOKAHEAD <= driven[-1]) & (np.abs(to_centre) < OFF_ROAD)
         self.goal[rows], self.known[rows] = np.where(known[:, None], goal, self.goal[rows]), known
         earlier = np.maximum(np.searchsorted(driven, driven - EARLIER_FRAME, "right") - 1, 0)
         self.earlier[rows] = rows.start + earlier
-        back = axle[earlier] - axle
-        self.moved[rows] = np.stack(
-            [(back * rightward(heading)).sum(1), (back * forward(heading)).sum(1), heading[earlier] - heading], axis=1
-        )
+        back = components(axle[earlier] - axle, forward_vector(heading))
+        self.moved[rows] = np.column_stack([back, heading[earlier] - heading])
 
     @staticmethod
     def joined(parts: list["Lanes"]) -> "Lanes":
@@ -188,16 +197,14 @@ class Poses:
     def of(lanes: Lanes, offset: np.ndarray, yaw: np.ndarray, camera: np.ndarray, mirrored: np.ndarray) -> "Poses":
         """These poses at the rows of `lanes`, in true colours; offset, yaw: float (n,); the others as in the class."""
         turn = yaw - lanes.yaw
-        # The camera's place, relative to the recorded rear axle and along the recorded car: m right, m forward.
-        eye = np.stack(
-            [
-                (offset - lanes.offset) * np.cos(lanes.yaw) + AXLE_TO_CAMERA * np.sin(turn),
-                (offset - lanes.offset) * np.sin(lanes.yaw) + AXLE_TO_CAMERA * np.cos(turn),
-            ],
-            axis=1,
-        )
+        # Relative to the recorded rear axle and along the recorded car: m right, m forward.
+        away = offset - lanes.offset
+        axle = np.stack([away * np.cos(lanes.yaw), away * np.sin(lanes.yaw)], axis=1)
+        eye = camera_position(axle, forward_vector(turn))
         side = np.array(list(CAMERA_OFFSETS.values()))[camera]
-        warps = [warps_between(eye, turn, moved, side, mirrored) for moved in (np.zeros_like(lanes.moved), lanes.moved)]
+        warps = [
+            VIEW.homographies(eye, turn, moved, side, mirrored) for moved in (np.zeros_like(lanes.moved), lanes.moved)
+        ]
         steering = lanes.steering(offset, yaw)
         colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
         return Poses(camera, mirrored, np.stack(warps, axis=1), np.where(mirrored, -steering, steering), colours)
@@ -212,9 +219,9 @@ class Poses:
         read(camera, earlier): the `SOURCE_ROWS` of the row's frame, or of the earlier row's, by this camera, uint8.
         """
         camera, mirrored = int(self.camera[at]), bool(self.mirrored[at])
-        image, seen = warp(read(camera, False), self.warps[at, 0], mirrored)
+        image, seen = VIEW.warp(read(camera, False), self.warps[at, 0], mirrored)
         if not seen.all():
-            earlier, _ = warp(read(camera, True), self.warps[at, 1], mirrored)
+            earlier, _ = VIEW.warp(read(camera, True), self.warps[at, 1], mirrored)
             cv2.copyTo(earlier, cv2.bitwise_not(seen), image)
         return cv2.transform(image, self.colours[at])
 
@@ -224,16 +231,6 @@ def tints(rng: np.random.Generator, n: int) -> np.ndarray:
     saturation = rng.uniform(*SATURATION, n)[:, None, None]
     tint = rng.uniform(*TINT, (n, 3, 1))
     return (tint * (saturation * np.eye(3) + (1 - saturation) / 3)).astype(np.float32)
-
-
-def rightward(heading: np.ndarray) -> np.ndarray:
-    """The unit vector to the right of a heading: (n, 2), right and forward where the heading is 0."""
-    return np.stack([np.cos(heading), -np.sin(heading)], axis=1)
-
-
-def forward(heading: np.ndarray) -> np.ndarray:
-    """The unit vector along a heading: (n, 2), right and forward where the heading is 0."""
-    return np.stack([np.sin(heading), np.cos(heading)], axis=1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -345,55 +342,3 @@ class PoseViews(Views):
         frames = [self.observations.read(row, camera) for camera in range(len(CAMERAS))]
         labels = self.observations.lanes.camera_labels(row)
         return Example(frames, labels, self.images(np.array([i])), CROP[0], ["from a pose", "from another"])
-
-
-# --------------------------------------------------------------------------------------------------
-# Warping what the network sees
-
-SEEN = (FRAME[0] - sum(CROP), FRAME[1])  # rows and columns
-_FROM = np.linalg.inv(CAMERA_MATRIX) @ np.array([[1, 0, 0], [0, 1, ROWS.start], [0, 0, 1.0]])
-_CROP = np.array([[1, 0, 0], [0, 1, -CROP[0]], [0, 0, 1.0]])
-# The camera is turned and tilted, so that a flipped frame is not what it would see of the mirror world; the second is.
-_INTO = np.stack([_CROP @ CAMERA_MATRIX, _CROP @ CAMERA_MATRIX @ np.diag([-1.0, 1, 1])])
-
-
-def warps_between(eye, turn, stood, side, mirrored) -> np.ndarray:
-    """From frames to views: float64 (n, 2, 3, 3), for the ground and for what is infinitely far.
-
-    eye: (n, 2), right and forward, the camera looked through; turn: (n,), where it looks; stood: (n, 3), right,
-    forward, heading of the recorded rear axle; side: (n,), metres from there to the right, the recording camera.
-    """
-    s, c = np.sin(stood[:, 2]), np.cos(stood[:, 2])
-    away = eye - stood[:, :2] - np.stack([AXLE_TO_CAMERA * s + side * c, AXLE_TO_CAMERA * c - side * s], axis=1)
-    moved = np.tile(np.eye(3), (len(turn), 2, 1, 1))
-    moved[:, 0, 0, 1] = -(away[:, 0] * c - away[:, 1] * s) / CAMERA_HEIGHT
-    moved[:, 0, 2, 1] = -(away[:, 0] * s + away[:, 1] * c) / CAMERA_HEIGHT
-    s, c, o = np.sin(turn - stood[:, 2]), np.cos(turn - stood[:, 2]), np.zeros(len(turn))
-    turned = np.stack([c, o, -s, o, o + 1, o, s, o, c], axis=1).reshape(-1, 1, 3, 3)
-    return _INTO[mirrored.astype(int)][:, None] @ turned @ moved @ _FROM
-
-
-def _sky(mirrored: bool) -> np.ndarray:
-    """uint8 (HORIZON, 320): 255 where a view does not show ground near enough to move with the camera."""
-    columns, rows = np.meshgrid(np.arange(SEEN[1]), np.arange(HORIZON))
-    directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(_INTO[int(mirrored)]).T
-    return np.where(directions[..., 1] > FAR_SLOPE * directions[..., 2], 0, 255).astype(np.uint8)
-
-
-_SKY = _sky(False), _sky(True)
-_ROAD = np.zeros((ROWS.stop - ROWS.start, FRAME[1]), np.uint8)
-_ROAD[:, 1:-1] = 255
-
-
-def warp(frame: np.ndarray, warps: np.ndarray, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
-    """A frame's rows `ROWS`, uint8, as seen through `warps` (2, 3, 3): uint8 (75, 320, 3); and 255 where it was really
-    seen: uint8 (75, 320)."""
-    size = SEEN[::-1]
-    made = cv2.warpPerspective(frame, warps[0], size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    seen = cv2.warpPerspective(_ROAD, warps[0], size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-    far = cv2.warpPerspective(
-        frame, warps[1], (size[0], HORIZON), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
-    )
-    cv2.copyTo(far, _SKY[mirrored], made[:HORIZON])
-    seen[:HORIZON] |= _SKY[mirrored]
-    return made, seen
