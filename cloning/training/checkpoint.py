@@ -97,7 +97,7 @@ def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Argu
                 f"{path}: the run began with {option(name)} {began_with[name]}, not {getattr(arguments, name)}; "
                 "leave the option out, or start a new run without --resume"
             )
-    names = {one.name for one in fields(Arguments)} - NEVER_RESUMED - given
+    names = {item.name for item in fields(Arguments)} - NEVER_RESUMED - given
     return replace(arguments, **{name: value for name, value in began_with.items() if name in names}), saved
 
 

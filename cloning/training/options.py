@@ -69,7 +69,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog="The defaults are the report's. Stop a run with Ctrl-C at any time; --resume continues it.",
         argument_default=argparse.SUPPRESS,
     )
-    defaults = {one.name: getattr(Arguments(), one.name) for one in fields(Arguments)}
+    defaults = {item.name: getattr(Arguments(), item.name) for item in fields(Arguments)}
 
     def text(name: str, help_text: str) -> str:
         return f"{help_text} (default: {defaults[name]})"

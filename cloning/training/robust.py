@@ -16,7 +16,6 @@ from typing import ClassVar, Self
 import cv2
 import numpy as np
 
-from cloning.errors import RecordingError
 from cloning.lane.place import estimate_lane_position
 from cloning.pilot.network import CROP
 from cloning.recordings.format import CAMERAS
@@ -91,12 +90,12 @@ class Lanes:
 
     @staticmethod
     def of(recording: Recording) -> "Lanes":
-        """The lane at every row of a recording, estimated from its frames. Raises RecordingError, ModelError."""
+        """The lane at every row of a recording, estimated from its frames.
+
+        Raises OSError, RecordingError for images that can't be read, ModelError without a usable lane network.
+        """
         whole = stretches(recording)
-        try:
-            estimated = estimate_lane_position(recording, whole)
-        except (OSError, ValueError) as error:
-            raise RecordingError(f"{recording.folder}: {error}; restore the image, and run again") from error
+        estimated = estimate_lane_position(recording, whole)
         lanes = Lanes.unknown(len(recording))
         for stretch in whole:
             lanes._fill(stretch, estimated.lateral_offset[stretch.rows], estimated.trusted[stretch.rows])
@@ -136,11 +135,11 @@ class Lanes:
     @staticmethod
     def joined(parts: list["Lanes"]) -> "Lanes":
         """The rows of all parts, one part after the other."""
-        return Lanes(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Lanes)))
+        return Lanes(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(Lanes)))
 
     def take(self, rows: np.ndarray) -> "Lanes":
         """These rows, in this order."""
-        return Lanes(*(getattr(self, one.name)[rows] for one in fields(self)))
+        return Lanes(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def steering(self, offset: float | np.ndarray, yaw: float | np.ndarray) -> np.ndarray:
         """The recovery steering from a pose at each row, by pure pursuit of the goal: float32 (n,), -1..1."""
@@ -202,16 +201,15 @@ class Poses:
         axle = np.stack([away * np.cos(lanes.yaw), away * np.sin(lanes.yaw)], axis=1)
         eye = camera_position(axle, forward_vector(turn))
         side = np.array(list(CAMERA_OFFSETS.values()))[camera]
-        warps = [
-            VIEW.homographies(eye, turn, moved, side, mirrored) for moved in (np.zeros_like(lanes.moved), lanes.moved)
-        ]
+        own_frame = np.zeros_like(lanes.moved)
+        warps = [VIEW.homographies(eye, turn, moved, side, mirrored) for moved in (own_frame, lanes.moved)]
         steering = lanes.steering(offset, yaw)
         colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
         return Poses(camera, mirrored, np.stack(warps, axis=1), np.where(mirrored, -steering, steering), colours)
 
     def take(self, rows: np.ndarray) -> "Poses":
         """These rows, in this order."""
-        return Poses(*(getattr(self, one.name)[rows] for one in fields(self)))
+        return Poses(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:
         """What the network sees of one row: uint8 (75, 320, 3), RGB.
