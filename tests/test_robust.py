@@ -15,11 +15,11 @@ from cloning.lane.reader import LanePosition
 from cloning.pilot.network import CROP
 from cloning.recordings.format import FRAME
 from cloning.recordings.log import Recording
-from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, FAR_SLOPE, FIRST_BONNET_ROW
+from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
-from cloning.road.warp import ground_mask
+from cloning.road.warp import SOURCE_ROWS, ground_mask
 from cloning.training import robust
-from cloning.training.robust import ROWS, Lanes, Poses
+from cloning.training.robust import Lanes, Poses
 
 N, SPEED = 300, 20.0  # rows; mph
 
@@ -44,7 +44,7 @@ def recording(steering, pause_after=None):
 def lanes(monkeypatch, steering=0.0, offset=0.0, **more) -> Lanes:
     reading = LanePosition(np.full(N, offset), np.zeros(N), np.ones(N, bool))
     monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
-    return Lanes.beside(recording(steering, **more))
+    return Lanes.of(recording(steering, **more))
 
 
 def drive_back(lanes: Lanes, bend: float, right: float, yaw: float, metres: float) -> tuple[float, float]:
@@ -80,7 +80,10 @@ def test_a_shifted_car_comes_back_and_stays(monkeypatch, steering, right, yaw):
 
 def test_the_further_off_the_harder_back(monkeypatch):
     one = lanes(monkeypatch).take(np.array([50]))
-    by_place = [float(one.steering(right, 0.0)[0]) for right in np.linspace(-robust.STEEP, robust.STEEP, 9)]
+    by_place = [
+        float(one.steering(right, 0.0)[0])
+        for right in np.linspace(-robust.STEEPEST_FROM, robust.STEEPEST_FROM, 9)
+    ]
     by_yaw = [float(one.steering(0.0, yaw)[0]) for yaw in np.linspace(-0.2, 0.2, 9)]
     for found in (by_place, by_yaw):
         assert (np.diff(found) < 0).all()
@@ -100,18 +103,18 @@ def test_the_lane_is_beside_the_human_as_far_as_was_read(monkeypatch, bend, offs
 def test_where_most_is_not_trusted_the_humans_way_stands_for_the_lane(monkeypatch):
     reading = LanePosition(np.ones(N), np.ones(N), np.arange(N) % 2 == 0)
     monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
-    found = Lanes.beside(recording(0.2))
+    found = Lanes.of(recording(0.2))
     assert not found.offset.any()
     assert found.steering(found.offset, found.yaw)[found.known] == pytest.approx(0.2, abs=1e-3)
 
 
 def test_the_way_on_is_not_known_before_a_break(monkeypatch):
     found = lanes(monkeypatch, pause_after=149)
-    rows = robust.AHEAD / (SPEED * MPH / 15)
+    rows = robust.LOOKAHEAD / (SPEED * MPH / 15)
     missing = np.flatnonzero(~found.known)
     for end in (150, N):
         assert len(missing[(missing < end) & (missing > end - 100)]) == pytest.approx(rows, abs=4)
-    assert (found.before[150:] >= 150).all()
+    assert (found.earlier[150:] >= 150).all()
 
 
 # --------------------------------------------------------------------------------------------------
@@ -138,14 +141,14 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
     """And mirrored, what the same camera, tilted as it is, would see of the mirror world."""
     one = lanes(monkeypatch, 0.05, offset=0.4).take(np.array([100]))
     poses = Poses.of(one, np.array([right]), np.array([yaw]), np.array([camera]), np.array([mirrored]))
-    side = list(robust.SIDES.values())[camera]
+    side = list(CAMERA_OFFSETS.values())[camera]
 
     def stood(x, z, heading):  # in the lane's frame
         return plane(
             x + AXLE_TO_CAMERA * np.sin(heading) + side * np.cos(heading),
             z + AXLE_TO_CAMERA * np.cos(heading) - side * np.sin(heading),
             heading,
-        )[ROWS]
+        )[SOURCE_ROWS]
 
     def read(_, before):
         offset, turned = float(one.offset[0]), float(one.yaw[0])
@@ -167,7 +170,7 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
 
 def test_drawn_poses_are_on_both_sides_by_every_camera_and_lead_back(monkeypatch):
     found = lanes(monkeypatch).take(np.full(4000, 100))
-    poses = found.drawn(np.random.default_rng(0), np.zeros(4000, bool))
+    poses = found.sample_poses(np.random.default_rng(0), np.zeros(4000, bool))
     assert np.bincount(poses.camera, minlength=3).min() > 800
     assert abs(poses.steering.mean()) < 0.01
     for camera in range(3):  # the camera does not tell the side
@@ -190,7 +193,7 @@ def test_robust_trains_and_says_what_was_left_out(finished, drawn):
     assert "way on unknown" in done.stdout
     row = next(line for line in done.stdout.splitlines() if line.startswith("total"))
     assert int(row.split()[-1]) == 60 - int(row.split()[-2])
-    metres = 2 * robust.CHORD + robust.AHEAD  # at the beginning and at the end
+    metres = 2 * robust.HEADING_CHORD + robust.LOOKAHEAD  # at the beginning and at the end
     assert int(row.split()[-2]) == pytest.approx(metres / (30.19 * MPH * 0.067), abs=2)
     assert (folder / "diagnostic_images" / "training_generator_augmented-0.png").exists()
     arguments = torch.load(folder / "model.pt", weights_only=True)["arguments"]
@@ -238,7 +241,7 @@ def test_drives_too_short_are_named(tmp_path):
 
 def test_other_colours_keep_grey_nearly_grey_and_light():
     grey, red = (np.float32([100, 100, 100]), np.float32([200, 50, 50]))
-    colours = robust.other_colours(np.random.default_rng(0), 1000)
+    colours = robust.tints(np.random.default_rng(0), 1000)
     assert colours.shape == (1000, 3, 3) and colours.dtype == np.float32
     made = colours @ grey
     assert made.min() >= 84.9 and made.max() <= 115.1 and made.std(0) == pytest.approx(8.7, abs=1)
@@ -248,16 +251,16 @@ def test_other_colours_keep_grey_nearly_grey_and_light():
 
 def test_half_of_the_views_are_of_other_colours(monkeypatch):
     many = lanes(monkeypatch, 0.05, offset=0.4).take(np.full(1000, 100))
-    poses = many.drawn(np.random.default_rng(0), np.zeros(1000, bool))
+    poses = many.sample_poses(np.random.default_rng(0), np.zeros(1000, bool))
     plain = (poses.colours == np.eye(3)).all((1, 2))
     assert 0.4 < plain.mean() < 0.6
 
 
 def test_rows_in_bends_are_drawn_more_often(monkeypatch):
     many = lanes(monkeypatch, 0.4)
-    straight, bent = Lanes.empty(3), many.take(np.array([100]))
+    straight, bent = Lanes.unknown(3), many.take(np.array([100]))
     weights = Lanes.joined([straight, bent]).weights()
     steering = abs(float(bent.steering(np.zeros(1), np.zeros(1))[0]))
     assert steering > 0.2
     assert weights.sum() == pytest.approx(1)
-    assert weights[3] / weights[0] == pytest.approx((robust.SHARE + steering) / robust.SHARE)
+    assert weights[3] / weights[0] == pytest.approx((robust.STRAIGHT_WEIGHT + steering) / robust.STRAIGHT_WEIGHT)

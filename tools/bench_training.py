@@ -40,9 +40,9 @@ def begin(folders: list[str], samples: int, output: Path):
     """A model.py run over these folders, not yet trained."""
     import model
 
-    arguments, given = model.parse([*folders, "--samples-per-epoch", str(samples), "--output", str(output)])
-    training, validation, _ = model.prepare(arguments, given)
-    return model.Run(arguments, training, validation)
+    options = ["--samples-per-epoch", str(samples), "--epochs", "1", "--output", str(output)]
+    arguments, training, validation, _ = model.prepare(*model.parse([*folders, *options]))
+    return model.TrainingRun(arguments, training, validation)
 
 
 def flops(network) -> int:
@@ -64,12 +64,12 @@ def flops(network) -> int:
 
 def part_ab(run, _):
     """Both in one process, a bare step after every fourth batch, so that what else the machine does falls on both."""
-    bare, draw_pictures, turns = run.generator.begin(0)(), run.draw_pictures, itertools.count(1)
+    bare, write_pictures, turns = run.generator.begin(0)(), run.write_pictures, itertools.count(1)
     spent, steps = 0.0, 0
 
     def between_batches():
         nonlocal spent, steps
-        draw_pictures()
+        write_pictures()
         if next(turns) % 4 == 0:
             run.pool.submit(int).result()  # behind the images of the next batch, which are (a)'s
             started = time.perf_counter()
@@ -79,11 +79,11 @@ def part_ab(run, _):
             synchronize(run.device)
             spent, steps = spent + time.perf_counter() - started, steps + 1
 
-    run.draw_pictures, run.arguments.epochs = between_batches, 1
+    run.write_pictures = between_batches
     started = time.perf_counter()
     run.train()
     whole = time.perf_counter() - started - spent
-    return {"a": run.history[0]["images"] / whole, "b": steps * bare.total / spent}
+    return {"a": run.progress.history[0]["images"] / whole, "b": steps * bare.total / spent}
 
 
 def one_by_one(generator, number: int):
@@ -91,14 +91,14 @@ def one_by_one(generator, number: int):
     import numpy as np
 
     from cloning.recordings.format import FRAME
-    from model import CROP, of_each_kind
+    from model import CROP, augment, of_each_kind
 
-    drawn, images, angles = generator.draw(number), [], []
-    for i, (at, camera) in enumerate(zip(drawn["observation"], drawn["camera"], strict=True)):
+    choices, images, angles = generator.sample(number), [], []
+    for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
         cropped = generator.observations.read(at, camera)[None, CROP[0] : FRAME[0] - CROP[1]]
-        for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), of_each_kind(cropped), CROP[0])):
+        for kind, (which, made) in enumerate(augment(choices, np.array([i]), of_each_kind(cropped), CROP[0])):
             images += list(made)
-            angles += [drawn["angles"][i, kind]] * len(which)
+            angles += [choices.views.labels[i, kind]] * len(which)
     return np.stack(images), np.array(angles)
 
 
