@@ -118,7 +118,7 @@ def test_documents_name_what_exists(document):
         assert (document.parent / link).exists(), link
     for tool in re.findall(r"python -m tools\.([a-z_]+)", text):
         assert (ROOT / "tools" / f"{tool}.py").exists(), tool
-    for path in re.findall(r"`((?:cloning|simulator|tools|tests)/[\w/.-]*)`", text):
+    for path in re.findall(r"`((?:cloning|simulator|tools|tests)/[a-z_/.]*)`", text):
         assert (ROOT / path).exists(), path
 
 
