@@ -224,10 +224,10 @@ def measure(part: str, recordings: list[str], samples: int, steps: int, folder: 
 
 def peak_memory() -> float | None:
     """Return the peak resident memory of this process in GB, or None on Windows, which does not tell it."""
-    try:
-        import resource
-    except ImportError:
+    if sys.platform == "win32":
         return None
+    import resource
+
     unit = 1e9 if sys.platform == "darwin" else 1e6  # bytes on macOS, kilobytes elsewhere
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
