@@ -125,7 +125,8 @@ def part_c(run: "model.TrainingRun", steps: int) -> dict[str, float]:
     """Measure (c), a typical training loop."""
     import torch
 
-    network = run.network.to(memory_format=torch.contiguous_format)
+    network = run.network
+    network.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]  # not in the stubs
     torch.set_num_threads(threads())
     optimizer = torch.optim.Adam(network.parameters(), 1e-4)
     numbers = iter(range(1000))
