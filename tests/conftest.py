@@ -1,6 +1,7 @@
 """A tiny rendered recording in the simulator's own format, and helpers that run model.py on it."""
 
 import contextlib
+import csv
 import io
 import os
 import subprocess
@@ -15,6 +16,7 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
+HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from another folder
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -116,3 +118,20 @@ def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
     return torch.load(path, weights_only=True)["network"]
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    """Whether two networks have equal weights."""
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def log(folder: Path) -> list[dict[str, str]]:
+    """The rows of a run's training_log.csv."""
+    with open(folder / "training_log.csv", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="session")
+def finished(drawn, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
+    """A run of two epochs as in the report: what it printed, and its folder; not to be changed."""
+    return finished_run(drawn, tmp_path_factory.mktemp("run"), *SHORT)

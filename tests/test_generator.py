@@ -180,7 +180,7 @@ def test_images_and_angles_of_an_observation(generator):
         np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], choices.brightness[i : i + 1])[0])
 
 
-def test_the_yardsticks_batch_is_the_generators(generator):
+def test_the_benchmarks_batch_is_the_generators(generator):
     made, angles = one_by_one(generator, 3)
     batch = generator.begin(3)()
     assert made.shape == batch.images.shape
