@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from conftest import HERE, ROOT, SHORT, draw_recording, log, run_here, run_model, same, weights
@@ -52,15 +53,13 @@ def test_what_a_run_leaves(finished):
 
 
 def test_training_learns(drawn, tmp_path):
-    """After a few seconds the network predicts frames that it was not trained on far better than the mean steering."""
+    """After three seconds it predicts frames that it was not trained on ten times better than the mean steering."""
     faster = ("--learning-rate", 1e-3, "--samples-per-epoch", 700, "--epochs", 3)
     done = run_here(drawn, *SHORT, *faster, "--output", tmp_path / "model.pt")
-    table = [line.split() for line in done.stdout.splitlines()]
-    errors = next(row[-4:] for row in table if row[:5] == ["steering", "of", "0", "to", "1"])
-    steer_mean, last = float(errors[1]), float(errors[2])
-    assert last < 0.3 * steer_mean
-    correlations = next(row[-4:] for row in table if row[:1] == ["correlation"])
-    assert float(correlations[2]) > 0.9
+    steering = np.loadtxt(drawn / "driving_log.csv", delimiter=",", usecols=3)
+    assert float(log(tmp_path)[-1]["val_loss"]) < 0.1 * steering.var()  # the error of steering the mean
+    correlations = next(line.split()[-4:] for line in done.stdout.splitlines() if line.startswith("correlation"))
+    assert float(correlations[2]) > 0.95
     assert "hardly follows" not in done.stdout
 
 
