@@ -15,8 +15,9 @@ from cloning.lane.reader import Lane
 from cloning.pilot.network import CROP
 from cloning.recordings.format import FRAME
 from cloning.recordings.log import Recording
-from cloning.road.camera import BONNET_ROW, CAMERA_HEIGHT, CAMERA_MATRIX, FAR_SLOPE, ground_mask
+from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
+from cloning.road.warp import ground_mask
 from cloning.training import robust
 from cloning.training.robust import ROWS, Lanes, Poses
 
@@ -156,7 +157,7 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
         )
 
     expected = plane(right + AXLE_TO_CAMERA * np.sin(yaw), AXLE_TO_CAMERA * np.cos(yaw), yaw, mirrored)[
-        CROP[0] : BONNET_ROW
+        CROP[0] : FIRST_BONNET_ROW
     ]
     wrong = np.abs(poses.view(0, read).astype(int) - expected).max(2)
     assert np.percentile(wrong[12:], 95) < 12

@@ -18,7 +18,7 @@ from cloning.lane.reader import see
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
-from cloning.road.camera import CAMERA_OFFSETS, project
+from cloning.road.camera import CAMERA_OFFSETS, project_ground
 from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, stretches
 from cloning.road.track import Place, Track
 from simulator import scenery
@@ -48,7 +48,7 @@ def line_columns(track: Track, place: np.ndarray, aside: float, camera: str, row
     near = (round(place[0] / track.step) + np.arange(45)) % len(track.points)
     away = track.points[near, :2] - aside * track.rightward[near] - eye
     ahead = away @ forward
-    seen = project(away[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
+    seen = project_ground(away[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
     return np.interp(rows, seen[:, 1], seen[:, 0], left=np.nan, right=np.nan)
 
 

@@ -22,6 +22,22 @@ MIN_TRUSTED = 0.7  # share of a stretch's rows whose lane is trusted; below it, 
 MIN_SPEED = 1.0  # m/s: slower than walking, the frames say nothing about steering
 
 
+def forward_vector(heading: np.ndarray | float) -> np.ndarray:
+    """Return the unit vector along a heading: (…, 2), right and forward in the frame where the heading is 0."""
+    return np.stack([np.sin(heading), np.cos(heading)], axis=-1)
+
+
+def right_of(forward: np.ndarray) -> np.ndarray:
+    """Return the unit vector to the right of another: (…, 2); both (right, forward) or both (x east, y north)."""
+    return np.stack([forward[..., 1], -forward[..., 0]], axis=-1)
+
+
+def components(vector: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """Return a vector's components to the right of and along a unit vector: (…, 2); all in the same frame."""
+    right = vector[..., 0] * forward[..., 1] - vector[..., 1] * forward[..., 0]
+    return np.stack([right, vector[..., 0] * forward[..., 0] + vector[..., 1] * forward[..., 1]], axis=-1)
+
+
 def curvature(steering):
     """Of the way at this steering, 1/m, right positive; steering -1..1, a number or an array.
 

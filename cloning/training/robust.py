@@ -13,10 +13,18 @@ import numpy as np
 
 from cloning.lane.place import read_lane
 from cloning.pilot.network import CROP
-from cloning.recordings.format import FRAME
 from cloning.recordings.log import Recording
-from cloning.road.camera import BONNET_ROW, CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, EARLIER_FRAME, FAR_SLOPE
-from cloning.road.motion import AXLE_TO_CAMERA, MIN_TRUSTED, OFF_ROAD, REAR_AXLE, steering_for, stretches
+from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
+from cloning.road.motion import (
+    AXLE_TO_CAMERA,
+    MIN_TRUSTED,
+    OFF_ROAD,
+    REAR_AXLE,
+    forward_vector,
+    steering_for,
+    stretches,
+)
+from cloning.road.warp import SOURCE_ROWS, CroppedView
 
 AHEAD = 6.0  # m along the lane's centre: the point that the car is steered for
 STEEP = 1.0  # m: from further off the car comes back no steeper than from here, at up to STEEP / AHEAD radians
@@ -28,8 +36,8 @@ REACH = 2.4  # m from the human's way: further to the side too little was seen
 NEARBY = 1.7  # m: a camera within this distance from a pose may show it
 TINTED = 0.5  # of the views
 STRENGTH, TINTS = (0.1, 1.5), (0.85, 1.15)  # of their colours, and factors of red, green and blue
-ROWS = slice(45, BONNET_ROW)  # of a recorded frame: what is needed for the rows that the network sees
-HORIZON = 6  # rows of what the network sees that may show what is above the horizon
+ROWS = SOURCE_ROWS  # of a recorded frame: what views are warped from
+VIEW = CroppedView(CROP)
 
 
 @dataclass
@@ -160,15 +168,13 @@ class Poses:
     def of(lanes: Lanes, right, yaw, camera: np.ndarray, mirrored: np.ndarray) -> "Poses":
         turn = yaw - lanes.yaw
         # Of the camera, from the recorded rear axle, along the recorded car.
-        eye = np.stack(
-            [
-                (right - lanes.offset) * np.cos(lanes.yaw) + AXLE_TO_CAMERA * np.sin(turn),
-                (right - lanes.offset) * np.sin(lanes.yaw) + AXLE_TO_CAMERA * np.cos(turn),
-            ],
-            axis=1,
-        )
+        away = right - lanes.offset
+        axle = np.stack([away * np.cos(lanes.yaw), away * np.sin(lanes.yaw)], axis=1)
+        eye = camera_position(axle, forward_vector(turn))
         side = np.array(list(CAMERA_OFFSETS.values()))[camera]
-        warps = [warps_between(eye, turn, moved, side, mirrored) for moved in (np.zeros_like(lanes.moved), lanes.moved)]
+        warps = [
+            VIEW.homographies(eye, turn, moved, side, mirrored) for moved in (np.zeros_like(lanes.moved), lanes.moved)
+        ]
         steering = lanes.steering(right, yaw)
         colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
         return Poses(camera, mirrored, np.stack(warps, axis=1), np.where(mirrored, -steering, steering), colours)
@@ -182,9 +188,9 @@ class Poses:
         read(camera, before): the row's frame, or that of the earlier row, by this camera: uint8, its rows `ROWS`.
         """
         camera, mirrored = int(self.camera[at]), bool(self.mirrored[at])
-        made, seen = warp(read(camera, False), self.warps[at, 0], mirrored)
+        made, seen = VIEW.warp(read(camera, False), self.warps[at, 0], mirrored)
         if not seen.all():
-            before, _ = warp(read(camera, True), self.warps[at, 1], mirrored)
+            before, _ = VIEW.warp(read(camera, True), self.warps[at, 1], mirrored)
             cv2.copyTo(before, cv2.bitwise_not(seen), made)
         return cv2.transform(made, self.colours[at])
 
@@ -203,55 +209,3 @@ def across(heading: np.ndarray) -> np.ndarray:
 
 def ahead(heading: np.ndarray) -> np.ndarray:
     return np.stack([np.sin(heading), np.cos(heading)], axis=1)
-
-
-# --------------------------------------------------------------------------------------------------
-# Warping what the network sees
-
-SEEN = (FRAME[0] - sum(CROP), FRAME[1])  # rows and columns
-_FROM = np.linalg.inv(CAMERA_MATRIX) @ np.array([[1, 0, 0], [0, 1, ROWS.start], [0, 0, 1.0]])
-_CROP = np.array([[1, 0, 0], [0, 1, -CROP[0]], [0, 0, 1.0]])
-# The camera is turned and tilted, so that a flipped frame is not what it would see of the mirror world; the second is.
-_INTO = np.stack([_CROP @ CAMERA_MATRIX, _CROP @ CAMERA_MATRIX @ np.diag([-1.0, 1, 1])])
-
-
-def warps_between(eye, turn, stood, side, mirrored) -> np.ndarray:
-    """From frames to views: float64 (n, 2, 3, 3), for the ground and for what is infinitely far.
-
-    eye: (n, 2), right and forward, the camera looked through; turn: (n,), where it looks; stood: (n, 3), right,
-    forward, heading of the recorded rear axle; side: (n,), metres from there to the right, the recording camera.
-    """
-    s, c = np.sin(stood[:, 2]), np.cos(stood[:, 2])
-    away = eye - stood[:, :2] - np.stack([AXLE_TO_CAMERA * s + side * c, AXLE_TO_CAMERA * c - side * s], axis=1)
-    moved = np.tile(np.eye(3), (len(turn), 2, 1, 1))
-    moved[:, 0, 0, 1] = -(away[:, 0] * c - away[:, 1] * s) / CAMERA_HEIGHT
-    moved[:, 0, 2, 1] = -(away[:, 0] * s + away[:, 1] * c) / CAMERA_HEIGHT
-    s, c, o = np.sin(turn - stood[:, 2]), np.cos(turn - stood[:, 2]), np.zeros(len(turn))
-    turned = np.stack([c, o, -s, o, o + 1, o, s, o, c], axis=1).reshape(-1, 1, 3, 3)
-    return _INTO[mirrored.astype(int)][:, None] @ turned @ moved @ _FROM
-
-
-def _sky(mirrored: bool) -> np.ndarray:
-    """uint8 (HORIZON, 320): 255 where a view does not show ground near enough to move with the camera."""
-    columns, rows = np.meshgrid(np.arange(SEEN[1]), np.arange(HORIZON))
-    directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(_INTO[int(mirrored)]).T
-    return np.where(directions[..., 1] > FAR_SLOPE * directions[..., 2], 0, 255).astype(np.uint8)
-
-
-_SKY = _sky(False), _sky(True)
-_ROAD = np.zeros((ROWS.stop - ROWS.start, FRAME[1]), np.uint8)
-_ROAD[:, 1:-1] = 255
-
-
-def warp(frame: np.ndarray, warps: np.ndarray, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
-    """A frame's rows `ROWS`, uint8, as seen through `warps` (2, 3, 3): uint8 (75, 320, 3); and 255 where it was really
-    seen: uint8 (75, 320)."""
-    size = SEEN[::-1]
-    made = cv2.warpPerspective(frame, warps[0], size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    seen = cv2.warpPerspective(_ROAD, warps[0], size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-    far = cv2.warpPerspective(
-        frame, warps[1], (size[0], HORIZON), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
-    )
-    cv2.copyTo(far, _SKY[mirrored], made[:HORIZON])
-    seen[:HORIZON] |= _SKY[mirrored]
-    return made, seen
