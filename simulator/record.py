@@ -9,6 +9,8 @@ from collections import deque
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from datetime import timedelta
 
+from tqdm import tqdm
+
 from cloning.errors import SimulatorError
 from cloning.recordings.writer import EPOCH, Clock, RecordingWriter
 from cloning.road.motion import MPH
@@ -16,7 +18,6 @@ from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Expert, Recovery
-from simulator.progress import Progress
 from simulator.run import Run
 from simulator.world import Scene
 
@@ -61,10 +62,11 @@ def record(
     run = Run(track)
     run.car.speed_limit = speed * MPH
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
-    clock, progress = Clock(), Progress(laps, "laps")
+    clock = Clock()
     with (
         RecordingWriter(folder, EPOCH + timedelta(days=seed % 10_000)) as recording,
         ProcessPoolExecutor(DRAWERS, initializer=_begin_drawing) as drawers,
+        tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None) as bar,
     ):
         rows = deque()  # that are being drawn
 
@@ -82,7 +84,7 @@ def record(
                     )
                     if len(rows) > 2 * DRAWERS:
                         write()
-                    progress.show(max(0.0, run.travelled) / track.length, run.time)
+                    bar.update(round(max(0.0, run.travelled)) - bar.n)
             while rows:
                 write()
         except BrokenExecutor as error:
@@ -90,5 +92,4 @@ def record(
                 f"{folder}: a process that draws was killed (out of memory?); the {recording.rows} "
                 "rows before are whole"
             ) from error
-    progress.finish(laps, run.time)
     return run
