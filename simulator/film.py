@@ -41,10 +41,9 @@ class ChaseFilm(DriveFilm):
         if self.error or not self.clock.due(run.time):
             return
         transform = run.car.node.get_transform()
-        self.scene.car.set_transform(transform)
-        self.scene.look_from(*transform.get_pos())
+        self.scene.move_car(transform)
         place_chase_camera(self.camera, transform)
-        self.add(caption(self.buffer.draw()[0], run))
+        self.add(caption(self.buffer.render()[0], run))
 
 
 def caption(frame: np.ndarray, run: Run) -> np.ndarray:

@@ -63,7 +63,7 @@ class LapReport(TypedDict):
 
 def lap_report(run: Run, client: Client | None = None) -> LapReport:
     """Return the report of a run, with the figures of the client that drove it, if one did."""
-    offset = np.abs(run.path.offset) if run.path.offset else np.zeros(1)
+    offset = np.abs(run.trajectory.offset) if run.trajectory.offset else np.zeros(1)
     lap_times = np.diff([0.0, *run.lap_times])
     report: LapReport = {
         "track": run.track.name,
@@ -154,12 +154,12 @@ def write_picture(path: str | Path, run: Run) -> None:
         edge = track.points[ring, :2] + side * track.rightward[ring] * track.edges[ring, column, None]
         axes.plot(*edge.T, color="0.6", linewidth=0.7)
     every = max(1, round(0.1 / STEP))
-    path_driven = np.column_stack([run.path.x, run.path.y])[::every]
+    path_driven = np.column_stack([run.trajectory.x, run.trajectory.y])[::every]
     if len(path_driven) > 1:
         pieces = np.stack([path_driven[:-1], path_driven[1:]], axis=1)
         joined = np.linalg.norm(np.diff(path_driven, axis=0), axis=1) < JUMP
         lines = LineCollection(list(pieces[joined]), cmap="viridis", norm=colors.Normalize(0, 4), linewidth=1.8)
-        lines.set_array(np.abs(run.path.offset)[::every][:-1][joined])
+        lines.set_array(np.abs(run.trajectory.offset)[::every][:-1][joined])
         axes.add_collection(lines)
         figure.colorbar(lines, ax=axes, label="distance from the centre line, m", shrink=0.7)
     start = track.at(track.starts["autonomous"])

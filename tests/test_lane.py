@@ -47,7 +47,7 @@ def drive(tmp_path_factory):
     run = record(folder, Track("lake"), 0.12, 30, seed=3)
     recording = read_recording(folder)
     steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-    return recording, np.array(run.path.offset)[steps]
+    return recording, np.array(run.trajectory.offset)[steps]
 
 
 def test_a_strip_is_level_and_looks_straight_ahead():

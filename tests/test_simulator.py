@@ -136,9 +136,9 @@ def test_leaving_the_road_is_noted_and_the_car_set_back():
 def in_bends(run):
     """Steering a recording would hold, 15 a second, where the road's radius is under 60 m."""
     track, step = run.track, round(1 / 15 / 0.02)
-    places = [track.locate(x, y)[0] for x, y in zip(run.path.x[::step], run.path.y[::step], strict=True)]
+    places = [track.locate(x, y)[0] for x, y in zip(run.trajectory.x[::step], run.trajectory.y[::step], strict=True)]
     bend = np.abs(track.curvature[(np.array(places) / track.step).astype(int) % len(track.curvature)]) > 1 / 60
-    return np.array(run.path.steering[::step])[bend]
+    return np.array(run.trajectory.steering[::step])[bend]
 
 
 @pytest.mark.parametrize(("name", "direction"), [("lake", "ccw"), ("lake", "cw"), ("jungle", "ccw"), ("jungle", "cw")])

@@ -366,7 +366,7 @@ def test_lockstep_repeats_to_the_last_digit():
     for _ in range(2):
         with Server(lambda packet, n: [STEER % (f"{0.02 * ((n * 7919) % 5 - 2):.3f}", "0.7")]) as server:
             runs.append(drive(server, laps=0.05).run)
-    assert runs[0].path == runs[1].path
+    assert runs[0].trajectory == runs[1].trajectory
     assert report.lap_report(runs[0]) == report.lap_report(runs[1])
 
 

@@ -58,7 +58,7 @@ def drives(network, laps: float) -> None:
                 recording = read_recording(folder)
                 found = combine(recording, see(recording, network))
             step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-            true = np.array(run.path.offset)[step]
+            true = np.array(run.trajectory.offset)[step]
             error = found.offset - true
             print(
                 f"{f'drawn drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "

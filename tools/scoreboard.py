@@ -24,7 +24,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TypedDict
 
-from cloning.compute import threads
+from cloning.cores import threads
 from cloning.errors import UserError
 from cloning.outputs import write_json, write_output
 from cloning.recordings.log import find_folders
