@@ -6,11 +6,7 @@ import sys
 
 import torch
 
-
-def threads() -> int:
-    """Threads for this process: the cores that it may use, shared with the other ranks on this machine."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
+from cloning.cores import threads as threads  # re-exported
 
 
 def choose_device(name: str) -> torch.device:

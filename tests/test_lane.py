@@ -32,16 +32,17 @@ from cloning.lane.reader import (
 )
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
-from cloning.replay.replay import references
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
 from cloning.road.motion import REAR_AXLE, Stretch, stretches
 from cloning.road.track import Track
+from simulator import __main__ as simulator
 from simulator.car import STEP
 from simulator.record import record
 from tools import follow_driver, lane_accuracy, train_lane
 from tools.train_lane import consistency_loss, render_strips, strip_homography, visible_mask
 
 LITTLE = ("--looks", "1", "--frames", "6", "--steps", "2")
+PILOT = ROOT / "cloning" / "pilot" / "shipped.pt"
 UNSEEN = 1003  # a look that the network was not trained on
 REAL = real_recordings()
 
@@ -53,7 +54,7 @@ def drive(tmp_path_factory):
     run = record(folder, Track("lake"), 0.12, 30, seed=3)
     recording = read_recording(folder)
     steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-    return recording, np.array(run.path.offset)[steps]
+    return recording, np.array(run.trajectory.offset)[steps]
 
 
 def test_a_strip_is_level_and_looks_straight_ahead():
@@ -270,9 +271,10 @@ def test_robust_training_without_weights_says_so(no_weights, drawn, tmp_path, ca
     assert "lane.pt: no such file" in capsys.readouterr().err
 
 
-def test_a_replay_without_weights_says_so(no_weights, drawn):
-    with pytest.raises(ModelError, match=r"lane\.pt: no such file"):
-        references(read_recording(drawn))
+def test_a_replay_without_weights_says_so(no_weights, drawn, capsys):
+    assert simulator.main(["replay", str(drawn), "--model", str(PILOT)]) == 2
+    error = capsys.readouterr().err
+    assert "simulator: " in error and "lane.pt: no such file" in error
 
 
 def test_a_damaged_image_is_named(copied):
@@ -285,7 +287,7 @@ def test_a_damaged_image_is_named(copied):
 @pytest.mark.parametrize("tool", [train_lane, lane_accuracy, follow_driver], ids=lambda tool: tool.__name__)
 def test_the_tools_name_what_is_missing(tool, tmp_path, capsys):
     name = tool.__name__.removeprefix("tools.")
-    arguments = {"lane_accuracy": ["--laps", "0"], "follow_driver": [str(ROOT / "cloning" / "pilot" / "shipped.pt")]}
+    arguments = {"lane_accuracy": ["--laps", "0"], "follow_driver": [str(PILOT)]}
     assert tool.main([*arguments.get(name, []), str(tmp_path / "nowhere")]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"{name}: ") and "nowhere" in error
