@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from cloning.recordings.log import logs_below
-
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
 
@@ -94,12 +92,3 @@ def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
     return torch.load(path, weights_only=True)["network"]
-
-
-NO_REAL_RECORDINGS = "no recordings of the real simulator in data/, in ../shared/recordings or in $RECORDINGS"
-
-
-def real_recordings() -> list[Path]:
-    """Return the folders of the real recordings on this machine; they are too large to come with the project."""
-    elsewhere = Path(os.environ.get("RECORDINGS", ROOT.parent / "shared" / "recordings"))
-    return sorted(log.parent for folder in (ROOT / "data", elsewhere) for log in logs_below(folder))

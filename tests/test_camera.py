@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from conftest import NO_REAL_RECORDINGS, real_recordings
+import real_recordings
 
 from cloning.recordings.log import read_recording
 from cloning.replay.views import Views
 from cloning.road import camera, motion, warp
-
-REAL = real_recordings()
 
 
 def ground_picture(right: float, forward: float, yaw: float) -> np.ndarray:
@@ -115,8 +113,8 @@ def test_breaks_are_not_driven_over(drawn):
     assert rows()[-1] == slice(201, 240)
 
 
-@pytest.mark.skipif(not REAL, reason=NO_REAL_RECORDINGS)
-@pytest.mark.parametrize("folder", REAL, ids=lambda folder: folder.name)
+@pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)
+@pytest.mark.parametrize("folder", real_recordings.FOLDERS, ids=lambda folder: folder.name)
 def test_a_real_centre_frame_warped_to_the_side_cameras_is_theirs(folder):
     recording = read_recording(folder)
     straight = np.flatnonzero(np.abs(recording.steering) < 0.05)[::40]

@@ -10,8 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import real_recordings
 import torch
-from conftest import NO_REAL_RECORDINGS, ROOT, draw_recording, real_recordings
+from conftest import ROOT, draw_recording
 
 from cloning.errors import ModelError, RecordingError
 from cloning.lane import reader
@@ -44,7 +45,6 @@ from tools.train_lane import consistency_loss, render_strips, strip_homography, 
 LITTLE = ("--looks", "1", "--frames", "6", "--steps", "2")
 PILOT = ROOT / "cloning" / "pilot" / "shipped.pt"
 UNSEEN = 1003  # a look that the network was not trained on
-REAL = real_recordings()
 
 
 @pytest.fixture(scope="module")
@@ -222,8 +222,8 @@ def test_a_drawing_of_another_kind_is_an_unknown_road(drawn):
     assert estimate_lane_position(recording, stretches(recording)).trusted.mean() < 0.35  # measured: 0.267
 
 
-@pytest.mark.skipif(not REAL, reason=NO_REAL_RECORDINGS)
-@pytest.mark.parametrize("folder", REAL, ids=lambda folder: folder.name)
+@pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)
+@pytest.mark.parametrize("folder", real_recordings.FOLDERS, ids=lambda folder: folder.name)
 def test_real_recordings_are_trusted(folder):
     recording = read_recording(folder)
     recording.keep(np.arange(min(len(recording), 600)))
