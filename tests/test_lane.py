@@ -42,7 +42,7 @@ from simulator.record import record
 from tools import follow_driver, lane_accuracy, train_lane
 from tools.train_lane import consistency_loss, render_strips, strip_homography, visible_mask
 
-LITTLE = ("--looks", "1", "--frames", "6", "--steps", "2")
+SHORT_TRAINING = ("--looks", "1", "--frames", "6", "--steps", "2")
 PILOT = ROOT / "cloning" / "pilot" / "shipped.pt"
 UNSEEN = 1003  # a look that the network was not trained on
 
@@ -234,7 +234,7 @@ def test_real_recordings_are_trusted(folder):
 def test_training_leaves_weights_that_load(tmp_path, drawn):
     output = tmp_path / "lane.pt"
     done = subprocess.run(
-        [sys.executable, "-m", "tools.train_lane", drawn, *LITTLE, "--output", output],
+        [sys.executable, "-m", "tools.train_lane", drawn, *SHORT_TRAINING, "--output", output],
         capture_output=True,
         text=True,
         timeout=300,
