@@ -1,5 +1,5 @@
 """A stand-in for Udacity's driving simulator: the same roads, car, cameras, recordings and wire, without a screen.
 
-The modules in the order in which a frame goes through them: scenery, world, car, cameras, then record or client, then
-report. `python -m simulator --help` tells what it does.
+The modules in the order of the data: scenery, world, car, cameras, then record or client, then report.
+`python -m simulator --help` lists its commands.
 """

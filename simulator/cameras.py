@@ -1,4 +1,4 @@
-"""The cameras: what they see of a scene, as frames and as JPEG."""
+"""The car's cameras: renders what they see of a scene, and encodes it as the simulator's JPEG."""
 
 import cv2
 import numpy as np
@@ -12,22 +12,23 @@ from panda3d.core import (
     NodePath,
     PerspectiveLens,
     Texture,
+    TransformState,
     WindowProperties,
     load_prc_file_data,
 )
 
 from cloning.errors import SimulatorError
-from cloning.recordings.format import FRAME
+from cloning.recordings.format import CAMERAS, FRAME
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, MOUNT_PITCH, VERTICAL_FIELD
 from simulator.world import INSIDE, Scene
 
-QUALITY = 75
-NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m
+JPEG_QUALITY = 75  # with colour at half resolution: what the tables of real recordings' images show
+NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m, of the real simulator's cameras
 ROWS, COLUMNS = FRAME[:2]
-# Rows drawn for one of the frame: the road, seen at a slant, flickers else, where the real one is smooth.
-FINER = 2
+SUPERSAMPLING = 2  # rows rendered for each row of a frame; without it, the road ahead flickers as the real one does not
 
-# Transforms that are nearly equal must not be taken for one another: a frame would depend on the frames before it.
+# Without a transform cache: nearly equal transforms would be replaced by earlier ones, and a frame would depend on the
+# frames before it.
 load_prc_file_data(
     "",
     "window-type none\naudio-library-name null\nsync-video false\nnotify-level-display error\n"
@@ -36,40 +37,40 @@ load_prc_file_data(
 
 
 def lens(rows: int = ROWS, columns: int = COLUMNS) -> PerspectiveLens:
-    made = PerspectiveLens()
-    made.set_near_far(NEAR_PLANE, FAR_PLANE)
+    """Return a lens with the cameras' vertical field of view for images of this shape."""
+    perspective = PerspectiveLens()
+    perspective.set_near_far(NEAR_PLANE, FAR_PLANE)
     across = 2 * np.degrees(np.arctan(np.tan(np.radians(VERTICAL_FIELD / 2)) * columns / rows))
-    made.set_fov(across, VERTICAL_FIELD)
-    return made
+    perspective.set_fov(across, VERTICAL_FIELD)
+    return perspective
 
 
 def jpeg(frame: np.ndarray) -> bytes:
-    """A frame, uint8 (rows, columns, 3) RGB, as the simulator's JPEG: quality 75, colour at half
-    resolution."""
+    """Encode a frame, uint8 (rows, columns, 3) RGB, as the simulator does."""
     done, data = cv2.imencode(
         ".jpg",
         cv2.cvtColor(frame, cv2.COLOR_RGB2BGR),
         [
             cv2.IMWRITE_JPEG_QUALITY,
-            QUALITY,
+            JPEG_QUALITY,
             cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
             cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
         ],
     )
     if not done:
-        raise ValueError("the frame cannot be written as JPEG")
+        raise ValueError("OpenCV cannot encode the frame as JPEG")
     return data.tobytes()
 
 
 class Buffer:
-    """Regions below one another in one picture that is drawn without a screen."""
+    """An image rendered without a screen, with one region for each camera, one below the other."""
 
     def __init__(self, rows: int, columns: int, cameras: list[NodePath]):
-        """rows: of each region. Raises SimulatorError."""
+        """rows, columns: of each region. Raises SimulatorError."""
         pipe = GraphicsPipeSelection.get_global_ptr().make_pipe("TinyOffscreenGraphicsPipe", "p3tinydisplay")
         if not pipe:
             raise SimulatorError(
-                "panda3d's software renderer does not load: it needs libX11.so.6 (apt-get install libx11-6)"
+                "panda3d's software renderer cannot be loaded: on Linux it needs libX11.so.6 (apt-get install libx11-6)"
             )
         properties = FrameBufferProperties()
         properties.set_rgba_bits(8, 8, 8, 0)
@@ -84,17 +85,18 @@ class Buffer:
             region = buffer.make_display_region(0, 1, 1 - (i + 1) / len(cameras), 1 - i / len(cameras))
             region.set_camera(camera)
 
-    def draw(self) -> np.ndarray:
-        """uint8 (regions, rows, columns, 3), RGB."""
+    def render(self) -> np.ndarray:
+        """Render the regions: uint8 (regions, rows, columns, 3), RGB."""
         self.engine.render_frame()
         pixels = np.frombuffer(self.image.get_ram_image_as("RGB"), np.uint8)
         return np.ascontiguousarray(pixels.reshape(-1, self.shape[2], 3)[::-1]).reshape(self.shape)
 
 
 class Cameras:
-    """The car's cameras on a scene."""
+    """The car's cameras in a scene."""
 
-    def __init__(self, scene: Scene, names: tuple[str, ...] = ("center", "left", "right")):
+    def __init__(self, scene: Scene, names: tuple[str, ...] = CAMERAS):
+        """Mount the named cameras on the scene's car."""
         self.scene = scene
         mounted = []
         for name in names:
@@ -103,14 +105,12 @@ class Cameras:
             camera.set_pos(*CAMERA_POSITIONS[name])
             camera.set_hpr(-CAMERA_YAW, -MOUNT_PITCH, -CAMERA_ROLL)
             mounted.append(camera)
-        self.buffer = Buffer(FINER * ROWS, COLUMNS, mounted)
+        self.buffer = Buffer(SUPERSAMPLING * ROWS, COLUMNS, mounted)
 
-    def frames(self, transform) -> np.ndarray:
-        """uint8 (cameras, 160, 320, 3), RGB, in the order of the names, with the car's node at the
-        transform."""
-        self.scene.car.set_transform(transform)
-        self.scene.look_from(*transform.get_pos())
-        fine = self.buffer.draw()
+    def frames(self, transform: TransformState) -> np.ndarray:
+        """Render the frames with the car at the transform: uint8 (cameras, 160, 320, 3), RGB, in the names' order."""
+        self.scene.move_car(transform)
+        fine = self.buffer.render()
         tall = cv2.resize(fine.reshape(-1, COLUMNS, 3), (COLUMNS, len(fine) * ROWS), interpolation=cv2.INTER_AREA)
         tone = self.scene.scenery.tone
         return (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)

@@ -1,12 +1,14 @@
-"""How a person drives: keyboard, mouse and gamepad, as in the original recorder; knows no engine."""
+"""How a person drives: keyboard, mouse and gamepad as in the original recorder, independent of the engine."""
 
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
-KEY_STEP = 0.05  # of steering a physics step while a key is held, and back again
+from cloning.road.motion import TOP_SPEED_MPH
+
+KEY_STEP = 0.05  # change of steering in each physics step while a key is held, and back again
 CRUISE_THROTTLE = 0.4
 DEAD_ZONE = 0.08  # of a stick around its middle
-DRAG = 0.5  # of the window's width that the mouse is dragged for full steering
-TOP_MPH = 30
+FULL_DRAG = 0.5  # share of the window's width that the mouse is dragged for full steering
 HELP = """arrows or WASD   steer, throttle, brake and reverse
 mouse drag       steer
 space            cruise (throttle 0.4) on or off
@@ -14,10 +16,10 @@ space            cruise (throttle 0.4) on or off
 R                record on or off
 X and Y          save this position, jump back to it
 C                chase or bonnet view
-F1               these keys
+F1               show or hide this help
 Esc              quit
 
-gamepad (Logitech F310 and the like): left stick throttle,
+gamepad (Logitech F310 and similar): left stick throttle,
 right stick steering, D-pad set speed, A cruise, B record,
 X save position, Y jump back"""
 
@@ -50,72 +52,78 @@ HELD = {
 
 @dataclass
 class Sticks:
-    """A gamepad's sticks, -1..1 with up and right positive, and the buttons held: a, b, x, y, up, down."""
+    """A gamepad's sticks, -1..1 with up and right positive, and its pressed buttons: a, b, x, y, up, down."""
 
     throttle: float = 0.0
     steering: float = 0.0
-    buttons: set = field(default_factory=set)
+    buttons: set[str] = field(default_factory=set)
 
 
-def past_dead_zone(value: float) -> float:
-    """A stick's value, -1..1, without the jitter around its middle and continuous beyond it."""
+def apply_dead_zone(value: float) -> float:
+    """Return a stick's value, -1..1, as 0 within the dead zone and continuous outside it."""
     beyond = max(0.0, abs(value) - DEAD_ZONE) / (1 - DEAD_ZONE)
     return min(1.0, beyond) if value > 0 else -min(1.0, beyond)
 
 
-class Controls:
-    """What the person wants: steering and throttle -1..1, cruise, set speed in mph, and the actions just
-    asked for."""
+def balance(held: AbstractSet[str], positive: str, negative: str) -> float:
+    """Return 1, -1 or 0 for keys of the positive group held, of the negative group, or of neither or both."""
+    return float(not held.isdisjoint(HELD[positive])) - float(not held.isdisjoint(HELD[negative]))
 
-    def __init__(self):
+
+class Controls:
+    """The driver's commands: steering and throttle -1..1, cruise control, set speed in mph, and pending actions."""
+
+    def __init__(self) -> None:
         self.steering = self.throttle = 0.0
-        self.cruise, self.set_speed = False, TOP_MPH
-        self.asked: list[str] = []
-        self.buttons: set = set()
-        self.drag: tuple[float, float] | None = None  # the mouse's place and the steering when the drag began
+        self.cruise, self.set_speed = False, TOP_SPEED_MPH
+        self.actions: list[str] = []
+        self.buttons: set[str] = set()
+        self.drag: tuple[float, float] | None = None  # the mouse position and the steering when the drag began
 
     def press(self, key: str) -> None:
-        """A key or gamepad button went down: "r", "space", "pad a"."""
+        """Handle a key or gamepad button that was pressed, such as "r", "space" or "pad a"."""
         action = ACTIONS.get(key)
         if action == "cruise":
             self.cruise = not self.cruise
         elif action == "faster":
-            self.set_speed = min(TOP_MPH, self.set_speed + 1)
+            self.set_speed = min(TOP_SPEED_MPH, self.set_speed + 1)
         elif action == "slower":
             self.set_speed = max(1, self.set_speed - 1)
         elif action:
-            self.asked.append(action)
+            self.actions.append(action)
 
-    def take(self) -> list[str]:
-        """The actions asked for since the last time: record, save, jump, view, help, quit."""
-        asked, self.asked = self.asked, []
-        return asked
+    def take_actions(self) -> list[str]:
+        """Return the actions requested since the last call: record, save, jump, view, help, quit."""
+        actions, self.actions = self.actions, []
+        return actions
 
-    def pedals(self, held: set) -> float:
-        """1 for W, -1 for S, 0 for neither or both."""
-        return float(bool(held & set(HELD["up"]))) - float(bool(held & set(HELD["down"])))
+    def pedals(self, held: AbstractSet[str]) -> float:
+        """Return 1 for W, -1 for S, 0 for neither or both."""
+        return balance(held, "up", "down")
 
-    def step(self, held: set, mouse: float | None = None, pad: Sticks | None = None) -> None:
-        """One physics step with these keys held; mouse: across the window, -1..1, while its button is
-        down."""
+    def step(self, held: AbstractSet[str], mouse: float | None = None, pad: Sticks | None = None) -> None:
+        """Update the commands for one physics step.
+
+        held: the keys that are down; mouse: its position across the window, -1..1, while its button is down.
+        """
         for button in sorted(pad.buttons - self.buttons) if pad else ():
             self.press(f"pad {button}")
         self.buttons = set(pad.buttons) if pad else set()
-        keys = float(bool(held & set(HELD["right"]))) - float(bool(held & set(HELD["left"])))
-        stick = past_dead_zone(pad.steering) if pad else 0.0
+        stick = apply_dead_zone(pad.steering) if pad else 0.0
         if mouse is not None:
             if self.drag is None:
                 self.drag = mouse, self.steering
             start, before = self.drag
-            self.steering = max(-1.0, min(1.0, before + (mouse - start) / 2 / DRAG))
+            self.steering = max(-1.0, min(1.0, before + (mouse - start) / 2 / FULL_DRAG))
         elif stick:
             self.steering = stick
         else:
-            self.steering += max(-KEY_STEP, min(KEY_STEP, keys - self.steering))
+            wanted = balance(held, "right", "left")
+            self.steering += max(-KEY_STEP, min(KEY_STEP, wanted - self.steering))
         if mouse is None:
             self.drag = None
         pedal = self.pedals(held)
-        push = past_dead_zone(pad.throttle) if pad else 0.0
+        push = apply_dead_zone(pad.throttle) if pad else 0.0
         if pedal < 0 or push < 0:
             self.cruise = False
         self.throttle = pedal or push or (CRUISE_THROTTLE if self.cruise else 0.0)

@@ -1,4 +1,4 @@
-"""An expert drives and is recorded, faster than real time."""
+"""Records laps that the expert drives, faster than real time."""
 
 import functools
 import multiprocessing
@@ -6,32 +6,50 @@ import os
 import signal
 import threading
 from collections import deque
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from datetime import timedelta
+from pathlib import Path
+from typing import NamedTuple
 
+from panda3d.core import TransformState
+from tqdm import tqdm
+
+from cloning.cores import threads
 from cloning.errors import SimulatorError
 from cloning.recordings.writer import EPOCH, Clock, RecordingWriter
-from cloning.road.motion import MPH
+from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Expert, Recovery
-from simulator.progress import Progress
 from simulator.run import Run
 from simulator.world import Scene
 
-DRAWERS = min(3, os.cpu_count() or 1)  # processes that draw; the engine uses one core, and 50 MB of its own, in each
+MAX_RENDERERS = 3  # processes; each uses one core and 50 MB
 
 
-def _begin_drawing() -> None:
-    """In a drawing process: leave Ctrl-C to the recorder, and end when it does, even if it is killed."""
+class Row(NamedTuple):
+    """A row of the recording whose images are being rendered: simulated seconds, steering, pedals, and speed in mph."""
+
+    time: float
+    images: Future[list[bytes]]
+    steering: float
+    throttle: float
+    brake: float
+    speed: float
+
+
+def _start_renderer() -> None:
+    """In a rendering process: leave Ctrl-C to the recording process, and end when that ends, even if it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
 
-    def end():
-        multiprocessing.parent_process().join()
-        os._exit(1)
+    def end_with_parent() -> None:
+        if parent:
+            parent.join()
+            os._exit(1)
 
-    threading.Thread(target=end, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 @functools.cache
@@ -39,56 +57,56 @@ def _cameras(track: str, look: int) -> Cameras:
     return Cameras(Scene(scenery.build(track, look)))
 
 
-def _draw(track: str, look: int, transform) -> list[bytes]:
-    """In a drawing process: the three cameras' JPEGs. They depend on the car's place alone, not on rows before."""
+def _render(track: str, look: int, transform: TransformState) -> list[bytes]:
+    """In a rendering process: return the three cameras' JPEGs, which depend on the car's pose alone."""
     return [jpeg(frame) for frame in _cameras(track, look).frames(transform)]
 
 
 def record(
-    folder: str,
+    folder: str | Path,
     track: Track,
     laps: float,
-    speed: float = 30.0,
+    speed: float = TOP_SPEED_MPH,
     seed: int = 0,
     look: int = 0,
     recovery: bool = False,
 ) -> Run:
-    """Record the expert's laps at a set speed in mph into a new folder. Raises SimulatorError.
+    """Record the expert's laps into a new folder and return the run. Raises SimulatorError.
 
-    recovery: only its returns from the road's sides. The images' names tell the seed's day, not today: the same seed
-    and arguments make the same files.
+    speed: set speed in mph; recovery: record only returns from the road's edges. The dates in the images' names depend
+    on the seed, not on today, so that the same arguments give the same files.
     """
     run = Run(track)
     run.car.speed_limit = speed * MPH
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
-    clock, progress = Clock(), Progress(laps, "laps")
+    clock = Clock()
+    renderers = min(MAX_RENDERERS, threads())
     with (
         RecordingWriter(folder, EPOCH + timedelta(days=seed % 10_000)) as recording,
-        ProcessPoolExecutor(DRAWERS, initializer=_begin_drawing) as drawers,
+        ProcessPoolExecutor(renderers, initializer=_start_renderer) as pool,
+        tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None) as bar,
     ):
-        rows = deque()  # that are being drawn
+        pending: deque[Row] = deque()
 
-        def write():
-            time, images, *numbers = rows.popleft()
-            recording.add(time, images.result(), *numbers)
+        def write() -> None:
+            row = pending.popleft()
+            recording.add(row.time, row.images.result(), row.steering, row.throttle, row.brake, row.speed)
 
         try:
             while run.travelled < laps * track.length:
                 run.step(*expert.drive(run))
-                if clock.due(run.time) and (not recovery or expert.recording):
-                    images = drawers.submit(_draw, track.name, look, run.car.node.get_transform())
-                    rows.append(
-                        (run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph)
-                    )
-                    if len(rows) > 2 * DRAWERS:
+                if clock.due(run.time) and expert.recording:
+                    images = pool.submit(_render, track.name, look, run.car.node.get_transform())
+                    throttle, brake = max(0.0, run.throttle), max(0.0, -run.throttle)
+                    pending.append(Row(run.time, images, run.steering, throttle, brake, run.speed_mph))
+                    if len(pending) > 2 * renderers:
                         write()
-                    progress.show(max(0.0, run.travelled) / track.length, run.time)
-            while rows:
+                    bar.update(round(max(0.0, run.travelled)) - bar.n)
+            while pending:
                 write()
         except BrokenExecutor as error:
             raise SimulatorError(
-                f"{folder}: a process that draws was killed (out of memory?); the {recording.rows} "
-                "rows before are whole"
+                f"{folder}: a rendering process was killed, perhaps for lack of memory; "
+                f"the {recording.rows} rows before are whole"
             ) from error
-    progress.finish(laps, run.time)
     return run

@@ -1,4 +1,4 @@
-"""One simulated drive: the car on its track, what it did, and where it left the road."""
+"""A simulated run: the car on its track, its trajectory, and its departures from the road."""
 
 from dataclasses import dataclass, field
 
@@ -8,15 +8,21 @@ from cloning.replay.autonomy import autonomy
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator.car import STEP, WHEELS, Car
-from simulator.world import ground
+from simulator.world import build_physics
 
-REACH = 1.95  # m from the car's middle to a wheel, at most
+WHEEL_REACH = 1.95  # m: no wheel is farther from the car's middle
 
 
 @dataclass(frozen=True)
 class Departure:
-    """Where and when a wheel left the road's surface: seconds, metres along the track, m/s, metres (x east, y
-    north)."""
+    """A wheel left the road.
+
+    time   simulated seconds since the start
+    s      metres along the track
+    speed  m/s
+    x, y   the car's position in metres, east and north
+    side   of the road, "left" or "right"
+    """
 
     time: float
     s: float
@@ -27,33 +33,45 @@ class Departure:
 
 
 @dataclass
-class Path:
-    """What the car did, an entry a physics step of 0.02 s: metres, m/s, steering -1..1."""
+class Trajectory:
+    """What the car did, with one entry for each physics step.
 
-    x: list = field(default_factory=list)
-    y: list = field(default_factory=list)
-    offset: list = field(default_factory=list)  # to the right of the centre line
-    speed: list = field(default_factory=list)
-    steering: list = field(default_factory=list)
+    x, y      position in metres, east and north
+    offset    lateral offset in metres
+    speed     m/s
+    steering  -1..1
+    """
+
+    x: list[float] = field(default_factory=list)
+    y: list[float] = field(default_factory=list)
+    offset: list[float] = field(default_factory=list)
+    speed: list[float] = field(default_factory=list)
+    steering: list[float] = field(default_factory=list)
 
 
 class Run:
-    """The car on its track. Time is simulated: it passes only in `step`."""
+    """The car on its track, in simulated time, which passes only in `step`.
+
+    s, offset   the car's position: metres along the track and to the right of its centre line
+    time        simulated seconds
+    travelled   metres along the track since the start, negative behind it
+    distance    metres that the car drove
+    """
 
     def __init__(self, track: Track, start: str = "training"):
-        """start: where it begins, as one of the simulator's modes does: "training" or "autonomous"."""
+        """start: the mode of the real simulator whose starting place is used, "training" or "autonomous"."""
         self.track = track
-        self.car = Car(ground(track))
+        self.car = Car(build_physics(track))
         self.s, self.offset = track.starts[start], 0.0
         self.time, self.travelled, self.distance = 0.0, 0.0, 0.0
         self.departures: list[Departure] = []
         self.lap_times: list[float] = []
-        self.path = Path()
+        self.trajectory = Trajectory()
         self.steering = self.throttle = 0.0
         self.set_back()
 
     def set_back(self, offset: float = 0.0, speed: float = 0.0) -> None:
-        """Put the car on the road where it is along it, settled on its springs, rolling at `speed` m/s."""
+        """Place the car on the road at `s`, settled on its springs, with a lateral offset in m and a speed in m/s."""
         self.car.place(self.track.at(self.s, offset))
         self.car.settle()
         self.car.body.set_linear_velocity(self.car.node.get_quat().get_forward() * speed)
@@ -61,47 +79,53 @@ class Run:
 
     @property
     def speed_mph(self) -> float:
+        """Speed in mph."""
         return self.car.speed / MPH
 
     @property
     def laps(self) -> int:
+        """Number of finished laps."""
         return len(self.lap_times)
 
     def step(self, steering: float, throttle: float) -> bool:
-        """Drive for 0.02 s. Returns False, with the car set back on the centre line, if it left the road."""
+        """Drive for one physics step; return False if the car left the road and was set back on its centre line.
+
+        steering, throttle: see `Car.step`.
+        """
         self.steering, self.throttle = steering, throttle
         self.car.step(steering, throttle)
         self.time += STEP
-        at = self.car.node.get_pos()
+        position = self.car.node.get_pos()
         before = self.s
-        self.s, self.offset = self.track.locate(at.x, at.y, before)
+        self.s, self.offset = self.track.locate(position.x, position.y, before)
         length = self.track.length
         self.travelled += (self.s - before + length / 2) % length - length / 2
         self.distance += self.car.speed * STEP
         if self.travelled >= (self.laps + 1) * length:
             self.lap_times.append(self.time)
-        path = self.path
-        path.x.append(at.x)
-        path.y.append(at.y)
-        path.offset.append(self.offset)
-        path.speed.append(self.car.speed)
-        path.steering.append(steering)
+        trajectory = self.trajectory
+        trajectory.x.append(position.x)
+        trajectory.y.append(position.y)
+        trajectory.offset.append(self.offset)
+        trajectory.speed.append(self.car.speed)
+        trajectory.steering.append(steering)
         side = self.off_road()
         if side:
-            self.departures.append(Departure(self.time, self.s, self.car.speed, at.x, at.y, side))
+            self.departures.append(Departure(self.time, self.s, self.car.speed, position.x, position.y, side))
             self.set_back()
         return not side
 
     def off_road(self) -> str:
-        """The side on which a wheel stands beyond the road's surface; empty while none does."""
-        at = int(self.s / self.track.step)
-        if abs(self.offset) + REACH < self.track.edges[at - 3 : at + 3].min(initial=REACH if at < 3 else np.inf):
-            return ""  # no wheel can reach so far: most of the time
+        """Return the side on which a wheel is beyond the edge of the road, "left" or "right", or an empty string."""
+        i = int(self.s / self.track.step)
+        edges = self.track.edges[i - 3 : i + 3]
+        if abs(self.offset) + WHEEL_REACH < edges.min(initial=WHEEL_REACH if i < 3 else np.inf):
+            return ""  # mostly: no wheel can reach an edge
         matrix = self.car.node.get_mat()
-        for aside, forward, _, _ in WHEELS:
-            wheel = matrix.xform_point((aside, forward, 0))
+        for right_of_middle, forward, _, _ in WHEELS:
+            wheel = matrix.xform_point((right_of_middle, forward, 0))
             s, offset = self.track.locate(wheel.x, wheel.y, self.s)
-            left, right = self.track.edges[int(s / self.track.step) % len(self.track.edges)]
+            left, right = self.track.edges[self.track.index(s)]
             if offset < -left:
                 return "left"
             if offset > right:
@@ -109,9 +133,10 @@ class Run:
         return ""
 
     def autonomy(self) -> float:
-        """NVIDIA's measure, 0..1: the share of the time in which no human would have had to take over."""
+        """Return NVIDIA's autonomy, at most 1: see `cloning.replay.autonomy`."""
         return autonomy(len(self.departures), self.time)
 
     def roughness(self) -> float:
-        """Mean absolute change of the steering per second."""
-        return float(np.abs(np.diff(self.path.steering)).mean() / STEP) if len(self.path.steering) > 1 else 0.0
+        """Return the mean absolute change of the steering per second."""
+        steering = self.trajectory.steering
+        return float(np.abs(np.diff(steering)).mean() / STEP) if len(steering) > 1 else 0.0

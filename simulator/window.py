@@ -1,10 +1,12 @@
-"""The window: a person drives, records, or watches drive.py drive and takes over from it."""
+"""The window: a person drives and records, or watches drive.py drive and takes over from it."""
 
 import time
 from datetime import datetime
+from pathlib import Path
 
 from direct.gui.OnscreenText import OnscreenText
 from direct.showbase.ShowBase import ShowBase
+from direct.task.Task import Task
 from panda3d.core import (
     GamepadButton,
     InputDevice,
@@ -21,7 +23,7 @@ from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import scenery
-from simulator.cameras import Cameras, jpeg
+from simulator.cameras import FAR_PLANE, NEAR_PLANE, Cameras, jpeg
 from simulator.car import STEP
 from simulator.client import Remote
 from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks
@@ -30,7 +32,8 @@ from simulator.run import Run
 from simulator.world import INSIDE, OUTSIDE, Scene
 
 SIZE = 960, 540
-BEHIND_AT_MOST = 0.2  # s of physics that a slow frame is caught up with; the rest is lost
+FIELD_OF_VIEW = 80  # degrees, horizontal
+MAX_DELAY = 0.2  # s of physics that are made up for after a slow frame; the rest is lost
 
 
 BUTTONS = {
@@ -44,14 +47,14 @@ BUTTONS = {
 
 
 class Gamepad:
-    """The first gamepad that panda3d finds, as the recorder's controls read it."""
+    """The first gamepad that panda3d finds."""
 
-    def __init__(self, manager=None):
-        """manager: what finds devices, panda3d's own otherwise."""
+    def __init__(self, manager: InputDeviceManager | None = None):
+        """manager: finds the devices, by default panda3d's own."""
         self.manager = manager or InputDeviceManager.get_global_ptr()
 
     def read(self) -> Sticks | None:
-        """None while no gamepad is plugged in."""
+        """Return the present state of sticks and buttons, or None while no gamepad is connected."""
         self.manager.update()
         pads = self.manager.get_devices(InputDevice.DeviceClass.gamepad)
         if not len(pads):
@@ -64,33 +67,37 @@ class Gamepad:
 
 
 class Window(ShowBase):
-    """`run_` is the drive; ShowBase has a method `run`."""
+    """The window and its drive, `simulation` (ShowBase has a method `run`)."""
 
-    def __init__(self, track: Track, folder: str, look: int = 0, server: tuple | None = None):
-        """folder: of the recording, made when recording first begins.
+    def __init__(self, track: Track, folder: str | Path, look: int = 0, server: tuple[str, int] | None = None):
+        """Open the window. Raises SimulatorError.
 
-        server: drive.py's host and port, where it is to drive. Raises SimulatorError.
+        folder: of the recording, created when recording first starts; server: host and port of drive.py if that drives.
         """
         try:
             super().__init__(windowType="onscreen")
         except Exception as error:
-            raise SimulatorError("no window can be opened: is there a screen (DISPLAY)?") from error
+            raise SimulatorError("cannot open a window: connect a screen (on Linux, set DISPLAY)") from error
         properties = WindowProperties()
         properties.set_title(f"{track.name} {track.direction}")
         properties.set_size(*SIZE)
         self.win.request_properties(properties)
         self.disable_mouse()
-        self.run_ = Run(track, "autonomous" if server else "training")
+        self.simulation = Run(track, "autonomous" if server else "training")
         self.scene = Scene(scenery.build(track.name, look))
         self.scene.root.reparent_to(self.render)
         self.cameras = Cameras(self.scene)
         self.controls, self.gamepad = Controls(), Gamepad()
-        self.remote = Remote(*server, Cameras(self.scene, ("center",))) if server else None
-        self.folder, self.recording, self.clock, self.recording_on = folder, None, Clock(), False
-        self.saved = (self.run_.s, 0.0)
+        self.remote: Remote | None = None
+        if server:
+            host, port = server
+            self.remote = Remote(host, port, Cameras(self.scene, ("center",)))
+        self.folder, self.clock, self.recording_on = folder, Clock(), False
+        self.recording: RecordingWriter | None = None
+        self.saved = (self.simulation.s, 0.0)  # metres along the track, lateral offset
         self.chase = True
-        self.camLens.set_near_far(0.3, 1000)
-        self.camLens.set_fov(80)
+        self.camLens.set_near_far(NEAR_PLANE, FAR_PLANE)
+        self.camLens.set_fov(FIELD_OF_VIEW)
         self.text = OnscreenText(
             "",
             pos=(-1.7, 0.9),
@@ -113,85 +120,91 @@ class Window(ShowBase):
         for key in ACTIONS:
             if not key.startswith("pad "):
                 self.accept(key, self.controls.press, [key])
-        self.then = time.monotonic()
+        self.simulated_until = time.monotonic()
         self.task_mgr.add(self.tick, "tick")
 
-    def held(self) -> set:
-        """The driving keys that are down."""
+    def held(self) -> set[str]:
+        """Return the driving keys that are down."""
         watcher, keys = self.mouseWatcherNode, {}
-        for names in HELD.values():
-            arrow, letter = names
+        for arrow, letter in HELD.values():
             keys[arrow] = getattr(KeyboardButton, arrow.removeprefix("arrow_"))()
             keys[letter] = KeyboardButton.ascii_key(letter)
         return {name for name, handle in keys.items() if watcher.is_button_down(handle)}
 
     def mouse(self) -> float | None:
+        """Return the mouse position across the window, -1..1, or None while its button is up."""
         watcher = self.mouseWatcherNode
         if watcher.has_mouse() and watcher.is_button_down(MouseButton.one()):
-            return watcher.get_mouse_x()
+            return float(watcher.get_mouse_x())
         return None
 
-    def tick(self, task):
+    def tick(self, task: Task) -> int:
+        """Simulate the time since the last frame, and show the result; panda3d calls this before each frame."""
         now = time.monotonic()
         held, mouse, pad = self.held(), self.mouse(), self.gamepad.read()
         by_hand = not self.remote or self.controls.pedals(held) != 0
         if self.remote:
-            self.remote.answer(by_hand, self.run_)
-        while now - self.then >= STEP:
-            self.then = max(self.then + STEP, now - BEHIND_AT_MOST)
+            self.remote.answer(by_hand, self.simulation)
+        driver: Controls | Remote = self.remote if self.remote and not by_hand else self.controls
+        while now - self.simulated_until >= STEP:
+            self.simulated_until = max(self.simulated_until + STEP, now - MAX_DELAY)
             self.controls.step(held, mouse, pad)
-            self.run_.car.speed_limit = self.controls.set_speed * MPH
-            who = self.controls if by_hand else self.remote
-            self.run_.step(who.steering, who.throttle)
-            if self.recording_on and self.clock.due(self.run_.time):
-                self.sample()
-        for action in self.controls.take():
+            self.simulation.car.speed_limit = self.controls.set_speed * MPH
+            self.simulation.step(driver.steering, driver.throttle)
+            if self.recording and self.recording_on and self.clock.due(self.simulation.time):
+                self.write_row(self.recording)
+        for action in self.controls.take_actions():
             getattr(self, f"do_{action}")()
         self.show(by_hand)
-        return task.cont
+        return int(task.cont)
 
-    def sample(self) -> None:
-        run = self.run_
+    def write_row(self, recording: RecordingWriter) -> None:
+        """Render the cameras and add a row to the recording."""
+        run = self.simulation
         images = [jpeg(frame) for frame in self.cameras.frames(run.car.node.get_transform())]
-        self.recording.add(
-            run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph
-        )
+        recording.add(run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph)
 
     def do_record(self) -> None:
+        """Start or stop recording."""
         if self.recording is None:
             self.recording = RecordingWriter(self.folder, begin=datetime.now())
         self.recording_on = not self.recording_on
-        self.clock = Clock(self.run_.time)
+        self.clock = Clock(self.simulation.time)
 
     def do_save(self) -> None:
-        self.saved = (self.run_.s, self.run_.offset)
+        """Save the car's position."""
+        self.saved = (self.simulation.s, self.simulation.offset)
 
     def do_jump(self) -> None:
-        self.run_.s = self.saved[0]
-        self.run_.set_back(self.saved[1])
+        """Set the car back to the saved position."""
+        self.simulation.s = self.saved[0]
+        self.simulation.set_back(self.saved[1])
 
     def do_view(self) -> None:
+        """Switch between the chase view and the bonnet view."""
         self.chase = not self.chase
 
     def do_help(self) -> None:
+        """Show or hide the help."""
         (self.help.show if self.help.is_hidden() else self.help.hide)()
 
     def do_quit(self) -> None:
+        """Close the window and end the program."""
         self.finish()
         self.userExit()
 
     def finish(self) -> None:
-        """Close what is open."""
+        """Close the recording and the connection."""
         if self.recording:
             self.recording.close()
         if self.remote:
             self.remote.close()
 
     def show(self, by_hand: bool) -> None:
-        run = self.run_
+        """Place the camera and write the status lines; by_hand: whether the person drives."""
+        run = self.simulation
         transform = run.car.node.get_transform()
-        self.scene.car.set_transform(transform)
-        self.scene.look_from(*transform.get_pos())
+        self.scene.move_car(transform)
         self.cam.node().set_camera_mask(OUTSIDE if self.chase else INSIDE)
         if self.chase:
             self.camera.reparent_to(self.render)
@@ -206,9 +219,9 @@ class Window(ShowBase):
         if self.controls.cruise:
             lines[0] += "   cruise"
         if self.remote:
-            lines.append(f"drive.py: {self.remote.state}" + ("   you steer" if by_hand else ""))
+            lines.append(f"drive.py: {self.remote.state}" + ("   you drive" if by_hand else ""))
         if self.recording:
             state = "recording" if self.recording_on else "recording stopped"
             lines.append(f"{state}: {self.recording.rows} rows in {self.recording.folder}")
-        lines.append("F1 shows the keys")
+        lines.append("F1: help")
         self.text.setText("\n".join(lines))

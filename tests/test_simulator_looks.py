@@ -1,4 +1,4 @@
-"""What is drawn: other looks on the same road, returns from the road's sides, and the film."""
+"""Rendered frames: other looks on the same road, camera positions, recovery recordings, and the film."""
 
 import csv
 import subprocess
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cloning.errors import SimulatorError
+from cloning.errors import OutputError
 from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
@@ -19,7 +19,7 @@ from simulator.world import Scene
 
 
 def view(track, look, s=300.0, offset=0.0):
-    """What the three cameras see from the lane's middle, s metres along."""
+    """Render the three cameras from the lane's centre or `offset` m right of it, s metres along."""
     run = Run(Track(track))
     run.s = s
     run.set_back(offset)
@@ -27,11 +27,11 @@ def view(track, look, s=300.0, offset=0.0):
 
 
 @pytest.mark.parametrize("track", ["lake", "jungle"])
-def test_another_look_is_another_picture_of_the_same_road(track):
+def test_another_look_is_another_image_of_the_same_road(track):
     run = Run(Track(track))
     same, again, other = (view(track, look) for look in (0, 0, 4))
     assert np.array_equal(same, again)
-    assert np.abs(same.astype(int) - other).mean() > 10
+    assert np.abs(same.astype(int) - other).mean() > 25
     assert run.track.points.shape == Track(track).points.shape
 
 
@@ -44,30 +44,33 @@ def test_horizon_and_vanishing_point_lie_where_the_real_frames_have_them():
     lines = []
     for side in (-1, 1):
         rows = np.arange(82, 110)
-        found = []
-        for row in rows:  # 3.5 m aside, seen from 1.26 m up
+        line = []
+        for row in rows:  # the line is 3.5 m to the side, seen from a height of 1.26 m
             near = 159.5 + side * 3.5 / 1.26 * (row - 61)
             columns = np.arange(max(0, round(near) - 12), min(320, round(near) + 13))
-            found.append(columns[np.argmax(yellow[row, columns])])
-        lines.append(np.polyfit(rows, found, 1))
+            line.append(columns[np.argmax(yellow[row, columns])])
+        lines.append(np.polyfit(rows, line, 1))
     (left, a), (right, b) = lines
     row = (b - a) / (left - right)
-    assert row == pytest.approx(61, abs=2)
+    assert row == pytest.approx(61, abs=1)
     assert left * row + a == pytest.approx(159.5, abs=4)
 
 
 def test_the_side_cameras_see_from_the_sides():
-    """A car 0.8 m to the left sees with its centre camera what the left camera saw."""
+    """A car 0.8 m further left sees with its centre camera what the left camera saw, and likewise on the right."""
     centre, left, right = view("lake", 0)
-    moved = view("lake", 0, offset=0.806)[0]
-    road = np.s_[70:130]
-    assert (
-        np.abs(moved[road].astype(int) - left[road]).mean() < 0.6 * np.abs(centre[road].astype(int) - left[road]).mean()
-    )
-    assert np.abs(left[road].astype(int) - right[road]).mean() > 5
+
+    def difference(one, other):
+        road = np.s_[70:130]
+        return np.abs(one[road].astype(int) - other[road]).mean()
+
+    assert difference(left, right) > 20
+    for offset, side in ((-0.806, left), (0.825, right)):
+        moved = view("lake", 0, offset=offset)[0]
+        assert difference(moved, side) < 0.35 * difference(centre, side)
 
 
-def test_recovery_records_only_the_way_back():
+def test_recovery_records_only_the_returns():
     run = Run(Track("lake"))
     expert = Recovery(run.track, seed=1)
     returns, offsets = 0, []
@@ -78,18 +81,18 @@ def test_recovery_records_only_the_way_back():
             offsets.append(abs(run.offset))
         if before and not expert.recording:
             returns += 1
-            assert abs(run.offset) < 0.3
-            assert offsets[0] > 0.9
+            assert abs(run.offset) < 0.25
+            assert offsets[0] > 1.2
             assert offsets[-1] < offsets[0]
             offsets = []
-    assert returns >= 4
+    assert returns >= 8
     assert not run.departures
 
 
 def test_recovery_folder_has_gaps_in_time(tmp_path):
     folder = tmp_path / "recovery"
     done = subprocess.run(
-        [sys.executable, "-m", "simulator", "record", str(folder), "--recovery", "--laps", "0.3"],
+        [sys.executable, "-m", "simulator", "record", str(folder), "--recovery", "--laps", "0.2"],
         capture_output=True,
         text=True,
     )
@@ -116,7 +119,7 @@ def test_films_the_drive(tmp_path):
     assert reader.get(cv2.CAP_PROP_FPS) == 15
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 5
     assert list(tmp_path.iterdir()) == [tmp_path / "drive.mp4"]
-    with pytest.raises(SimulatorError, match=r"\.mp4"):
+    with pytest.raises(OutputError, match=r"\.mp4"):
         ChaseFilm(str(tmp_path / "nowhere" / "drive.mp4"), film.scene)
 
 
@@ -124,4 +127,4 @@ def test_jpegs_are_the_simulators_size_and_rgb():
     frame = np.zeros((160, 320, 3), np.uint8)
     frame[..., 0] = 200
     decoded = cv2.imdecode(np.frombuffer(jpeg(frame), np.uint8), cv2.IMREAD_COLOR)
-    assert np.abs(decoded[80, 160].astype(int) - (0, 0, 200)).max() < 6
+    assert np.abs(decoded[80, 160].astype(int) - (0, 0, 200)).max() < 2

@@ -1,4 +1,4 @@
-"""A person's controls against the original's, with a fake gamepad, and the window with real key presses."""
+"""The driver's controls against the original's, with a fake gamepad, and the window with real key presses."""
 
 import os
 import shutil
@@ -61,7 +61,7 @@ def test_cruise_holds_the_throttle_until_the_brake():
 
 
 class Device:
-    """A Logitech F310 as panda3d shows it: axes and buttons by name."""
+    """A Logitech F310 as panda3d presents it: axes and buttons by name."""
 
     def __init__(self):
         self.axes = {
@@ -127,12 +127,12 @@ def test_the_f310s_buttons_act_once_a_press(button, action):
     device.down = {button}
     for _ in range(5):
         controls.step(set(), pad=pad.read())
-    assert controls.take() == [action]
+    assert controls.take_actions() == [action]
     device.down = set()
     controls.step(set(), pad=pad.read())
     device.down = {button}
     controls.step(set(), pad=pad.read())
-    assert controls.take() == [action]
+    assert controls.take_actions() == [action]
 
 
 def test_the_f310s_cruise_and_set_speed():
@@ -155,7 +155,7 @@ def test_other_pads_come_through_the_same_mapping():
     controls.step(set(), pad=Sticks(throttle=-0.5, steering=0.5, buttons={"b"}))
     assert controls.throttle < -0.4
     assert controls.steering > 0.4
-    assert controls.take() == ["record"]
+    assert controls.take_actions() == ["record"]
 
 
 def until(condition, seconds=40):
@@ -216,7 +216,7 @@ def test_the_window_is_driven_and_records(tmp_path):
         server.wait()
 
 
-def test_without_a_screen_it_says_so(tmp_path):
+def test_without_a_screen_it_reports_that(tmp_path):
     environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
     done = subprocess.run(
         [sys.executable, "-m", "simulator", "window", "--folder", str(tmp_path / "x")],

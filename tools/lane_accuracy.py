@@ -76,7 +76,7 @@ def measure_drives(network: LaneNetwork, laps: float) -> None:
                 recording = read_recording(folder)
                 position = fuse_detections(recording, detect_centres(recording, network))
             step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-            true = np.array(run.path.offset)[step]
+            true = np.array(run.trajectory.offset)[step]
             error = position.lateral_offset - true
             print(
                 f"{f'rendered drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "

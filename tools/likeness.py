@@ -1,133 +1,170 @@
-"""How much the drawn frames are like real ones: a table of figures, and frames side by side.
+"""How much rendered frames resemble real ones: a table of figures, and frames side by side.
 
     python -m tools.likeness data/lake-ccw --picture side_by_side.png
 
-`cloning/lane/place.py` tells where on a known road a real recording was driven, and the car is drawn at the same
-places. Of every camera: mean colour, brightness by rows, and where the lake's inner yellow lines lie, in columns from where flat
-geometry has them.
+`cloning.lane.place` tells where on a known road a real recording was driven, and the stand-in simulator renders the
+same places. For each camera: mean colour, mean colour of image rows, and the columns of the lake's inner yellow lines
+relative to where flat geometry has them.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from cloning.errors import RecordingError, UserError
 from cloning.lane.place import localise_all
 from cloning.lane.reader import detect_centres
-from cloning.recordings.format import CAMERAS
+from cloning.recordings.format import CAMERAS, FRAME
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_OFFSETS, camera_position, project_ground
 from cloning.road.motion import REAR_AXLE, stretches
-from cloning.road.track import Place, Track
+from cloning.road.track import LEFT, RIGHT, Place, Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
+from simulator.scenery.lake import INNER_LINE
 from simulator.world import Scene
 
 ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
-BANDS = (range(76, 82), range(86, 94), range(104, 116))  # rows in which the lines are looked for: far, middle, near
-LINE = 3.5  # m from the lake's centre line to the middle of the inner yellow line
-AROUND = np.arange(-14, 14.1, 0.5)  # columns
+BANDS = (range(76, 82), range(86, 94), range(104, 116))  # rows in which the lines are searched: far, middle, near
+SEARCH = np.arange(-14, 14.1, 0.5)  # columns around the expected one
 
 
-def axle(track: Track, place: np.ndarray) -> tuple[Place, np.ndarray]:
-    """The rear axle's middle at a place as `place.Localisation` has it, with the car's heading, and the way it points."""
-    s, right, yaw = place
-    at = track.at(s, right)
-    heading = at.heading - yaw
-    return Place(at.x, at.y, at.z, heading, at.grade), np.array([np.cos(heading), np.sin(heading)])
+def rear_axle(track: Track, position: np.ndarray) -> tuple[Place, np.ndarray]:
+    """Return the pose of the rear axle's middle, with the car's heading, and the unit vector ahead, (2,).
+
+    position: s, metres to the right, heading error, as in `cloning.lane.place.Localisation`.
+    """
+    s, right, yaw = position
+    place = track.at(s, right)
+    heading = place.heading - yaw
+    return Place(place.x, place.y, place.z, heading, place.grade), np.array([np.cos(heading), np.sin(heading)])
 
 
-def line_columns(track: Track, place: np.ndarray, aside: float, camera: str, rows: range) -> np.ndarray:
-    """Where flat geometry has the line `aside` metres left of the centre line, in some rows: columns, or nan."""
-    at, forward = axle(track, place)
+def line_columns(track: Track, position: np.ndarray, offset: float, camera: str, rows: range) -> np.ndarray:
+    """Return the columns at which flat geometry has a line in some rows, nan where it is out of view.
+
+    offset: metres from the centre line to the line, right positive.
+    """
+    axle, forward = rear_axle(track, position)
     right = np.array([forward[1], -forward[0]])
-    eye = camera_position(np.array([at.x, at.y]), forward, CAMERA_OFFSETS[camera])
-    near = (round(place[0] / track.step) + np.arange(45)) % len(track.points)
-    away = track.points[near, :2] - aside * track.rightward[near] - eye
-    ahead = away @ forward
-    seen = project_ground(away[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
-    return np.interp(rows, seen[:, 1], seen[:, 0], left=np.nan, right=np.nan)
+    eye = camera_position(np.array([axle.x, axle.y]), forward, CAMERA_OFFSETS[camera])
+    near = (round(position[0] / track.step) + np.arange(45)) % len(track.points)
+    line = track.points[near, :2] + offset * track.rightward[near] - eye
+    ahead = line @ forward
+    pixels = project_ground(line[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
+    return np.interp(rows, pixels[:, 1], pixels[:, 0], left=np.nan, right=np.nan)
 
 
-def line_profile(frames: np.ndarray, columns: list[np.ndarray], rows: range) -> tuple[float, int]:
-    """Where the yellow is, in columns from those given, on the mean over all rows in which they are in view.
+def line_offset(frames: np.ndarray, columns: list[np.ndarray], rows: range) -> tuple[float, int]:
+    """Return how many columns right of the expected ones yellow is on average, and in how many rows it was searched.
 
-    frames: uint8 (n, 160, 320, 3) RGB. Also how many rows those are. nan where nothing stands out.
+    frames: uint8 (n, 160, 320, 3) RGB; columns: for each frame, the expected column in each row.
     """
     profiles = []
     for frame, expected in zip(frames.astype(np.float32), columns, strict=True):
         yellow = frame[..., 0] + frame[..., 1] - 2 * frame[..., 2]
         for row, column in zip(rows, expected, strict=True):
-            if AROUND[-1] < column < 319 - AROUND[-1]:
-                profiles.append(np.interp(column + AROUND, np.arange(320), yellow[row]))
+            if SEARCH[-1] < column < FRAME[1] - 1 - SEARCH[-1]:
+                profiles.append(np.interp(column + SEARCH, np.arange(FRAME[1]), yellow[row]))
     if not profiles:
         return np.nan, 0
     mean = np.mean(profiles, axis=0)
     mean -= np.linspace(mean[:8].mean(), mean[-8:].mean(), len(mean))
-    weight = np.clip(mean - mean.max() / 2, 0, None) * (np.abs(AROUND - AROUND[mean.argmax()]) < 5)
-    return float((weight * AROUND).sum() / weight.sum()), len(profiles)
+    weight = np.clip(mean - mean.max() / 2, 0, None) * (np.abs(SEARCH - SEARCH[mean.argmax()]) < 5)
+    return float((weight * SEARCH).sum() / weight.sum()), len(profiles)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recording", type=Path, help="a real recording of the lake or the jungle")
-    parser.add_argument("--frames", type=int, default=120, help="places to compare (default 120)")
-    parser.add_argument("--picture", help="write frames side by side: real above, drawn below")
-    args = parser.parse_args()
-    recording = read_recording(args.recording)
+def render(track: Track, positions: np.ndarray) -> np.ndarray:
+    """Render the three cameras at positions (n, 3), as `rear_axle` takes them: uint8 (n, 3, 160, 320, 3), RGB."""
+    run, cameras = Run(track), Cameras(Scene(scenery.build(track.name)))
+    rendered = []
+    for position in positions:
+        axle, forward = rear_axle(track, position)
+        x, y = (axle.x, axle.y) + REAR_AXLE * forward
+        run.car.place(Place(x, y, axle.z + REAR_AXLE * axle.grade, axle.heading, axle.grade))
+        run.car.settle()
+        rendered.append([decode(jpeg(frame)) for frame in cameras.frames(run.car.node.get_transform())])
+    return np.array(rendered)
+
+
+def compare(folder: Path, count: int, picture: str | None) -> None:
+    """Print the figures of `count` places of a recording and write the picture. Raises UserError."""
+    recording = read_recording(folder)
     drives = list(localise_all(stretches(recording), detect_centres(recording)))
     if not drives:
-        raise SystemExit(f"{args.recording}: not found on a known road")
-    rows, found = max(drives, key=lambda one: one[0].stop - one[0].start)
-    track, name = found.track, found.track.name
-    print(f"{name}, {track.direction}, {rows.stop - rows.start} rows")
-    chosen = np.linspace(0, len(found.states) - 1, args.frames).astype(int)
-    run, cameras = Run(track), Cameras(Scene(scenery.build(name)))
-    real, drawn = [], []
-    for i in chosen:
-        real.append([decode(recording.path(rows.start + i, camera).read_bytes()) for camera in range(3)])
-        at, forward = axle(track, found.states[i])
-        x, y = (at.x, at.y) + REAR_AXLE * forward
-        run.car.place(Place(x, y, at.z + REAR_AXLE * at.grade, at.heading, at.grade))
-        run.car.settle()
-        frames = cameras.frames(run.car.node.get_transform())
-        drawn.append([decode(jpeg(frame)) for frame in frames])
-    real, drawn = np.array(real), np.array(drawn)
-    print(f"{'':28}{'real':>24}{'drawn':>24}")
+        raise RecordingError(f"{folder}: drives on no known road; give a recording of the lake or the jungle")
+    rows, placed = max(drives, key=lambda drive: drive[0].stop - drive[0].start)
+    track = placed.track
+    print(f"{track.name}, {track.direction}, {rows.stop - rows.start} rows")
+    chosen = np.linspace(0, len(placed.states) - 1, count).astype(int)
+    positions = placed.states[chosen]
+    paths = [[recording.path(rows.start + i, camera) for camera in range(len(CAMERAS))] for i in chosen]
+    real = np.array([[decode(path.read_bytes()) for path in row] for row in paths])
+    rendered = render(track, positions)
+    print(f"{'':28}{'real':>24}{'rendered':>24}")
     for c, camera in enumerate(CAMERAS):
-        pair = [frames[:, c].astype(float) for frames in (real, drawn)]
-        print(
-            f"{camera + ', mean colour RGB':28}"
-            + "".join(f"{np.array2string(p.mean((0, 1, 2)).round(0)):>24}" for p in pair)
-        )
+        colours = [frames[:, c].mean((0, 1, 2)) for frames in (real, rendered)]
+        print_colours(f"{camera}, mean colour RGB", colours)
     for row in ROWS:
-        pair = [frames[:, 0, row].astype(float).mean((0, 1)).round(0) for frames in (real, drawn)]
-        print(f"{f'center, row {row}':28}" + "".join(f"{np.array2string(p):>24}" for p in pair))
-    profile = [frames[:, 0].astype(float).mean((0, 2, 3)) for frames in (real, drawn)]
+        print_colours(f"center, row {row}", [frames[:, 0, row].mean((0, 1)) for frames in (real, rendered)])
+    profile = [frames[:, 0].mean((0, 2, 3)) for frames in (real, rendered)]
     print(
         f"{'row profile, correlation':28}{np.corrcoef(*profile)[0, 1]:>24.3f}"
         f"   mean difference {np.abs(profile[0] - profile[1]).mean():.1f}"
     )
-    if name == "lake":
-        for c, camera in enumerate(CAMERAS):
-            for side, aside in (("left", LINE), ("right", -LINE)):
-                for band in BANDS:
-                    columns = [line_columns(track, found.states[i], aside, camera, band) for i in chosen]
-                    pair = [line_profile(frames[:, c], columns, band) for frames in (real, drawn)]
-                    print(
-                        f"{f'{camera}, {side} line, row {band[len(band) // 2]}':28}"
-                        + "".join(f"{at:>+15.1f} (n={n:4})" for at, n in pair)
-                    )
-    if args.picture:
-        strips = []
-        for i in np.linspace(0, len(chosen) - 1, 8).astype(int):
-            strips.append(np.vstack([np.hstack(real[i][[1, 0, 2]]), np.hstack(drawn[i][[1, 0, 2]])]))
-        columns = [np.vstack(strips[:4]), np.vstack(strips[4:])]
-        cv2.imwrite(args.picture, cv2.cvtColor(np.hstack(columns), cv2.COLOR_RGB2BGR))
+    if track.name == "lake":
+        print_lines(track, positions, real, rendered)
+    if picture:
+        write_picture(picture, real, rendered)
+
+
+def print_colours(name: str, colours: list[np.ndarray]) -> None:
+    """Print a line of the table with colours (3,)."""
+    print(f"{name:28}" + "".join(f"{np.array2string(colour.round(0)):>24}" for colour in colours))
+
+
+def print_lines(track: Track, positions: np.ndarray, real: np.ndarray, rendered: np.ndarray) -> None:
+    """Print where the inner lines are relative to flat geometry, in columns."""
+    for c, camera in enumerate(CAMERAS):
+        for name, side in (("left", LEFT), ("right", RIGHT)):
+            for band in BANDS:
+                columns = [line_columns(track, position, side * INNER_LINE, camera, band) for position in positions]
+                offsets = [line_offset(frames[:, c], columns, band) for frames in (real, rendered)]
+                print(
+                    f"{f'{camera}, {name} line, row {band[len(band) // 2]}':28}"
+                    + "".join(f"{offset:>+15.1f} (n={n:4})" for offset, n in offsets)
+                )
+
+
+def write_picture(path: str, real: np.ndarray, rendered: np.ndarray) -> None:
+    """Write eight places in two columns, real frames above rendered ones. Raises UserError."""
+    strips = []
+    for i in np.linspace(0, len(real) - 1, 8).astype(int):
+        strips.append(np.vstack([np.hstack(frames[i][[1, 0, 2]]) for frames in (real, rendered)]))
+    image = np.hstack([np.vstack(strips[:4]), np.vstack(strips[4:])])
+    if not cv2.imwrite(path, cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
+        raise UserError(f"{path}: cannot be written; give an image file in an existing folder")
+
+
+def main() -> int:
+    """Parse the command line, compare and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording", type=Path, help="a real recording of the lake or the jungle")
+    parser.add_argument("--frames", type=int, default=120, help="places to compare (default 120)")
+    parser.add_argument("--picture", help="write frames side by side: real above, rendered below")
+    args = parser.parse_args()
+    try:
+        compare(args.recording, args.frames, args.picture)
+    except UserError as error:
+        print(f"likeness: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -10,6 +10,7 @@ from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 
 MPH = 0.44704  # m/s
+TOP_SPEED_MPH = 30  # at which the simulator clamps the car's speed
 FULL_LOCK = 25.0  # degrees of the front wheels at steering 1
 WHEELBASE = 2.87  # m
 REAR_AXLE = 1.6  # m behind the car's middle

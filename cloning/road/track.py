@@ -1,4 +1,4 @@
-"""The two roads: their centre lines, where their surface ends, and where on them a point lies."""
+"""The two roads: their centre lines, their edges, and the position of a point relative to them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,11 +6,15 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+LEFT, RIGHT = -1, 1  # sides of a road; lateral offsets are positive to the right
+
 
 @dataclass(frozen=True)
 class Place:
-    """A pose on the road: metres, x east, y north, z up; heading in radians, 0 east, counter-clockwise; grade
-    dz/ds."""
+    """A pose on the road: position in metres, heading in radians, grade.
+
+    x is east, y north, z up; heading is 0 towards the east and grows counter-clockwise; grade is dz/ds.
+    """
 
     x: float
     y: float
@@ -20,54 +24,80 @@ class Place:
 
 
 @dataclass(frozen=True)
+class Section:
+    """A section of one side of a road, in the direction in which the track's file lists its points.
+
+    side        LEFT or RIGHT
+    start, end  metres along the centre line; a negative start lies before the first point
+    """
+
+    side: int
+    start: float
+    end: float
+
+
+@dataclass(frozen=True)
 class Road:
-    """What is known of a track beside its centre line; distances along it in metres, in its file's order."""
+    """What is known of a track besides its centre line.
 
-    forward: str  # the direction in which its file lists the points
-    edge: float  # from the centre line to the surface's end, m
-    kerbs: tuple = ()  # (side, from, to, edge): stretches where the surface ends elsewhere; side +1 is left
-    training: tuple | None = None  # x, y where the training mode starts; the first point otherwise
-    autonomous: tuple | None = None
+    forward               direction in which its file lists the points: "cw" or "ccw"
+    edge                  metres from the centre line to the edge of the road surface
+    bridge                start and end of the bridge, metres along the centre line
+    bridge_edge           as edge, on the bridge; None where it is the same
+    kerbs, kerb_edge      sections with a kerb, and the edge of the road surface there
+    training, autonomous  x, y where these modes start, in metres; the file's first point if None
+    """
+
+    forward: str
+    edge: float
+    bridge: tuple[float, float]
+    bridge_edge: float | None = None
+    kerbs: tuple[Section, ...] = ()
+    kerb_edge: float = 0.0
+    training: tuple[float, float] | None = None
+    autonomous: tuple[float, float] | None = None
 
 
-# Kerbs, verges and bridge were read off recordings of the real simulator, aligned to the centre line by their
-# steering.
+# Kerbs and bridges were measured in recordings of the real simulator, aligned to the centre line by their steering.
 ROADS = {
     "lake": Road(
         forward="ccw",
         edge=3.95,
+        bridge=(674, 783),
+        bridge_edge=4.6,
+        kerbs=(
+            Section(LEFT, -45, 50),
+            Section(RIGHT, -45, 55),
+            Section(LEFT, 465, 545),
+            Section(RIGHT, 478, 545),
+            Section(LEFT, 815, 892),
+            Section(RIGHT, 825, 845),
+            Section(RIGHT, 860, 885),
+            Section(LEFT, 965, 1022),
+            Section(RIGHT, 958, 1022),
+        ),
+        kerb_edge=4.95,
         training=(179.8, 89.9),
         autonomous=(-40.6, 108.7),
-        kerbs=(
-            (1, -45, 50, 4.95),
-            (-1, -45, 55, 4.95),
-            (1, 465, 545, 4.95),
-            (-1, 478, 545, 4.95),
-            (1, 815, 892, 4.95),
-            (-1, 825, 845, 4.95),
-            (-1, 860, 885, 4.95),
-            (1, 965, 1022, 4.95),
-            (-1, 958, 1022, 4.95),
-            (1, 674, 783, 4.6),
-            (-1, 674, 783, 4.6),
-        ),
     ),
-    "jungle": Road(forward="cw", edge=4.1),
+    "jungle": Road(forward="cw", edge=4.1, bridge=(806, 872)),
 }
 
 
 class Track:
-    """A track in one direction, as points about 1 m apart; s is the distance driven from the first, in metres.
+    """A track driven in one direction, as points about 1 m apart; s is the distance from the first point in metres.
 
     points     float64 (n, 3): m
     heading    float64 (n,): radians, continuous
     rightward  float64 (n, 2): unit vectors to the right
     curvature  float64 (n,): 1/m, right positive
     grade      float64 (n,): dz/ds
-    edges      float64 (n, 2): m to the left and to the right at which the surface ends
+    edges      float64 (n, 2): metres from the centre line to the left and the right edge of the road surface
+    starts     s where the modes "training" and "autonomous" start
     """
 
     def __init__(self, name: str, direction: str | None = None):
+        """Load a track; the direction is "cw" or "ccw", by default that of the real simulator."""
         self.name, road = name, ROADS[name]
         self.direction = direction or road.forward
         listed = np.loadtxt(Path(__file__).with_name(f"{name}.csv"), delimiter=",", skiprows=1)
@@ -83,10 +113,11 @@ class Track:
         self.step = self.length / n
         self.points = np.column_stack([np.interp(np.arange(n) * self.step, along, fine[:, i]) for i in range(3)])
         self.edges = np.full((n, 2), road.edge)
-        for side, start, end, edge in road.kerbs:
-            self.edges[self._stretch(start, end), 0 if side > 0 else 1] = edge
-        self.backward = self.direction != road.forward
-        if self.backward:  # the first point stays the first
+        for kerb in road.kerbs:
+            self.edges[self._indices(kerb.start, kerb.end), 0 if kerb.side == LEFT else 1] = road.kerb_edge
+        if road.bridge_edge is not None:
+            self.edges[self._indices(*road.bridge)] = road.bridge_edge
+        if self.direction != road.forward:  # the first point stays the first
             self.points = np.roll(self.points[::-1], 1, axis=0)
             self.edges = np.roll(self.edges[::-1, ::-1], 1, axis=0)
         around = np.roll(self.points, -1, axis=0) - np.roll(self.points, 1, axis=0)
@@ -99,21 +130,24 @@ class Track:
         kernel = np.ones(5) / 5
         self.curvature = -np.convolve(np.r_[turn[-3:], turn, turn[:2]], kernel, "valid")[:n] / self.step
         self.starts = {
-            mode: self.locate(*where)[0] if where else 0.0
-            for mode, where in (("training", road.training), ("autonomous", road.autonomous))
+            mode: self.locate(*start)[0] if start else 0.0
+            for mode, start in (("training", road.training), ("autonomous", road.autonomous))
         }
 
     def turns(self) -> float:
-        """Radians by which the heading has grown after a lap."""
+        """Return the radians by which the heading grows over a lap."""
         return 2 * np.pi * round((self.heading[-1] - self.heading[0]) / (2 * np.pi))
 
-    def _stretch(self, start: float, end: float) -> np.ndarray:
-        """Indices of the points from `start` to `end` metres along the listed direction; start may be
-        negative."""
+    def _indices(self, start: float, end: float) -> np.ndarray:
+        """Return the indices of the points from `start` to `end` metres along the file's direction."""
         return np.arange(round(start / self.step), round(end / self.step) + 1) % len(self.points)
 
+    def index(self, s: float) -> int:
+        """Return the index of the last point at or before s metres along the track."""
+        return int(s / self.step) % len(self.points)
+
     def at(self, s: float, right: float = 0.0) -> Place:
-        """The pose at s metres along the track and `right` metres to the right of the centre line."""
+        """Return the pose at s metres along the track, `right` metres to the right of the centre line."""
         n = len(self.points)
         i, part = divmod(s / self.step, 1)
         i = int(i) % n
@@ -125,9 +159,10 @@ class Track:
         return Place(x + np.sin(heading) * right, y - np.cos(heading) * right, z, heading, grade)
 
     def locate(self, x: float, y: float, near: float | None = None) -> tuple[float, float]:
-        """(s, metres to the right) of the point of the centre line nearest to (x, y), in metres.
+        """Return s and the lateral offset, in metres, of the position (x, y).
 
-        near: an earlier s; only 30 m around it are looked at, which is fast and tells a road from one it crosses.
+        near: s shortly before. Only points within 15 m of it are searched, which is fast and keeps the car on its road
+        where the track crosses itself.
         """
         n = len(self.points)
         if near is None:
@@ -143,8 +178,3 @@ class Track:
         s = (i * self.step + ahead / max(bend, 0.2)) % self.length
         there = self.at(s)
         return s, float((x - there.x) * np.sin(there.heading) - (y - there.y) * np.cos(there.heading))
-
-    def listed(self, s: float) -> float:
-        """s, driven in this direction, as the distance along the file's order, which features are given
-        in."""
-        return (self.length - s) % self.length if self.backward else s

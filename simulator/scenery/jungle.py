@@ -1,25 +1,51 @@
-"""The jungle's scenery, from its centre line: a road through dark cliffs that climbs 30 m and crosses over
-itself."""
+"""The jungle's scenery: a road through dark cliffs that climbs 30 m and crosses over itself.
+
+Positions of features along the road were read off frames of the real simulator, as were the colours.
+"""
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial import cKDTree
 
-from cloning.road.track import Track
+from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
 from simulator.scenery import looks, textures
-from simulator.scenery.looks import Look
+from simulator.scenery.looks import Look, Palette
 from simulator.scenery.parts import Scenery, body, bonnet, dome
-from simulator.scenery.shapes import Light, Mesh, around, box, grid, lit, plants, ribbon, roadside, stretch, together
+from simulator.scenery.shapes import (
+    Light,
+    Material,
+    Mesh,
+    box,
+    distances,
+    grid,
+    illuminate,
+    merge,
+    plants,
+    ribbon,
+    roadside,
+    whole_lap,
+)
 
-LINE, ROAD = 4.1, 4.45  # m from the centre line: the white edge line, the asphalt's end
-DASH, GAP = 6.0, 6.0  # m
-BRIDGE = (806, 872)  # over the road at 1350, 20 m below
-RAILS = ((1, 0, 45), (-1, 880, 940), (1, 1440, 1493))  # side (+1 is left of the listed direction), from, to
-MARKED = ((1, 395, 470), (-1, 395, 470), (1, 770, 872), (-1, 770, 872), (1, 1075, 1110))  # marker posts
+ROAD = ROADS["jungle"]  # its bridge crosses the road at 1350 m, 20 m below
+EDGE_LINE = ROAD.edge  # m from the centre line to the white line along the road's edge
+ASPHALT = 4.45  # m from the centre line to the asphalt's end
+DASH, GAP = 6.0, 6.0  # m, of the centre line
+RAILS = (Section(LEFT, 0, 45), Section(RIGHT, 880, 940), Section(LEFT, 1440, 1493))
+# Sections with marker posts, besides the bends
+MARKED = (
+    Section(LEFT, 395, 470),
+    Section(RIGHT, 395, 470),
+    Section(LEFT, 770, 872),
+    Section(RIGHT, 770, 872),
+    Section(LEFT, 1075, 1110),
+)
+MARKED_CURVATURE = 1 / 18  # 1/m: sharper bends have posts on their outer side
 CELL = 4.0  # m between the ground's points
-REACH = 75.0  # m of ground around the track
-CLIFFS = (12.0, 4.0)  # m from the road where cliffs begin, and over which they rise
+MARGIN = 75.0  # m of ground around the track
+CLIFF_DISTANCE, CLIFF_WIDTH = 12.0, 4.0  # m from the centre line to the cliffs' feet, and from there to their tops
+LANE_DISTANCE = 9.5  # m from the centre line within which the ground stays below the road
 
-PALETTE = {
+PALETTE: Palette = {
     "zenith": (0.22, 0.35, 0.59),
     "horizon": (0.59, 0.71, 0.88),
     "asphalt": (0.90, 0.89, 0.86),
@@ -36,37 +62,42 @@ PALETTE = {
 LIGHT = Light(sun=(0.62, 0.35, 0.70), sunlight=(0.86, 0.82, 0.72), fill=(0.40, 0.42, 0.42))
 
 
-class Land:
-    """The ground's height around the road, and what lies in the cliffs' shadow."""
+class JungleTerrain:
+    """The height of the ground around the road, on a grid, and the shadows of the cliffs.
 
-    def __init__(self, track: Track, random):
+    xs, ys     float64 (columns,), (rows,): the grid's coordinates, m
+    positions  float64 (rows, columns, 2): m
+    distance   float64 (rows, columns): m to the centre line
+    height     float64 (rows, columns): m
+    """
+
+    def __init__(self, track: Track, random: Generator):
         self.track = track
-        low, high = track.points[:, :2].min(axis=0) - REACH, track.points[:, :2].max(axis=0) + REACH
+        low, high = track.points[:, :2].min(axis=0) - MARGIN, track.points[:, :2].max(axis=0) + MARGIN
         self.xs, self.ys = (np.arange(a, b, CELL) for a, b in zip(low, high, strict=True))
-        places = np.stack(np.meshgrid(self.xs, self.ys), axis=-1)
-        below = np.ones(len(track.points), bool)  # all of the road but the bridge lies on the ground
-        below[np.round(stretch(*BRIDGE) / track.step).astype(int)] = False
-        road = track.points[below]
-        away, near = cKDTree(road[:, :2]).query(places, k=24)
+        self.positions = np.stack(np.meshgrid(self.xs, self.ys), axis=-1)
+        on_ground = np.ones(len(track.points), bool)
+        on_ground[np.round(distances(*ROAD.bridge) / track.step).astype(int)] = False
+        points = track.points[on_ground]
+        away, near = cKDTree(points[:, :2]).query(self.positions, k=24)
         weight = 1 / np.maximum(away, 1.0) ** 3
-        level = (weight * road[near, 2]).sum(axis=-1) / weight.sum(axis=-1)
-        self.away = away[..., 0]
-        rows, columns = self.away.shape
+        level = (weight * points[near, 2]).sum(axis=-1) / weight.sum(axis=-1)
+        self.distance = away[..., 0]
+        rows, columns = self.distance.shape
         rough = textures.clouds(random, 256, 16, 5)[:rows, :columns]
         slow = textures.clouds(random, 256, 40, 3)[:rows, :columns]
-        rise = np.clip((self.away - CLIFFS[0] - 4 * np.clip(slow, -0.6, 1.5)) / CLIFFS[1], 0, 1)
+        rise = np.clip((self.distance - CLIFF_DISTANCE - 4 * np.clip(slow, -0.6, 1.5)) / CLIFF_WIDTH, 0, 1)
         tall = 9 + 8 * np.clip(slow + 0.8, 0, 2.5) + 2 * rough
-        crest = np.clip((self.away - 38) / 12, 0, 1) * (12 + 9 * np.abs(rough))
-        cliff = rise * np.round(tall / 4) * 4 + crest  # terraces
-        self.height = level + cliff + 0.35 * rough * np.clip((self.away - 6) / 8, 0, 1)
-        lowest = np.where(away < 9.5, road[near, 2], np.inf).min(axis=-1)
+        crest = np.clip((self.distance - 38) / 12, 0, 1) * (12 + 9 * np.abs(rough))
+        cliff = rise * np.round(tall / 4) * 4 + crest  # in terraces of 4 m
+        self.height = level + cliff + 0.35 * rough * np.clip((self.distance - 6) / 8, 0, 1)
+        lowest = np.where(away < LANE_DISTANCE, points[near, 2], np.inf).min(axis=-1)
         self.height = np.minimum(self.height, np.where(np.isfinite(lowest), lowest - 0.7, np.inf))
-        self.places = places
 
-    def at(self, places: np.ndarray) -> np.ndarray:
-        """Metres of height at places (n, 2), between the grid's points."""
-        column = np.clip((places[:, 0] - self.xs[0]) / CELL, 0, len(self.xs) - 1.001)
-        row = np.clip((places[:, 1] - self.ys[0]) / CELL, 0, len(self.ys) - 1.001)
+    def height_at(self, positions: np.ndarray) -> np.ndarray:
+        """Interpolate the height, (n,) metres, at positions (n, 2)."""
+        column = np.clip((positions[:, 0] - self.xs[0]) / CELL, 0, len(self.xs) - 1.001)
+        row = np.clip((positions[:, 1] - self.ys[0]) / CELL, 0, len(self.ys) - 1.001)
         i, j = row.astype(int), column.astype(int)
         u, v = row - i, column - j
         z = self.height
@@ -77,157 +108,138 @@ class Land:
             + u * v * z[i + 1, j + 1]
         )
 
-    def shade(self, points: np.ndarray, light: Light) -> np.ndarray:
-        """1 in the sun, 0 where the ground stands between it and the points (n, 3)."""
+    def sunlit(self, points: np.ndarray, light: Light) -> np.ndarray:
+        """Return 1 for each of the points (n, 3) that the sun reaches and 0 for those in the ground's shadow: (n,)."""
         sun = np.array(light.sun)
-        lit_ = np.ones(len(points), bool)
+        reached = np.ones(len(points), bool)
         for step in range(2, 32):
             ray = points + sun * (1.7 * step)
-            lit_ &= ray[:, 2] > self.at(ray[:, :2]) - 0.5
-        return lit_.astype(float)
+            reached &= ray[:, 2] > self.height_at(ray[:, :2]) - 0.5
+        return reached.astype(float)
+
+    def cast_shadows(self, mesh: Mesh, light: Light, darkest: float) -> Mesh:
+        """Darken the mesh's colours in the ground's shadow to the share `darkest`, and return it."""
+        sunlit = self.sunlit(mesh.points + np.array([0, 0, 0.8]), light)[:, None]
+        mesh.colours[:] *= darkest + (1 - darkest) * sunlit
+        return mesh
 
 
-def shadowed(mesh: Mesh, land: Land, light: Light, depth: float) -> Mesh:
-    """The mesh with its colours darkened in the cliffs' shadow."""
-    shade = land.shade(mesh.points + np.array([0, 0, 0.8]), light)[:, None]
-    mesh.colours[:] *= depth + (1 - depth) * shade
-    return mesh
-
-
-def ground(land: Land, random, light: Light, palette: dict) -> Mesh:
-    rows, columns = land.away.shape
-    points = np.concatenate([land.places, land.height[..., None]], axis=-1).reshape(-1, 3)
-    faces = grid(rows, columns)
-    white = Mesh(
-        points,
-        np.ones_like(points),
-        land.places.reshape(-1, 2) / 9.0,
-        faces,
-        textures.rock(random, streak=1.0),
-    )
-    level = lit(white, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), faced_up=True).colours[:, :1]
-    steep = np.clip((0.86 - level) * 5, 0, 1)
+def ground(terrain: JungleTerrain, random: Generator, light: Light, palette: Palette) -> Mesh:
+    """Return the ground: grass where it is level, rock where it is steep."""
+    rows, columns = terrain.distance.shape
+    points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1).reshape(-1, 3)
+    uv = terrain.positions.reshape(-1, 2) / 9.0
+    mesh = Mesh(points, np.ones_like(points), uv, grid(rows, columns), textures.rock(random, streak=1.0))
+    flatness = illuminate(mesh, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), face_up=True).colours[:, :1]
+    steep = np.clip((0.86 - flatness) * 5, 0, 1)
     tone = 1 + 0.16 * textures.clouds(random, 256, 10, 4)[:rows, :columns].reshape(-1, 1)
-    white.colours[:] = (np.array(palette["grass"]) * (1 - steep) + np.array(palette["cliff"]) * steep) * tone
-    return shadowed(lit(white, light, faced_up=True), land, light, 0.55)
+    mesh.colours[:] = (np.array(palette["grass"]) * (1 - steep) + np.array(palette["cliff"]) * steep) * tone
+    return terrain.cast_shadows(illuminate(mesh, light, face_up=True), light, 0.55)
 
 
-def tarmac(random, look: Look) -> np.ndarray:
-    """Asphalt as wide as the road, a dash and a gap long, divided by its own colour, which the vertices
-    carry."""
+def road_texture(random: Generator, look: Look) -> np.ndarray:
+    """Return asphalt as wide as the road, a dash and a gap long, relative to its colour, which the mesh has."""
     palette = look.palette
     texture = textures.asphalt(random, grain=0.03 * look.grain, spots=0.35 * look.spots).astype(float)
     rows, columns = texture.shape[:2]
-    left = ROAD - (np.arange(columns) + 0.5) / columns * 2 * ROAD
+    offset = np.abs((np.arange(columns) + 0.5) / columns * 2 * ASPHALT - ASPHALT)
     white = np.array(palette["line"]) / palette["asphalt"] * 255
-    texture[:, np.abs(np.abs(left) - LINE) < 0.10] = white
-    texture[: round(rows * DASH / (DASH + GAP)), np.abs(left) < 0.11] = white
+    texture[:, np.abs(offset - EDGE_LINE) < 0.10] = white
+    texture[: round(rows * DASH / (DASH + GAP)), offset < 0.11] = white
     return np.clip(texture, 0, 255).astype(np.uint8)
 
 
-def road(land: Land, random, look: Look) -> list[Mesh]:
-    """Asphalt with its lines, grassy verges, and the bridge's sides."""
-    track, plain, soil = land.track, textures.line(), textures.soil(random)
+def road(terrain: JungleTerrain, random: Generator, look: Look) -> list[Mesh]:
+    """Return the asphalt with its lines, grassy verges, and the bridge's sides."""
+    track, plain, soil = terrain.track, textures.plain(), textures.soil(random)
     light, palette = look.light, look.palette
-    across = np.linspace(ROAD, -ROAD, 7)
-    painted = 0.5 - across / (2 * ROAD)
-    surface = (palette["asphalt"], tarmac(random, look), DASH + GAP)
-    meshes = [ribbon(track, around(track, 1.5), across, 0.0, *surface, painted)]
-    for start, end in ((0.0, BRIDGE[0]), (BRIDGE[1], track.length)):
-        for side in (1, -1):
-            shape = (track, stretch(start, end, 2.5), side, (ROAD, 6.2, 9.8), (-0.01, -0.08, -0.75))
-            meshes.append(lit(roadside(*shape, palette["grass"], soil, 9.0), light, faced_up=True))
-    out = ROAD + 0.25
-    for side in (1, -1):
-        for offsets, heights in (
-            ((out, out), (0.15, -1.3)),
-            ((ROAD, out), (0.15, 0.15)),
-            ((0, out), (-1.3, -1.3)),
+    offsets = np.linspace(-ASPHALT, ASPHALT, 7)
+    across = 0.5 + offsets / (2 * ASPHALT)
+    asphalt = Material(palette["asphalt"], road_texture(random, look), DASH + GAP, across)
+    meshes = [ribbon(track, whole_lap(track, 1.5), offsets, 0.0, asphalt)]
+    grass, deck = Material(palette["grass"], soil, 9.0), Material(palette["deck"], plain, 4.0, across=(0, 1))
+    for start, end in ((0.0, ROAD.bridge[0]), (ROAD.bridge[1], track.length)):
+        for side in (LEFT, RIGHT):
+            s = distances(start, end, 2.5)
+            verge = roadside(track, s, side, (ASPHALT, 6.2, 9.8), (-0.01, -0.08, -0.75), grass)
+            meshes.append(illuminate(verge, light, face_up=True))
+    outer = ASPHALT + 0.25
+    for side in (LEFT, RIGHT):
+        for face, heights in (
+            ((outer, outer), (0.15, -1.3)),
+            ((ASPHALT, outer), (0.15, 0.15)),
+            ((0, outer), (-1.3, -1.3)),
         ):
-            shape = (track, stretch(*BRIDGE), side, offsets, heights)
-            meshes.append(roadside(*shape, palette["deck"], plain, 4.0, (0, 1)))
-    return [shadowed(mesh, land, light, 0.68) for mesh in meshes]
+            meshes.append(roadside(track, distances(*ROAD.bridge), side, face, heights, deck))
+    return [terrain.cast_shadows(mesh, light, 0.68) for mesh in meshes]
 
 
-def furniture(track: Track, light: Light, palette: dict) -> list[Mesh]:
-    """Guard rails, marker posts with their boards, and the bridge's piers."""
-    white, made = textures.line(), []
-    for side, start, end in RAILS:
-        for low, high in ((0.45, 0.8),):
-            made.append(
-                ribbon(
-                    track,
-                    stretch(start, end, 2.0),
-                    (side * 5.3, side * 5.3),
-                    (low, high),
-                    palette["rail"],
-                    white,
-                    4.0,
-                    across=(0, 1),
-                )
-            )
-        for s in np.arange(start, end, 4.0):
-            place = track.at(s, -side * 5.35)
-            made.append(
-                box(
-                    (place.x, place.y, place.z - 0.2),
-                    (0.12, 0.25, 1.1),
-                    place.heading,
-                    palette["post"],
-                    white,
-                )
-            )
+def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
+    """Return guard rails, marker posts with their boards, and the bridge's piers."""
+    white, meshes = textures.plain(), []
+
+    def add_box(s: float, right: float, bottom: float, size: tuple[float, float, float], colour: str) -> None:
+        """Add a box aligned with the road; bottom: metres above the road."""
+        place = track.at(s, right)
+        meshes.append(box((place.x, place.y, place.z + bottom), size, place.heading, palette[colour], white))
+
+    rail = Material(palette["rail"], white, 4.0, across=(0, 1))
+    for section in RAILS:
+        s = distances(section.start, section.end, 2.0)
+        meshes.append(ribbon(track, s, (section.side * 5.3, section.side * 5.3), (0.45, 0.8), rail))
+        for post_s in np.arange(section.start, section.end, 4.0):
+            add_box(post_s, section.side * 5.35, -0.2, (0.12, 0.25, 1.1), "post")
     bends = [
-        (int(np.sign(track.curvature[i])), i * track.step)
+        (-int(np.sign(track.curvature[i])), i * track.step)
         for i in range(0, len(track.points), 9)
-        if abs(track.curvature[i]) > 1 / 18
+        if abs(track.curvature[i]) > MARKED_CURVATURE
     ]
-    posts = bends + [(side, s) for side, start, end in MARKED for s in np.arange(start, end, 7.0)]
-    for side, s in posts:
-        place = track.at(s, -side * 5.2)
-        made.append(box((place.x, place.y, place.z - 0.5), (0.09, 0.09, 3.1), place.heading, palette["post"], white))
-        made.append(box((place.x, place.y, place.z + 2.3), (0.10, 0.55, 0.30), place.heading, palette["board"], white))
-    for s in np.arange(BRIDGE[0] + 6, BRIDGE[1], 18.0):
-        for side in (1, -1):
-            place = track.at(s, -side * 4.6)
-            made.append(box((place.x, place.y, place.z - 26), (0.7, 0.7, 25.0), place.heading, palette["deck"], white))
-    return [lit(together(made), light)]
+    marked = [(section.side, s) for section in MARKED for s in np.arange(section.start, section.end, 7.0)]
+    for side, post_s in bends + marked:
+        add_box(post_s, side * 5.2, -0.5, (0.09, 0.09, 3.1), "post")
+        add_box(post_s, side * 5.2, 2.3, (0.10, 0.55, 0.30), "board")
+    for pier_s in np.arange(ROAD.bridge[0] + 6, ROAD.bridge[1], 18.0):
+        for side in (LEFT, RIGHT):
+            add_box(pier_s, side * 4.6, -26, (0.7, 0.7, 25.0), "deck")
+    return [illuminate(merge(meshes), light)]
 
 
-def palms(land: Land, random, light: Light, palette: dict) -> list[Mesh]:
-    """Palms on the grass beside the road and on the cliffs, and undergrowth at the cliffs' feet."""
-    low, high = land.places[0, 0], land.places[-1, -1]
-    places = random.uniform(low, high, (5200, 2))
-    row = ((places[:, 1] - land.ys[0]) / CELL).astype(int)
-    column = ((places[:, 0] - land.xs[0]) / CELL).astype(int)
-    away = land.away[row, column]
-    chance = np.where(away < 10.5, 0, np.where(away < 20, 0.22, 0.16))
-    keep = random.uniform(size=len(places)) < chance
-    places = np.c_[places, land.at(places) - 0.2][keep]
-    shade = land.shade(places + np.array([0, 0, 4]), light)[:, None]
-    tall = random.uniform(4.5, 9.0, len(places))
-    colours = np.clip(
-        np.array(palette["palm"]) * random.uniform(0.8, 1.5, (len(places), 1)) * (0.55 + 0.75 * shade), 0, 1
-    )
+def palms(terrain: JungleTerrain, random: Generator, light: Light, palette: Palette) -> list[Mesh]:
+    """Return palms on the grass beside the road and on the cliffs, and undergrowth at the cliffs' feet."""
+    low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
+    positions = random.uniform(low, high, (5200, 2))
+    row = ((positions[:, 1] - terrain.ys[0]) / CELL).astype(int)
+    column = ((positions[:, 0] - terrain.xs[0]) / CELL).astype(int)
+    distance = terrain.distance[row, column]
+    chance = np.where(distance < 10.5, 0, np.where(distance < 20, 0.22, 0.16))
+    keep = random.uniform(size=len(positions)) < chance
+    feet = np.c_[positions, terrain.height_at(positions) - 0.2][keep]
+    sunlit = terrain.sunlit(feet + np.array([0, 0, 4]), light)[:, None]
+    heights = random.uniform(4.5, 9.0, len(feet))
+    brightness = random.uniform(0.8, 1.5, (len(feet), 1))
+    colours = np.clip(np.array(palette["palm"]) * brightness * (0.55 + 0.75 * sunlit), 0, 1)
     meshes = []
     for kind in range(4):
-        mine = np.arange(len(places)) % 4 == kind
-        texture = textures.palm(random) if kind < 3 else textures.bush(random)
-        height = tall[mine] * (1.0 if kind < 3 else 0.3)
-        meshes.append(plants(places[mine], height, (0.9 if kind < 3 else 2.0) * height, colours[mine], texture, random))
+        chosen = np.arange(len(feet)) % 4 == kind
+        bush = kind == 3
+        texture = textures.bush(random) if bush else textures.palm(random)
+        height = heights[chosen] * (0.3 if bush else 1.0)
+        meshes.append(plants(feet[chosen], height, (2.0 if bush else 0.9) * height, colours[chosen], texture, random))
     return meshes
 
 
 def scenery(look: int) -> Scenery:
+    """Return the jungle's scenery in a look; the order of the calls fixes what each samples from the random stream."""
     random = np.random.default_rng(look)
-    chosen = looks.make_look(look, LIGHT, PALETTE)
-    light, palette = chosen.light, chosen.palette
-    land = Land(Track("jungle"), random)
+    appearance = looks.make_look(look, LIGHT, PALETTE)
+    light, palette = appearance.light, appearance.palette
+    terrain = JungleTerrain(Track("jungle"), random)
     meshes = [
-        ground(land, random, light, palette),
-        *road(land, random, chosen),
-        *furniture(land.track, light, palette),
-        *palms(land, random, light, palette),
+        ground(terrain, random, light, palette),
+        *road(terrain, random, appearance),
+        *rails_and_posts(terrain.track, light, palette),
+        *palms(terrain, random, light, palette),
     ]
     sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
-    return Scenery(meshes, sky, bonnet(palette["bonnet"], light), body(palette["bonnet"], light), tone=chosen.tone)
+    car = palette["bonnet"]
+    return Scenery(meshes, sky, bonnet(car, light), body(car, light), tone=appearance.tone)

@@ -1,35 +1,41 @@
-"""All that is to be seen on a track: its meshes, sky and haze, and the car's own bonnet."""
+"""What every scenery consists of: its meshes, sky and haze, and the car's own bonnet and body."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from cloning.road.camera import height_at_rows
-from simulator.scenery.shapes import Light, Mesh, box, grid, lit, together
+from simulator.scenery import textures
+from simulator.scenery.shapes import Colour, Light, Mesh, box, grid, illuminate, merge
 
 
 @dataclass(frozen=True)
 class Haze:
-    """colour: 0..1; range: metres from where to where it grows from nothing to all; most: its largest
-    share."""
+    """Haze that grows with the distance.
 
-    colour: tuple[float, float, float]
+    range    metres from the camera at which it begins and at which it would hide everything
+    maximum  its largest share of a colour, 0..1
+    """
+
+    colour: Colour
     range: tuple[float, float]
-    most: float = 1.0
+    maximum: float = 1.0
 
 
 @dataclass(frozen=True)
 class Scenery:
+    """All that the cameras see; bonnet and body move with the car. tone: see `looks.Look`."""
+
     meshes: list[Mesh]
     sky: Mesh
     bonnet: Mesh
     body: Mesh
     haze: Haze | None = None
-    tone: np.ndarray | None = None  # (3, 4), the camera's: see looks
+    tone: np.ndarray | None = None
 
 
 def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
-    """A sky around the viewer, its texture's bottom row at the horizon."""
+    """Return a sky around the viewer; the texture's bottom row lies at the horizon."""
     turn, rise = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.radians([-8, 0, 5, 10, 20, 40, 88]))
     points = radius * np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1)
     height = np.clip(rise / np.radians(40), 0.01, 0.99)
@@ -37,42 +43,41 @@ def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
     return Mesh(points.reshape(-1, 3), np.ones((turn.size, 3)), uv, grid(*turn.shape), texture)
 
 
-def bonnet(colour: tuple[float, float, float], light: Light) -> Mesh:
-    """The car's bonnet in the car's coordinates (x right, y forward, z up, in metres), shaped to fit the real
-    frames.
+def bonnet(colour: Colour, light: Light) -> Mesh:
+    """Return the car's bonnet in the car's coordinates: x right, y forward, z up, in metres.
 
-    Its front edge hides what the real one hides from the centre camera: image row at each sideways x.
+    Its front edge was fitted to real centre frames: `rows` are the image rows of the edge at lateral positions x.
     """
-    aside = np.linspace(-0.70, 0.63, 43)
-    front = 2.10 - 0.40 * (aside / 0.64) ** 2
+    x = np.linspace(-0.70, 0.63, 43)
+    front = 2.10 - 0.40 * (x / 0.64) ** 2
     rows = np.interp(
-        aside,
+        x,
         [-0.70, -0.67, -0.60, -0.53, -0.36, -0.22, 0.11, 0.32, 0.49, 0.605, 0.63],
         [175, 159, 154, 147, 142.7, 137.7, 137, 141.7, 150, 158, 172],
     )
-    edge = height_at_rows(rows, aside, front)
-    bands = np.array([0.0, 0.015, 0.03, 0.12, 0.2, 0.24, 0.28, 0.6, 1.0])  # of the way back from the edge
+    edge = height_at_rows(rows, x, front)
+    bands = np.array([0.0, 0.015, 0.03, 0.12, 0.2, 0.24, 0.28, 0.6, 1.0])  # share of the length, from the front edge
     shade = np.array([0.55, 0.85, 1.0, 0.95, 0.80, 0.45, 0.95, 1.15, 1.2])
     y = front + (1.40 - front) * bands[:, None]
-    z = edge + (0.62 - edge) * bands[:, None] ** 0.8 - 0.25 * (aside / 0.64) ** 4 * bands[:, None]
-    points = np.stack([np.broadcast_to(aside, y.shape), y, z], axis=-1)
+    z = edge + (0.62 - edge) * bands[:, None] ** 0.8 - 0.25 * (x / 0.64) ** 4 * bands[:, None]
+    points = np.stack([np.broadcast_to(x, y.shape), y, z], axis=-1)
     colours = np.clip(shade[:, None, None] * np.array(colour), 0, 1)
     colours = np.broadcast_to(colours, points.shape).copy()
-    lamps = np.abs(np.abs(aside + 0.03) - 0.50) < 0.035
+    lamps = np.abs(np.abs(x + 0.03) - 0.50) < 0.035
     colours[2:4, lamps] = 0.85
     mesh = Mesh(
         points.reshape(-1, 3),
         colours.reshape(-1, 3),
         np.zeros((points[..., 0].size, 2)),
         grid(*y.shape)[:, ::-1],
-        np.full((4, 4, 3), 255, np.uint8),
+        textures.plain(),
     )
-    return lit(mesh, light, faced_up=True)
+    return illuminate(mesh, light, face_up=True)
 
 
-def body(colour: tuple[float, float, float], light: Light) -> Mesh:
-    """The car as seen from outside, in the car's coordinates as the bonnet is."""
-    plain, dark = np.full((4, 4, 3), 255, np.uint8), (0.08, 0.08, 0.09)
+def body(colour: Colour, light: Light) -> Mesh:
+    """Return the car as seen from outside, in the same coordinates as the bonnet."""
+    plain, dark = textures.plain(), (0.08, 0.08, 0.09)
     boxes = [
         box((0, -0.15, 0.35), (1.75, 4.3, 0.45), 0.0, colour, plain),
         box((0, -0.45, 0.80), (1.45, 2.1, 0.50), 0.0, dark, plain),
@@ -80,4 +85,4 @@ def body(colour: tuple[float, float, float], light: Light) -> Mesh:
         box((0, -2.35, 0.65), (1.5, 0.08, 0.12), 0.0, (0.75, 0.10, 0.08), plain),
     ]
     boxes += [box((x, y, 0.0), (0.25, 0.68, 0.68), 0.0, dark, plain) for x in (-0.88, 0.88) for y in (1.27, -1.60)]
-    return lit(together(boxes), light)
+    return illuminate(merge(boxes), light)

@@ -1,20 +1,25 @@
-"""Meshes as arrays: ribbons along the road, sheets of ground, rocks, posts, and pictures of plants on crossed
-quads."""
+"""Meshes as arrays: ribbons along the road, boulders, boxes, and plants as crossed images."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from cloning.road.track import Track
+from cloning.road.track import LEFT, Track
+
+Colour = tuple[float, float, float]  # RGB, 0..1
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """points (n, 3) in metres; colours (n, 3), 0..1, which the texture is multiplied with; uv (n, 2); faces
-    (m, 3) indices.
+    """Triangles with colours at their corners and one texture.
 
-    texture: uint8 (rows, columns, 3 or 4); with 4 channels, parts whose alpha is under half are not drawn. sheen: by
-    how much it is brighter where it is seen at a slant, far ahead.
+    points   float (n, 3): m
+    colours  float (n, 3): 0..1, multiplied with the texture
+    uv       float (n, 2): texture coordinates
+    faces    int (m, 3): indices into the points
+    texture  uint8 (rows, columns, 3 RGB or 4 RGBA); with 4 channels, pixels with alpha below half are transparent
+    sheen    relative gain in brightness where the mesh is seen far ahead, at a grazing angle
     """
 
     points: np.ndarray
@@ -27,124 +32,165 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Light:
-    """sun: unit vector towards it; colours of the sun and of the shaded side's fill, 0..1."""
+    """The light of a scene: sun is the unit vector towards it; fill is the light that reaches shaded sides."""
 
     sun: tuple[float, float, float]
-    sunlight: tuple[float, float, float]
-    fill: tuple[float, float, float]
+    sunlight: Colour
+    fill: Colour
 
     def on(self, normals: np.ndarray) -> np.ndarray:
-        """(n, 3): what a white surface shows for unit normals (n, 3)."""
+        """Return the colours, (n, 3), of a white surface with unit normals (n, 3)."""
         facing = np.clip(normals @ np.array(self.sun), 0, 1)[:, None]
         return np.array(self.fill) + facing * np.array(self.sunlight)
 
 
+@dataclass(frozen=True)
+class Material:
+    """The colour and texture of a ribbon.
+
+    colour   (3,) or (distances, offsets, 3)
+    texture  as in Mesh
+    metres   of road that one repetition of the texture covers
+    across   texture coordinates at the ribbon's offsets; None: one repetition in `metres` across the road, too
+    """
+
+    colour: ArrayLike
+    texture: np.ndarray
+    metres: float
+    across: ArrayLike | None = None
+
+
 def grid(rows: int, columns: int) -> np.ndarray:
-    """Faces of a sheet of rows x columns points, counter-clockwise seen with rows to the north and columns to
-    the east."""
+    """Return the faces of a sheet of rows x columns points.
+
+    They are counter-clockwise seen with the rows towards north and the columns towards east.
+    """
     a = np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)
     b = a + columns
     return np.stack([a, a + 1, b + 1, a, b + 1, b], axis=-1).reshape(-1, 3)
 
 
 def normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals at the points, (n, 3), each the area-weighted mean of its faces'."""
+    """Return unit normals at the points, (n, 3): the area-weighted means of the adjacent faces' normals."""
     a, b, c = (points[faces[:, i]] for i in range(3))
-    each = np.cross(b - a, c - a)
+    face_normals = np.cross(b - a, c - a)
     total = np.zeros_like(points)
     for corner in range(3):
-        np.add.at(total, faces[:, corner], each)
+        np.add.at(total, faces[:, corner], face_normals)
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
 
 
-def lit(mesh: Mesh, light: Light, faced_up: bool = False) -> Mesh:
-    """The mesh with its colours under the light; faced_up: normals are turned to look upwards."""
+def illuminate(mesh: Mesh, light: Light, face_up: bool = False) -> Mesh:
+    """Return the mesh with its colours under the light; face_up turns its normals upwards."""
     facing = normals(mesh.points, mesh.faces)
-    if faced_up:
+    if face_up:
         facing *= np.where(facing[:, 2:] < 0, -1.0, 1.0)
     return replace(mesh, colours=np.clip(mesh.colours * light.on(facing), 0, 1))
 
 
-def ribbon(track: Track, s, offsets, heights, colour, texture, metres: float, across=None) -> Mesh:
-    """A strip along the road: at each of the distances s, points at `offsets` metres left of the centre line.
+def ribbon(track: Track, s: ArrayLike, offsets: ArrayLike, heights: ArrayLike, material: Material) -> Mesh:
+    """Return a strip along the road, through the distances s in metres.
 
-    offsets, heights (above the road): (k,), left to right, the same everywhere. colour: (3,), or (len(s), k, 3).
-    metres: of road that one texture covers; across: the texture's coordinate at each offset, else by the same metres.
+    offsets, heights: (k,), its cross-section from left to right: metres to the right of the centre line and above the
+    road.
     """
     s, offsets = np.asarray(s, float), np.asarray(offsets, float)
     n, k = len(s), len(offsets)
     index = np.round(s / track.step).astype(int) % len(track.points)
     points = np.empty((n, k, 3))
-    points[:, :, :2] = track.points[index, None, :2] - track.rightward[index, None] * offsets[None, :, None]
+    points[:, :, :2] = track.points[index, None, :2] + track.rightward[index, None] * offsets[None, :, None]
     points[:, :, 2] = track.points[index, None, 2] + np.broadcast_to(heights, (n, k))
-    across = -offsets / metres if across is None else np.asarray(across, float)
-    uv = np.stack(np.broadcast_arrays(across[None, :], (s / metres)[:, None]), axis=-1)
-    colours = np.broadcast_to(np.asarray(colour, float), (n, k, 3))
-    return Mesh(points.reshape(-1, 3), colours.reshape(-1, 3).copy(), uv.reshape(-1, 2), grid(n, k), texture)
+    across = offsets / material.metres if material.across is None else np.asarray(material.across, float)
+    uv = np.stack(np.broadcast_arrays(across[None, :], (s / material.metres)[:, None]), axis=-1)
+    colours = np.broadcast_to(np.asarray(material.colour, float), (n, k, 3))
+    return Mesh(points.reshape(-1, 3), colours.reshape(-1, 3).copy(), uv.reshape(-1, 2), grid(n, k), material.texture)
 
 
-def roadside(track: Track, s, side: int, offsets, heights, colour, texture, metres: float, across=None) -> Mesh:
-    """A ribbon beside the road, on its left (side 1) or mirrored to its right (-1); offsets from the road
-    outwards."""
+def roadside(track: Track, s: ArrayLike, side: int, offsets: ArrayLike, heights: ArrayLike, material: Material) -> Mesh:
+    """Return a ribbon on one side of the road, LEFT or RIGHT; the cross-section runs outwards from the centre line."""
     offsets, heights = side * np.array(offsets, float), np.array(heights, float)
-    across = -offsets / metres if across is None else np.array(across, float)
-    if side > 0:  # ribbons run from left to right
+    across = offsets / material.metres if material.across is None else np.array(material.across, float)
+    if side == LEFT:  # ribbons run from left to right
         offsets, heights, across = offsets[::-1], heights[::-1], across[::-1]
-    return ribbon(track, s, offsets, heights, colour, texture, metres, across)
+    return ribbon(track, s, offsets, heights, replace(material, across=across))
 
 
-def around(track: Track, every: float = 1.0) -> np.ndarray:
-    """Distances once round the whole track, the first point again at the end."""
-    return np.linspace(0, track.length, round(track.length / every) + 1)
+def whole_lap(track: Track, spacing: float = 1.0) -> np.ndarray:
+    """Return distances about `spacing` metres apart round the track, from the first point to the first point again."""
+    return np.linspace(0, track.length, round(track.length / spacing) + 1)
 
 
-def stretch(start: float, end: float, every: float = 1.0) -> np.ndarray:
-    return np.linspace(start, end, max(2, round((end - start) / every) + 1))
+def distances(start: float, end: float, spacing: float = 1.0) -> np.ndarray:
+    """Return distances along the track from start to end, in metres, about `spacing` apart."""
+    return np.linspace(start, end, max(2, round((end - start) / spacing) + 1))
 
 
-def plants(places: np.ndarray, heights: np.ndarray, widths: np.ndarray, colours: np.ndarray, texture, random) -> Mesh:
-    """Two crossed upright pictures at each of the places (n, 3); heights and widths (n,) in metres, colours
-    (n, 3)."""
+def plants(
+    places: np.ndarray,
+    heights: np.ndarray,
+    widths: np.ndarray,
+    colours: np.ndarray,
+    texture: np.ndarray,
+    random: np.random.Generator,
+) -> Mesh:
+    """Return two crossed upright images of a plant at each place.
+
+    places: (n, 3), the foot of each; heights, widths: (n,), metres; colours: (n, 3).
+    """
     turn = random.uniform(0, np.pi, len(places))[:, None] + np.array([0, np.pi / 2])
-    aside = (
-        np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1) * (widths / 2)[:, None, None]
-    )  # (n, 2, 3)
+    sideways = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)  # (n, 2, 3)
+    sideways = sideways * (widths / 2)[:, None, None]
     foot, up = places[:, None], np.zeros((len(places), 1, 3))
     up[:, 0, 2] = heights
-    corners = np.stack([foot - aside, foot + aside, foot + aside + up, foot - aside + up], axis=2)  # (n, 2, 4, 3)
+    corners = np.stack([foot - sideways, foot + sideways, foot + sideways + up, foot - sideways + up], axis=2)
     quads = 2 * len(places)
     faces = np.arange(quads)[:, None, None] * 4 + np.array([[0, 1, 2], [0, 2, 3]])
     uv = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), (quads, 1))
     return Mesh(corners.reshape(-1, 3), np.repeat(colours, 8, axis=0), uv, faces.reshape(-1, 3), texture)
 
 
-def boulder(centre, size, random, colour, texture, lumps: float = 0.15, detail: int = 9) -> Mesh:
-    """A lumpy ellipsoid; size: its half axes in metres."""
-    polar, turn = np.meshgrid(np.linspace(0, np.pi, detail), np.linspace(0, 2 * np.pi, 2 * detail), indexing="ij")
+def boulder(
+    centre: tuple[float, float, float],
+    half_axes: tuple[float, float, float],
+    random: np.random.Generator,
+    colour: Colour,
+    texture: np.ndarray,
+) -> Mesh:
+    """Return an uneven ellipsoid; lengths in metres."""
+    rows = 9
+    polar, turn = np.meshgrid(np.linspace(0, np.pi, rows), np.linspace(0, 2 * np.pi, 2 * rows), indexing="ij")
     waves = sum(
         random.normal() * np.cos(random.integers(1, 4) * turn + random.uniform(0, 6)) * np.sin(polar) ** 2
         for _ in range(5)
     )
-    radius = 1 + lumps * waves / 2
+    radius = 1 + 0.15 * waves / 2
     ball = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=-1)
-    points = (ball * radius[..., None] * np.array(size) + np.array(centre)).reshape(-1, 3)
+    points = (ball * radius[..., None] * np.array(half_axes) + np.array(centre)).reshape(-1, 3)
     uv = np.column_stack([turn.ravel() / np.pi * 2, -polar.ravel() / np.pi])
     faces = grid(*polar.shape)
     return Mesh(points, np.tile(np.array(colour, float), (len(points), 1)), uv, faces, texture)
 
 
-def box(centre, size, heading: float, colour, texture) -> Mesh:
-    """An upright box: centre of its foot, (length, width, height) in metres, its length along `heading`."""
-    length, width, height = size
+def box(
+    foot: tuple[float, float, float],
+    size: tuple[float, float, float],
+    heading: float,
+    colour: Colour,
+    texture: np.ndarray,
+) -> Mesh:
+    """Return an upright box without a bottom.
+
+    foot: centre of its base; size: length along `heading` (radians), width and height, metres.
+    """
     corner = np.array([[x, y, z] for z in (0, 1) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))])
     sides = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7))
-    points = corner[np.array(sides).ravel()] * (length, width, height)
+    points = corner[np.array(sides).ravel()] * size
     cos, sin = np.cos(heading), np.sin(heading)
     points[:, :2] = points[:, :2] @ np.array([[cos, sin], [-sin, cos]])
     faces = np.arange(5)[:, None, None] * 4 + np.array([[0, 1, 2], [0, 2, 3]])
     uv = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), (5, 1))
     return Mesh(
-        points + np.array(centre),
+        points + np.array(foot),
         np.tile(np.array(colour, float), (20, 1)),
         uv,
         faces.reshape(-1, 3),
@@ -152,8 +198,8 @@ def box(centre, size, heading: float, colour, texture) -> Mesh:
     )
 
 
-def together(meshes: list[Mesh]) -> Mesh:
-    """Meshes that share one texture, as one."""
+def merge(meshes: list[Mesh]) -> Mesh:
+    """Return one mesh of meshes that share a texture."""
     first = np.cumsum([0] + [len(mesh.points) for mesh in meshes[:-1]])
     return replace(
         meshes[0],

@@ -1,32 +1,38 @@
-"""Textures drawn from a seed: uint8 (rows, columns, 3 RGB or 4 RGBA). They are bright: the vertices carry the
-colours."""
+"""Procedural textures: uint8 (rows, columns, 3 RGB or 4 RGBA).
+
+They are bright and nearly grey, because the engine multiplies them with the meshes' colours.
+"""
 
 import cv2
 import numpy as np
+from numpy.random import Generator
+
+from simulator.scenery.shapes import Colour
 
 
-def noise(random, shape: tuple[int, int], blur: float) -> np.ndarray:
-    """Gaussian noise of unit variance that repeats at its edges, smoothed over `blur` pixels."""
-    grain = random.standard_normal(shape).astype(np.float32)
+def noise(random: Generator, shape: tuple[int, int], blur: float) -> np.ndarray:
+    """Return Gaussian noise of unit variance, smoothed over `blur` pixels, that tiles seamlessly."""
+    grain: np.ndarray = random.standard_normal(shape).astype(np.float32)
     if blur:
         edge = int(3 * blur) + 1
         grain = cv2.GaussianBlur(np.pad(grain, edge, mode="wrap"), (0, 0), blur)[edge:-edge, edge:-edge]
     return grain / grain.std()
 
 
-def clouds(random, size: int, coarsest: float, octaves: int = 5) -> np.ndarray:
-    """Noise of several scales, each half as strong as the one twice its size; zero mean, unit variance."""
-    total = sum(noise(random, (size, size), coarsest / 2**k) / 2**k for k in range(octaves))
+def clouds(random: Generator, size: int, coarsest: float, octaves: int = 5) -> np.ndarray:
+    """Return noise of zero mean and unit variance in octaves, each half as coarse and half as strong as the last."""
+    total = np.sum([noise(random, (size, size), coarsest / 2**k) / 2**k for k in range(octaves)], axis=0)
     return (total - total.mean()) / total.std()
 
 
 def grey(mean: float, *layers: np.ndarray) -> np.ndarray:
-    """A grey texture from a mean (0..1) and layers of deviations."""
+    """Return a grey texture from a mean, 0..1, and layers of deviations from it."""
     level = np.clip((mean + sum(layers)) * 255, 0, 255).astype(np.uint8)
     return np.repeat(level[..., None], 3, axis=2)
 
 
-def asphalt(random, size: int = 512, grain: float = 0.15, spots: float = 1.0) -> np.ndarray:
+def asphalt(random: Generator, size: int = 512, grain: float = 0.15, spots: float = 1.0) -> np.ndarray:
+    """Return asphalt; grain and spots scale the contrast of its fine and its coarse structure."""
     stones = noise(random, (size, size), 0.8)
     return grey(
         0.72,
@@ -37,36 +43,40 @@ def asphalt(random, size: int = 512, grain: float = 0.15, spots: float = 1.0) ->
     )
 
 
-def concrete(random, size: int = 128) -> np.ndarray:
+def concrete(random: Generator, size: int = 128) -> np.ndarray:
+    """Return one concrete slab with the joint to the next."""
     texture = grey(0.90, 0.02 * noise(random, (size, size), 1.5), 0.03 * noise(random, (size, size), 20))
-    texture[:2] = 160  # the joint between two slabs
+    texture[:2] = 160  # the joint
     return texture
 
 
 def kerb(size: int = 64) -> np.ndarray:
+    """Return one red and one white stripe of a kerb."""
     texture = np.full((size, size, 3), (250, 248, 240), np.uint8)
     texture[: size // 2] = (232, 100, 98)
     return texture
 
 
-def line() -> np.ndarray:
+def plain() -> np.ndarray:
+    """Return plain white."""
     return np.full((4, 4, 3), 255, np.uint8)
 
 
-def soil(random, size: int = 256) -> np.ndarray:
+def soil(random: Generator, size: int = 256) -> np.ndarray:
+    """Return soil or grass."""
     return grey(0.80, 0.07 * clouds(random, size, 24), 0.05 * noise(random, (size, size), 0.8))
 
 
-def rock(random, size: int = 256, streak: float = 6.0) -> np.ndarray:
-    """Streaked downwards, as the cliffs' stretched textures are; streak: how many times longer than wide."""
+def rock(random: Generator, size: int = 256, streak: float = 6.0) -> np.ndarray:
+    """Return rock with vertical streaks, as on the real cliffs; streak: their length relative to their width."""
     pad = 40
     grain = np.pad(random.standard_normal((size, size)).astype(np.float32), pad, mode="wrap")
     streaks = cv2.GaussianBlur(grain, (0, 0), 2, sigmaY=2 * streak)[pad:-pad, pad:-pad]
     return grey(0.74, 0.13 * streaks / streaks.std(), 0.06 * clouds(random, size, 24))
 
 
-def cobbles(random, size: int = 512, stones: int = 12) -> np.ndarray:
-    """Irregular setts, longer along the road (rows) than across it, with pale joints."""
+def cobbles(random: Generator, size: int = 512, stones: int = 12) -> np.ndarray:
+    """Return irregular cobbles, longer along the road (rows) than across it, with pale joints."""
     rows, columns = np.mgrid[0:size, 0:size].astype(np.float32)
     rows += 7 * noise(random, (size, size), 18)
     columns += 5 * noise(random, (size, size), 18)
@@ -80,8 +90,8 @@ def cobbles(random, size: int = 512, stones: int = 12) -> np.ndarray:
     return grey(0.0, level)
 
 
-def pine(random, size: int = 128, low: float = 0.62) -> np.ndarray:
-    """A pine on a bare trunk; low: where its branches end, 0 the top, 1 the ground."""
+def pine(random: Generator, size: int = 128, low: float = 0.62) -> np.ndarray:
+    """Return a pine; low: how far down its branches reach, from 0 at the top to 1 at the ground."""
     texture = np.zeros((size, size, 4), np.uint8)
     texture[:, :, :3] = 150
     middle = size // 2
@@ -104,8 +114,8 @@ def pine(random, size: int = 128, low: float = 0.62) -> np.ndarray:
     return texture
 
 
-def bush(random, size: int = 64) -> np.ndarray:
-    """Dark tufts along the ground."""
+def bush(random: Generator, size: int = 64) -> np.ndarray:
+    """Return a bush of dark tufts."""
     texture = np.zeros((size, size, 4), np.uint8)
     texture[:, :, :3] = 140
     for _ in range(6):
@@ -118,7 +128,8 @@ def bush(random, size: int = 64) -> np.ndarray:
     return texture
 
 
-def reeds(random, size: int = 64) -> np.ndarray:
+def reeds(random: Generator, size: int = 64) -> np.ndarray:
+    """Return a clump of reeds."""
     texture = np.zeros((size, size, 4), np.uint8)
     texture[:, :, :3] = 140
     for _ in range(60):
@@ -135,7 +146,8 @@ def reeds(random, size: int = 64) -> np.ndarray:
     return texture
 
 
-def palm(random, size: int = 128) -> np.ndarray:
+def palm(random: Generator, size: int = 128) -> np.ndarray:
+    """Return a palm on a bent trunk."""
     texture = np.zeros((size, size, 4), np.uint8)
     texture[:, :, :3] = 150
     crown = np.array([size * 0.52, size * 0.26])
@@ -164,8 +176,8 @@ def palm(random, size: int = 128) -> np.ndarray:
     return texture
 
 
-def sky(zenith, horizon, rows: int = 128) -> np.ndarray:
-    """Colours 0..1 at the top and at the bottom row."""
+def sky(zenith: Colour, horizon: Colour, rows: int = 128) -> np.ndarray:
+    """Return a vertical gradient from the zenith's colour in the top row to the horizon's in the bottom row."""
     part = np.linspace(0, 1, rows)[:, None, None]
     level = (1 - part) * np.array(zenith) + part * np.array(horizon)
     return np.repeat(level * 255, 8, axis=1).astype(np.uint8)

@@ -1,0 +1,169 @@
+"""The land around the lake: heights and soils beside the road, as read off frames of the real simulator."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cloning.road.track import LEFT, RIGHT, Section, Track
+from simulator.scenery import textures
+from simulator.scenery.looks import Palette
+from simulator.scenery.shapes import Light, Mesh, grid, illuminate
+
+CELL = 7.0  # m between the ground's points
+WATER_LEVEL = -1.2  # m
+CLIFF = Section(RIGHT, -45, 55)  # dark rock close to the road
+# Red earth beside the road
+EARTH = (
+    Section(RIGHT, -45, 110),
+    Section(RIGHT, 215, 440),
+    Section(LEFT, 220, 420),
+    Section(RIGHT, 560, 640),
+    Section(RIGHT, 843, 864),
+    Section(LEFT, 150, 240),
+)
+# Metres along the road and height in metres of the land 25 m beside it
+HEIGHTS_LEFT = (
+    (-20, 2),
+    (25, 3),
+    (60, 1.5),
+    (110, 2.5),
+    (135, -1),
+    (160, -3),
+    (215, -3),
+    (245, 2.5),
+    (300, 2.5),
+    (350, 1.5),
+    (420, 1),
+    (470, 0.5),
+    (500, -3),
+    (790, -3),
+    (805, 0.5),
+    (865, 2),
+    (905, 3),
+    (940, 2),
+    (960, -3),
+    (1018, -3),
+    (1032, 1.5),
+    (1085, 2),
+)
+HEIGHTS_RIGHT = (
+    (-60, 7),
+    (-40, 9),
+    (40, 9),
+    (62, 5),
+    (75, 2),
+    (110, 3),
+    (150, 7),
+    (200, 11),
+    (300, 14),
+    (420, 15),
+    (500, 13),
+    (535, 5),
+    (560, 0),
+    (585, -3),
+    (790, -3),
+    (805, 1),
+    (850, 1.5),
+    (880, 4),
+    (930, 6),
+    (958, 1.5),
+    (1000, 1.5),
+    (1024, 4),
+    (1075, 3.5),
+)
+
+
+def interpolate_round(table: tuple[tuple[float, float], ...], s: np.ndarray, length: float) -> np.ndarray:
+    """Interpolate a table of (s, value) at distances s along a closed track of this length."""
+    known, value = np.array(table, float).T
+    return np.interp(s, np.r_[known - length, known, known + length], np.tile(value, 3))
+
+
+def in_sections(sections: Iterable[Section], s: np.ndarray, side: np.ndarray, length: float) -> np.ndarray:
+    """Return for each s and side whether it lies in one of the sections of a closed track of this length."""
+    inside = np.zeros(np.shape(s), bool)
+    for section in sections:
+        inside |= (side == section.side) & ((s - section.start) % length <= section.end - section.start)
+    return inside
+
+
+class LakeTerrain:
+    """The height of the ground and the nearest road as functions of the position."""
+
+    def __init__(self, track: Track, random: np.random.Generator, relief: float = 1.0, shift: float = 0.0):
+        """relief: factor of the heights; shift: metres by which the land is shifted back along the road."""
+        self.track, self.relief, self.shift = track, relief, shift
+        self.tree = cKDTree(track.points[:, :2])
+        self.rolling = textures.clouds(random, 256, 24, 5)  # one metre of height a unit, 4 m a pixel
+
+    def nearest_road(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return, for positions (n, 2), the distance to the centre line, the s of the land's tables, and the side."""
+        distance, nearest = self.tree.query(positions)
+        right = np.einsum("ij,ij->i", positions - self.track.points[nearest, :2], self.track.rightward[nearest])
+        return distance, (nearest * self.track.step + self.shift) % self.track.length, np.where(right < 0, LEFT, RIGHT)
+
+    def height(self, positions: np.ndarray) -> np.ndarray:
+        """Return the heights, (n,) metres above the road, at positions (n, 2)."""
+        distance, s, side = self.nearest_road(positions)
+        length = self.track.length
+        left, right = (interpolate_round(table, s, length) for table in (HEIGHTS_LEFT, HEIGHTS_RIGHT))
+        near = np.where(side == LEFT, left, right)
+        near = np.where(near > 0, self.relief * near, near)
+        cliff = in_sections((CLIFF,), s, side, length)
+        rise = np.clip((distance - np.where(cliff, 15, 9)) / np.where(cliff, 6, 22), 0, 1)
+        rise = rise * rise * (3 - 2 * rise)
+        row, column = (np.floor(positions / 4).astype(int) % 256).T
+        roll = self.rolling[row, column]
+        far = np.clip((distance - 35) / 90, 0, 1)
+        beyond = self.relief * np.where(near > 2.5, 14 + 9 * roll, 1.5 + 4 * roll) if len(positions) else roll
+        lake = (side == LEFT) & (distance > 40)
+        beyond = np.where(lake, -3 + 2.2 * roll, beyond)
+        z = near * rise * (1 + 0.15 * roll) + np.where(lake, (beyond - near) * far, np.maximum(beyond, 0) * far * 0.8)
+        z = np.where(near < 0, np.where(distance > 60, z + 2.2 * far * (side == RIGHT), z), z)
+        return np.where(distance < 8.5, -0.15, z + 0.02)
+
+
+def ground(
+    terrain: LakeTerrain, random: np.random.Generator, light: Light, palette: Palette, soil: np.ndarray
+) -> list[Mesh]:
+    """Return a fine sheet of ground near the road and a coarse one, slightly lower, farther away."""
+    tone = textures.clouds(random, 256, 12, 4)
+    points_2d, length = terrain.track.points[:, :2], terrain.track.length
+    low, high = points_2d.min(axis=0) - 230, points_2d.max(axis=0) + 230
+    sheets = []
+    for cell, nearest, farthest, lower in ((CELL, 0, 66, 0.0), (2.5 * CELL, 48, 400, 0.4)):
+        xs, ys = (np.arange(a, b, cell) for a, b in zip(low, high, strict=True))
+        positions = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+        distance, s, side = terrain.nearest_road(positions)
+        points = np.c_[positions, terrain.height(positions) - lower]
+        sheet = Mesh(points, np.ones_like(points), positions / 14.0, grid(len(ys), len(xs)), soil)
+        flatness = illuminate(sheet, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), face_up=True).colours[:, :1]
+        steep = np.clip((0.93 - flatness) * 6, 0, 1)
+        patch = tone[tuple((np.floor(positions / 5).astype(int) % 256).T)][:, None]
+        green = 0.35 * np.clip(0.5 + 0.35 * patch, 0, 1)
+        colour = np.array(palette["grass"]) * (1 - green) + np.array(palette["green"]) * green
+        earth = in_sections(EARTH, s, side, length) & (distance < 30)
+        colour = np.where(earth[:, None], np.array(palette["earth"]), colour)
+        colour = colour * (1 - steep) + np.array(palette["sand"]) * (1 + 0.10 * patch) * steep
+        cliff = in_sections((CLIFF,), s, side, length) & (distance > 14) & (distance < 32)
+        sheet.colours[:] = np.where(cliff[:, None], np.array(palette["cliff"]), colour)
+        corners = distance[sheet.faces]
+        visible = (points[sheet.faces, 2].max(axis=1) > WATER_LEVEL - 0.4) & (corners.max(axis=1) > nearest)
+        visible &= corners.min(axis=1) < farthest
+        sheets.append(replace(illuminate(sheet, light, face_up=True), faces=sheet.faces[visible]))
+    return sheets
+
+
+def water(random: np.random.Generator, palette: Palette) -> Mesh:
+    """Return the lake's surface."""
+    side = np.linspace(-760, 760, 27)
+    flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    return Mesh(
+        np.c_[flat, np.full(len(flat), WATER_LEVEL)],
+        np.tile(np.array(palette["water"]), (len(flat), 1)),
+        flat / 40,
+        grid(27, 27),
+        textures.grey(0.97, 0.02 * textures.noise(random, (64, 64), 3)),
+    )
