@@ -20,12 +20,3 @@ def write(path: Path, data: bytes) -> None:
     except OSError as error:
         beside.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(path)) from error
-
-
-def set_aside(*files: Path) -> None:
-    """Keep an earlier run's models under -previous."""
-    for path in files:
-        if path.exists():
-            previous = path.with_stem(f"{path.stem}-previous")
-            os.replace(path, previous)
-            print(f"{path} of an earlier run is now {previous}")

@@ -6,7 +6,7 @@ from conftest import ROOT
 
 from cloning.recordings.log import logs_below, read_recording
 from cloning.replay.views import Views
-from cloning.road import camera, motion
+from cloning.road import camera, motion, warp
 
 REAL = sorted(path.parent for path in logs_below(ROOT / "data"))
 
@@ -25,7 +25,7 @@ def ground_picture(right: float, forward: float, yaw: float) -> np.ndarray:
 
 @pytest.mark.parametrize("pose", [(0.8, 0, 0), (-1.2, 0, 0), (0, 1.5, 0), (0, 0, 0.1), (0.9, 0.5, -0.12)])
 def test_a_warped_frame_is_what_is_seen_from_there(pose):
-    made, seen = camera.warp(ground_picture(0, 0, 0), *pose)
+    made, seen = warp.warp(ground_picture(0, 0, 0), *pose)
     expected = ground_picture(*pose)
     near = seen & (np.arange(160) > 72)[:, None]  # further away the stripes are finer than pixels
     assert near[75:135].mean() > 0.6
@@ -34,15 +34,15 @@ def test_a_warped_frame_is_what_is_seen_from_there(pose):
 
 
 def test_unseen_is_told_and_the_bonnet_is_no_road():
-    _, seen = camera.warp(np.zeros((160, 320, 3), np.uint8), 0, 0, 0)
+    _, seen = warp.warp(np.zeros((160, 320, 3), np.uint8), 0, 0, 0)
     assert seen[2:134, 2:-2].all() and not seen[136:].any()
-    _, seen = camera.warp(np.zeros((160, 320, 3), np.uint8), 1.5, 0, 0)  # to the right: its right is unknown
+    _, seen = warp.warp(np.zeros((160, 320, 3), np.uint8), 1.5, 0, 0)  # to the right: its right is unknown
     assert not seen[120, 300] and seen[120, 20]
 
 
 def test_the_ground_is_projected_where_it_is_warped_from():
     """A point 10 m ahead and 2 m to the right is seen in the middle of the road from 2 m to the right."""
-    near, far = camera.project(np.array([2.0, 0.0]), np.array([10.0, 10.0]))
+    near, far = camera.project_ground(np.array([2.0, 0.0]), np.array([10.0, 10.0]))
     ground, _ = camera.homographies(2, 0, 0)
     moved = ground @ [*near, 1]
     assert moved[:2] / moved[2] == pytest.approx(far, abs=1e-9)
@@ -101,7 +101,7 @@ def test_a_real_centre_frame_warped_to_the_side_cameras_is_theirs(folder):
     for at in straight:
         for which, side in ((1, camera.CAMERA_OFFSETS["left"]), (2, camera.CAMERA_OFFSETS["right"])):
             truth, before = views.frame(int(at), which).astype(int), views.frame(int(at), 0).astype(int)
-            made, seen = camera.warp(views.frame(int(at), 0), side, 0, 0)
+            made, seen = warp.warp(views.frame(int(at), 0), side, 0, 0)
             road = seen & (np.arange(160) >= 66)[:, None]
             gains.append(np.abs(before - truth)[road].mean() / np.abs(made.astype(int) - truth)[road].mean())
     assert np.median(gains) > 1.4

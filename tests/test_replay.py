@@ -12,7 +12,7 @@ import pytest
 import torch
 from conftest import ROOT, draw_recording
 
-from cloning.lane.reader import Lane
+from cloning.lane.reader import LanePosition
 from cloning.pilot.network import Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
@@ -91,7 +91,7 @@ def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
     """The human drives 0.8 m right of the lane's centre: an echo is off by as much, and set back beyond a limit."""
     offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
     trusted = np.ones(len(recording), bool)
-    monkeypatch.setattr("cloning.lane.place.read_lane", lambda *_: Lane(offset, yaw, trusted))
+    monkeypatch.setattr("cloning.lane.place.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
     references = replay.references(recording)
     done = replay.drive(recording, references, 1.0, lambda moment: moment.human)
     assert not done.interventions and done.distance == pytest.approx(np.full(300, 0.8))

@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
+from unittest import mock
 
 from cloning.compute import keep_freed_memory, threads
 from cloning.errors import UserError
@@ -52,9 +53,9 @@ def begin(folders: list[str], samples: int, output: Path) -> "model.TrainingRun"
     """Prepare a run of model.py on these folders, without training."""
     import model
 
-    arguments, given = model.parse([*folders, "--samples-per-epoch", str(samples), "--output", str(output)])
-    training, validation, _ = model.prepare(arguments, given)
-    return model.Run(arguments, training, validation)
+    options = ["--samples-per-epoch", str(samples), "--epochs", "1", "--output", str(output)]
+    arguments, training, validation, _ = model.prepare(*model.parse([*folders, *options]))
+    return model.TrainingRun(arguments, training, validation)
 
 
 def flops(network: "Network") -> int:
@@ -80,12 +81,12 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
 
     So other load on the machine affects both equally.
     """
-    bare, draw_pictures, turns = run.generator.begin(0)(), run.draw_pictures, itertools.count(1)
+    bare, write_pictures, turns = run.generator.begin(0)(), run.write_pictures, itertools.count(1)
     spent, steps = 0.0, 0
 
     def between_batches() -> None:
         nonlocal spent, steps
-        draw_pictures()
+        write_pictures()
         if next(turns) % 4 == 0:
             run.pool.submit(int).result()  # wait for the next batch's images, whose time belongs to (a)
             started = time.perf_counter()
@@ -95,11 +96,11 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
             synchronize(run.device)
             spent, steps = spent + time.perf_counter() - started, steps + 1
 
-    run.draw_pictures, run.arguments.epochs = between_batches, 1
     started = time.perf_counter()
-    run.train()
+    with mock.patch.object(run, "write_pictures", between_batches):
+        run.train()
     whole = time.perf_counter() - started - spent
-    return {"a": run.history[0]["images"] / whole, "b": steps * bare.total / spent}
+    return {"a": run.progress.history[0]["images"] / whole, "b": steps * bare.total / spent}
 
 
 def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray", "np.ndarray"]:
@@ -110,14 +111,15 @@ def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray",
     import numpy as np
 
     from cloning.recordings.format import FRAME
-    from model import CROP, of_each_kind
+    from model import CROP, augment, of_each_kind
 
-    drawn, images, angles = generator.draw(number), [], []
-    for i, (at, camera) in enumerate(zip(drawn["observation"], drawn["camera"], strict=True)):
+    choices, images, angles = generator.sample(number), [], []
+    for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
         cropped = generator.observations.read(at, camera)[None, CROP[0] : FRAME[0] - CROP[1]]
-        for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), of_each_kind(cropped), CROP[0])):
-            images += list(made)
-            angles += [drawn["angles"][i, kind]] * len(which)
+        augmented = augment(choices, np.array([i]), of_each_kind(cropped), CROP[0])
+        for kind, (rows, kind_images) in enumerate(augmented):
+            images += list(kind_images)
+            angles += [choices.views.labels[i, kind]] * len(rows)
     return np.stack(images), np.array(angles)
 
 
@@ -125,14 +127,16 @@ def part_c(run: "model.TrainingRun", steps: int) -> dict[str, float]:
     """Measure (c), a typical training loop."""
     import torch
 
-    network = run.network.to(memory_format=torch.contiguous_format)
+    network = run.network
+    for parameter in network.parameters():
+        parameter.data = parameter.data.contiguous()  # model.py has them channels last
     torch.set_num_threads(threads())
     optimizer = torch.optim.Adam(network.parameters(), 1e-4)
     numbers = iter(range(1000))
 
     def step() -> None:
-        made, angles = one_by_one(run.generator, next(numbers))
-        frames = torch.from_numpy(made).to(run.device)
+        images, angles = one_by_one(run.generator, next(numbers))
+        frames = torch.from_numpy(images).to(run.device)
         x = (frames.permute(0, 3, 1, 2).float() / 127.5 - 1).contiguous()
         for convolution in network.convolutions:
             x = torch.nn.functional.elu(convolution(x))

@@ -2,8 +2,8 @@
 
     python -m tools.likeness data/lake-ccw --picture side_by_side.png
 
-`roads.py` tells where on a known road a real recording was driven, and the car is drawn at the same places. Of every
-camera: mean colour, brightness by rows, and where the lake's inner yellow lines lie, in columns from where flat
+`cloning/lane/place.py` tells where on a known road a real recording was driven, and the car is drawn at the same
+places. Of every camera: mean colour, brightness by rows, and where the lake's inner yellow lines lie, in columns from where flat
 geometry has them.
 """
 
@@ -13,13 +13,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cloning.lane.place import known
-from cloning.lane.reader import see
+from cloning.lane.place import localise_all
+from cloning.lane.reader import detect_centres
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
-from cloning.road.camera import CAMERA_OFFSETS, project
-from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, stretches
+from cloning.road.camera import CAMERA_OFFSETS, camera_position, project_ground
+from cloning.road.motion import REAR_AXLE, stretches
 from cloning.road.track import Place, Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
@@ -33,7 +33,7 @@ AROUND = np.arange(-14, 14.1, 0.5)  # columns
 
 
 def axle(track: Track, place: np.ndarray) -> tuple[Place, np.ndarray]:
-    """The rear axle's middle at a place as `roads.Placed` has it, with the car's heading, and the way it points."""
+    """The rear axle's middle at a place as `place.Localisation` has it, with the car's heading, and the way it points."""
     s, right, yaw = place
     at = track.at(s, right)
     heading = at.heading - yaw
@@ -44,11 +44,11 @@ def line_columns(track: Track, place: np.ndarray, aside: float, camera: str, row
     """Where flat geometry has the line `aside` metres left of the centre line, in some rows: columns, or nan."""
     at, forward = axle(track, place)
     right = np.array([forward[1], -forward[0]])
-    eye = (at.x, at.y) + AXLE_TO_CAMERA * forward + CAMERA_OFFSETS[camera] * right
+    eye = camera_position(np.array([at.x, at.y]), forward, CAMERA_OFFSETS[camera])
     near = (round(place[0] / track.step) + np.arange(45)) % len(track.points)
     away = track.points[near, :2] - aside * track.rightward[near] - eye
     ahead = away @ forward
-    seen = project(away[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
+    seen = project_ground(away[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
     return np.interp(rows, seen[:, 1], seen[:, 0], left=np.nan, right=np.nan)
 
 
@@ -78,18 +78,18 @@ def main():
     parser.add_argument("--picture", help="write frames side by side: real above, drawn below")
     args = parser.parse_args()
     recording = read_recording(args.recording)
-    drives = list(known(stretches(recording), see(recording)))
+    drives = list(localise_all(stretches(recording), detect_centres(recording)))
     if not drives:
         raise SystemExit(f"{args.recording}: not found on a known road")
     rows, found = max(drives, key=lambda one: one[0].stop - one[0].start)
     track, name = found.track, found.track.name
     print(f"{name}, {track.direction}, {rows.stop - rows.start} rows")
-    chosen = np.linspace(0, len(found.place) - 1, args.frames).astype(int)
+    chosen = np.linspace(0, len(found.states) - 1, args.frames).astype(int)
     run, cameras = Run(track), Cameras(Scene(scenery.build(name)))
     real, drawn = [], []
     for i in chosen:
         real.append([decode(recording.path(rows.start + i, camera).read_bytes()) for camera in range(3)])
-        at, forward = axle(track, found.place[i])
+        at, forward = axle(track, found.states[i])
         x, y = (at.x, at.y) + REAR_AXLE * forward
         run.car.place(Place(x, y, at.z + REAR_AXLE * at.grade, at.heading, at.grade))
         run.car.settle()
@@ -115,7 +115,7 @@ def main():
         for c, camera in enumerate(CAMERAS):
             for side, aside in (("left", LINE), ("right", -LINE)):
                 for band in BANDS:
-                    columns = [line_columns(track, found.place[i], aside, camera, band) for i in chosen]
+                    columns = [line_columns(track, found.states[i], aside, camera, band) for i in chosen]
                     pair = [line_profile(frames[:, c], columns, band) for frames in (real, drawn)]
                     print(
                         f"{f'{camera}, {side} line, row {band[len(band) // 2]}':28}"

@@ -76,10 +76,10 @@ def references(recording: Recording, by_lane: bool = True) -> list[Reference]:
     """The stretches to be driven, without those where the human is off the road, and what counts as their centre."""
     found, whole = [], stretches(recording)
     if by_lane:
-        from cloning.lane.place import read_lane  # which loads torch
+        from cloning.lane.place import estimate_lane_position  # which loads torch
 
-        lane = read_lane(recording, whole)
-        offset, yaw, trusted = lane.offset, lane.yaw, lane.trusted
+        lane = estimate_lane_position(recording, whole)
+        offset, yaw, trusted = lane.lateral_offset, lane.heading_error, lane.trusted
     else:
         offset = yaw = trusted = np.zeros(len(recording))
     for stretch in whole:

@@ -6,8 +6,9 @@ import numpy as np
 
 from cloning.recordings.images import decode
 from cloning.recordings.log import Recording
-from cloning.road.camera import BONNET_ROW, CAMERA_OFFSETS, EARLIER_FRAME, warp
-from cloning.road.motion import AXLE_TO_CAMERA, Stretch
+from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, FIRST_BONNET_ROW, camera_position
+from cloning.road.motion import AXLE_TO_CAMERA, Stretch, components, forward_vector, right_of
+from cloning.road.warp import warp
 
 
 class Views:
@@ -40,30 +41,26 @@ class Views:
         uint8 (160, 320, 3), RGB.
         """
         heading = self.heading[at]
-        eye = np.array(
-            [
-                self.right[at] + right * np.cos(heading) + AXLE_TO_CAMERA * np.sin(heading + yaw),
-                self.forward[at] - right * np.sin(heading) + AXLE_TO_CAMERA * np.cos(heading + yaw),
-            ]
-        )
+        axle = self._axle(at) + right * right_of(forward_vector(heading))
+        eye = camera_position(axle, forward_vector(heading + yaw))
         beside = right + AXLE_TO_CAMERA * np.sin(yaw)
         camera = int(np.argmin([abs(beside - side) for side in CAMERA_OFFSETS.values()]))
         made, seen = self._warped(at, camera, eye, heading + yaw)
         earlier = int(np.searchsorted(self.driven, self.driven[at] - EARLIER_FRAME, "right")) - 1
-        missing = (~seen[:BONNET_ROW]).nonzero()
+        missing = (~seen[:FIRST_BONNET_ROW]).nonzero()
         if earlier >= 0 and len(missing[0]):
             top, left, bottom, end = *np.min(missing, axis=1), *(np.max(missing, axis=1) + 1)
             before, _ = self._warped(earlier, camera, eye, heading + yaw, (top, bottom, left, end))
             part = made[top:bottom, left:end]
             np.copyto(part, before, where=~seen[top:bottom, left:end, None])
-        made[BONNET_ROW:] = self.frame(at, 0)[BONNET_ROW:]
+        made[FIRST_BONNET_ROW:] = self.frame(at, 0)[FIRST_BONNET_ROW:]
         return made
 
+    def _axle(self, at: int) -> np.ndarray:
+        """The rear axle's middle, float64 (2,): m to the right and forward in the stretch's frame."""
+        return np.array([self.right[at], self.forward[at]])
+
     def _warped(self, at: int, camera: int, eye: np.ndarray, heading: float, *box):
-        s, c = np.sin(self.heading[at]), np.cos(self.heading[at])
-        side = list(CAMERA_OFFSETS.values())[camera]
-        stands = np.array(
-            [self.right[at] + AXLE_TO_CAMERA * s + side * c, self.forward[at] + AXLE_TO_CAMERA * c - side * s]
-        )
-        away = eye - stands
-        return warp(self.frame(at, camera), away @ (c, -s), away @ (s, c), heading - self.heading[at], *box)
+        along = forward_vector(self.heading[at])
+        away = eye - camera_position(self._axle(at), along, list(CAMERA_OFFSETS.values())[camera])
+        return warp(self.frame(at, camera), *components(away, along), heading - self.heading[at], *box)
