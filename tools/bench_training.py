@@ -25,6 +25,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
+from unittest import mock
 
 from cloning.compute import keep_freed_memory, threads
 from cloning.errors import UserError
@@ -95,9 +96,9 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
             synchronize(run.device)
             spent, steps = spent + time.perf_counter() - started, steps + 1
 
-    run.write_pictures = between_batches  # type: ignore[method-assign]
     started = time.perf_counter()
-    run.train()
+    with mock.patch.object(run, "write_pictures", between_batches):
+        run.train()
     whole = time.perf_counter() - started - spent
     return {"a": run.progress.history[0]["images"] / whole, "b": steps * bare.total / spent}
 
@@ -115,9 +116,10 @@ def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray",
     choices, images, angles = generator.sample(number), [], []
     for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
         cropped = generator.observations.read(at, camera)[None, CROP[0] : FRAME[0] - CROP[1]]
-        for kind, (which, augmented) in enumerate(augment(choices, np.array([i]), of_each_kind(cropped), CROP[0])):
-            images += list(augmented)
-            angles += [choices.views.labels[i, kind]] * len(which)
+        augmented = augment(choices, np.array([i]), of_each_kind(cropped), CROP[0])
+        for kind, (rows, kind_images) in enumerate(augmented):
+            images += list(kind_images)
+            angles += [choices.views.labels[i, kind]] * len(rows)
     return np.stack(images), np.array(angles)
 
 
@@ -126,14 +128,15 @@ def part_c(run: "model.TrainingRun", steps: int) -> dict[str, float]:
     import torch
 
     network = run.network
-    network.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]  # not in the stubs
+    for parameter in network.parameters():
+        parameter.data = parameter.data.contiguous()  # model.py has them channels last
     torch.set_num_threads(threads())
     optimizer = torch.optim.Adam(network.parameters(), 1e-4)
     numbers = iter(range(1000))
 
     def step() -> None:
-        made, angles = one_by_one(run.generator, next(numbers))
-        frames = torch.from_numpy(made).to(run.device)
+        images, angles = one_by_one(run.generator, next(numbers))
+        frames = torch.from_numpy(images).to(run.device)
         x = (frames.permute(0, 3, 1, 2).float() / 127.5 - 1).contiguous()
         for convolution in network.convolutions:
             x = torch.nn.functional.elu(convolution(x))
