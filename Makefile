@@ -1,44 +1,48 @@
 # make test   install what is needed into .venv, check the style, run the tests
-# make lint   the style alone
-# make demo   record, train and drive a lap in the stand-in simulator: about 15 minutes on 2 cores; stop it, run it again
+# make lint   check only the style, the types and the direction of the imports
+# make demo   record, train and drive a lap in the stand-in simulator: about 15 minutes on 2 cores. To continue after an
+#             interruption, run it again.
 
 PYTHON ?= python3
 BIN = .venv/bin
-# Debian's python3 lacks the means to make a virtual environment, and panda3d's wheel libX11 (no screen is needed).
+# Debian's python3 comes without ensurepip, which venv needs, and panda3d's wheel needs libX11 even without a screen.
 APT = ./.ci/apt
 
 test: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2
 
 lint: .venv/installed
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 
-# The stamp is written last, so that a broken install is begun anew.
-.venv/installed: requirements.txt
+# The stamp is written last, so that an interrupted installation is repeated.
+.venv/installed: requirements.txt requirements-dev.txt
 	@$(PYTHON) -c "import ensurepip" 2>/dev/null || $(APT) python3-venv
-	@ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
+	@[ "$$(uname)" != Linux ] || PATH="$$PATH:/sbin" ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	touch $@
 
 demo: demo/lap.json
-	@echo "demo/: model.pt, training_loss.png, lap.json, lap.png (the way driven), lap.mp4 (the film)"
+	@echo "demo/ holds model.pt, training_loss.png, lap.json (report), lap.png (trajectory) and lap.mp4 (film)"
 
-# A step that was stopped begins anew, but training goes on where it was.
+# An interrupted recording starts again; an interrupted training run continues.
 demo/recorded: .venv/installed
-	@echo "1 of 3: an expert drives a lap of the lake in each direction and is recorded (1 to 2 minutes)"
+	@echo "1 of 3: record an expert that drives a lap of the lake track in each direction (1 to 2 minutes)"
 	rm -rf demo/data
 	$(BIN)/python -m simulator record demo/data/lake-ccw --track lake --direction ccw
 	$(BIN)/python -m simulator record demo/data/lake-cw --track lake --direction cw
 	touch $@
 
 demo/trained: demo/recorded
-	@echo "2 of 3: ten epochs of training (10 to 12 minutes)"
+	@echo "2 of 3: train for ten epochs (10 to 12 minutes)"
 	$(BIN)/python model.py demo/data --output demo/model.pt --resume
 	touch $@
 
 demo/lap.json: demo/trained
-	@echo "3 of 3: drive.py drives a lap of the lake at 9 mph (2 minutes)"
+	@echo "3 of 3: drive a lap of the lake track at 9 mph with drive.py (2 minutes)"
 	$(BIN)/python drive.py demo/model.pt & server=$$!; trap "kill $$server" EXIT; \
 	$(BIN)/python -m simulator drive --track lake --report $@ --picture demo/lap.png --film demo/lap.mp4
 

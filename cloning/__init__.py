@@ -1,1 +1,1 @@
-"""Learning to drive from recordings: everything but the commands and the stand-in simulator."""
+"""Behavioral cloning: everything that training, driving and replaying need, apart from the three commands."""

@@ -19,3 +19,7 @@ class FolderError(UserError):
 
 class SimulatorError(UserError):
     """The stand-in simulator, its window or its server cannot go on."""
+
+
+class OutputError(UserError):
+    """A file that the user asked for and that cannot be written."""

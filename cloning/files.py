@@ -1,31 +1,44 @@
-"""Files that are whole or not there: written beside their place and renamed."""
+"""Write files so that they are either complete or absent: under a temporary name first, renamed at the end."""
 
+import errno
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
-def write(path: Path, data: bytes) -> None:
-    """Write a file beside its place and rename it there, so that a kill leaves the old file or the new one, whole.
+@contextmanager
+def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]:
+    """Yield a temporary path in the same folder and rename it to `path` when the block ends without an exception.
 
-    Raises OSError with the file's name (a full disk, say); the old file stays.
+    A process killed at any time leaves the old file or the new one, complete. After an exception the temporary file
+    is deleted and the old file stays. The block writes and closes the temporary file (which is called `.NAME.part`);
+    if it writes nothing, an existing `path` stays as it is.
+
+    per_process: several processes may write this file at the same time; the last one wins.
+    Raises OSError with the name `path`, not the temporary one, for example when the disk is full.
     """
     path = Path(path)
-    beside = path.with_name(f".{path.name}.part")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part" if per_process else f".{path.name}.part")
     try:
-        with open(beside, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        yield temporary
+        if temporary.exists():
+            os.replace(temporary, path)
+    except BaseException as error:
+        with suppress(OSError):  # the reason why it could not be written matters more
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(temporary), temporary):
+            reason = error.strerror or str(error)  # NumPy raises OSError with a text alone
+            raise OSError(error.errno or errno.EIO, reason, str(path)) from error
+        raise
 
 
-def set_aside(*files: Path) -> None:
-    """Keep an earlier run's models under -previous."""
-    for path in files:
-        if path.exists():
-            previous = path.with_stem(f"{path.stem}-previous")
-            os.replace(path, previous)
-            print(f"{path} of an earlier run is now {previous}")
+def write(path: str | Path, data: bytes) -> None:
+    """Write a file completely or not at all, and wait until it is on the disk.
+
+    Raises OSError with the file's name (a full disk, for example); the old file stays.
+    """
+    with written_whole(path) as temporary, open(temporary, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,46 +1,108 @@
-"""Films: H.264 in an mp4 file, whole or not there."""
+"""Write films: H.264 in mp4 files that are either complete or absent."""
 
+import contextlib
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cloning.errors import OutputError
+from cloning.files import written_whole
+
+if TYPE_CHECKING:
+    from av.video.stream import VideoStream
+
 
 class FilmWriter:
-    """An mp4 film being written: H.264 in yuv420p, which browsers and desktop players play.
+    """Writes an mp4 film: H.264 in yuv420p, which browsers and desktop players show.
 
-    PyAV's wheel brings FFmpeg's libraries with x264: no program to install, and the film is finished or an error.
+    PyAV's wheel contains FFmpeg's libraries with x264, so there is no program to install. Use one writer from one
+    thread only. After an error the unfinished film is deleted at once.
     """
 
-    def __init__(self, path: Path, rate: Fraction | int, quality: int = 18, preset: str = "medium"):
-        """rate: frames a second; quality: x264's crf, less is better; preset: x264's. Raises OSError."""
+    def __init__(self, path: str | Path, rate: Fraction | int, quality: int = 18, preset: str = "medium"):
+        """Open the film; it appears at `path` when it is closed.
+
+        rate: frames per second; quality: x264's crf, less is better; preset: x264's. Raises OSError.
+        """
         import av  # large, and needed only here
 
         self.path, self.rate, self.av = Path(path), rate, av
         self.options = {"crf": str(quality), "preset": preset}
-        self.beside = self.path.with_name(f".{self.path.name}.part")
-        self.beside.touch()  # PyAV itself opens the file only for the first frame
-        self.container = av.open(str(self.beside), "w", format="mp4", options={"movflags": "faststart"})
-        self.stream = None
+        self.stream: VideoStream | None = None
+        self._place = contextlib.ExitStack()  # renames the temporary file when it is closed
+        self.temporary = self._place.enter_context(written_whole(path))
+        try:
+            self.temporary.touch()  # PyAV opens the file only for the first frame
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        self.container = av.open(str(self.temporary), "w", format="mp4", options={"movflags": "faststart"})
 
     def add(self, frame: np.ndarray) -> None:
-        """A frame, uint8 (rows, columns, 3), RGB, of the first one's size."""
-        # yuv420p halves the colour's resolution, so both sides are even
+        """Append a frame, uint8 (rows, columns, 3), RGB, of the first frame's size. Raises OSError."""
+        # Each side is even, because yuv420p halves the resolution of colour.
         frame = np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
-        if self.stream is None:
-            self.stream = self.container.add_stream("libx264", self.rate, options=self.options)
-            self.stream.pix_fmt, self.stream.height, self.stream.width = "yuv420p", *frame.shape[:2]
-        self.container.mux(self.stream.encode(self.av.VideoFrame.from_ndarray(frame, "rgb24")))
+        with self._discarded_on_error():
+            if self.stream is None:
+                self.stream = self.container.add_stream("libx264", self.rate, options=self.options)
+                self.stream.pix_fmt, self.stream.height, self.stream.width = "yuv420p", *frame.shape[:2]
+            self.container.mux(self.stream.encode(self.av.VideoFrame.from_ndarray(frame, "rgb24")))
 
     def close(self) -> None:
-        """Put the finished film in its place; without a frame there is none."""
-        if self.stream:
+        """Finish the film and move it to its path; without a frame there is no film. Raises OSError."""
+        if self.stream is None:
+            self.discard()
+            return
+        with self._discarded_on_error():
             self.container.mux(self.stream.encode(None))
-        self.container.close()
-        if self.stream:
-            self.beside.replace(self.path)
-        self.discard()
+            self.container.close()
+        self._place.close()
 
     def discard(self) -> None:
-        """Leave no film."""
-        self.beside.unlink(missing_ok=True)
+        """Delete the unfinished film; a finished one stays."""
+        with contextlib.suppress(OSError):  # the disk may be too full for the end of the file
+            self.container.close()
+        self.temporary.unlink(missing_ok=True)
+        self._place.close()
+
+    @contextlib.contextmanager
+    def _discarded_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            self.discard()
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
+
+
+class DriveFilm:
+    """A film of a drive, which continues when the film cannot be: the error is raised at the end, by `close`."""
+
+    def __init__(self, path: str, rate: int, quality: int):
+        """Open the film; rate: frames per second; quality: x264's crf. Raises OutputError."""
+        self.path = path
+        self.error: OSError | None = None
+        try:
+            # A film of a drive is for looking at; with the preset "medium" encoding would take longer than driving.
+            self.writer = FilmWriter(path, rate, quality, preset="veryfast")
+        except OSError as error:
+            raise OutputError(f"{path}: {error.strerror}; give a place where a film can be written") from error
+
+    def add(self, frame: np.ndarray) -> None:
+        """Append a frame, uint8 (rows, columns, 3), RGB; after an error, do nothing."""
+        if self.error is None:
+            try:
+                self.writer.add(frame)
+            except OSError as error:
+                self.error = error
+
+    def close(self) -> None:
+        """Finish the film. Raises OutputError if it could not be written; no part of it is left then."""
+        try:
+            if self.error:
+                raise self.error
+            self.writer.close()
+        except OSError as error:
+            remedy = "free some disk space, or leave out the film"
+            raise OutputError(f"{self.path}: {error.strerror}; no film was written: {remedy}") from error

@@ -1,15 +1,22 @@
-"""What a user gets: python -m simulator record, drive, window, replay."""
+"""The simulator's commands: python -m simulator record, drive, replay, window."""
 
 import argparse
+import functools
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from cloning.errors import RecordingError, SimulatorError
+from cloning.errors import UserError
+from cloning.outputs import check_folders, run_all, write_json
+from cloning.replay.autonomy import LIMITS
 from cloning.road.track import ROADS, Track
+
+if TYPE_CHECKING:
+    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
 
 def positive(text: str) -> float:
+    """Parse a number above 0."""
     value = float(text)
     if not 0 < value < 1e6:
         raise argparse.ArgumentTypeError("must be above 0")
@@ -17,32 +24,41 @@ def positive(text: str) -> float:
 
 
 def mph(text: str) -> float:
+    """Parse a set speed."""
     value = float(text)
     if not 1 <= value <= 30:
-        raise argparse.ArgumentTypeError("must be 1 to 30 mph, which is as fast as the car goes")
+        raise argparse.ArgumentTypeError("must be 1 to 30 mph; 30 is the car's top speed")
     return value
 
 
 def natural(text: str) -> int:
+    """Parse a whole number from 0 up."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError("must be 0 or more")
     return value
 
 
-def add_record(commands) -> argparse.ArgumentParser:
+def add_record(commands: "Subparsers") -> None:
+    """Add the options of `record`."""
     parser = commands.add_parser("record", help="an expert drives and is recorded, faster than real time")
     parser.set_defaults(run=record)
-    parser.add_argument("folder", help="a new recording: IMG/ and driving_log.csv")
+    parser.add_argument("folder", help="the new recording: IMG/ and driving_log.csv")
     parser.add_argument("--laps", type=positive, default=1, help="default 1")
     parser.add_argument("--speed", type=mph, default=30.0, help="set speed in mph, 1 to 30 (default)")
-    parser.add_argument("--recovery", action="store_true", help="only returns from the road's sides")
-    parser.add_argument("--seed", type=natural, default=0, help="of the wandering in the lane (default 0)")
-    return parser
+    parser.add_argument("--recovery", action="store_true", help="record only recoveries from the road's sides")
+    parser.add_argument("--seed", type=natural, default=0, help="of the expert's wandering in its lane (default 0)")
+    add_road(parser)
 
 
-def add_drive(commands) -> argparse.ArgumentParser:
-    parser = commands.add_parser("drive", help="the client of drive.py; exit status 1 if the car left the road")
+def add_drive(commands: "Subparsers") -> None:
+    """Add the options of `drive`."""
+    parser = commands.add_parser(
+        "drive",
+        help="drive.py drives; prints a lap report",
+        epilog="Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if it could not be driven or "
+        "a file could not be written.",
+    )
     parser.set_defaults(run=drive)
     parser.add_argument("--laps", type=positive, default=1, help="default 1")
     add_server(parser)
@@ -51,88 +67,98 @@ def add_drive(commands) -> argparse.ArgumentParser:
     pace.add_argument(
         "--lockstep",
         action="store_true",
-        help="simulated time waits for each answer, so that a run repeats (default)",
+        help="simulated time waits for each answer, so that a run is repeatable (default)",
     )
-    pace.add_argument("--realtime", action="store_true", help="the wall clock's time and the wire's latency")
+    pace.add_argument("--realtime", action="store_true", help="simulated time passes with the wall clock")
     parser.add_argument("--report", metavar="FILE", help="write the lap report as JSON")
-    parser.add_argument("--picture", metavar="FILE.png", help="draw the track from above with the way driven")
+    parser.add_argument("--picture", metavar="FILE.png", help="plot the track from above with the path driven")
     parser.add_argument("--film", metavar="FILE.mp4", help="film the drive from behind the car")
-    return parser
+    add_road(parser)
 
 
-def add_replay(commands) -> None:
-    parser = commands.add_parser("replay", help="a model drives real recordings; how far it stays on the road")
+def add_replay(commands: "Subparsers") -> None:
+    """Add the options of `replay`."""
+    parser = commands.add_parser("replay", help="a model drives real recordings; prints how far it stays on the road")
     parser.set_defaults(run=replay)
     parser.add_argument("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
-    parser.add_argument("--model", metavar="model.pt", help="drive by it in this process, not by drive.py's answers")
+    parser.add_argument("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
     parser.add_argument(
         "--limit",
         type=positive,
         nargs="+",
-        default=[1.0, 2.5],
-        help="m off-centre at which a human would take over (default 1 2.5: NVIDIA's, and where the "
-        "car's side touches the edge line)",
+        default=LIMITS,
+        help="m from the lane centre at which a human would take over; one drive per limit (default 1 2.5: NVIDIA's, "
+        "and where the side of the car is on the edge line)",
     )
     parser.add_argument(
         "--reference",
         choices=("lane", "human"),
         default="lane",
-        help="what off-centre is counted from: the lane's centre as read from the frames (default), or "
-        "the way that the human drove",
+        help="measure offsets from the lane centre, estimated from the frames (default), or from the human "
+        "driver's path",
     )
     add_server(parser)
     add_wait(parser)
-    parser.add_argument("--report", metavar="FILE", help="write the figures as JSON, a list with one entry a recording")
-    parser.add_argument("--picture", metavar="FILE.png", help="draw distance and steering over the recording")
-    parser.add_argument("--film", metavar="FILE.mp4", help="film what the model saw, at the last limit")
+    parser.add_argument("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
+    parser.add_argument("--picture", metavar="FILE.png", help="plot offset and steering over time")
+    parser.add_argument("--film", metavar="FILE.mp4", help="film the model's view, at the last limit")
+
+
+def add_window(commands: "Subparsers") -> None:
+    """Add the options of `window`."""
+    parser = commands.add_parser("window", help="you drive and record, or watch drive.py drive")
+    parser.set_defaults(run=window)
+    parser.add_argument("--folder", help="of the recording (default data/window-DATE-TIME)")
+    parser.add_argument("--autonomous", action="store_true", help="drive.py drives; W or S takes over")
+    add_server(parser)
+    add_road(parser)
+
+
+def add_server(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where drive.py is."""
+    parser.add_argument("--host", default="127.0.0.1", help="where drive.py runs (default 127.0.0.1)")
+    parser.add_argument("--port", type=int, default=4567, help="default 4567")
 
 
 def add_wait(parser: argparse.ArgumentParser) -> None:
+    """Add --wait."""
     parser.add_argument(
         "--wait", type=positive, default=60.0, help="seconds to wait for a server or an answer (default 60)"
     )
 
 
-def add_window(commands) -> argparse.ArgumentParser:
-    parser = commands.add_parser("window", help="a person drives and records, or watches drive.py drive")
-    parser.set_defaults(run=window)
-    parser.add_argument("--folder", help="of the recording (default data/window-DATE-TIME)")
-    parser.add_argument("--autonomous", action="store_true", help="drive.py drives; W or S takes over")
-    add_server(parser)
-    return parser
+def add_road(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose a track and its look."""
+    parser.add_argument("--track", choices=sorted(ROADS), default="lake", help="default lake")
+    parser.add_argument(
+        "--direction",
+        choices=("ccw", "cw"),
+        help="default: the simulator's own, ccw on the lake and cw in the jungle",
+    )
+    parser.add_argument(
+        "--look",
+        type=natural,
+        default=0,
+        help="0 (default): like the real simulator; others: other light, soils, trees and shadows",
+    )
 
 
-def add_server(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--host", default="127.0.0.1", help="where drive.py runs (default 127.0.0.1)")
-    parser.add_argument("--port", type=int, default=4567, help="default 4567")
-
-
-def arguments(argv=None) -> argparse.Namespace:
+def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
+    """Parse the command line; `run` is the function of the command."""
     parser = argparse.ArgumentParser(
         prog="python -m simulator", description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
-    add_replay(commands)
-    for command in (add_record(commands), add_drive(commands), add_window(commands)):
-        command.add_argument("--track", choices=sorted(ROADS), default="lake", help="default lake")
-        command.add_argument(
-            "--direction",
-            choices=("ccw", "cw"),
-            help="default the simulator's own: ccw on the lake, cw in the jungle",
-        )
-        command.add_argument(
-            "--look",
-            type=natural,
-            default=0,
-            help="0 (default): as the real one; others: other light, soils, trees, shadows",
-        )
+    for add in (add_replay, add_record, add_drive, add_window):
+        add(commands)
     return parser.parse_args(argv)
 
 
-# What loads panda3d is imported where it is used: `--help` and bad arguments need none of it.
+# Each command imports what it needs itself: `--help` and bad arguments need neither panda3d nor torch.
 
 
-def record(args) -> int:
+def record(args: argparse.Namespace) -> int:
+    """Have the expert drive and record it."""
     from simulator.record import record
 
     track = Track(args.track, args.direction)
@@ -142,93 +168,60 @@ def record(args) -> int:
     return 0
 
 
-def drive(args) -> int:
+def drive(args: argparse.Namespace) -> int:
+    """Have drive.py drive, and write the files that were asked for, even if the drive ends early."""
     from simulator import report, scenery
     from simulator.cameras import Cameras
     from simulator.client import Client
     from simulator.film import ChaseFilm
-    from simulator.progress import Progress
     from simulator.run import Run
     from simulator.world import Scene
 
-    outputs(args.report, args.picture, args.film)
+    check_folders(args.report, args.picture, args.film)
     run = Run(Track(args.track, args.direction), "autonomous")
     scene = Scene(scenery.build(args.track, args.look))
-    film = ChaseFilm(args.film, scene) if args.film else None
     client = Client(run, Cameras(scene, ("center",)), args.host, args.port, args.wait, args.realtime)
-    if film:
-        client.watch = lambda: film.watch(run)
-    try:
-        client.drive(args.laps, Progress(args.laps, "laps"))
-    finally:
-        summary = report.figures(run, client)
+
+    def print_report() -> None:
         if run.time:
-            print(report.text(summary))
-        if film:
-            film.close()
-        if args.report:
-            report.write_json(args.report, summary)
-        if args.picture:
-            report.write_picture(args.picture, run)
+            print(report.report_text(report.lap_report(run, client)))
+
+    steps: list[Callable[[], object]] = [lambda: client.drive(args.laps), print_report]
+    if args.film:
+        film = ChaseFilm(args.film, scene)
+        client.watch = functools.partial(film.watch, run)
+        steps.append(film.close)
+    if args.report:
+        steps.append(lambda: write_json(args.report, report.lap_report(run, client)))
+    if args.picture:
+        steps.append(lambda: report.write_picture(args.picture, run))
+    run_all(*steps)
     return 1 if run.departures else 0
 
 
-def replay(args) -> int:
-    from cloning.recordings.log import find_folders
-    from cloning.replay import replay as replaying
-    from cloning.replay import score
-    from cloning.replay.drivers import InProcess, Served
-    from simulator import report
-    from simulator.progress import Progress
+def replay(args: argparse.Namespace) -> int:
+    """Have a model drive real recordings."""
+    from cloning.replay import command
 
-    outputs(args.report, args.picture, args.film)
-    folders = find_folders(args.folders)
-    steer = InProcess(args.model) if args.model else Served(args.host, args.port, args.wait)
-    film = score.SideBySide(args.film) if args.film else None
-    reports = []
-    try:
-        for folder in folders:
-            recording = replaying.load(folder)
-            references = replaying.references(recording, args.reference == "lane")
-            if not references:
-                raise SimulatorError(f"{folder}: no two seconds of driving without a break to replay")
-            rows = sum(len(reference.stretch) for reference in references)
-
-            def drive(limit, folder=folder, recording=recording, references=references, rows=rows):
-                progress = Progress(rows, f"rows of {folder.name} at {limit:g} m")
-
-                def watch(moment, done):
-                    progress.show(len(done.row), sum(done.time))
-                    if film and limit == args.limit[-1]:
-                        film.watch(moment, done)
-
-                return replaying.drive(recording, references, limit, steer, watch)
-
-            with ThreadPoolExecutor(len(args.limit) if args.model else 1) as pool:
-                drives = list(pool.map(drive, args.limit))
-            reports.append(score.figures(recording, references, drives, args.reference))
-            print(score.text(reports[-1]), flush=True)
-            if args.picture:
-                path = Path(args.picture)
-                path = path if len(folders) == 1 else path.with_stem(f"{path.stem}-{folder.name}")
-                score.picture(path, recording, drives)
-    finally:
-        steer.close()
-        if film:
-            film.close()
-        if args.report and reports:
-            report.write_json(args.report, reports)
+    command.run(
+        command.Options(
+            folders=args.folders,
+            model=args.model,
+            host=args.host,
+            port=args.port,
+            wait=args.wait,
+            limits=args.limit,
+            reference=args.reference,
+            report=args.report,
+            picture=args.picture,
+            film=args.film,
+        )
+    )
     return 0
 
 
-def outputs(*paths: str | None) -> None:
-    """Raises SimulatorError before the work, not after it, if a file's folder is missing."""
-    for path in filter(None, paths):
-        if not Path(path).absolute().parent.is_dir():
-            raise SimulatorError(f"{path}: there is no such folder; make it first")
-
-
-def window(args) -> int:
+def window(args: argparse.Namespace) -> int:
+    """Open the window in which a person drives."""
     from datetime import datetime
 
     from simulator.window import Window
@@ -243,15 +236,16 @@ def window(args) -> int:
     return 0
 
 
-def main(argv=None) -> int:
-    args = arguments(argv)
+def main(argv: list[str] | None = None) -> int:
+    """Run a command and return its exit status."""
+    args = parse_arguments(argv)
     try:
         return args.run(args)
-    except (SimulatorError, RecordingError) as error:
+    except UserError as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\nstopped; what was written is whole", file=sys.stderr)
+        print("\nsimulator: stopped; the files that it has written are complete", file=sys.stderr)
         return 130
 
 

@@ -1,160 +1,186 @@
-"""The autonomous mode: the car sends what its centre camera sees and drives as the server answers."""
+"""The autonomous mode: the car sends its centre camera's frames and drives by the server's answers."""
 
 import time
+from collections.abc import Callable
+
+from tqdm import tqdm
 
 from cloning.errors import SimulatorError
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import Clock
-from cloning.wire.client import MANUAL, Answer, Connection, Gone, read, telemetry
+from cloning.wire.client import (
+    CONNECT,
+    MANUAL_TELEMETRY,
+    Answer,
+    Connection,
+    ConnectionLost,
+    parse_answer,
+    telemetry_packet,
+)
 from cloning.wire.session import OPENS, ClientSession
 from simulator.cameras import Cameras, jpeg
 from simulator.car import STEP
-from simulator.progress import Progress
 from simulator.run import Run
 
-STANDS_STILL = 60.0  # simulated seconds in which the car has to get on by a metre
+STANDSTILL_TIME = 60.0  # simulated seconds within which the car must have moved by a metre
+MAX_CATCH_UP = 25  # physics steps in a row with which real time is caught up before the server is heard again
+RETRY_INTERVAL = 1.0  # s between two attempts of the window to connect
 
 
 class Standstill(SimulatorError):
     """The server answers, but the car does not move."""
 
 
-def picture(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
-    """The telemetry packet of this moment; steering and throttle as last commanded, -1..1."""
+def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
+    """Return the telemetry packet of this moment; steering and throttle as last commanded, -1..1."""
     frame = cameras.frames(run.car.node.get_transform())[0]
-    return telemetry(steering, throttle, run.speed_mph, jpeg(frame))
+    return telemetry_packet(steering, throttle, run.speed_mph, jpeg(frame))
 
 
 class Client(ClientSession):
-    """Drives a run by a server's answers, connecting again when it goes away."""
+    """Drives the car by a server's answers, and connects again when the connection is lost."""
 
     def __init__(self, run: Run, cameras: Cameras, host: str, port: int, wait: float, realtime: bool):
-        """wait: seconds of patience with a server that is not there or does not answer usably."""
-        super().__init__(host, port, wait, patient=realtime)
+        """realtime: drive in the wall clock's time, not in lock-step; wait: see ClientSession."""
+        super().__init__(host, port, wait, real_timing=realtime)
         self.run, self.cameras, self.realtime = run, cameras, realtime
-        self.watch = None  # called after each physics step, if set
-        self.steering = self.throttle = 0.0
-        self.frames = 0
-        self.own_time = 0.0  # s of wall time not spent waiting for the server
-        self.moved = (0.0, 0.0)
+        self.watch: Callable[[], None] | None = None  # called after each physics step
+        self.steering = self.throttle = 0.0  # as last commanded
+        self.frames = 0  # sent
+        self.own_time = 0.0  # s of wall time in which the simulator itself worked, in lock-step
+        self._moved_at, self._moved_to = 0.0, 0.0  # s and m travelled, when the car had last moved by a metre
 
-    def picture(self) -> str:
-        """The telemetry packet of this moment."""
+    def next_frame(self) -> str:
+        """Return the telemetry packet of this moment, and count it."""
         self.frames += 1
-        return picture(self.run, self.cameras, self.steering, self.throttle)
+        return current_telemetry(self.run, self.cameras, self.steering, self.throttle)
 
     def obey(self, answer: Answer) -> None:
-        if answer.steering is not None:
+        """Take over a command's steering and throttle."""
+        if answer.steering is not None and answer.throttle is not None:
             self.steering, self.throttle = answer.steering, answer.throttle
 
     def step(self) -> None:
+        """Drive one physics step. Raises Standstill."""
         self.run.step(self.steering, self.throttle)
         if self.watch:
             self.watch()
-        since, at = self.moved
-        if abs(self.run.travelled - at) > 1:
-            self.moved = (self.run.time, self.run.travelled)
-        elif self.run.time - since > STANDS_STILL:
+        if abs(self.run.travelled - self._moved_to) > 1:
+            self._moved_at, self._moved_to = self.run.time, self.run.travelled
+        elif self.run.time - self._moved_at > STANDSTILL_TIME:
             raise Standstill(
-                f"the car has stood still for {STANDS_STILL:.0f} s (throttle {self.throttle:g}, "
-                f"{self.dropped} unusable answers)"
+                f"the car has stood still for {STANDSTILL_TIME:.0f} s (throttle {self.throttle:g}, "
+                f"{self.unusable} unusable answers)"
             )
 
-    def drive(self, laps: float, progress: Progress) -> None:
+    def drive(self, laps: float) -> None:
         """Drive the laps. Raises SimulatorError."""
         goal = laps * self.run.track.length
-        drive = self._in_real_time if self.realtime else self._in_lockstep
-        while True:
-            self.wire = self.connect()
-            try:
-                drive(goal, progress)
-                return
-            except Gone as error:
-                self.reconnect(error)
-            finally:
-                self.close()
+        drive = self._drive_in_real_time if self.realtime else self._drive_in_lockstep
+        with tqdm(total=round(goal), unit="m", unit_scale=True, disable=None) as bar:
+            while True:
+                self.connect()
+                try:
+                    drive(goal, bar)
+                    return
+                except ConnectionLost as error:
+                    self.count_reconnection(error)
+                finally:
+                    self.close()
 
-    def _in_lockstep(self, goal: float, progress: Progress) -> None:
-        """Simulated time waits for each answer: 15 frames a simulated second."""
-        self.listen()
+    def _show(self, bar: tqdm) -> None:
+        bar.update(round(max(0.0, self.run.travelled)) - bar.n)
+
+    def _drive_in_lockstep(self, goal: float, bar: tqdm) -> None:
+        """Let simulated time wait for each answer: 15 frames per simulated second."""
+        self.receive_greeting()
         clock = Clock(self.run.time + 1 / SAMPLE_RATE)
         while self.run.travelled < goal:
-            self.obey(self.early())
+            self.obey(self.receive_unasked())
             begin = time.perf_counter()
-            packet = self.picture()
+            packet = self.next_frame()
             self.own_time += time.perf_counter() - begin
-            answer = self.exchange(packet)
+            answer = self.request_answer(packet)
             begin = time.perf_counter()
             self.obey(answer)
             self.step()
             while not clock.due(self.run.time) and self.run.travelled < goal:
                 self.step()
             self.own_time += time.perf_counter() - begin
-            progress.show(max(0.0, self.run.travelled) / self.run.track.length, self.run.time)
+            self._show(bar)
 
-    def _in_real_time(self, goal: float, progress: Progress) -> None:
-        """Simulated time is the wall's. Each open and each answer makes one frame, and a lost answer is a
-        lost frame."""
-        sent: list[float] = []
+    def _drive_in_real_time(self, goal: float, bar: tqdm) -> None:
+        """Let simulated time pass with the wall clock; each open and each answer brings about one frame.
+
+        As in the real simulator, a lost answer means one frame less in flight from then on.
+        """
+        sent: list[float] = []  # when each telemetry without an answer yet was sent
+        greeted = False  # the commands before CONNECT answer no telemetry
         for _ in range(OPENS):
-            self.wire.send(self.picture())
+            self.connection.send(self.next_frame())
             sent.append(time.perf_counter())
-        begin, origin, usable = time.perf_counter(), self.run.time, time.monotonic()
+        begin, origin, last_usable = time.perf_counter(), self.run.time, time.monotonic()
         while self.run.travelled < goal:
             due = int((time.perf_counter() - begin) / STEP) * STEP + origin
-            for _ in range(min(25, round((due - self.run.time) / STEP))):
+            for _ in range(min(MAX_CATCH_UP, round((due - self.run.time) / STEP))):
                 self.step()
-            packet = self.wire.receive(max(0.0, begin + self.run.time - origin + STEP - time.perf_counter()))
-            progress.show(max(0.0, self.run.travelled) / self.run.track.length, self.run.time)
-            answer = self.usable(packet) if packet else None
+            packet = self.connection.receive(max(0.0, begin + self.run.time - origin + STEP - time.perf_counter()))
+            self._show(bar)
+            answer = self.parse(packet) if packet else None
+            greeted = greeted or packet == CONNECT
             if answer is None:
-                if time.monotonic() - usable > self.wait:
-                    raise SimulatorError(f"no usable answer in {self.wait:.0f} s ({self.dropped} unusable ones so far)")
+                if time.monotonic() - last_usable > self.wait:
+                    raise self.no_answer()
                 continue
-            usable = time.monotonic()
-            if sent:
+            last_usable = time.monotonic()
+            if sent and greeted:
                 self.round_trips.append(time.perf_counter() - sent.pop(0))
             self.obey(answer)
-            self.wire.send(self.picture())
+            self.connection.send(self.next_frame())
             sent.append(time.perf_counter())
 
 
 class Remote:
-    """drive.py as the window sees it: never waited for, looked for each second while it is away."""
+    """drive.py as the window's driver: polled once per window frame, and tried again each second while it is away."""
 
     def __init__(self, host: str, port: int, cameras: Cameras):
         self.address, self.cameras = (host, port), cameras
-        self.steering = self.throttle = 0.0
-        self.wire: Connection | None = None
+        self.steering = self.throttle = 0.0  # as last commanded
+        self.connection: Connection | None = None
         self.state, self.next_try = "not connected", 0.0
 
     def answer(self, by_hand: bool, run: Run) -> None:
-        """Obey what has arrived, and send a frame for each, or null while a person steers."""
+        """Obey what has arrived, and send a frame for each answer, or null while a person steers."""
         try:
-            if self.wire is None:
-                self._connect(run)
-            for _ in range(OPENS + 1):  # not for as long as answers come: the window has to be drawn as well
-                packet = self.wire.receive(0) if self.wire else None
-                answer = read(packet) if packet else None
+            connection = self.connection or self._connect(run)
+            if connection is None:
+                return
+            for _ in range(OPENS + 1):  # not for as long as answers come: the window must be rendered, too
+                packet = connection.receive(0)
+                answer = parse_answer(packet) if packet else None
                 if answer is None:
                     continue
-                if answer.steering is not None:
+                if answer.steering is not None and answer.throttle is not None:
                     self.steering, self.throttle = answer.steering, answer.throttle
-                self.wire.send(MANUAL if by_hand else picture(run, self.cameras, self.steering, self.throttle))
-        except Gone as error:
-            self.wire, self.state = None, str(error)
+                connection.send(
+                    MANUAL_TELEMETRY if by_hand else current_telemetry(run, self.cameras, self.steering, self.throttle)
+                )
+        except ConnectionLost as error:
+            self.connection, self.state = None, str(error)
             self.steering = self.throttle = 0.0
 
-    def _connect(self, run: Run) -> None:
+    def _connect(self, run: Run) -> Connection | None:
         if time.monotonic() < self.next_try:
-            return
-        self.next_try = time.monotonic() + 1
-        self.wire = Connection(*self.address, patient=True)
+            return None
+        self.next_try = time.monotonic() + RETRY_INTERVAL
+        self.connection = Connection(*self.address, real_timing=True)
         self.state = "drives"
         for _ in range(OPENS):
-            self.wire.send(picture(run, self.cameras, 0.0, 0.0))
+            self.connection.send(current_telemetry(run, self.cameras, 0.0, 0.0))
+        return self.connection
 
     def close(self) -> None:
-        if self.wire:
-            self.wire.close()
-            self.wire = None
+        """Close the connection, if one is open."""
+        if self.connection:
+            self.connection.close()
+            self.connection = None

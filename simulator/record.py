@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from panda3d.core import TransformState
+from tqdm import tqdm
 
 from cloning.cores import threads
 from cloning.errors import SimulatorError
@@ -21,7 +22,6 @@ from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Expert, Recovery
-from simulator.progress import Progress
 from simulator.run import Run
 from simulator.world import Scene
 
@@ -79,11 +79,12 @@ def record(
     run = Run(track)
     run.car.speed_limit = speed * MPH
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
-    clock, progress = Clock(), Progress(laps, "laps")
+    clock = Clock()
     renderers = min(MAX_RENDERERS, threads())
     with (
         RecordingWriter(folder, EPOCH + timedelta(days=seed % 10_000)) as recording,
         ProcessPoolExecutor(renderers, initializer=_start_renderer) as pool,
+        tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None) as bar,
     ):
         pending: deque[Row] = deque()
 
@@ -100,7 +101,7 @@ def record(
                     pending.append(Row(run.time, images, run.steering, throttle, brake, run.speed_mph))
                     if len(pending) > 2 * renderers:
                         write()
-                    progress.show(max(0.0, run.travelled) / track.length, run.time)
+                    bar.update(round(max(0.0, run.travelled)) - bar.n)
             while pending:
                 write()
         except BrokenExecutor as error:
@@ -108,5 +109,4 @@ def record(
                 f"{folder}: a rendering process was killed, perhaps for lack of memory; "
                 f"the {recording.rows} rows before are whole"
             ) from error
-    progress.finish(laps, run.time)
     return run

@@ -1,5 +1,8 @@
-"""A tiny recording, drawn here, in the simulator's own format, and the means to run the commands on it."""
+"""A tiny rendered recording in the simulator's own format, and helpers that run model.py on it."""
 
+import contextlib
+import csv
+import io
 import os
 import subprocess
 import sys
@@ -16,11 +19,20 @@ from cloning.recordings.images import decode
 
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
+HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from another folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_cache(tmp_path_factory):
+    """Fixtures that several tests share write no checked images into the user's cache folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path_factory, monkeypatch):
-    """What is remembered of checked images stays out of the user's cache folder."""
+    """Each test has a cache of checked images of its own, empty at first."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
 
 
@@ -42,7 +54,7 @@ def draw_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarr
 
 
 def draw_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/Users/driver/data/IMG/") -> Path:
-    """A folder as the simulator records it: no header, absolute paths, 15 rows a second, every tenth off throttle."""
+    """A folder as the simulator records it: no header, absolute paths, 15 rows a second, throttle 0 in every tenth."""
     rng = np.random.default_rng(seed)
     (folder / "IMG").mkdir(parents=True)
     clock, lines = datetime(2018, 7, 16, 17, 11, 43) + timedelta(days=seed), []
@@ -57,7 +69,7 @@ def draw_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/
             cv2.imwrite(str(folder / "IMG" / names[-1]), frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 75])
         throttle = 0 if row % 10 == 9 else 1
         lines.append(",".join([prefix + name for name in names] + [f"{0.4 * bend:.6g}", str(throttle), "0", "30.19"]))
-    (folder / "driving_log.csv").write_text("\n".join(lines) + "\n")
+    (folder / "driving_log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
 
 
@@ -101,7 +113,7 @@ def steering(model_file, jpegs) -> list[np.float32]:
 
 
 def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
-    """The real command line, with its output."""
+    """model.py, or another command, in a process of its own, with its output."""
     command = command or [sys.executable, str(ROOT / "model.py")]
     return subprocess.run(
         [*command, *map(str, arguments)],
@@ -113,12 +125,43 @@ def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
     )
 
 
+def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
+    """The same as `run_model`, in this process: it saves two seconds of imports."""
+    import model
+
+    command = list(map(str, arguments))
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
+        try:
+            status = model.main(command)
+        except SystemExit as error:  # argparse's
+            status = error.code
+    return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
+
+
 def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.CompletedProcess, Path]:
     """A run that was never interrupted: what it printed, and its folder."""
-    done = run_model(recording, *arguments, "--output", folder / "model.pt")
+    done = run_here(recording, *arguments, "--output", folder / "model.pt")
     assert done.returncode == 0, done.stderr
     return done, folder
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
     return torch.load(path, weights_only=True)["network"]
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    """Whether two networks have equal weights."""
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def log(folder: Path) -> list[dict[str, str]]:
+    """The rows of a run's training_log.csv."""
+    with open(folder / "training_log.csv", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="session")
+def finished(drawn, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
+    """A run of two epochs as in the report: what it printed, and its folder; not to be changed."""
+    return finished_run(drawn, tmp_path_factory.mktemp("run"), *SHORT)

@@ -1,18 +1,16 @@
-"""The car's way and the camera's view from beside it, against geometry."""
+"""The car's trajectory and the cameras' geometry, against geometry worked out otherwise, and warped frames."""
 
 import numpy as np
 import pytest
-from conftest import ROOT
+import real_recordings
 
-from cloning.recordings.log import logs_below, read_recording
+from cloning.recordings.log import read_recording
 from cloning.replay.views import Views
-from cloning.road import camera, motion
-
-REAL = sorted(path.parent for path in logs_below(ROOT / "data"))
+from cloning.road import camera, motion, warp
 
 
 def ground_picture(right: float, forward: float, yaw: float) -> np.ndarray:
-    """An oracle: what a camera at this pose sees of a ground of smooth stripes, drawn ray by ray."""
+    """An oracle: what a camera at this pose sees of a ground of smooth stripes, rendered ray by ray."""
     columns, rows = np.meshgrid(np.arange(320), np.arange(160))
     rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(camera.CAMERA_MATRIX).T
     x, y, z = rays[..., 0], np.maximum(rays[..., 1], 1e-3), rays[..., 2]
@@ -25,27 +23,51 @@ def ground_picture(right: float, forward: float, yaw: float) -> np.ndarray:
 
 @pytest.mark.parametrize("pose", [(0.8, 0, 0), (-1.2, 0, 0), (0, 1.5, 0), (0, 0, 0.1), (0.9, 0.5, -0.12)])
 def test_a_warped_frame_is_what_is_seen_from_there(pose):
-    made, seen = camera.warp(ground_picture(0, 0, 0), *pose)
+    made, seen = warp.warp(ground_picture(0, 0, 0), *pose)
     expected = ground_picture(*pose)
     near = seen & (np.arange(160) > 72)[:, None]  # further away the stripes are finer than pixels
-    assert near[75:135].mean() > 0.6
+    assert near[75:135].mean() > 0.82  # measured: 0.856 to 1
     difference = np.abs(made.astype(int) - expected)[near]
-    assert difference.mean() < 1.5 and np.percentile(difference, 99) < 12
+    assert difference.mean() < 0.62 and np.percentile(difference, 99) < 8  # measured: 0.481, 6
 
 
 def test_unseen_is_told_and_the_bonnet_is_no_road():
-    _, seen = camera.warp(np.zeros((160, 320, 3), np.uint8), 0, 0, 0)
+    _, seen = warp.warp(np.zeros((160, 320, 3), np.uint8), 0, 0, 0)
     assert seen[2:134, 2:-2].all() and not seen[136:].any()
-    _, seen = camera.warp(np.zeros((160, 320, 3), np.uint8), 1.5, 0, 0)  # to the right: its right is unknown
+    _, seen = warp.warp(np.zeros((160, 320, 3), np.uint8), 1.5, 0, 0)  # to the right: its right is unknown
     assert not seen[120, 300] and seen[120, 20]
 
 
 def test_the_ground_is_projected_where_it_is_warped_from():
     """A point 10 m ahead and 2 m to the right is seen in the middle of the road from 2 m to the right."""
-    near, far = camera.project(np.array([2.0, 0.0]), np.array([10.0, 10.0]))
+    near, far = camera.project_ground(np.array([2.0, 0.0]), np.array([10.0, 10.0]))
     ground, _ = camera.homographies(2, 0, 0)
     moved = ground @ [*near, 1]
     assert moved[:2] / moved[2] == pytest.approx(far, abs=1e-9)
+
+
+def test_homographies_of_many_poses_are_those_of_each():
+    poses = np.random.default_rng(0).normal(0, 0.3, (3, 20))
+    many = camera.homographies(*poses)
+    assert many.shape == (20, 2, 3, 3)
+    assert many == pytest.approx(np.array([camera.homographies(*pose) for pose in poses.T]), rel=1e-12)
+
+
+def test_a_camera_is_where_the_cars_pose_and_its_mounting_put_it():
+    """In a trajectory's frame (right, forward) and on a track (x east, y north), against complex numbers."""
+    yaw, axle, offset = 0.3, np.array([2.0, -1.0]), 0.825
+    turned = (motion.AXLE_TO_CAMERA - 1j * offset) * np.exp(-1j * yaw)  # forward real, left imaginary
+    found = camera.camera_position(axle, motion.forward_vector(yaw), offset)
+    assert found == pytest.approx(np.add(axle, [-turned.imag, turned.real]))
+    turned = (motion.AXLE_TO_CAMERA - 1j * offset) * np.exp(1j * yaw)  # east real, north imaginary
+    found = camera.camera_position(axle, np.array([np.cos(yaw), np.sin(yaw)]), offset)
+    assert found == pytest.approx(np.add(axle, [turned.real, turned.imag]))
+
+
+def test_components_undo_a_turn():
+    forward = motion.forward_vector(np.array([0.4, -2.0]))
+    vector = 3 * motion.right_of(forward) + 5 * forward
+    assert motion.components(vector, forward) == pytest.approx(np.array([[3, 5], [3, 5]]))
 
 
 def test_steering_and_curvature_are_inverse():
@@ -91,8 +113,8 @@ def test_breaks_are_not_driven_over(drawn):
     assert rows()[-1] == slice(201, 240)
 
 
-@pytest.mark.skipif(not REAL, reason="no recordings under data/")
-@pytest.mark.parametrize("folder", REAL)
+@pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)
+@pytest.mark.parametrize("folder", real_recordings.FOLDERS, ids=lambda folder: folder.name)
 def test_a_real_centre_frame_warped_to_the_side_cameras_is_theirs(folder):
     recording = read_recording(folder)
     straight = np.flatnonzero(np.abs(recording.steering) < 0.05)[::40]
@@ -101,7 +123,7 @@ def test_a_real_centre_frame_warped_to_the_side_cameras_is_theirs(folder):
     for at in straight:
         for which, side in ((1, camera.CAMERA_OFFSETS["left"]), (2, camera.CAMERA_OFFSETS["right"])):
             truth, before = views.frame(int(at), which).astype(int), views.frame(int(at), 0).astype(int)
-            made, seen = camera.warp(views.frame(int(at), 0), side, 0, 0)
+            made, seen = warp.warp(views.frame(int(at), 0), side, 0, 0)
             road = seen & (np.arange(160) >= 66)[:, None]
             gains.append(np.abs(before - truth)[road].mean() / np.abs(made.astype(int) - truth)[road].mean())
-    assert np.median(gains) > 1.4
+    assert np.median(gains) > 1.65  # measured: 2.12 to 2.46

@@ -12,7 +12,8 @@ from conftest import draw_recording
 import model
 from cloning.recordings.check import check_images
 from cloning.recordings.log import Recording, read_recording
-from model import Generator, Observations, brighten, resample, shade, split
+from cloning.training.observations import center_digests
+from model import Arguments, Generator, ReportObservations, brighten, shade, split
 from tools.bench_training import one_by_one
 
 
@@ -33,10 +34,10 @@ def observations(steering, recordings=None, frame=None):
     n = len(steering)
     recordings = recordings or [recording(n)]
     which = np.repeat(np.arange(len(recordings)), [len(r) for r in recordings])
-    return Observations(
+    return ReportObservations(
         recordings,
         which,
-        np.zeros((n, 3), np.int32),
+        np.concatenate([np.arange(len(r), dtype=np.int32) for r in recordings]),
         np.asarray(steering, np.float32),
         np.arange(n, dtype=np.uint64) if frame is None else frame,
         np.concatenate([r.time for r in recordings]),
@@ -46,15 +47,16 @@ def observations(steering, recordings=None, frame=None):
 def loaded(folder):
     found = read_recording(folder)
     check_images(found)
-    return Observations(
-        [found], np.zeros(len(found), int), found.images, found.steering, found.digests[found.images[:, 0]], found.time
+    rows = np.arange(len(found), dtype=np.int32)
+    return ReportObservations(
+        [found], np.zeros(len(found), int), rows, found.steering, center_digests(found, rows), found.time
     )
 
 
 @pytest.fixture
 def generator(drawn):
     with ThreadPoolExecutor(2) as pool:
-        yield Generator(loaded(drawn), 128, 0.2, 0, pool, ahead=1)
+        yield Generator(loaded(drawn), Arguments(), pool, ahead=1)
 
 
 def test_validation_is_a_fifth_in_stretches_of_two_seconds_over_the_whole_recording():
@@ -78,7 +80,7 @@ def test_copies_of_a_frame_are_all_on_one_side():
 
 def test_resampling_has_the_recipes_shares():
     steering = np.repeat([0.0, 0.019, -0.02, 0.2, 0.21, -0.5, 0.51, 1], 10000)
-    got = resample(observations(steering), seed=1).steering
+    got = observations(steering).resample(seed=1).steering
     straight = (np.abs(got) < 0.0195).sum()
     assert straight / 20000 == pytest.approx(0.8, abs=0.01)
     for once in (-0.02, 0.2, 0.51, 1):
@@ -93,7 +95,7 @@ def test_resampling_has_the_recipes_shares():
 
 def test_problem_areas_are_repeated_four_times():
     names = ["lake", "bridge-repetitive", "data-corrections"]
-    got = resample(observations(np.full(30, 0.1), [recording(10, name) for name in names]), seed=0)
+    got = observations(np.full(30, 0.1), [recording(10, name) for name in names]).resample(seed=0)
     assert np.bincount(got.recording).tolist() == [10, 40, 40]
 
 
@@ -134,51 +136,51 @@ def test_shadow_of_a_cropped_image_is_the_crop_of_the_shadowed_frame():
     np.testing.assert_array_equal(one_shaded(image[60:135], (30.5, 300.2), True, 0.4, 60), whole[60:135])
 
 
-def test_chances_and_ranges_over_many_draws(generator):
-    draws = [generator.draw(number) for number in range(200)]
+def test_probabilities_and_ranges_over_many_batches(generator):
+    draws = [generator.sample(number) for number in range(200)]
     n = 200 * 128
-    kinds = sum((d["places"] >= 0).sum(0) for d in draws) / n
+    kinds = sum((d.places >= 0).sum(0) for d in draws) / n
     np.testing.assert_allclose(kinds, [1, 0.9, 1, 0.8], atol=0.01)
-    np.testing.assert_allclose(np.bincount(np.concatenate([d["camera"] for d in draws])) / n, [1 / 3] * 3, atol=0.01)
+    np.testing.assert_allclose(np.bincount(np.concatenate([d.camera for d in draws])) / n, [1 / 3] * 3, atol=0.01)
     for name, low, high in (("brightness", 0.4, 1.2), ("darkness", 0.2, 0.5), ("line", 0, 320)):
-        values = np.concatenate([d[name] for d in draws])
+        values = np.concatenate([getattr(d, name) for d in draws])
         assert low <= values.min() and values.max() <= high
         assert values.mean() == pytest.approx((low + high) / 2, rel=0.01)
         assert values.std() == pytest.approx((high - low) / 12**0.5, rel=0.02)
-    assert np.concatenate([d["left"] for d in draws]).mean() == pytest.approx(0.5, abs=0.01)
-    assert np.mean([d["keep"].mean() for d in draws]) == pytest.approx(0.5, abs=0.001)
-    assert np.mean([len(d["keep"]) for d in draws]) == pytest.approx(473.6, rel=0.005)  # the original log's batches
+    assert np.concatenate([d.left for d in draws]).mean() == pytest.approx(0.5, abs=0.01)
+    assert np.mean([d.keep.mean() for d in draws]) == pytest.approx(0.5, abs=0.001)
+    assert np.mean([len(d.keep) for d in draws]) == pytest.approx(473.6, rel=0.005)  # the original log's batches
 
 
 def test_a_pass_takes_every_observation_once_and_the_next_one_in_another_order(generator):
     size = len(generator.observations)
-    seen = np.concatenate([generator.draw(number)["observation"] for number in range(size)])  # 128 passes
+    seen = np.concatenate([generator.sample(number).observation for number in range(size)])  # 128 passes
     first, second = seen[:size], seen[size : 2 * size]
     assert sorted(first) == sorted(second) == list(range(size))
     assert list(first) != list(second)
 
 
 def test_images_and_angles_of_an_observation(generator):
-    drawn, everything = generator.draw(5), generator.observations
+    choices, everything = generator.sample(5), generator.observations
     batch = next(generator.batches(5))
     assert (batch.images.shape[1:], batch.images.dtype) == ((75, 320, 3), np.uint8)
     for i in range(0, 128, 9):
-        at, camera = drawn["observation"][i], drawn["camera"][i]
+        at, camera = choices.observation[i], choices.camera[i]
         name = ("center", "left", "right")[camera]
         assert Path(everything.path(at, camera)).name.startswith(name)
         jpeg = cv2.imread(str(everything.path(at, camera)))[60:135, :, ::-1]
         angle = everything.steering[at] + {"center": 0, "left": 0.2, "right": -0.2}[name]
-        places = drawn["places"][i]
+        places = choices.places[i]
         np.testing.assert_array_equal(batch.images[places[0]], jpeg)
         np.testing.assert_allclose(
             batch.angles[places[places >= 0]], np.array([angle, -angle, angle, angle])[places >= 0], rtol=1e-6
         )
         if places[1] >= 0:
             np.testing.assert_array_equal(cv2.flip(batch.images[places[1]], 1), jpeg)  # twice is the identity
-        np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], drawn["brightness"][i : i + 1])[0])
+        np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], choices.brightness[i : i + 1])[0])
 
 
-def test_the_yardsticks_batch_is_the_generators(generator):
+def test_the_benchmarks_batch_is_the_generators(generator):
     made, angles = one_by_one(generator, 3)
     batch = generator.begin(3)()
     assert made.shape == batch.images.shape
@@ -193,8 +195,8 @@ def test_a_batch_depends_on_seed_and_number_alone(generator):
     again = next(batches)
     np.testing.assert_array_equal(third.images, again.images)
     np.testing.assert_array_equal(third.keep, again.keep)
-    other = Generator(generator.observations, 128, 0.2, 1, generator.pool, ahead=1)
-    assert not np.array_equal(other.draw(3)["camera"], generator.draw(3)["camera"])
+    other = Generator(generator.observations, Arguments(seed=1), generator.pool, ahead=1)
+    assert not np.array_equal(other.sample(3).camera, generator.sample(3).camera)
 
 
 def test_two_ranks_make_the_batch_that_one_process_makes(generator, monkeypatch):

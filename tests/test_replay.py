@@ -6,19 +6,27 @@ import re
 import subprocess
 import sys
 
+import av
 import cv2
 import numpy as np
 import pytest
 import torch
 from conftest import ROOT, draw_recording
 
-from cloning.lane.reader import Lane
+from cloning.errors import SimulatorError, UserError
+from cloning.lane.reader import LanePosition
 from cloning.pilot.network import Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
-from cloning.replay import replay
-from cloning.replay.score import against
+from cloning.replay import command, replay
+from cloning.replay.autonomy import LIMITS
+from cloning.replay.score import steering_metrics
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +49,14 @@ def model(tmp_path_factory):
 
 
 def human(recording):
-    return replay.references(recording, by_lane=False)
+    return replay.reference_lines(recording, by_lane=False)
 
 
 def test_an_echo_of_the_human_is_exactly_right(recording):
-    for limit in replay.LIMITS:
-        done = replay.drive(recording, human(recording), limit, lambda moment: moment.human)
+    for limit in LIMITS:
+        done = replay.drive(recording, human(recording), limit, lambda frame: frame.human_steering)
         assert done.autonomy() == 1 and not done.interventions
-        assert not np.any(done.distance) and not np.any(done.beside)
+        assert not np.any(done.offset) and not np.any(done.offset_from_human)
         assert len(done.row) == 300
 
 
@@ -56,62 +64,62 @@ def test_an_echo_of_the_human_is_exactly_right(recording):
 def test_bad_drivers_score_badly(recording, driver):
     random = np.random.default_rng(0)
     steering = {
-        "nothing": lambda moment: 0.0,
-        "noise": lambda moment: random.uniform(-1, 1),
-        "the other way": lambda moment: -moment.human,
+        "nothing": lambda frame: 0.0,
+        "noise": lambda frame: random.uniform(-1, 1),
+        "the other way": lambda frame: -frame.human_steering,
     }[driver]
     done = replay.drive(recording, human(recording), 1.0, steering)
     assert done.autonomy() < 0
-    assert done.autonomy() == pytest.approx(1 - 6 * len(done.interventions) / sum(done.time))
+    assert done.autonomy() == pytest.approx(1 - 6 * len(done.interventions) / sum(done.seconds))
 
 
 def test_the_car_goes_where_geometry_says(recording):
     """On a straight, a constant steering drives a circle off the human's way, once the car has begun to turn."""
     recording.steering[:], recording.speed[:] = 0.0, 15
-    done = replay.drive(recording, human(recording), 3.0, lambda moment: 0.02)
+    done = replay.drive(recording, human(recording), 3.0, lambda frame: 0.02)
     at = next(iter(done.interventions))
-    seconds, speed, bend = np.cumsum(done.time[:at]), 15 * MPH, curvature(np.float32(0.02))
+    seconds, speed, bend = np.cumsum(done.seconds[:at]), 15 * MPH, curvature(np.float32(0.02))
     # abreast of the human, on a circle
     yaw = np.arcsin(speed * bend * (seconds - YAW_LAG * (1 - np.exp(-seconds / YAW_LAG))))
     expected = np.r_[0, np.cumsum(np.diff(seconds) * speed * np.tan((yaw[1:] + yaw[:-1]) / 2))]
-    assert done.beside[:at] == pytest.approx(expected + REAR_AXLE * np.sin(yaw), abs=0.03)
-    assert done.interventions[at] > 3 and done.distance[at] == 0
+    assert done.offset_from_human[:at] == pytest.approx(expected + REAR_AXLE * np.sin(yaw), abs=0.03)
+    assert done.interventions[at] > 3 and done.offset[at] == 0
 
 
 def test_in_a_bend_the_inner_way_is_shorter(recording):
     """Whoever steers a little more than the human in a bend runs a circle of his own, whatever the human's speed."""
     recording.steering[:], recording.speed[:] = 0.3, 20
-    done = replay.drive(recording, human(recording)[:1], 30.0, lambda moment: 0.32)
+    done = replay.drive(recording, human(recording)[:1], 30.0, lambda frame: 0.32)
     r, own = 1 / curvature(np.float32(0.3)), 1 / curvature(np.float32(0.32))
     # Both start from the same place: the own circle's centre lies r - own nearer, so it comes back after a round.
-    assert max(done.beside) == pytest.approx(2 * (r - own), rel=0.15)
+    assert max(done.offset_from_human) == pytest.approx(2 * (r - own), rel=0.15)
 
 
 def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
     """The human drives 0.8 m right of the lane's centre: an echo is off by as much, and set back beyond a limit."""
     offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
     trusted = np.ones(len(recording), bool)
-    monkeypatch.setattr("cloning.lane.place.read_lane", lambda *_: Lane(offset, yaw, trusted))
-    references = replay.references(recording)
-    done = replay.drive(recording, references, 1.0, lambda moment: moment.human)
-    assert not done.interventions and done.distance == pytest.approx(np.full(300, 0.8))
+    monkeypatch.setattr("cloning.lane.place.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
+    lines = replay.reference_lines(recording)
+    done = replay.drive(recording, lines, 1.0, lambda frame: frame.human_steering)
+    assert not done.interventions and done.offset == pytest.approx(np.full(300, 0.8))
     offset[150:] = 1.2
-    done = replay.drive(recording, replay.references(recording), 1.0, lambda moment: moment.human)
-    assert min(done.interventions) == 150 and done.distance[150] == pytest.approx(0, abs=1e-6)
-    assert done.beside[150] == pytest.approx(-1.2)
+    done = replay.drive(recording, replay.reference_lines(recording), 1.0, lambda frame: frame.human_steering)
+    assert min(done.interventions) == 150 and done.offset[150] == pytest.approx(0, abs=1e-6)
+    assert done.offset_from_human[150] == pytest.approx(-1.2)
     offset[100:200] = 6  # off the road
-    assert [reference.rows for reference in replay.references(recording)] == [slice(0, 100), slice(200, 300)]
+    assert [line.rows for line in replay.reference_lines(recording)] == [slice(0, 100), slice(200, 300)]
     trusted[:] = False
-    [reference] = replay.references(recording)
-    assert not reference.lane and not reference.offset.any()
+    [line] = replay.reference_lines(recording)
+    assert not line.is_lane_centre and not line.offset.any()
 
 
 def test_the_model_sees_the_recorded_file_itself_while_it_is_on_the_humans_way(recording):
     seen = []
 
-    def driver(moment):
-        seen.append((moment.jpeg(), moment.recorded, moment.seen))
-        return moment.human + (0.3 if len(seen) == 100 else 0)
+    def driver(frame):
+        seen.append((frame.jpeg(), frame.recorded, frame.view))
+        return frame.human_steering + (0.3 if len(seen) == 100 else 0)
 
     replay.drive(recording, human(recording), 2.5, driver)
     names = [recording.folder / "IMG" / os.fsdecode(recording.names[image]) for image in recording.images[:, 0]]
@@ -123,21 +131,22 @@ def test_the_model_sees_the_recorded_file_itself_while_it_is_on_the_humans_way(r
 
 def test_errors_and_correlations_are_what_they_say():
     human = np.sin(np.arange(200) / 9)
-    assert against(human, human) == {"error": 0, "correlation": 1}
-    assert against(-human, human)["correlation"] == -1
-    assert against(np.zeros(200), human) == {
+    assert steering_metrics(human, human) == {"error": 0, "correlation": 1}
+    assert steering_metrics(-human, human)["correlation"] == -1
+    assert steering_metrics(np.zeros(200), human) == {
         "error": pytest.approx(np.sqrt(np.mean(human**2)), abs=1e-4),
         "correlation": None,
     }
 
 
-def run(*arguments) -> subprocess.CompletedProcess:
+def run(*arguments, **more) -> subprocess.CompletedProcess:
     return subprocess.run(
         [sys.executable, "-m", "simulator", "replay", *map(str, arguments)],
         cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=300,
+        **more,
     )
 
 
@@ -160,7 +169,7 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     assert alone.stdout == served.stdout
     [report] = json.loads((tmp_path / "a.json").read_text())
     assert set(report["limits"]) == {"1", "2.5"} and report["rows_driven"] == 300
-    assert report["reference"] == {"lane centre": 0, "human's way": 300} and "not trusted" not in alone.stdout
+    assert report["reference"] == {"lane centre": 0, "human's way": 300} and "cannot be estimated" not in alone.stdout
     one = report["limits"]["1"]
     assert one["interventions"] == len(one["where"]) and one["autonomy_percent"] < 100
     assert (folder[-1] / "IMG" / one["where"][0]["image"]).is_file()
@@ -171,9 +180,8 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
         "distance_p95_m": 0,
     }
     assert (tmp_path / "way.png").read_bytes()[:4] == b"\x89PNG"
-    probe = __import__("av").open(str(tmp_path / "seen.mp4"))
-    assert sum(1 for _ in probe.decode(video=0)) == 300
-    assert probe.streams.video[0].width == 1280
+    assert film_frames(tmp_path / "seen.mp4") == 300
+    assert av.open(str(tmp_path / "seen.mp4")).streams.video[0].width == 1280
 
 
 def test_on_an_unknown_road_the_humans_way_is_the_reference(tmp_path, model):
@@ -182,7 +190,8 @@ def test_on_an_unknown_road_the_humans_way_is_the_reference(tmp_path, model):
         cv2.imwrite(str(path), random.integers(0, 255, (160, 320, 3), np.uint8))
     done = run(folder, "--model", model, "--limit", "2", "--report", tmp_path / "r.json")
     assert done.returncode == 0, done.stderr
-    assert "the human's way in 60 rows" in done.stdout and "an unknown road?" in done.stdout
+    assert "from the human driver's path in 60 rows" in done.stdout
+    assert "the lane centre cannot be estimated reliably" in done.stdout
     assert list(json.loads((tmp_path / "r.json").read_text())[0]["limits"]) == ["2"]
 
 
@@ -190,8 +199,8 @@ def test_the_same_answer_in_process_as_by_the_network(recording, model):
     network, answers = load_model(model), []
     recording.keep(np.arange(45))
 
-    def driver(moment):
-        answers.append(float(steer(network, decode(moment.jpeg()))))
+    def driver(frame):
+        answers.append(float(steer(network, decode(frame.jpeg()))))
         return answers[-1]
 
     done = replay.drive(recording, human(recording), 2.5, driver)
@@ -213,6 +222,64 @@ def test_unusable_arguments_are_said(folder, model, arguments, said):
     assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
 
 
+def film_frames(path) -> int:
+    return sum(1 for _ in av.open(str(path)).decode(video=0))
+
+
+@pytest.mark.parametrize(("limits", "driven"), [(["1", "1"], ["1"]), (["2", "1", "2"], ["2", "1"])])
+def test_a_limit_given_twice_is_driven_once_and_one_drive_writes_the_film(model, tmp_path, limits, driven):
+    folder = draw_recording(tmp_path / "lake", rows=60)
+    outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json"
+    done = run("--reference", "human", folder, "--model", model, "--limit", *limits, *outputs)
+    assert done.returncode == 0, done.stderr
+    assert list(json.loads((tmp_path / "r.json").read_text())[0]["limits"]) == driven
+    assert film_frames(tmp_path / "x.mp4") == 60
+
+
+@pytest.mark.skipif(not resource, reason="this system has no limit on the size of files")
+def test_a_full_disk_costs_the_film_alone(folder, model, tmp_path):
+    outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json", "--picture", tmp_path / "p.png"
+    most = 300_000  # bytes: enough for the plot, a tenth of the film
+
+    def limit_files():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+
+    done = run("--reference", "human", folder, "--model", model, "--limit", "2", *outputs, preexec_fn=limit_files)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert re.fullmatch(r"simulator: \S+x\.mp4: .*no film was written.*\n", done.stderr)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["p.png", "r.json"]
+    assert "autonomy" in done.stdout and json.loads((tmp_path / "r.json").read_text())[0]["limits"]["2"]
+
+
+def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording):
+    rows = []
+
+    def driver(frame):
+        rows.append(frame.row)
+        if len(rows) > 100:
+            raise SimulatorError("the network's steering is not finite")
+        return 0.0
+
+    with pytest.raises(SimulatorError, match="not finite"):
+        command.drive_at_limits(recording, human(recording), driver, {1.0: None, 2.0: None, 3.0: None}, parallel=True)
+    assert len(rows) < 110
+
+
+def test_all_outputs_are_tried_and_every_failure_is_said():
+    from cloning.outputs import run_all
+
+    done = []
+
+    def fails(reason):
+        raise reason
+
+    with pytest.raises(UserError, match="first; second"):
+        run_all(lambda: fails(UserError("first")), lambda: fails(UserError("second")), lambda: done.append("report"))
+    with pytest.raises(KeyboardInterrupt):
+        run_all(lambda: fails(KeyboardInterrupt()), lambda: done.append("film"), lambda: fails(UserError("third")))
+    assert done == ["report", "film"]
+
+
 def test_a_recording_without_two_seconds_of_driving_is_refused(tmp_path, model):
     done = run(draw_recording(tmp_path / "short", rows=20), "--model", model)
     assert done.returncode == 2 and "two seconds" in done.stderr
@@ -221,8 +288,8 @@ def test_a_recording_without_two_seconds_of_driving_is_refused(tmp_path, model):
 def test_stretches_are_joined_in_one_report(folder, tmp_path):
     recording = read_recording(folder)
     recording.time[150:] += 60
-    done = replay.drive(recording, human(recording), 1.0, lambda moment: moment.human)
-    assert len(human(recording)) == 2 and sum(done.time) == pytest.approx(298 * 0.067, abs=0.01)
+    done = replay.drive(recording, human(recording), 1.0, lambda frame: frame.human_steering)
+    assert len(human(recording)) == 2 and sum(done.seconds) == pytest.approx(298 * 0.067, abs=0.01)
 
 
 def test_the_score_board_keeps_what_it_has(tmp_path, model):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cloning.errors import SimulatorError
+from cloning.errors import OutputError
 from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
@@ -119,7 +119,7 @@ def test_films_the_drive(tmp_path):
     assert reader.get(cv2.CAP_PROP_FPS) == 15
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 5
     assert list(tmp_path.iterdir()) == [tmp_path / "drive.mp4"]
-    with pytest.raises(SimulatorError, match=r"\.mp4"):
+    with pytest.raises(OutputError, match=r"\.mp4"):
         ChaseFilm(str(tmp_path / "nowhere" / "drive.mp4"), film.scene)
 
 

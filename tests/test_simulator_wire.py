@@ -1,5 +1,4 @@
-"""The simulator's end of the wire, against a server on a raw socket that follows the real client's
-transcript."""
+"""The simulator's end of the wire, against a server on a raw socket that follows the real client's transcript."""
 
 import base64
 import contextlib
@@ -12,17 +11,19 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 
 import cv2
 import numpy as np
 import pytest
 
-from cloning.errors import SimulatorError
+from cloning.errors import OutputError, SimulatorError
+from cloning.outputs import write_json
 from cloning.road.track import Track
-from cloning.wire.client import FRAGMENT, Answer, read
+from cloning.wire.client import FRAGMENT, Answer, parse_answer
 from simulator import report
+from simulator.__main__ import main
 from simulator.client import Client, Remote, Standstill
-from simulator.progress import Progress
 from simulator.run import Run
 
 STEER = '42["steer",{"steering_angle":"%s","throttle":"%s"}]'
@@ -135,7 +136,7 @@ class Blank:
 def drive(server, laps=0.02, wait=5.0, realtime=False):
     run = Run(Track("lake"), "autonomous")
     client = Client(run, Blank(), "127.0.0.1", server.port, wait, realtime)
-    client.drive(laps, Progress(laps, "laps"))
+    client.drive(laps)
     return client
 
 
@@ -237,13 +238,13 @@ def test_steering_goes_out_in_degrees_and_the_car_obeys():
     ],
 )
 def test_what_the_real_client_drops_is_dropped(packet):
-    assert read(packet) is None
+    assert parse_answer(packet) is None
 
 
 def test_answers_are_read():
-    assert read(STEER % ("-0.05", "0.2")) == Answer(-0.05, 0.2)
-    assert read(STEER % ("-7", "2")) == Answer(-1.0, 1.0)
-    assert read('42["manual",{}]') == Answer()
+    assert parse_answer(STEER % ("-0.05", "0.2")) == Answer(-0.05, 0.2)
+    assert parse_answer(STEER % ("-7", "2")) == Answer(-1.0, 1.0)
+    assert parse_answer('42["manual",{}]') == Answer()
 
 
 def test_a_lost_reply_is_said_with_what_came_instead():
@@ -268,7 +269,7 @@ def test_a_missing_server_is_waited_for_then_said():
     closed.close()
     run = Run(Track("lake"), "autonomous")
     with pytest.raises(SimulatorError, match=r"no server at 127\.0\.0\.1.*drive\.py"):
-        Client(run, Blank(), "127.0.0.1", port, 0.5, False).drive(1, Progress(1, "laps"))
+        Client(run, Blank(), "127.0.0.1", port, 0.5, False).drive(1)
 
 
 def test_a_server_that_is_no_websocket_is_said():
@@ -284,7 +285,7 @@ def test_a_server_that_is_no_websocket_is_said():
         thread.start()
         run = Run(Track("lake"), "autonomous")
         with pytest.raises(SimulatorError, match="404"):
-            Client(run, Blank(), "127.0.0.1", listener.getsockname()[1], 0.0, False).drive(1, Progress(1, "laps"))
+            Client(run, Blank(), "127.0.0.1", listener.getsockname()[1], 0.0, False).drive(1)
         thread.join(5)
 
 
@@ -337,22 +338,22 @@ def test_the_window_looks_for_a_server_without_waiting():
 
 
 def test_pings_and_leaves_a_server_that_does_not_answer_them(monkeypatch):
-    monkeypatch.setattr("cloning.wire.client.PING_EVERY", 0.2)
-    monkeypatch.setattr("cloning.wire.client.PONG_WITHIN", 0.5)
-    monkeypatch.setattr("cloning.wire.client.ANSWERS_WITHIN", 0.5)
+    monkeypatch.setattr("cloning.wire.client.PING_INTERVAL", 0.2)
+    monkeypatch.setattr("cloning.wire.client.PONG_TIMEOUT", 0.5)
+    monkeypatch.setattr("cloning.wire.client.CONNECT_TIMEOUT", 0.5)
 
     server = Server(ahead, sessions=2)
     send = server.send
     server.send = lambda client, text: None if text == "3" else send(client, text)
     with server, pytest.raises(SimulatorError):
         client = Client(Run(Track("lake"), "autonomous"), Blank(), "127.0.0.1", server.port, 1.5, False)
-        client.drive(1, Progress(1, "laps"))
+        client.drive(1)
     assert client.reconnections >= 1
     assert server.messages.count("2") >= 3  # not the first alone
 
 
 def test_a_car_that_is_never_driven_is_said(monkeypatch):
-    monkeypatch.setattr("simulator.client.STANDS_STILL", 5.0)
+    monkeypatch.setattr("simulator.client.STANDSTILL_TIME", 5.0)
     with (
         Server(lambda packet, n: [STEER % ("0", "0")]) as server,
         pytest.raises(Standstill, match="stood still"),
@@ -366,23 +367,78 @@ def test_lockstep_repeats_to_the_last_digit():
         with Server(lambda packet, n: [STEER % (f"{0.02 * ((n * 7919) % 5 - 2):.3f}", "0.7")]) as server:
             runs.append(drive(server, laps=0.05).run)
     assert runs[0].trajectory == runs[1].trajectory
-    assert report.figures(runs[0]) == report.figures(runs[1])
+    assert report.lap_report(runs[0]) == report.lap_report(runs[1])
 
 
 def test_report_says_what_happened(tmp_path):
     with Server(lambda packet, n: [STEER % ("0.3" if n > 30 else "0", "1")]) as server:
         client = drive(server, laps=0.05)
-    figures = report.figures(client.run, client)
+    figures = report.lap_report(client.run, client)
     assert figures["departures"]
     assert figures["autonomy"] == pytest.approx(
         1 - 6 * len(figures["departures"]) / figures["simulated_seconds"], abs=1e-3
     )
     assert figures["frames_per_simulated_second"] == pytest.approx(15, abs=0.5)
-    said = report.text(figures)
+    said = report.report_text(figures)
     assert f"departures: {len(figures['departures'])}" in said
-    report.write_json(tmp_path / "report.json", figures)
+    write_json(tmp_path / "report.json", figures)
     assert json.loads((tmp_path / "report.json").read_text()) == figures
     report.write_picture(tmp_path / "way.png", client.run)
     assert cv2.imread(tmp_path / "way.png").std() > 10
-    with pytest.raises(SimulatorError, match="nowhere"):
-        report.write_json(tmp_path / "nowhere" / "report.json", figures)
+    with pytest.raises(OutputError, match="nowhere"):
+        write_json(tmp_path / "nowhere" / "report.json", figures)
+
+
+def test_a_round_trip_in_real_time_is_that_of_the_telemetry_that_is_answered():
+    """The greeting answers no telemetry, though it comes while the first two are in flight."""
+    pause = 0.05
+
+    def slowly(packet, n):
+        time.sleep(pause)
+        return ahead(packet, n)
+
+    with Server(slowly) as server:
+        client = drive(server, realtime=True)
+    # Three telemetries circulate, and the server answers one at a time.
+    assert min(client.round_trips) >= 0.9 * pause
+    assert np.median(client.round_trips) == pytest.approx(3 * pause, rel=0.2)
+
+
+@pytest.mark.parametrize(("steering", "status"), [("0", 0), ("1", 1)])
+def test_the_exit_status_tells_whether_the_car_left_the_road(steering, status, capsys):
+    with Server(lambda packet, n: [STEER % (steering if n > 15 else "0", "1")]) as server:
+        assert main(["drive", "--laps", "0.03", "--port", str(server.port)]) == status
+    departures = int(re.search(r"departures: (\d+)", capsys.readouterr().out)[1])
+    assert bool(departures) == bool(status)
+
+
+def test_the_exit_status_of_a_drive_without_a_server_is_2(capsys):
+    closed = socket.create_server(("127.0.0.1", 0))
+    port = closed.getsockname()[1]
+    closed.close()
+    assert main(["drive", "--wait", "0.1", "--port", str(port)]) == 2
+    assert "simulator: no server" in capsys.readouterr().err
+
+
+def test_a_full_disk_costs_the_film_alone(tmp_path, capsys):
+    resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fills_up(packet, n):
+        # The first frames of the film fit, then nothing does, until the drive is over.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10 if 20 < n < 90 else before[0], before[1]))
+        return [STEER % ("0", "0.3")]
+
+    names = [tmp_path / name for name in ("x.mp4", "report.json", "above.png")]
+    outputs = [str(word) for pair in zip(("--film", "--report", "--picture"), names, strict=True) for word in pair]
+    try:
+        with Server(fills_up) as server:
+            assert main(["drive", "--laps", "0.03", "--port", str(server.port), *outputs]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    printed = capsys.readouterr()
+    assert re.search(r"simulator: \S+x\.mp4: .*no film was written", printed.err)
+    assert "departures: 0" in printed.out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["above.png", "report.json"]
+    assert json.loads((tmp_path / "report.json").read_text())["distance_m"] > 30
+    assert cv2.imread(tmp_path / "above.png").std() > 10

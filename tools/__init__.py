@@ -1,1 +1,1 @@
-"""Tools: benchmarks, the score board and the training of the lane network; each runs as `python -m tools.NAME`."""
+"""Tools: benchmarks, the scoreboard and the training of the lane network; run each as `python -m tools.NAME`."""

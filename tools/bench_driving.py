@@ -1,11 +1,12 @@
-"""How fast drive.py answers, beside the floor and beside the usual shape of such a server, in one run.
+"""Measure how fast drive.py answers, compared with the lower bound and with a typical server.
 
-    python -m tools.bench_driving model.pt data/lake-ccw                     # a minute or two
-    python -m tools.bench_driving model.pt data/lake-ccw --frames 50000      # whether memory stays flat
+    python -m tools.bench_driving model.pt data/lake-ccw                     # one or two minutes
+    python -m tools.bench_driving model.pt data/lake-ccw --frames 50000      # shows whether memory use grows
 
-One client in lock-step over loopback, in the simulator's fragments and without TCP_NODELAY. The floor is what can't be
-saved: decoding that JPEG and a bare forward pass, batch 1, one thread. The servers take turns, so that what else the
-machine does falls on all alike.
+One client per server sends telemetry in lock-step over loopback, in the simulator's fragments and without TCP_NODELAY.
+The lower bound is the time to decode the JPEG and run one forward pass (batch size 1, one thread). The servers take
+turns, so that other load on the machine affects all of them equally. Needs Linux: CPU time and memory are read from
+/proc.
 """
 
 import argparse
@@ -17,145 +18,181 @@ import tempfile
 import threading
 import time
 import urllib.request
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from cloning.pilot.network import load_model
+from cloning.errors import UserError
+from cloning.pilot.network import Network, load_model
 from cloning.recordings.images import decode
 from tools.simulator_client import Simulator, fragments, telemetry
 
 ROOT = Path(__file__).parent.parent
 
-TICKS = 100  # a second, in /proc/PID/stat
+TICKS = 100  # per second, the unit of time in /proc/PID/stat
+TURN = 100  # frames that a server answers before it is the next one's turn
+WARM_UP = 50  # frames that are not counted
 
 
 class Server:
-    """A server process and a client in lock-step with it."""
+    """A server process with a connected client, and what was measured of it."""
 
-    def __init__(self, name: str, command: list):
+    def __init__(self, name: str, command: Sequence[str | Path]):
         self.name = name
         self.process = subprocess.Popen([sys.executable, *map(str, command)], stderr=subprocess.PIPE, text=True)
-        lines = (re.search(r"Listening on .*:(\d+)", line) for line in self.process.stderr)
-        self.port = next(int(found[1]) for found in lines if found)
-        threading.Thread(target=self.process.stderr.read, daemon=True).start()
+        self.port = self.listening_port()
         self.client = Simulator(self.port)
         self.client.open()
-        self.round_trips, self.inside, self.memory = [], [], []
-        self.seconds = self.cpu = 0.0
+        self.round_trips: list[float] = []  # seconds, measured by the client
+        self.latencies: list[float] = []  # seconds, measured by the server
+        self.memory: list[float] = []  # MB, after each turn
+        self.seconds = self.cpu_time = 0.0  # over all counted frames
 
-    def close(self):
+    def listening_port(self) -> int:
+        """Read the port that the server prints, and discard all later output."""
+        assert self.process.stderr
+        for line in self.process.stderr:
+            if port := re.search(r"Listening on .*:(\d+)", line):
+                threading.Thread(target=self.process.stderr.read, daemon=True).start()
+                return int(port[1])
+        raise UserError(f"{self.name} ended before it listened on a port; run it alone to see why")
+
+    def close(self) -> None:
+        """End the client and the server."""
         self.client.socket.close()
         self.process.terminate()
         self.process.wait()
 
     def drive(self, messages: list[list[bytes]], count: bool = True) -> None:
-        self.client.send("2")  # as the simulator does every 25 s, or the classic server hangs up
+        """Send these messages, each a list of fragments, in lock-step; measure them if `count`."""
+        self.client.send("2")  # a ping as the simulator sends every 25 s, without which the typical server hangs up
         self.client.receive()
-        cpu, began = self.cpu_seconds(), time.perf_counter()
-        for fragments_of_one in messages:
-            start = time.perf_counter()
-            for fragment in fragments_of_one:
+        cpu_before, started = self.cpu_seconds(), time.perf_counter()
+        for message in messages:
+            sent = time.perf_counter()
+            for fragment in message:
                 self.client.socket.sendall(fragment)
             self.client.receive()
             if count:
-                self.round_trips.append(time.perf_counter() - start)
+                self.round_trips.append(time.perf_counter() - sent)
         if count:
-            self.seconds += time.perf_counter() - began
-            self.cpu += self.cpu_seconds() - cpu
-            status = Path(f"/proc/{self.process.pid}/status").read_text()
-            self.memory.append(int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024)
+            self.seconds += time.perf_counter() - started
+            self.cpu_time += self.cpu_seconds() - cpu_before
+            self.memory.append(self.resident_megabytes())
 
     def cpu_seconds(self) -> float:
+        """Return the server's CPU time so far, user and system, in seconds."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / TICKS
 
-    def ask_inside(self, frames: int) -> None:
-        """The server's own times of the last frames, from the page's events."""
+    def resident_megabytes(self) -> float:
+        """Return the server's resident memory in MB."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(status.split("VmRSS:")[1].split()[0]) / 1024
+
+    def read_latencies(self, frames: int) -> None:
+        """Read the server's own latency of the last frames from the events that feed its page."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/live", timeout=10) as events:
             rows = json.loads(next(line for line in events if line.startswith(b"data:"))[6:])["rows"]
-        self.inside += [row[-1] / 1000 for row in rows[-frames:]]
+        self.latencies += [row[-1] / 1000 for row in rows[-frames:]]
 
 
 @contextmanager
-def page_open(port: int):
-    """A reader of the page's events, with the attention, as a browser would be."""
-    reader = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            "import sys, urllib.request\nfor line in urllib.request.urlopen(sys.argv[1]): pass",
-            f"http://127.0.0.1:{port}/live?attention",
-        ]
-    )
+def open_page(port: int) -> Iterator[None]:
+    """Read the page's events, attention maps included, as a browser does while the page is open."""
+    read_events = "import sys, urllib.request\nfor line in urllib.request.urlopen(sys.argv[1]): pass"
+    address = f"http://127.0.0.1:{port}/live?attention"
+    reader = subprocess.Popen([sys.executable, "-c", read_events, address])
     time.sleep(1)
     yield
     reader.kill()
     reader.wait()
 
 
-def floor(network, jpegs: list[bytes]) -> list[float]:
+def lower_bounds(network: Network, jpegs: list[bytes]) -> list[float]:
+    """Return the seconds to decode each JPEG and run one forward pass on it."""
     times = []
     for jpeg in jpegs:
-        start = time.perf_counter()
+        started = time.perf_counter()
         with torch.inference_mode():
             float(network(torch.from_numpy(decode(jpeg))[None])[0])
-        times.append(time.perf_counter() - start)
+        times.append(time.perf_counter() - started)
     return times
 
 
-def milliseconds(times) -> str:
+def milliseconds(times: list[float]) -> str:
+    """Format the median and the 99th percentile of times in seconds."""
     return f"{np.median(times) * 1e3:7.2f} {np.quantile(times, 0.99) * 1e3:8.2f}"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model")
-    parser.add_argument("recording", type=Path, help="its centre images are sent")
-    parser.add_argument("--frames", type=int, default=3000, help="to each server (default %(default)s)")
-    args = parser.parse_args()
-    jpegs = [path.read_bytes() for path in sorted(args.recording.glob("IMG/center_*.jpg"))[:500]]
+def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], list[Server]]:
+    """Return the lower bounds in seconds, and the servers with what was measured of them."""
     messages = [fragments("42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")])) for jpeg in jpegs]
-    torch.set_num_threads(1)
-    network, floors, per_turn = load_model(args.model), [], 100
+    network, bounds = load_model(model), []
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        drive = [ROOT / "drive.py", args.model]
-        servers = [
-            Server("drive.py", [*drive, "--port", 0]),
-            Server("drive.py, saving frames", [*drive, Path(folder) / "run1", "--port", 0]),
-            Server("drive.py, page open", [*drive, "--port", 0]),
-            Server("classic", ["-m", "tools.classic_server", args.model]),
-        ]
-        for server in servers:
-            stack.callback(server.close)
-            server.drive(messages[:50], count=False)
-        at = 0
-        for _ in range(args.frames // per_turn):
-            part, at = slice(at, at + per_turn), (at + per_turn) % len(jpegs)
-            floors += floor(network, jpegs[part])
+        drive = (ROOT / "drive.py", model)
+        commands: dict[str, Sequence[str | Path]] = {
+            "drive.py": (*drive, "--port", "0"),
+            "drive.py, saving frames": (*drive, Path(folder) / "run1", "--port", "0"),
+            "drive.py, page open": (*drive, "--port", "0"),
+            "typical server": ("-m", "tools.classic_server", model),
+        }
+        servers = []
+        for name, command in commands.items():
+            servers.append(Server(name, command))
+            stack.callback(servers[-1].close)
+            servers[-1].drive(messages[:WARM_UP], count=False)
+        start = 0
+        for _ in range(frames // TURN):
+            turn, start = slice(start, start + TURN), (start + TURN) % len(jpegs)
+            bounds += lower_bounds(network, jpegs[turn])
             for server in servers:
-                if "page" in server.name:
-                    with page_open(server.port):
-                        server.drive(messages[part])
-                else:
-                    server.drive(messages[part])
+                with open_page(server.port) if "page" in server.name else nullcontext():
+                    server.drive(messages[turn])
                 if "drive" in server.name:
-                    server.ask_inside(per_turn)
-    best = np.median(floors)
-    print(
-        f"{len(floors)} frames each; times in ms\n{'':25} median      p99  /floor  frames/s  CPU/frame  MB first  last"
+                    server.read_latencies(TURN)
+    return bounds, servers
+
+
+def main() -> None:
+    """Run the benchmark and print its table."""
+    parser = argparse.ArgumentParser(
+        prog="bench_driving", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    print(f"{'floor: decode + forward':24} {milliseconds(floors)}    1.00")
+    parser.add_argument("model", help="a model file that model.py wrote")
+    parser.add_argument("recording", type=Path, help="recording whose first 500 centre images are sent")
+    parser.add_argument("--frames", type=int, default=3000, help="frames for each server (default %(default)s)")
+    args = parser.parse_args()
+    if not Path("/proc/self/stat").exists():
+        parser.error("needs Linux, whose /proc tells the CPU time and memory of a process")
+    jpegs = [path.read_bytes() for path in sorted(args.recording.glob("IMG/center_*.jpg"))[:500]]
+    if not jpegs:
+        parser.error(f"{args.recording}: no centre images in its IMG/; name a folder that holds driving_log.csv")
+    if args.frames < TURN:
+        parser.error(f"--frames: at least {TURN}")
+    torch.set_num_threads(1)
+    try:
+        bounds, servers = measure(args.model, jpegs, args.frames)
+    except UserError as error:
+        sys.exit(f"bench_driving: {error}")
+    print(
+        f"{len(bounds)} frames each; times in ms\n{'':25} median      p99  /bound  frames/s  CPU/frame  MB first  last"
+    )
+    print(f"{'bound: decode + forward':24} {milliseconds(bounds)}    1.00")
     for server in servers:
+        count = len(server.round_trips)
         print(
-            f"{server.name:24} {milliseconds(server.round_trips)} {np.median(server.round_trips) / best:7.2f} "
-            f"{len(server.round_trips) / server.seconds:9.1f} {server.cpu / len(server.round_trips) * 1e3:10.2f} "
+            f"{server.name:24} {milliseconds(server.round_trips)} "
+            f"{np.median(server.round_trips) / np.median(bounds):7.2f} "
+            f"{count / server.seconds:9.1f} {server.cpu_time / count * 1e3:10.2f} "
             f"{server.memory[0]:9.0f} {server.memory[-1]:5.0f}"
         )
-        if server.inside:
-            print(f"{'  in the server':24} {milliseconds(server.inside)} {np.median(server.inside) / best:7.2f}")
+        if server.latencies:
+            ratio = np.median(server.latencies) / np.median(bounds)
+            print(f"{'  in the server':24} {milliseconds(server.latencies)} {ratio:7.2f}")
 
 
 if __name__ == "__main__":

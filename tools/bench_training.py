@@ -1,59 +1,73 @@
-"""How fast `model.py` trains, beside what bounds it and beside what people write today, in one run.
+"""Measure how fast `model.py` trains, compared with the processor's limit and with a typical training loop.
 
-    python -m tools.bench_training                                  # over a third of a lap that it renders
-    python -m tools.bench_training data/lake-ccw data/lake-cw       # over real ones
+    python -m tools.bench_training                                  # on a third of a lap that it renders
+    python -m tools.bench_training data/lake-ccw data/lake-cw       # on these recordings
 
-(a) model.py's own epoch: generator, step, saving, pictures and validation
-(b) the bare optimisation step on one resident batch, as model.py does it
-(c) what people write today: fp32, contiguous, the whole batch at once, images decoded and augmented one by one by the
-    training's own thread
-(k) Keras with the classic generator, where TensorFlow is installed
-and the processor's own product of two matrices, which bounds (b). Each part is a process of its own; the parts take
-turns, so that a machine that slows down slows them all. Rates are training images per second.
+(a) an epoch of model.py: generator, optimisation steps, checkpoints, pictures and validation
+(b) only the optimisation step, as model.py does it, repeated on one batch in memory
+(c) a typical training loop: float32, contiguous tensors, the whole batch at once; the training thread itself decodes
+    and augments the images one by one
+(k) Keras with the same one-by-one generator, if TensorFlow is installed
+
+The limit for (b) follows from the processor's rate of multiplying two matrices. Each part runs in a process of its own;
+the parts take turns, so that a change of the machine's speed affects all of them. Rates are training images per second.
 """
 
 import argparse
 import importlib.util
 import itertools
 import json
-import os
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
+from unittest import mock
 
-from cloning.compute import keep_freed_memory
+from cloning.compute import keep_freed_memory, threads
+from cloning.errors import UserError
 from cloning.road.track import Track
 
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+
+    import model
+    from cloning.pilot.network import Network
+
 PARTS = ("bound", "ab", "c", "k")
+BATCH_IMAGES = 474  # of a batch of 128 observations, which give 3.7 images each on average
 NAMES = {
-    "bound": "bound by the matrix product",
-    "a": "(a) model.py's epoch",
-    "b": "(b) bare step",
-    "c": "(c) what people write today",
-    "k": "(k) Keras, classic generator",
+    "bound": "limit by matrix multiplication",
+    "a": "(a) an epoch of model.py",
+    "b": "(b) only the optimisation step",
+    "c": "(c) a typical training loop",
+    "k": "(k) Keras, one-by-one generator",
 }
 
 
-def begin(folders: list[str], samples: int, output: Path):
-    """A model.py run over these folders, not yet trained."""
+def begin(folders: list[str], samples: int, output: Path) -> "model.TrainingRun":
+    """Prepare a run of model.py on these folders, without training."""
     import model
 
-    arguments, given = model.parse([*folders, "--samples-per-epoch", str(samples), "--output", str(output)])
-    training, validation, _ = model.prepare(arguments, given)
-    return model.Run(arguments, training, validation)
+    options = ["--samples-per-epoch", str(samples), "--epochs", "1", "--output", str(output)]
+    arguments, training, validation, _ = model.prepare(*model.parse([*folders, *options]))
+    return model.TrainingRun(arguments, training, validation)
 
 
-def flops(network) -> int:
-    """Multiplications and additions an image costs, forward and backward."""
+def flops(network: "Network") -> int:
+    """Count the multiplications and additions per image, forward and backward."""
     import torch
 
-    total = []
+    total: list[int] = []
 
-    def count(module, inputs, output):
+    def count(module: torch.nn.Module, _: tuple, output: torch.Tensor) -> None:
+        assert isinstance(module, torch.nn.Conv2d | torch.nn.Linear)
         products = 2 * output[0].numel() * module.weight[0].numel()
-        total.append(products * (2 if module is network.convolutions[0] else 3))  # frames need no gradient
+        total.append(products * (2 if module is network.convolutions[0] else 3))  # no gradient for the image
 
     hooks = [module.register_forward_hook(count) for module in (*network.convolutions, *network.dense)]
     network(torch.zeros((1, 160, 320, 3), dtype=torch.uint8, device=next(network.parameters()).device))
@@ -62,16 +76,19 @@ def flops(network) -> int:
     return sum(total)
 
 
-def part_ab(run, _):
-    """Both in one process, a bare step after every fourth batch, so that what else the machine does falls on both."""
-    bare, draw_pictures, turns = run.generator.begin(0)(), run.draw_pictures, itertools.count(1)
+def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
+    """Measure (a) and (b) in one process, a step of (b) after every fourth batch of (a).
+
+    So other load on the machine affects both equally.
+    """
+    bare, write_pictures, turns = run.generator.begin(0)(), run.write_pictures, itertools.count(1)
     spent, steps = 0.0, 0
 
-    def between_batches():
+    def between_batches() -> None:
         nonlocal spent, steps
-        draw_pictures()
+        write_pictures()
         if next(turns) % 4 == 0:
-            run.pool.submit(int).result()  # behind the images of the next batch, which are (a)'s
+            run.pool.submit(int).result()  # wait for the next batch's images, whose time belongs to (a)
             started = time.perf_counter()
             (run.errors(bare) / bare.total).backward()
             run.optimizer.step()
@@ -79,40 +96,47 @@ def part_ab(run, _):
             synchronize(run.device)
             spent, steps = spent + time.perf_counter() - started, steps + 1
 
-    run.draw_pictures, run.arguments.epochs = between_batches, 1
     started = time.perf_counter()
-    run.train()
+    with mock.patch.object(run, "write_pictures", between_batches):
+        run.train()
     whole = time.perf_counter() - started - spent
-    return {"a": run.history[0]["images"] / whole, "b": steps * bare.total / spent}
+    return {"a": run.progress.history[0]["images"] / whole, "b": steps * bare.total / spent}
 
 
-def one_by_one(generator, number: int):
-    """A batch as a classic generator makes it, from its files, an image at a time: images and angles."""
+def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray", "np.ndarray"]:
+    """Make a batch as a typical generator does, one image at a time from its file.
+
+    Returns the images, uint8 (n, 75, 320, 3), and their steering, float32 (n,).
+    """
     import numpy as np
 
     from cloning.recordings.format import FRAME
-    from model import CROP, of_each_kind
+    from model import CROP, augment, of_each_kind
 
-    drawn, images, angles = generator.draw(number), [], []
-    for i, (at, camera) in enumerate(zip(drawn["observation"], drawn["camera"], strict=True)):
+    choices, images, angles = generator.sample(number), [], []
+    for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
         cropped = generator.observations.read(at, camera)[None, CROP[0] : FRAME[0] - CROP[1]]
-        for kind, (which, made) in enumerate(generator.augment(drawn, np.array([i]), of_each_kind(cropped), CROP[0])):
-            images += list(made)
-            angles += [drawn["angles"][i, kind]] * len(which)
+        augmented = augment(choices, np.array([i]), of_each_kind(cropped), CROP[0])
+        for kind, (rows, kind_images) in enumerate(augmented):
+            images += list(kind_images)
+            angles += [choices.views.labels[i, kind]] * len(rows)
     return np.stack(images), np.array(angles)
 
 
-def part_c(run, steps):
+def part_c(run: "model.TrainingRun", steps: int) -> dict[str, float]:
+    """Measure (c), a typical training loop."""
     import torch
 
-    network = run.network.to(memory_format=torch.contiguous_format)
-    torch.set_num_threads(len(os.sched_getaffinity(0)))
+    network = run.network
+    for parameter in network.parameters():
+        parameter.data = parameter.data.contiguous()  # model.py has them channels last
+    torch.set_num_threads(threads())
     optimizer = torch.optim.Adam(network.parameters(), 1e-4)
     numbers = iter(range(1000))
 
-    def step():
-        made, angles = one_by_one(run.generator, next(numbers))
-        frames = torch.from_numpy(made).to(run.device)
+    def step() -> None:
+        images, angles = one_by_one(run.generator, next(numbers))
+        frames = torch.from_numpy(images).to(run.device)
         x = (frames.permute(0, 3, 1, 2).float() / 127.5 - 1).contiguous()
         for convolution in network.convolutions:
             x = torch.nn.functional.elu(convolution(x))
@@ -124,10 +148,11 @@ def part_c(run, steps):
         loss.backward()
         optimizer.step()
 
-    return {"c": rate(step, 474, steps, run.device)}
+    return {"c": rate(step, BATCH_IMAGES, steps, run.device)}
 
 
-def part_k(run, steps):
+def part_k(run: "model.TrainingRun", steps: int) -> dict[str, float]:
+    """Measure (k), Keras with the one-by-one generator."""
     import keras
 
     layers = keras.layers
@@ -148,24 +173,24 @@ def part_k(run, steps):
     network.compile(optimizer=keras.optimizers.Adam(1e-4), loss="mse")
     numbers = iter(range(1000))
 
-    def step():
+    def step() -> None:
         network.train_on_batch(*one_by_one(run.generator, next(numbers)))
 
-    return {"k": rate(step, 474, steps, run.device)}
+    return {"k": rate(step, BATCH_IMAGES, steps, run.device)}
 
 
-def part_bound(run, _):
-    """Images a second, if a step were nothing but the products of matrices, at the best speed of several."""
+def part_bound(run: "model.TrainingRun", _: int) -> dict[str, float]:
+    """Measure the limit: images per second of a step that only multiplies matrices, the best of eight measurements."""
     import torch
 
-    torch.set_num_threads(len(os.sched_getaffinity(0)))
+    torch.set_num_threads(threads())
     size = 2048 if run.device.type == "cpu" else 8192
     a, b = (torch.randn(size, size, device=run.device).to(run.precision) for _ in "ab")
     return {"bound": max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size**3 / flops(run.network)}
 
 
-def rate(step, images: int, steps: int, device) -> float:
-    """Images a second over these steps, after one that does not count."""
+def rate(step: Callable[[], object], images: int, steps: int, device: "torch.device") -> float:
+    """Return the images per second over these steps, after one step that is not counted."""
     step()
     synchronize(device)
     started = time.perf_counter()
@@ -175,97 +200,99 @@ def rate(step, images: int, steps: int, device) -> float:
     return images * steps / (time.perf_counter() - started)
 
 
-def synchronize(device) -> None:
-    """Wait for a GPU's work to be done."""
+def synchronize(device: "torch.device") -> None:
+    """Wait until a GPU has finished its work."""
     if device.type == "cuda":
         import torch
 
         torch.cuda.synchronize(device)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("recordings", nargs="*", help="folders; without any, a third of a lap is rendered")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--samples", type=int, default=20224, help="images of the epoch in (a)")
-    parser.add_argument("--steps", type=int, default=5, help="counted batches in (b), (c) and (k)")
-    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        if arguments.part:
-            if arguments.part == "ab":
-                keep_freed_memory()  # as model.py's main does
-            run = begin(arguments.recordings, arguments.samples, Path(folder) / "model.pt")
-            rates = globals()[f"part_{arguments.part}"](run, arguments.steps)
-            print(
-                "\n"
-                + json.dumps(
-                    {
-                        "rates": rates,
-                        "gb": peak_memory(),
-                        "device": str(run.device),
-                        "precision": str(run.precision),
-                        "flops": flops(run.network),
-                    }
-                )
-            )
-            return
-        if not arguments.recordings:
-            from simulator.record import record
-
-            record(f"{folder}/rendered", Track("lake"), laps=0.35)
-            arguments.recordings = [f"{folder}/rendered"]
-        report(arguments)
+PART_FUNCTIONS = {"bound": part_bound, "ab": part_ab, "c": part_c, "k": part_k}
 
 
-def peak_memory() -> float:
-    """Of this process: GB resident at the most."""
+def measure(part: str, recordings: list[str], samples: int, steps: int, folder: Path) -> dict:
+    """Measure one part in this process; return its rates in images per second and the circumstances."""
+    if part == "ab":
+        keep_freed_memory()  # as model.py does
+    run = begin(recordings, samples, folder / "model.pt")
+    rates = PART_FUNCTIONS[part](run, steps)
+    return {
+        "rates": rates,
+        "gb": peak_memory(),
+        "device": str(run.device),
+        "precision": str(run.precision),
+        "flops": flops(run.network),
+    }
+
+
+def peak_memory() -> float | None:
+    """Return the peak resident memory of this process in GB, or None on Windows, which does not tell it."""
+    if sys.platform == "win32":
+        return None
     import resource
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    unit = 1e9 if sys.platform == "darwin" else 1e6  # bytes on macOS, kilobytes elsewhere
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def report(arguments) -> None:
+def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> None:
+    """Measure every part in each round and print the tables."""
     parts = [part for part in PARTS if part != "k" or importlib.util.find_spec("tensorflow")]
     rates: dict[str, list[float]] = {}
     memory: dict[str, float] = {}
-    for number in range(arguments.rounds):
+    measured: dict = {}
+    for number in range(1, rounds + 1):
         for part in parts:
-            command = [
-                sys.executable,
-                "-m",
-                "tools.bench_training",
-                *arguments.recordings,
-                "--part",
-                part,
-                "--samples",
-                str(arguments.samples),
-                "--steps",
-                str(arguments.steps),
-            ]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-            found = json.loads(done.stdout.splitlines()[-1])
-            for name, value in found["rates"].items():
+            command = [sys.executable, "-m", "tools.bench_training", *recordings, "--part", part]
+            command += ["--samples", str(samples), "--steps", str(steps)]
+            process = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+            if process.returncode:
+                raise UserError(f"part {part} failed; its own message stands above")
+            measured = json.loads(process.stdout.splitlines()[-1])
+            for name, value in measured["rates"].items():
                 rates.setdefault(name, []).append(value)
-                memory[name] = max(memory.get(name, 0), found["gb"])
-                print(f"round {number + 1}: {NAMES[name]}: {value:.0f}", file=sys.stderr, flush=True)
-    print(
-        f"\n{found['device']}, {found['precision'].removeprefix('torch.')}, {arguments.rounds} rounds, "
-        f"{found['flops'] / 1e6:.0f} MFLOP an image\n"
-    )
+                memory[name] = max(memory.get(name, 0.0), measured["gb"] or 0.0)
+                print(f"round {number}: {NAMES[name]}: {value:.0f}", file=sys.stderr, flush=True)
+    precision = measured["precision"].removeprefix("torch.")
+    print(f"\n{measured['device']}, {precision}, {rounds} rounds, {measured['flops'] / 1e6:.0f} MFLOP per image\n")
     print("| training images/s | median | least | most | peak memory GB |\n|---|---|---|---|---|")
     for name, values in rates.items():
-        values = sorted(values)
-        print(f"| {NAMES[name]} | {median(values):.0f} | {values[0]:.0f} | {values[-1]:.0f} | {memory[name]:.2f} |")
-    print("\n| ratio, round by round | median | least | most |\n|---|---|---|---|")
+        cells = (statistics.median(values), min(values), max(values))
+        print(f"| {NAMES[name]} | {' | '.join(f'{cell:.0f}' for cell in cells)} | {memory[name]:.2f} |")
+    print("\n| ratio in each round | median | least | most |\n|---|---|---|---|")
     for above, below in (("b", "bound"), ("a", "b"), ("a", "c"), *((("a", "k"),) if "k" in parts else ())):
-        ratios = sorted(x / y for x, y in zip(rates[above], rates[below], strict=True))
-        print(f"| {above} / {below} | {median(ratios):.2f} | {ratios[0]:.2f} | {ratios[-1]:.2f} |")
+        ratios = [x / y for x, y in zip(rates[above], rates[below], strict=True)]
+        print(f"| {above} / {below} | {statistics.median(ratios):.2f} | {min(ratios):.2f} | {max(ratios):.2f} |")
 
 
-def median(values: list[float]) -> float:
-    """The middle one of sorted values."""
-    return (values[(len(values) - 1) // 2] + values[len(values) // 2]) / 2
+def main() -> None:
+    """Run the benchmark, or one part of it for the process that compares them."""
+    parser = argparse.ArgumentParser(
+        prog="bench_training", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recordings", nargs="*", help="recordings; without any, a third of a lap is rendered")
+    parser.add_argument("--rounds", type=int, default=3, help="how often each part is measured (default %(default)s)")
+    parser.add_argument("--samples", type=int, default=20224, help="images per epoch in (a) (default %(default)s)")
+    parser.add_argument(
+        "--steps", type=int, default=5, help="batches that are counted in (c) and (k) (default %(default)s)"
+    )
+    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            if args.part:
+                measured = measure(args.part, args.recordings, args.samples, args.steps, Path(folder))
+                print("\n" + json.dumps(measured))
+                return
+            if not args.recordings:
+                from simulator.record import record
+
+                args.recordings = [f"{folder}/rendered"]
+                record(args.recordings[0], Track("lake"), laps=0.35)
+            compare(args.recordings, args.rounds, args.samples, args.steps)
+    except UserError as error:
+        sys.exit(f"bench_training: {error}")
 
 
 if __name__ == "__main__":

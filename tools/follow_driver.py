@@ -1,57 +1,68 @@
-"""How far a network steers as the drivers of recordings did.
+"""Measure how closely a network's steering follows the human driver's on recordings.
 
     python -m tools.follow_driver model.pt data/lake-ccw data/lake-cw
 
 Prints for each recording the correlation of the network's steering on the centre frames with the driver's, frame by
-frame and with both smoothed over nine frames (0.6 s), for a driver's hands are jerky where the road is not; and mean
-and spread of the smoothed steering. A model trained on drawn recordings alone tells so how like the real road the
-drawn one is.
+frame and with both smoothed over nine frames (0.6 s), because a driver's steering is jerkier than the road; and mean
+and standard deviation of the smoothed steering. For a model trained on rendered recordings alone, this tells how much
+the rendered road resembles the real one.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from cloning.pilot.network import load_model
-from cloning.recordings.images import decode
+from cloning.errors import UserError
+from cloning.pilot.network import Network, load_model
+from cloning.recordings.images import read_frame
 from cloning.recordings.log import read_recording
 
-FRAMES = 9
-PIECE = 32  # frames at once
+SMOOTHED_FRAMES = 9
+FRAMES_PER_BATCH = 32
 
 
 def smooth(steering: np.ndarray) -> np.ndarray:
-    """The mean over FRAMES frames: (n,) -> (n - 8,)."""
-    return np.convolve(steering, np.ones(FRAMES) / FRAMES, "valid")
+    """Return the moving average over SMOOTHED_FRAMES frames: (n,) -> (n - 8,)."""
+    return np.convolve(steering, np.ones(SMOOTHED_FRAMES) / SMOOTHED_FRAMES, "valid")
 
 
-def predict(network, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The network's and the driver's steering on a recording's centre frames, float (n,), in the order of time."""
+def predict(network: Network, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the network's and the driver's steering on a recording's centre frames: float32 (n,) each."""
     recording = read_recording(folder)
     paths = [recording.path(row) for row in range(len(recording))]
     predicted = []
-    for start in range(0, len(paths), PIECE):
-        frames = np.stack([decode(path.read_bytes()) for path in paths[start : start + PIECE]])
+    for start in range(0, len(paths), FRAMES_PER_BATCH):
+        frames = np.stack([read_frame(path) for path in paths[start : start + FRAMES_PER_BATCH]])
         with torch.inference_mode():
             predicted.append(network(torch.from_numpy(frames)).numpy())
     return np.concatenate(predicted), recording.steering
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model")
-    parser.add_argument("recordings", nargs="+", type=Path)
-    args = parser.parse_args()
-    network = load_model(args.model)
-    print(f"{'':24} correlation, smoothed    network: mean, spread    driver: mean, spread")
-    for folder in args.recordings:
-        pair = predict(network, folder)
-        soft = [smooth(steering) for steering in pair]
-        figures = "    ".join(f"{steering.mean():+.3f} {steering.std():.3f}        " for steering in soft)
-        print(f"{folder.name:24} {np.corrcoef(*pair)[0, 1]:11.2f} {np.corrcoef(*soft)[0, 1]:9.2f}    {figures}")
+def main(argv: list[str] | None = None) -> int:
+    """Print a row of figures for each recording; return the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="follow_driver", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("model", help="a model of model.py")
+    parser.add_argument("recordings", nargs="+", type=Path, help="folders with a driving_log.csv")
+    args = parser.parse_args(argv)
+    try:
+        network = load_model(args.model)
+        print(f"{'':24} correlation, smoothed    network: mean, deviation    driver: mean, deviation")
+        for folder in args.recordings:
+            ours, drivers = predict(network, folder)
+            ours_smoothed, drivers_smoothed = smooth(ours), smooth(drivers)
+            correlation, smoothed = np.corrcoef(ours, drivers)[0, 1], np.corrcoef(ours_smoothed, drivers_smoothed)[0, 1]
+            cells = [f"{values.mean():+.3f} {values.std():.3f}" for values in (ours_smoothed, drivers_smoothed)]
+            print(f"{folder.name:24} {correlation:11.2f} {smoothed:9.2f}    {cells[0]:28}{cells[1]}")
+    except (UserError, OSError) as error:
+        print(f"follow_driver: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,138 +1,172 @@
-"""How well `lane.py` reads the place in the lane.
+"""Measure how accurately `cloning/lane` estimates the car's position in its lane.
 
-    python -m tools.lane_accuracy RECORDING …                     # on drawn frames, and on these real recordings
-    python -m tools.lane_accuracy RECORDING --picture lane.png    # real frames with the lane as it is read
+    python -m tools.lane_accuracy RECORDING …                     # on rendered frames, and on these real recordings
+    python -m tools.lane_accuracy RECORDING --picture lane.png    # real frames with the estimated lane drawn in
 
-On drawn frames the place is known: of drives in looks that the network was not trained on, and of frames from random
-places. On real ones only where the side cameras stand beside the centre one is known: 0.806 and 0.825 m.
+Rendered frames come with the true position: frames from random poses, and drives, both in looks that the network was
+not trained on. For real recordings only the mounting of the side cameras is known: 0.806 and 0.825 m from the centre.
 """
 
 import argparse
+import sys
 import tempfile
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from cloning.lane.place import read_lane
-from cloning.lane.reader import AHEAD, MOUNT_OFFSETS, STRIP, combine, estimate, load, read_strips, see
-from cloning.recordings.images import decode
-from cloning.recordings.log import read_recording
-from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
-from cloning.road.motion import CAMERA_FORWARD, stretches
+from cloning.errors import UserError
+from cloning.files import write
+from cloning.lane.place import estimate_lane_position
+from cloning.lane.reader import (
+    DISTANCES_AHEAD,
+    MOUNT_OFFSETS,
+    STRIP_SHAPE,
+    LaneNetwork,
+    LanePosition,
+    detect_centres,
+    estimate_centres,
+    fuse_detections,
+    load_network,
+    read_strips,
+)
+from cloning.recordings.images import read_frame
+from cloning.recordings.log import Recording, read_recording
+from cloning.road.camera import project_ground
+from cloning.road.motion import CAMERA_FORWARD, components, forward_vector, stretches
 from cloning.road.track import Track
 from simulator.car import STEP
 from simulator.record import record
-from tools.train_lane import TRACKS, draw
+from tools.train_lane import TRACKS, render_strips
 
 UNSEEN = range(1000, 1003)  # looks
 EDGES = {"lake": 3.5, "jungle": 4.1}  # m from the centre to the lines
+GREEN, RED = (0, 220, 0), (0, 0, 255)  # BGR
 
 
-def places(network) -> None:
-    """Frames from random places: errors at the distances ahead."""
-    print(f"{'drawn frames, m ahead':34}" + "".join(f"{distance:>8g}" for distance in AHEAD))
+def measure_frames(network: LaneNetwork) -> None:
+    """Print the errors of single rendered frames from random poses, at each distance ahead."""
+    print(f"{'rendered frames, m ahead':34}" + "".join(f"{distance:>8g}" for distance in DISTANCES_AHEAD))
     for name in TRACKS:
-        drawn = [draw(name, look, 150, 1) for look in UNSEEN]
-        true = np.concatenate([centres for _, centres in drawn])
-        found = estimate(np.concatenate([strips for strips, _ in drawn]), network)
-        slopes = [
-            np.polyfit(t[known], f[known], 1)[0]
-            for t, f in zip(true.T, found.T, strict=True)
-            for known in [~np.isnan(t)]
-        ]
-        for figure, values in (
-            ("mean absolute error, m", np.nanmean(abs(found - true), 0)),
-            ("bias, m", np.nanmean(found - true, 0)),
-            ("slope", slopes),
-        ):
-            print(f"{f'{name}, {figure}':34}" + "".join(f"{value:8.2f}" for value in values))
+        strips, true = (
+            np.concatenate(arrays)
+            for arrays in zip(*(render_strips(name, look, 150, 1) for look in UNSEEN), strict=True)
+        )
+        estimated = estimate_centres(strips, network)
+        slopes = []
+        for x, y in zip(true.T, estimated.T, strict=True):
+            known = ~np.isnan(x)
+            slopes.append(np.polyfit(x[known], y[known], 1)[0])
+        rows = {
+            "mean absolute error, m": np.nanmean(abs(estimated - true), 0),
+            "bias, m": np.nanmean(estimated - true, 0),
+            "slope": np.array(slopes),
+        }
+        for label, values in rows.items():
+            print(f"{f'{name}, {label}':34}" + "".join(f"{value:8.2f}" for value in values))
 
 
-def drives(network, laps: float) -> None:
-    """Recordings of the stand-in, whose own path is the truth."""
+def measure_drives(network: LaneNetwork, laps: float) -> None:
+    """Print the errors on recordings of the stand-in simulator, which logs the true position."""
     for name in TRACKS:
         for look in UNSEEN:
             with tempfile.TemporaryDirectory() as folder:
                 run = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
                 recording = read_recording(folder)
-                found = combine(recording, see(recording, network))
+                position = fuse_detections(recording, detect_centres(recording, network))
             step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
             true = np.array(run.trajectory.offset)[step]
-            error = found.offset - true
+            error = position.lateral_offset - true
             print(
-                f"{f'drawn drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
+                f"{f'rendered drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
                 f"95th percentile {np.quantile(np.abs(error), 0.95):.2f}, bias {error.mean():+.2f}, "
-                f"slope {np.polyfit(true, found.offset, 1)[0]:.2f}; trusted {found.trusted.mean():.1%}"
+                f"slope {np.polyfit(true, position.lateral_offset, 1)[0]:.2f}; trusted {position.trusted.mean():.1%}"
             )
 
 
-def real(folder: str, network) -> None:
+def measure_recording(folder: str, network: LaneNetwork) -> None:
+    """Print where the side cameras of a real recording appear to be, its lateral offsets, and the time this takes."""
     recording = read_recording(folder)
     started = time.perf_counter()
     strips = read_strips(recording)
     decoded = time.perf_counter()
-    seen = estimate(strips.reshape(-1, *STRIP), network).reshape(-1, 3, len(AHEAD))
+    centres = estimate_centres(strips.reshape(-1, *STRIP_SHAPE), network).reshape(-1, 3, len(DISTANCES_AHEAD))
     estimated = time.perf_counter()
-    found = combine(recording, seen)
+    position = fuse_detections(recording, centres)
     finished = time.perf_counter()
-    beside = seen[:, :1] - seen[:, 1:]
+    apart = centres[:, :1] - centres[:, 1:]
     print(f"{folder}, {len(recording)} rows")
+    near = DISTANCES_AHEAD[:3]
     for side, name in enumerate(("left", "right")):
-        cells = [f"{np.mean(beside[:, side, k]):+.2f} ± {np.std(beside[:, side, k]):.2f}" for k in range(3)]
+        cells = [f"{np.mean(apart[:, side, k]):+.2f} ± {np.std(apart[:, side, k]):.2f}" for k in range(len(near))]
         print(
-            f"  {name + ' camera stands at':32}{', '.join(cells)} m, seen {AHEAD[0]:g}, {AHEAD[1]:g}, {AHEAD[2]:g} m "
-            f"ahead (mounted at {MOUNT_OFFSETS[side + 1]:+.2f})"
+            f"  {name + ' camera appears to be at':32}{', '.join(cells)} m, from {near[0]:g}, {near[1]:g}, {near[2]:g} "
+            f"m ahead (mounted at {MOUNT_OFFSETS[side + 1]:+.2f})"
         )
+    offset = position.lateral_offset
     print(
-        f"  {'off the centre':32}{np.abs(found.offset).mean():.2f} m, 95th percentile "
-        f"{np.quantile(np.abs(found.offset), 0.95):.2f}, mean {found.offset.mean():+.2f}; "
-        f"yaw {np.degrees(found.yaw).std():.1f} degrees; trusted {found.trusted.mean():.1%}"
+        f"  {'lateral offset':32}{np.abs(offset).mean():.2f} m, 95th percentile "
+        f"{np.quantile(np.abs(offset), 0.95):.2f}, mean {offset.mean():+.2f}; "
+        f"heading error {np.degrees(position.heading_error).std():.1f} degrees; trusted {position.trusted.mean():.1%}"
     )
-    spent = np.diff([started, decoded, estimated, finished]) / len(recording) * 1e3
-    print(f"  {'ms a row':32}{spent.sum():.2f}: decode {spent[0]:.2f}, network {spent[1]:.2f}, together {spent[2]:.2f}")
+    ms = np.diff([started, decoded, estimated, finished]) / len(recording) * 1e3
+    print(f"  {'ms a row':32}{ms.sum():.2f}: decode {ms[0]:.2f}, network {ms[1]:.2f}, fuse {ms[2]:.2f}")
 
 
-def drawn_in(recording, found, row: int, edge: float) -> np.ndarray:
-    """A centre frame with the lane's centre (green) and its edges (red) as far as 12 m ahead, taken as straight."""
-    frame = cv2.cvtColor(decode(recording.path(row).read_bytes()), cv2.COLOR_RGB2BGR)
-    ahead = np.linspace(CAMERA_FORWARD + 2.2, 12, 30)
-    s, c = np.sin(-found.yaw[row]), np.cos(-found.yaw[row])
-    for aside, colour in ((0, (0, 220, 0)), (-edge, (0, 0, 255)), (edge, (0, 0, 255))):
-        right = (aside - found.offset[row]) * c + ahead * s
-        forward = ahead * c - (aside - found.offset[row]) * s
-        pixels = np.stack([right, np.full_like(right, CAMERA_HEIGHT), forward - CAMERA_FORWARD]).T @ CAMERA_MATRIX.T
-        pixels = pixels[pixels[:, 2] > 0.3]
-        points = np.round(pixels[:, :2] / pixels[:, 2:]).astype(np.int32)
-        cv2.polylines(frame, [points[:, None]], False, colour, 1, cv2.LINE_AA)
-    cv2.putText(frame, f"{found.offset[row]:+.2f} m {np.degrees(found.yaw[row]):+.1f}", (6, 14), 0, 0.45, (0, 0, 0), 1)
-    return frame
+def draw_lane(recording: Recording, position: LanePosition, row: int, edge: float) -> np.ndarray:
+    """Draw the lane's centre (green) and edges (red) into a centre frame, as straight lines up to 12 m ahead.
+
+    edge: m from the centre. uint8 (160, 320, 3), BGR.
+    """
+    frame = cv2.cvtColor(read_frame(recording.path(row)), cv2.COLOR_RGB2BGR)
+    offset, yaw = position.lateral_offset[row], position.heading_error[row]
+    ahead = np.linspace(CAMERA_FORWARD + 2.2, 12, 30)  # m along the lane from the car's middle
+    for line, colour in ((0, GREEN), (-edge, RED), (edge, RED)):
+        points = np.stack([np.full_like(ahead, line - offset), ahead], axis=1)
+        right, forward = components(points, forward_vector(yaw)).T
+        visible = forward > CAMERA_FORWARD + 0.3
+        pixels = project_ground(right[visible], forward[visible] - CAMERA_FORWARD)
+        cv2.polylines(frame, [np.round(pixels).astype(np.int32)[:, None]], False, colour, 1, cv2.LINE_AA)
+    text = f"{offset:+.2f} m {np.degrees(yaw):+.1f}"
+    return cv2.putText(frame, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recordings", nargs="*", help="real ones")
-    parser.add_argument("--network", help="weights (default lane.pt)")
-    parser.add_argument("--laps", type=float, default=0.3, help="of each drawn drive (default 0.3)")
-    parser.add_argument("--picture", help="real frames with the lane as it is read")
-    args = parser.parse_args()
-    network = load(args.network) if args.network else load()
-    if args.laps:
-        places(network)
-        drives(network, args.laps)
-    pictures = []
-    for folder in args.recordings:
-        real(folder, network)
-        if args.picture:
-            recording = read_recording(folder)
-            found = read_lane(recording, stretches(recording), network)
-            edge = EDGES["jungle" if "jungle" in folder else "lake"]
-            rows = np.linspace(30, len(recording) - 30, 12).astype(int)
-            frames = [drawn_in(recording, found, row, edge) for row in rows]
-            pictures += [np.hstack(frames[k : k + 4]) for k in range(0, 12, 4)]
-    if pictures:
-        cv2.imwrite(args.picture, np.vstack(pictures))
+def draw_frames(folder: str, network: LaneNetwork) -> np.ndarray:
+    """Draw the estimated lane into twelve frames of a recording, in three rows of four: uint8 (480, 1280, 3), BGR."""
+    recording = read_recording(folder)
+    position = estimate_lane_position(recording, stretches(recording), network)
+    edge = EDGES["jungle" if "jungle" in folder else "lake"]
+    rows = np.linspace(30, len(recording) - 30, 12).astype(int)
+    frames = [draw_lane(recording, position, row, edge) for row in rows]
+    return np.vstack([np.hstack(frames[k : k + 4]) for k in range(0, 12, 4)])
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print the measurements and write the picture; return the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="lane_accuracy", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recordings", nargs="*", help="real recordings: folders with a driving_log.csv")
+    parser.add_argument("--network", help="weights (default: those that come with the project)")
+    parser.add_argument("--laps", type=float, default=0.3, help="length of each rendered drive; 0: none (default 0.3)")
+    parser.add_argument("--picture", type=Path, help="write real frames with the estimated lane drawn in")
+    args = parser.parse_args(argv)
+    try:
+        network = load_network(args.network)
+        if args.laps:
+            measure_frames(network)
+            measure_drives(network, args.laps)
+        for folder in args.recordings:
+            measure_recording(folder, network)
+        if args.picture and args.recordings:
+            pictures = np.vstack([draw_frames(folder, network) for folder in args.recordings])
+            write(args.picture, cv2.imencode(args.picture.suffix, pictures)[1].tobytes())
+    except (UserError, OSError) as error:
+        print(f"lane_accuracy: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

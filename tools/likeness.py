@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 
 from cloning.errors import RecordingError, UserError
-from cloning.lane.place import known
-from cloning.lane.reader import see
+from cloning.lane.place import localise_all
+from cloning.lane.reader import detect_centres
 from cloning.recordings.format import CAMERAS, FRAME
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
-from cloning.road.camera import CAMERA_OFFSETS, project
-from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, stretches
+from cloning.road.camera import CAMERA_OFFSETS, camera_position, project_ground
+from cloning.road.motion import REAR_AXLE, stretches
 from cloning.road.track import LEFT, RIGHT, Place, Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
@@ -37,7 +37,7 @@ SEARCH = np.arange(-14, 14.1, 0.5)  # columns around the expected one
 def rear_axle(track: Track, position: np.ndarray) -> tuple[Place, np.ndarray]:
     """Return the pose of the rear axle's middle, with the car's heading, and the unit vector ahead, (2,).
 
-    position: s, metres to the right, heading error, as in `cloning.lane.place.Placed`.
+    position: s, metres to the right, heading error, as in `cloning.lane.place.Localisation`.
     """
     s, right, yaw = position
     place = track.at(s, right)
@@ -52,11 +52,11 @@ def line_columns(track: Track, position: np.ndarray, offset: float, camera: str,
     """
     axle, forward = rear_axle(track, position)
     right = np.array([forward[1], -forward[0]])
-    eye = (axle.x, axle.y) + AXLE_TO_CAMERA * forward + CAMERA_OFFSETS[camera] * right
+    eye = camera_position(np.array([axle.x, axle.y]), forward, CAMERA_OFFSETS[camera])
     near = (round(position[0] / track.step) + np.arange(45)) % len(track.points)
     line = track.points[near, :2] + offset * track.rightward[near] - eye
     ahead = line @ forward
-    pixels = project(line[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
+    pixels = project_ground(line[ahead > 2] @ right, ahead[ahead > 2])[::-1]  # from the horizon down
     return np.interp(rows, pixels[:, 1], pixels[:, 0], left=np.nan, right=np.nan)
 
 
@@ -95,14 +95,14 @@ def render(track: Track, positions: np.ndarray) -> np.ndarray:
 def compare(folder: Path, count: int, picture: str | None) -> None:
     """Print the figures of `count` places of a recording and write the picture. Raises UserError."""
     recording = read_recording(folder)
-    drives = list(known(stretches(recording), see(recording)))
+    drives = list(localise_all(stretches(recording), detect_centres(recording)))
     if not drives:
         raise RecordingError(f"{folder}: drives on no known road; give a recording of the lake or the jungle")
     rows, placed = max(drives, key=lambda drive: drive[0].stop - drive[0].start)
     track = placed.track
     print(f"{track.name}, {track.direction}, {rows.stop - rows.start} rows")
-    chosen = np.linspace(0, len(placed.place) - 1, count).astype(int)
-    positions = placed.place[chosen]
+    chosen = np.linspace(0, len(placed.states) - 1, count).astype(int)
+    positions = placed.states[chosen]
     paths = [[recording.path(rows.start + i, camera) for camera in range(len(CAMERAS))] for i in chosen]
     real = np.array([[decode(path.read_bytes()) for path in row] for row in paths])
     rendered = render(track, positions)

@@ -1,11 +1,11 @@
-"""The score board: how models drive, on real recordings and in the stand-in simulator.
+"""The scoreboard: how well models drive, on real recordings and in the stand-in simulator.
 
     python -m tools.scoreboard model.pt --name "recipe, lake" --recordings data/lake-ccw data/lake-cw
     python -m tools.scoreboard model.pt --name shipped --recordings data --tracks lake --speeds 9 --looks 0 --laps 10
 
 Each row of the table is a course, each column a model. A run adds or replaces its model's figures on the courses that
-it was asked for, in tools/scoreboard.json, and writes the table anew from all of them, tools/scoreboard.md. Replays
-are driven in process, laps by drive.py and `python -m simulator drive` over the wire, as many at a time as there are
+it was asked for, in tools/scoreboard.json, and writes the whole table, tools/scoreboard.md. Recordings are replayed in
+process, laps are driven by drive.py and `python -m simulator drive` over the wire, as many at a time as the machine has
 cores.
 """
 
@@ -17,51 +17,66 @@ import shlex
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import TypedDict
 
-from cloning.compute import threads
-from cloning.files import write
+from cloning.cores import threads
+from cloning.errors import UserError
+from cloning.outputs import write_json, write_output
 from cloning.recordings.log import find_folders
+from cloning.replay.score import ReplayReport
+from simulator.report import LapReport
 
 ROOT = Path(__file__).resolve().parent.parent
 
 DIRECTIONS = ("ccw", "cw")
-UNSEEN = (101, 102, 103, 104, 105)  # looks that nothing was trained on
+UNSEEN_LOOKS = (101, 102, 103, 104, 105)  # no model was trained on them
 ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
-def report(folder: str, *command: str) -> tuple[object | None, str]:
-    """The JSON that a simulator command reports, or None, and what it said on stderr."""
-    file = Path(folder) / "report.json"
+class Column(TypedDict):
+    """A model's column: how it was trained, the commands that measured it, and course -> figures."""
+
+    what: str
+    commands: list[str]
+    courses: dict[str, str]
+
+
+def simulate(report: Path, *arguments: str) -> str:
+    """Run a simulator command that writes its report to this file, and return what it printed to stderr."""
     done = subprocess.run(
-        [sys.executable, "-m", "simulator", *command, "--report", str(file)],
+        [sys.executable, "-m", "simulator", *arguments, "--report", str(report)],
         cwd=ROOT,
         env=ONE_THREAD,
         capture_output=True,
         text=True,
     )
-    return (json.loads(file.read_text()) if file.exists() else None), done.stderr
+    return done.stderr
 
 
 def replay(model: Path, recording: Path) -> dict[str, str]:
-    """Course -> what a replay of the recording came to."""
+    """Replay a recording and return course -> figures. Raises UserError."""
     with tempfile.TemporaryDirectory() as folder:
-        found, said = report(folder, "replay", str(recording.resolve()), "--model", str(model))
-    if found is None:
-        raise SystemExit(f"{recording}: {said}")
-    limits, reference = found[0]["limits"], found[0]["reference"]
-    centre = "the lane's centre" if reference["lane centre"] else "the human's way"
-    figures = {}
-    for limit, one in limits.items():
-        driven = f"{one['autonomy_percent']:.1f} % ({one['interventions']}), {one['distance_mean_m']:.2f} m"
-        figures[f"real {recording.name}, {limit} m from {centre}"] = driven
-    return figures
+        file = Path(folder) / "report.json"
+        errors = simulate(file, "replay", str(recording.resolve()), "--model", str(model))
+        if not file.exists():
+            raise UserError(f"{recording}: {errors}")
+        reports: list[ReplayReport] = json.loads(file.read_text(encoding="utf-8"))
+    [report] = reports
+    reference = "the lane's centre" if report["reference"]["lane centre"] else "the human driver's path"
+    return {
+        f"real {recording.name}, {limit} m from {reference}": f"{metrics['autonomy_percent']:.1f} % "
+        f"({metrics['interventions']}), {metrics['distance_mean_m']:.2f} m"
+        for limit, metrics in report["limits"].items()
+    }
 
 
-def lap(model: Path, track: str, direction: str, mph: int, look: int, laps: float) -> dict[str, str]:
-    """Course -> what laps of the stand-in came to."""
+def drive_laps(model: Path, track: str, direction: str, mph: int, look: int, laps: float) -> dict[str, str]:
+    """Drive laps in the stand-in simulator and return course -> figures. Raises UserError."""
     server = subprocess.Popen(
         [sys.executable, "drive.py", str(model), "--speed", str(mph), "--port", "0"],
         cwd=ROOT,
@@ -69,35 +84,36 @@ def lap(model: Path, track: str, direction: str, mph: int, look: int, laps: floa
         stderr=subprocess.PIPE,
         text=True,
     )
+    course = f"{track} {direction}, {mph} mph, look {look}"
     try:
-        port = re.search(r":(\d+)\.", server.stderr.readline())[1]
+        port = listening_port(server)
         with tempfile.TemporaryDirectory() as folder:
-            found, said = report(
-                folder,
-                "drive",
-                "--track",
-                track,
-                "--direction",
-                direction,
-                "--look",
-                str(look),
-                "--laps",
-                str(laps),
-                "--port",
-                port,
-            )
+            file = Path(folder) / "report.json"
+            road = ("--track", track, "--direction", direction, "--look", str(look))
+            errors = simulate(file, "drive", *road, "--laps", str(laps), "--port", port)
+            if not file.exists():
+                raise UserError(f"{course}: {errors}")
+            report: LapReport = json.loads(file.read_text(encoding="utf-8"))
     finally:
         server.terminate()
         server.communicate()
-    if found is None:
-        raise SystemExit(f"{track} {direction}: {said}")
-    unfinished = "" if found["laps"] >= laps else f", {found['laps']} of {laps:g} laps"
-    driven = (
-        f"{len(found['departures'])} departures in {found['distance_m'] / 1000:.1f} km{unfinished}, "
-        f"{found['offset_mean_m']:.2f} m, at most {found['offset_max_m']:.2f}, "
-        f"roughness {found['steering_roughness_per_s']:.2f}"
+    unfinished = "" if report["laps"] >= laps else f", {report['laps']} of {laps:g} laps"
+    figures = (
+        f"{len(report['departures'])} departures in {report['distance_m'] / 1000:.1f} km{unfinished}, "
+        f"{report['offset_mean_m']:.2f} m, at most {report['offset_max_m']:.2f}, "
+        f"roughness {report['steering_roughness_per_s']:.2f}"
     )
-    return {f"{track} {direction}, {mph} mph, look {look}": driven}
+    return {course: figures}
+
+
+def listening_port(server: subprocess.Popen[str]) -> str:
+    """Return the port that drive.py prints once it listens. Raises UserError if it ends before."""
+    printed = []
+    for line in server.stderr or ():
+        if port := re.search(r"Listening on .*:(\d+)\.", line):
+            return port[1]
+        printed.append(line)
+    raise UserError("".join(printed).strip())
 
 
 HEAD = """# How models drive
@@ -108,26 +124,62 @@ steering's mean absolute change a second. Looks from 101 on were never trained o
 """
 
 
-def table(results: dict) -> str:
-    """The table as Markdown."""
-    courses = sorted({course for one in results.values() for course in one["courses"]}, key=order)
-    lines = [HEAD, "| course | " + " | ".join(results) + " |", "|---" * (len(results) + 1) + "|"]
+def table(columns: dict[str, Column]) -> str:
+    """Return the table as Markdown."""
+    courses = sorted({course for column in columns.values() for course in column["courses"]}, key=order)
+    lines = [HEAD, "| course | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     lines += [
-        f"| {course} | " + " | ".join(one["courses"].get(course, "-") for one in results.values()) + " |"
+        f"| {course} | " + " | ".join(column["courses"].get(course, "-") for column in columns.values()) + " |"
         for course in courses
     ]
-    lines += ["", "Made by:"]
-    for name, one in results.items():
-        lines += ["", f"* {name}: {one['what']}", *(f"  * `{command}`" for command in one["commands"])]
+    lines += ["", "Measured with:"]
+    for name, column in columns.items():
+        lines += ["", f"* {name}: {column['what']}", *(f"  * `{command}`" for command in column["commands"])]
     return "\n".join(lines) + "\n"
 
 
-def order(course: str) -> tuple:
-    """Real ones first; numbers as numbers."""
+def order(course: str) -> tuple[bool, list[int | str]]:
+    """Sort real recordings first, and numbers by their value."""
     return not course.startswith("real"), [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", course)]
 
 
+def command_line() -> str:
+    """Return the command that was typed, without --what, and paths by their last name alone."""
+    words = [word for before, word in pairwise(sys.argv) if "--what" not in (before, word)]
+    words = [Path(word).name if len(Path(word).parts) > 1 else word for word in words]
+    return shlex.join(["python", "-m", "tools.scoreboard", *words])
+
+
+def measure(args: argparse.Namespace) -> None:
+    """Drive the model on the courses that were asked for, and write the table. Raises UserError."""
+    model = args.model.resolve()
+    folders = find_folders(args.recordings) if args.recordings else []
+    jobs: list[Callable[[], dict[str, str]]] = [partial(replay, model, folder) for folder in folders]
+    jobs += [
+        partial(drive_laps, model, track, direction, mph, look, args.laps)
+        for track in args.tracks
+        for direction in DIRECTIONS
+        for mph in args.speeds
+        for look in args.looks
+    ]
+    measured: dict[str, str] = {}
+    with ThreadPoolExecutor(threads()) as pool:
+        for courses in pool.map(lambda job: job(), jobs):
+            measured |= courses
+            print("\n".join(f"{course}: {figures}" for course, figures in courses.items()), flush=True)
+    file = args.table.with_suffix(".json")
+    columns: dict[str, Column] = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    column = columns.setdefault(args.name, {"what": "", "commands": [], "courses": {}})
+    column["what"] = args.what or column["what"]
+    command = command_line()
+    column["commands"] = [*(earlier for earlier in column["commands"] if earlier != command), command]
+    column["courses"] |= measured
+    write_json(file, columns)
+    write_output(args.table, table(columns).encode())
+
+
 def main() -> None:
+    """Parse the command line and measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path)
     parser.add_argument("--name", required=True, help="of the model's column")
@@ -135,35 +187,13 @@ def main() -> None:
     parser.add_argument("--recordings", nargs="*", default=[], help="real recordings to replay")
     parser.add_argument("--tracks", nargs="*", default=["lake", "jungle"], choices=["lake", "jungle"])
     parser.add_argument("--speeds", nargs="*", type=int, default=[9, 15, 30], help="mph (default 9 15 30)")
-    parser.add_argument("--looks", nargs="*", type=int, default=[0, *UNSEEN[:2]], help="default 0 101 102")
-    parser.add_argument("--laps", type=float, default=1)
-    parser.add_argument("--table", type=Path, default=ROOT / "benchmarks" / "driving.md")
-    args = parser.parse_args()
-    model = args.model.resolve()
-    jobs = [(replay, model, folder) for folder in (find_folders(args.recordings) if args.recordings else [])]
-    jobs += [
-        (lap, model, track, direction, mph, look, args.laps)
-        for track in args.tracks
-        for direction in DIRECTIONS
-        for mph in args.speeds
-        for look in args.looks
-    ]
-    with ThreadPoolExecutor(threads()) as pool:
-        found: dict[str, str] = {}
-        for one in pool.map(lambda job: job[0](*job[1:]), jobs):
-            found |= one
-            print("\n".join(f"{course}: {came}" for course, came in one.items()), flush=True)
-    file = args.table.with_suffix(".json")
-    results = json.loads(file.read_text()) if file.exists() else {}
-    mine = results.setdefault(args.name, {"what": "", "commands": [], "courses": {}})
-    mine["what"] = args.what or mine["what"]
-    words = [word for before, word in pairwise(sys.argv) if "--what" not in (before, word)]
-    words = [Path(word).name if "/" in word else word for word in words]
-    command = shlex.join(["python", "-m", "tools.scoreboard", *words])
-    mine["commands"] = [*(one for one in mine["commands"] if one != command), command]
-    mine["courses"] |= found
-    write(file, json.dumps(results, indent=1).encode() + b"\n")
-    write(args.table, table(results).encode())
+    parser.add_argument("--looks", nargs="*", type=int, default=[0, *UNSEEN_LOOKS[:2]], help="default 0 101 102")
+    parser.add_argument("--laps", type=float, default=1, help="default 1")
+    parser.add_argument("--table", type=Path, default=ROOT / "tools" / "scoreboard.md", help="default %(default)s")
+    try:
+        measure(parser.parse_args())
+    except UserError as error:
+        sys.exit(f"tools.scoreboard: {error}")
 
 
 if __name__ == "__main__":

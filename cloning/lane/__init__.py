@@ -1,1 +1,1 @@
-"""The lane: lateral offset and heading, estimated from camera frames."""
+"""Lane: estimates lateral offset and heading from camera frames, and locates a drive on a known track."""

@@ -1,9 +1,9 @@
-"""Where on one of the known roads a recording was driven: both tracks' centre lines are known, so that the lane's
-centre is, too, where no single frame shows it well.
+"""The position in the lane at every row of a recording, from its place on one of the two known roads where it has one.
 
-An extended Kalman filter with a Rauch-Tung-Striebel smoother over (s, right, yaw) of the rear axle's middle: moved on
-by the steering, speed and time stamps, held by where `lane.py` sees the lane's centre ahead, which need not be right in
-each frame.
+The centre lines of both tracks are known, so the lane's centre is too, even where no single frame shows it well. An
+extended Kalman filter with a Rauch-Tung-Striebel smoother localises a stretch on a track: steering, speed and time
+stamps predict the rear axle's state, and the lane's centre ahead, as detected by `reader.py`, corrects it. Single
+detections may be wrong.
 """
 
 from collections.abc import Iterator
@@ -11,181 +11,213 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cloning.lane.reader import AHEAD, MOUNT_OFFSETS, Lane, LaneNetwork, combine, see
+from cloning.lane.reader import (
+    DISTANCES_AHEAD,
+    MOUNT_OFFSETS,
+    LaneNetwork,
+    LanePosition,
+    detect_centres,
+    fuse_detections,
+)
 from cloning.recordings.log import Recording
+from cloning.road.camera import camera_position
 from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch
 from cloning.road.track import ROADS, Track
 
-BLUR = (0.3 + 0.08 * AHEAD) * 2  # m: of what is seen ahead, twice as much as of a single frame: neighbours err alike
-CLEAR = 2.0  # standard deviations, from which on what is seen counts less
-LOST = 3.0  # standard deviations, that what ought to be seen and is not counts for
-AROUND = np.stack([AHEAD, AHEAD - 0.5, AHEAD + 0.5])
-NEAR = np.arange(-6, 40)  # of the road's points, which are a metre apart, what may be seen
-LONG, LIKELY = 300, -0.35  # rows, and a likelihood, from which on a stretch is believed to be where it was placed
-PROFILE, PACE = 200.0, 2.0  # m of the way whose bends are looked for on the roads, and between two points of it
-BEGIN = ((8, 150), (2, 600))  # how many of the places found so are followed over how many rows
-APART = 4.0  # m: the standard deviation of such a place
-# Variances: of where a drive begins; and standard deviations by which a row's way is unsure, by metre driven and radian
-# turned: along, beside and of the yaw. A car that turns hard slides.
-BEGINS = np.diag([APART**2, 4.0, 0.05])
-BY_METRE, BY_TURN, ALWAYS = np.array([0.03, 0.02, 0]), np.array([0, 0.4, 0.2]), np.array([0, 0, 0.003])
+# Measurement noise: standard deviation of a detection at each distance ahead, m. Twice that of a single frame, because
+# the errors of consecutive frames are correlated.
+MEASUREMENT_NOISE = (0.3 + 0.08 * DISTANCES_AHEAD) * 2
+OUTLIER_THRESHOLD = 2.0  # standard deviations beyond which a detection gets less weight
+MISSING_DETECTION = 3.0  # standard deviations that count where the track turns out of the camera's view
+# Process noise: standard deviations of (s, lateral offset, heading error) that each row adds: per metre driven, per
+# radian turned, and in any case. A car that turns hard slides.
+NOISE_PER_METRE, NOISE_PER_RADIAN = np.array([0.03, 0.02, 0]), np.array([0, 0.4, 0.2])
+NOISE_PER_ROW = np.array([0, 0, 0.003])
+# Covariance of the state at a candidate position: m², m², radians²; candidates are up to 4 m off along the track.
+INITIAL_COVARIANCE = np.diag([4.0**2, 4.0, 0.05])
+SLOPE_STEP = 0.5  # m before and behind a distance ahead, over which the centre line's slope is taken
+DISTANCES_WITH_NEIGHBOURS = np.r_[DISTANCES_AHEAD, DISTANCES_AHEAD - SLOPE_STEP, DISTANCES_AHEAD + SLOPE_STEP]
+VISIBLE_POINTS = np.arange(-6, 40)  # of a track, 1 m apart, that may lie at the distances ahead
+PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m of a trajectory whose heading is compared with the tracks', and its step
+SEARCH = ((8, 150), (2, 600))  # in turn: how many of the best candidates the filter follows, over how many rows
+# Stretches shorter than this find a bend that resembles their own on any track.
+MIN_ROWS = 300
+# 300-row pieces of real recordings have -0.25 to 0 on their own track, -0.45 and less on the other.
+MIN_LOG_LIKELIHOOD = -0.35
 
 
-def centre_ahead(track: Track, s: float, x: float, y: float, heading: float, ahead=AHEAD) -> np.ndarray:
-    """Where the centre line lies ahead of a camera at (x, y) that looks along `heading`, in the track's own metres and
-    radians, near the track's metre s: metres to its right at the distances `ahead`, nan beyond where it turns back.
+def centre_ahead(
+    track: Track, s: float, camera: np.ndarray, heading: float, distances: np.ndarray = DISTANCES_AHEAD
+) -> np.ndarray:
+    """Return where a track's centre line lies ahead of a camera: float64 (k,), m to its right.
 
-    ahead: (k,). float64 (k,).
+    s: m along the track near which to look; camera: (2,), its x and y, m; heading: radians, as the track's;
+    distances: (k,), m ahead of the camera; nan beyond the point where the track turns back.
     """
-    near = (round(s / track.step) + NEAR) % len(track.points)
-    away = track.points[near, :2] - (x, y)
+    near = (round(s / track.step) + VISIBLE_POINTS) % len(track.points)
+    away = track.points[near, :2] - camera
     forward = away @ (np.cos(heading), np.sin(heading))
-    aside = away @ (np.sin(heading), -np.cos(heading))
+    right = away @ (np.sin(heading), -np.cos(heading))
     back = np.flatnonzero(np.diff(forward) <= 0)
     end = back[0] + 1 if len(back) else len(forward)
-    return np.interp(ahead, forward[:end], aside[:end], right=np.nan)
+    return np.interp(distances, forward[:end], right[:end], right=np.nan)
 
 
 @dataclass
-class Placed:
+class Localisation:
     """A stretch of a recording on a known road.
 
-    track   in the direction driven
-    place   float64 (n, 3): of the rear axle's middle in each row: m along the track, m to the right of its centre line
-            and radians to it
-    likely  what was seen of the lane, and where it ought to have been seen: 0 where they are the same, -2.3 where they
-            have nothing to do with one another
+    track           in the direction driven
+    states          float64 (n, 3): the rear axle's state in each row: s, m along the track; lateral offset, m to the
+                    right of its centre line; heading error, radians to its right
+    log_likelihood  of a detection, on average, for a Cauchy distribution: 0 where detections agree with the track,
+                    -2.3 where they have nothing to do with it
     """
 
     track: Track
-    place: np.ndarray
-    likely: float
+    states: np.ndarray
+    log_likelihood: float
 
 
-class Filter:
-    """Follows a stretch along a track. A state is (s, right, yaw), as `Placed.place` has it."""
+class TrackFilter:
+    """The extended Kalman filter that follows a stretch along a track; its state is as in `Localisation`."""
 
-    def __init__(self, stretch: Stretch, seen: np.ndarray, track: Track):
-        """seen: float32 (n, 3, 5), what the three cameras see in the stretch's rows."""
+    def __init__(self, stretch: Stretch, centres: np.ndarray, track: Track) -> None:
+        """Prepare a stretch's motion and measurements; centres: float32 (n, 3, 5), of `reader.detect_centres`."""
         self.track, self.step, self.turn = track, np.diff(stretch.driven), np.diff(stretch.heading)
-        self.seen = np.median(seen + MOUNT_OFFSETS[:, None], axis=1)
+        self.measured = np.median(centres + MOUNT_OFFSETS[:, None], axis=1)
 
-    def bend(self, s: float) -> float:
-        """The road's curvature, 1/m, right positive."""
+    def curvature(self, s: float) -> float:
+        """Return the track's curvature at s, 1/m, right positive."""
         return float(self.track.curvature[round(s / self.track.step) % len(self.track.curvature)])
 
-    def move(self, at: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The state a row later, and its derivatives by this one: (3,), (3, 3)."""
+    def predict(self, row: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the state one row later, (3,), and its Jacobian by this one, (3, 3)."""
         s, right, yaw = state
-        step, turn, bend = self.step[at], self.turn[at], self.bend(s)
-        slower = max(0.3, 1 - bend * right)  # on the inside of a bend the centre line is the shorter way
-        on = step * np.cos(yaw + turn / 2) / slower
-        headings = self.track.at(s).heading - self.track.at(s + on).heading
-        road = (headings + np.pi) % (2 * np.pi) - np.pi
-        by = np.array(
+        step, turn, bend = self.step[row], self.turn[row], self.curvature(s)
+        slower = max(0.3, 1 - bend * right)  # on the inside of a bend the centre line is the shorter path
+        along = step * np.cos(yaw + turn / 2) / slower
+        headings = self.track.at(s).heading - self.track.at(s + along).heading
+        road_turn = (headings + np.pi) % (2 * np.pi) - np.pi
+        jacobian = np.array(
             [
-                [1, on * bend / slower, -step * np.sin(yaw)],
+                [1, along * bend / slower, -step * np.sin(yaw)],
                 [0, 1, step],
-                [bend - self.bend(s + on), -bend * on * bend / slower, 1],
+                [bend - self.curvature(s + along), -bend * along * bend / slower, 1],
             ]
         )
-        moved = s + on, right + step * np.sin(yaw + (turn - road) / 2), yaw + turn - road
-        return np.array(moved), by
+        moved = s + along, right + step * np.sin(yaw + (turn - road_turn) / 2), yaw + turn - road_turn
+        return np.array(moved), jacobian
 
-    def view(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What would be seen of the centre line, and its derivatives by the state: (5,), (5, 3); nan out of reach."""
+    def expect(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the expected measurement, (5,), and its Jacobian by the state, (5, 3); nan out of sight."""
         s, right, yaw = state
         axle = self.track.at(s, right)
         heading = axle.heading - yaw
-        eye = axle.x + AXLE_TO_CAMERA * np.cos(heading), axle.y + AXLE_TO_CAMERA * np.sin(heading)
-        seen, before, after = centre_ahead(self.track, s, *eye, heading, AROUND.ravel()).reshape(3, -1)
-        slope = (after - before) / (AROUND[2] - AROUND[1])
-        bend = self.bend(s)
-        turned = -(AHEAD + AXLE_TO_CAMERA) - slope * seen  # by the car's turning about its rear axle
-        on = (1 - bend * right) * (slope * np.cos(yaw) + np.sin(yaw)) + bend * turned
-        return seen, np.stack([on, slope * np.sin(yaw) - np.cos(yaw), turned], axis=1)
+        camera = camera_position(np.array([axle.x, axle.y]), np.array([np.cos(heading), np.sin(heading)]))
+        seen = centre_ahead(self.track, s, camera, heading, DISTANCES_WITH_NEIGHBOURS)
+        centre, before, after = seen.reshape(3, -1)
+        slope = (after - before) / (2 * SLOPE_STEP)
+        bend = self.curvature(s)
+        by_yaw = -(DISTANCES_AHEAD + AXLE_TO_CAMERA) - slope * centre  # the car turns about its rear axle
+        by_s = (1 - bend * right) * (slope * np.cos(yaw) + np.sin(yaw)) + bend * by_yaw
+        return centre, np.stack([by_s, slope * np.sin(yaw) - np.cos(yaw), by_yaw], axis=1)
 
     def run(self, s: float, n: int, smooth: bool = False) -> tuple[np.ndarray, float]:
-        """The places of the first n rows, begun at s; the last one alone unless smooth; and their likelihood."""
-        x, p = np.array([s, 0.0, 0.0]), BEGINS
-        filtered, predicted, likely = [], [], 0.0
-        for at in range(n):
+        """Filter the first n rows from a candidate position s; return states and log-likelihood.
+
+        float64 (n, 3) if smooth, else only the last state: (1, 3).
+        """
+        x, p = np.array([s, 0.0, 0.0]), INITIAL_COVARIANCE
+        filtered, predicted, log_likelihood = [], [], 0.0
+        for row in range(n):
             f = np.eye(3)
-            if at:
-                x, f = self.move(at - 1, x)
-                unsure = BY_METRE * self.step[at - 1] + BY_TURN * abs(self.turn[at - 1]) + ALWAYS
-                p = f @ p @ f.T + np.diag(unsure**2)
+            if row:
+                x, f = self.predict(row - 1, x)
+                noise = (
+                    NOISE_PER_METRE * self.step[row - 1] + NOISE_PER_RADIAN * abs(self.turn[row - 1]) + NOISE_PER_ROW
+                )
+                p = f @ p @ f.T + np.diag(noise**2)
             predicted.append((x, p, f))
-            expected, by = self.view(x)
-            sight = ~np.isnan(by).any(1)
-            likely -= np.log1p(np.where(sight, (self.seen[at] - expected) / BLUR, LOST) ** 2).mean()
-            for k in np.flatnonzero(sight):
-                h = by[k]
-                off = self.seen[at, k] - expected[k] - h @ (x - predicted[-1][0])
-                expecting = h @ p @ h
-                far = max(1.0, off**2 / (expecting + BLUR[k] ** 2) / CLEAR**2)
-                gain = p @ h / (expecting + BLUR[k] ** 2 * far)
-                x, p = x + gain * off, p - np.outer(gain, h @ p)
+            expected, jacobian = self.expect(x)
+            visible = ~np.isnan(jacobian).any(1)
+            error = np.where(visible, (self.measured[row] - expected) / MEASUREMENT_NOISE, MISSING_DETECTION)
+            log_likelihood -= np.log1p(error**2).mean()
+            for k in np.flatnonzero(visible):
+                h = jacobian[k]
+                innovation = self.measured[row, k] - expected[k] - h @ (x - predicted[-1][0])
+                variance = h @ p @ h
+                outlier = max(1.0, innovation**2 / (variance + MEASUREMENT_NOISE[k] ** 2) / OUTLIER_THRESHOLD**2)
+                gain = p @ h / (variance + MEASUREMENT_NOISE[k] ** 2 * outlier)
+                x, p = x + gain * innovation, p - np.outer(gain, h @ p)
             filtered.append((x, p))
-        places = [filtered[-1][0]]
+        states = [filtered[-1][0]]
         for (x, p), (y, q, f) in zip(filtered[-2::-1], predicted[:0:-1], strict=True) if smooth else ():
-            places.append(x + p @ f.T @ np.linalg.solve(q, places[-1] - y))
-        return np.array(places[::-1]), likely / n
+            states.append(x + p @ f.T @ np.linalg.solve(q, states[-1] - y))
+        return np.array(states[::-1]), log_likelihood / n
 
 
-def beginnings(one: Filter) -> list[tuple[float, float]]:
-    """Where on its track the stretch's bends are found: how far they are off (radians, standard deviation), and m along
-    the track; the best of each few metres."""
-    driven = np.r_[0, np.cumsum(one.step)]
-    wanted = np.arange(0, min(PROFILE, driven[-1]), PACE)
-    heading = np.interp(wanted, driven, np.r_[0, np.cumsum(one.turn)])
-    track = one.track
-    n = round(track.length / PACE)
-    around = np.r_[track.heading, track.heading + track.turns(), track.heading[0] + 2 * track.turns()]
-    lap = np.interp(np.arange(n + len(wanted)) * PACE, np.arange(len(around)) * track.step, around)
-    off = (np.lib.stride_tricks.sliding_window_view(lap, len(wanted))[:n] + heading).std(1)
-    least = (off <= np.roll(off, 1)) & (off < np.roll(off, -1))
-    return [(float(off[i]), i * PACE) for i in np.flatnonzero(least)]
+def candidate_positions(follower: TrackFilter) -> list[tuple[float, float]]:
+    """Find where on its track a stretch's bends may be, by comparing headings; the best of each few metres.
+
+    Returns (deviation, s): the standard deviation of the difference in heading, radians, and m along the track.
+    """
+    driven = np.r_[0, np.cumsum(follower.step)]
+    wanted = np.arange(0, min(PROFILE_LENGTH, driven[-1]), PROFILE_STEP)
+    heading = np.interp(wanted, driven, np.r_[0, np.cumsum(follower.turn)])
+    track = follower.track
+    n = round(track.length / PROFILE_STEP)
+    two_laps = np.r_[track.heading, track.heading + track.turns(), track.heading[0] + 2 * track.turns()]
+    resampled = np.interp(np.arange(n + len(wanted)) * PROFILE_STEP, np.arange(len(two_laps)) * track.step, two_laps)
+    deviation = (np.lib.stride_tricks.sliding_window_view(resampled, len(wanted))[:n] + heading).std(1)
+    minima = (deviation <= np.roll(deviation, 1)) & (deviation < np.roll(deviation, -1))
+    return [(float(deviation[i]), i * PROFILE_STEP) for i in np.flatnonzero(minima)]
 
 
-def placed(stretch: Stretch, seen: np.ndarray) -> Placed:
-    """A stretch on the road that it fits best.
+def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
+    """Localise a stretch on the track and direction that it fits best.
 
-    seen: float32 (n, 3, 5): where the lane's centre is seen in the stretch's rows, as `lane.see` gives it.
+    centres: float32 (n, 3, 5): of `reader.detect_centres`, in the stretch's rows.
     """
     n = len(stretch)
-    tries = []
+    candidates = []
     for name in ROADS:
         for direction in ("ccw", "cw"):
-            one = Filter(stretch, seen, Track(name, direction))
-            tries += [(off, one, s) for off, s in beginnings(one)]
-    for few, first in BEGIN:
-        tries = sorted(tries, key=lambda tried: tried[0])[:few]
-        tries = [(-one.run(s, min(first, n))[1], one, s) for _, one, s in tries]
-    _, one, s = min(tries, key=lambda tried: tried[0])
-    return Placed(one.track, *one.run(s, n, smooth=True))
+            follower = TrackFilter(stretch, centres, Track(name, direction))
+            candidates += [(deviation, follower, s) for deviation, s in candidate_positions(follower)]
+    for count, rows in SEARCH:
+        candidates = sorted(candidates, key=lambda candidate: candidate[0])[:count]
+        candidates = [(-follower.run(s, min(rows, n))[1], follower, s) for _, follower, s in candidates]
+    _, follower, s = min(candidates, key=lambda candidate: candidate[0])
+    return Localisation(follower.track, *follower.run(s, n, smooth=True))
 
 
-def known(whole: list[Stretch], seen: np.ndarray) -> Iterator[tuple[slice, Placed]]:
-    """The stretches of a recording that are surely on a known road; seen: float32 (n, 3, 5), as `lane.see` has it.
+def localise_all(stretches: list[Stretch], centres: np.ndarray) -> Iterator[tuple[slice, Localisation]]:
+    """Yield the rows and localisation of each stretch of a recording that is certainly on a known road.
 
-    Pieces of real recordings of 300 rows have a likelihood of -0.25 to 0 on their road, and of -0.45 and less on the
-    other track. Shorter ones find a bend that is like their own anywhere.
+    centres: float32 (n, 3, 5): of `reader.detect_centres`, in the recording's rows.
     """
-    for stretch in whole:
-        if len(stretch) >= LONG and (found := placed(stretch, seen[stretch.rows])).likely > LIKELY:
-            yield stretch.rows, found
+    for stretch in stretches:
+        if len(stretch) >= MIN_ROWS:
+            localisation = localise(stretch, centres[stretch.rows])
+            if localisation.log_likelihood > MIN_LOG_LIKELIHOOD:
+                yield stretch.rows, localisation
 
 
-def read_lane(recording: Recording, whole: list[Stretch], network: LaneNetwork | None = None) -> Lane:
-    """The place in the lane at every row of a recording: on a known road by that, on others as `lane.combine` has it.
+def estimate_lane_position(
+    recording: Recording, stretches: list[Stretch], network: LaneNetwork | None = None
+) -> LanePosition:
+    """Estimate the position in the lane at every row of a recording.
 
-    Raises OSError, ValueError for images that can't be read.
+    Where a stretch is on a known road, from its localisation; elsewhere as `reader.fuse_detections` does.
+    stretches: of the recording, `motion.stretches`; network: the shipped one if None.
+    Raises OSError, RecordingError for images that can't be read, ModelError without a usable network.
     """
-    seen = see(recording, network)
-    lane = combine(recording, seen)
-    for rows, found in known(whole, seen):
-        lane.yaw[rows] = found.place[:, 2]
-        lane.offset[rows] = found.place[:, 1] + REAR_AXLE * np.sin(found.place[:, 2])
-        lane.trusted[rows] = True
-    return lane
+    centres = detect_centres(recording, network)
+    position = fuse_detections(recording, centres, stretches)
+    for rows, localisation in localise_all(stretches, centres):
+        _, lateral_offset, heading_error = localisation.states.T
+        position.heading_error[rows] = heading_error
+        position.lateral_offset[rows] = lateral_offset + REAR_AXLE * np.sin(heading_error)
+        position.trusted[rows] = True
+    return position

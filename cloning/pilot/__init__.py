@@ -1,1 +1,1 @@
-"""The pilot: the network that steers, its file, what it looks at, and the page that shows it."""
+"""Pilot: the network that steers, its file, what it looks at, and the page that shows it."""

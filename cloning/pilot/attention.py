@@ -7,7 +7,7 @@ from torch import nn
 
 from cloning.pilot.network import Network, steer
 from cloning.recordings.format import FRAME
-from cloning.road.camera import project
+from cloning.road.camera import project_ground
 from cloning.road.motion import curvature
 
 GREEN, MAGENTA = (60, 255, 60), (255, 0, 200)  # RGB
@@ -62,6 +62,6 @@ def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) 
         picture = picture * (1 - strength) + np.asarray(MAGENTA, np.float32) * strength
     enlarged = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides what is nearer
-    points = project(curvature(steering) * ahead**2 / 2, ahead) * 2
+    points = project_ground(curvature(steering) * ahead**2 / 2, ahead) * 2
     cv2.polylines(enlarged, [np.round(points).astype(np.int32)], False, GREEN, 3, cv2.LINE_AA)
     return enlarged

@@ -1,1 +1,1 @@
-"""Recordings: `driving_log.csv` and the images of `IMG/`, read, checked and written."""
+"""Recordings: reads, checks and writes `driving_log.csv` and the images in `IMG/`."""

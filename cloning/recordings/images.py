@@ -1,10 +1,12 @@
 """Frames: decoded alike in training and in driving, and a recording's `IMG/` checked before it is trained on."""
 
 import struct
+from pathlib import Path
 
 import cv2
 import numpy as np
 
+from cloning.errors import RecordingError
 from cloning.recordings.format import FRAME
 
 
@@ -42,3 +44,14 @@ def decode(jpeg: bytes) -> np.ndarray:
     if frame is None:
         raise ValueError("damaged")
     return frame
+
+
+def read_frame(path: Path) -> np.ndarray:
+    """Read and decode a recorded image: uint8 (160, 320, 3), RGB.
+
+    Raises OSError for a file that can't be read, RecordingError for one that isn't a whole JPEG of a frame's size.
+    """
+    try:
+        return decode(path.read_bytes())
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}; copy it again, or delete its row from the log") from error

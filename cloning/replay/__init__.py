@@ -1,1 +1,1 @@
-"""Replay: real recordings driven by a model, and scored."""
+"""Replay: plays real recordings as if a model were driving, and scores the drive."""

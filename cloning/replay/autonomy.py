@@ -1,11 +1,12 @@
 """Autonomy, NVIDIA's measure of driving (arXiv 1604.07316, section 6): the one definition, for replays and laps."""
 
-PENALTY = 6.0  # s that NVIDIA counts for a human taking over
+LIMITS = (1.0, 2.5)  # m from the lane centre at which a human takes over: NVIDIA's; the car's side is on the edge line
+INTERVENTION_TIME = 6.0  # s that NVIDIA counts for a human who takes over and brings the car back
 
 
 def autonomy(interventions: int, seconds: float) -> float:
-    """1 - interventions x 6 s / seconds driven, at most 1.
+    """Return 1 - interventions x 6 s / seconds driven: at most 1, and 1 for a drive of no length.
 
-    Negative if a human would have had to drive for longer than the drive took; 1 for a drive of no length.
+    It is negative if the interventions would have taken longer than the drive.
     """
-    return 1 - interventions * PENALTY / seconds if seconds else 1.0
+    return 1 - interventions * INTERVENTION_TIME / seconds if seconds else 1.0

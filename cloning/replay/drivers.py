@@ -1,61 +1,58 @@
-"""Who steers a replay: drive.py over the wire, or a model in this process."""
+"""The drivers of a replay: drive.py over the wire, or a model in this process."""
 
 from cloning.errors import SimulatorError
 from cloning.recordings.images import decode
-from cloning.replay.replay import Moment
-from cloning.wire.client import Gone, telemetry
+from cloning.replay.replay import ReplayFrame
+from cloning.wire.client import ConnectionLost, telemetry_packet
 from cloning.wire.session import ClientSession
 
 
-class Served(ClientSession):
-    """drive.py steers, and is told what the simulator would tell it."""
+class ServerDriver(ClientSession):
+    """Sends drive.py the telemetry that the simulator would send, and steers as it answers."""
 
     def __init__(self, host: str, port: int, wait: float):
+        """wait: see ClientSession."""
         super().__init__(host, port, wait)
-        self.steering = self.throttle = 0.0
+        self.steering = self.throttle = 0.0  # as last commanded
 
-    def __call__(self, moment: Moment) -> float:
-        """Steering, -1..1. Raises SimulatorError when patience is at its end."""
-        packet = telemetry(self.steering, self.throttle, moment.speed, moment.jpeg())
+    def __call__(self, frame: ReplayFrame) -> float:
+        """Return the steering, -1..1. Raises SimulatorError if the server is away or does not answer for too long."""
+        packet = telemetry_packet(self.steering, self.throttle, frame.speed, frame.jpeg())
         while True:
             try:
-                if self.wire is None:
-                    self.wire = self.connect()
-                    self.listen()
-                self.early()
-                answer = self.exchange(packet)
+                if not self.connected:
+                    self.connect()
+                    self.receive_greeting()
+                self.receive_unasked()
+                answer = self.request_answer(packet)
                 break
-            except Gone as error:
-                self.reconnect(error)
+            except ConnectionLost as error:
+                self.count_reconnection(error)
                 self.close()
-        if answer.steering is not None:
+        if answer.steering is not None and answer.throttle is not None:
             self.steering, self.throttle = answer.steering, answer.throttle
         return self.steering
 
 
-class InProcess:
-    """A model steers by the same arithmetic as drive.py, without the wire."""
+class ModelDriver:
+    """Steers by a model in this process, with the same arithmetic as drive.py."""
 
     def __init__(self, model: str):
-        """Raises SimulatorError for an unusable model file."""
-        import torch  # large, and not needed over the wire
+        """Load the model. Raises ModelError."""
+        import torch  # large, and not needed to drive over the wire
 
-        from cloning.errors import ModelError
         from cloning.pilot.network import load_model, steer
 
-        torch.set_num_threads(1)
-        try:
-            self.network = load_model(model)
-        except ModelError as error:
-            raise SimulatorError(str(error)) from None
+        torch.set_num_threads(1)  # the drives at several limits run in a thread each
+        self.network = load_model(model)
         self.steer = steer
 
-    def __call__(self, moment: Moment) -> float:
-        """Steering, -1..1. Raises SimulatorError."""
+    def __call__(self, frame: ReplayFrame) -> float:
+        """Return the steering, -1..1. Raises SimulatorError if the network computes no finite number."""
         try:
-            return float(self.steer(self.network, decode(moment.jpeg())))
+            return float(self.steer(self.network, decode(frame.jpeg())))
         except ArithmeticError as error:
             raise SimulatorError(f"{error}: train the model again") from None
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no connection is open."""

@@ -1,13 +1,14 @@
 """A recording replayed as if a model drove it: NVIDIA's evaluation (arXiv 1604.07316, section 6).
 
-Each recorded frame is shown as the camera would see it from where the model's steering has brought the car; where that
-is, is integrated from the difference between the model's steering and the human's. Off the lane's centre by more than
-a limit, the car is set back onto it and an intervention counted.
+The driver is shown each recorded frame as the camera would see it from the pose to which the driver's steering has
+brought the car. The pose is integrated from the difference between that steering and the human driver's. When the car
+is further from the reference line than a limit, it is set back onto the line and an intervention is counted.
 """
 
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -20,185 +21,203 @@ from cloning.replay.views import Views
 from cloning.road.camera import VIEW_JPEG_QUALITY
 from cloning.road.motion import MIN_TRUSTED, MPH, OFF_ROAD, REAR_AXLE, Stretch, curvature, lagged_curvature, stretches
 
-LIMITS = (1.0, 2.5)  # m off the lane's centre: NVIDIA's, and where the car's side touches the edge line
+MAX_YAW = 1.2  # radians to the human driver's heading: views further to the side cannot be warped from the frames
+MIN_ROWS = 2 * SAMPLE_RATE  # of a stretch that is replayed: two seconds
 
 
 @dataclass(frozen=True)
-class Reference:
-    """What off-centre is counted from, over one stretch of a recording.
+class ReferenceLine:
+    """The line from which lateral offsets are measured, over one stretch of a recording.
 
-    stretch: of the recording; offset, yaw: float64 (n,), the human's metres to the right of it and radians to it;
-    lane: whether it is the lane's centre, or the human's own way (offset and yaw are then 0).
+    stretch         of the recording
+    offset          float64 (n,): m from the line to the human driver's car, right positive
+    yaw             float64 (n,): radians from the line to the human driver's heading, right positive
+    is_lane_centre  otherwise it is the human driver's path, and offset and yaw are 0
     """
 
     stretch: Stretch
     offset: np.ndarray
     yaw: np.ndarray
-    lane: bool
+    is_lane_centre: bool
 
     @property
     def rows(self) -> slice:
+        """The rows of the recording."""
         return self.stretch.rows
 
 
 @dataclass
 class Drive:
-    """One replay of a recording at one limit, an entry a row driven.
+    """What happened in one replay of a recording at one limit; each list has an entry per row driven.
 
-    row: of the recording; time: s, since the row before in the same stretch; distance: m to the right of the
-    reference; beside: m to the right of the human; steering, human: -1..1.
+    limit                m from the reference line
+    row                  of the recording
+    seconds              since the previous row of the same stretch
+    offset               m from the reference line, right positive
+    offset_from_human    m from the human driver's path, right positive
+    steering             the driver's, -1..1
+    human_steering       -1..1
+    interventions        the entry at which the car was set back -> its offset then, m
     """
 
     limit: float
     row: list[int] = field(default_factory=list)
-    time: list[float] = field(default_factory=list)
-    distance: list[float] = field(default_factory=list)
-    beside: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    offset: list[float] = field(default_factory=list)
+    offset_from_human: list[float] = field(default_factory=list)
     steering: list[float] = field(default_factory=list)
-    human: list[float] = field(default_factory=list)
-    interventions: dict[int, float] = field(default_factory=dict)  # entry at which it was set back: from how far off
+    human_steering: list[float] = field(default_factory=list)
+    interventions: dict[int, float] = field(default_factory=dict)
 
     def autonomy(self) -> float:
-        """NVIDIA's measure: 1 - interventions x 6 s / elapsed; negative if a human would have had to drive more than
-        there was to drive."""
-        return autonomy(len(self.interventions), sum(self.time))
+        """Return NVIDIA's measure; see `autonomy.autonomy`."""
+        return autonomy(len(self.interventions), sum(self.seconds))
 
 
-def load(folder) -> Recording:
-    """A recording with its whole rows, each once. Raises RecordingError."""
+def load(folder: str | Path) -> Recording:
+    """Read a recording, its complete rows without duplicates. Raises RecordingError."""
     recording = read_recording(folder)
     check_images(recording)
-    recording.keep(np.r_[True, np.diff(recording.images[:, 0]) != 0])  # over-sampled rows stand beside one another
+    recording.keep(np.r_[True, np.diff(recording.images[:, 0]) != 0])  # over-sampled rows follow one another
     return recording
 
 
-def references(recording: Recording, by_lane: bool = True) -> list[Reference]:
-    """The stretches to be driven, without those where the human is off the road, and what counts as their centre."""
-    found, whole = [], stretches(recording)
-    if by_lane:
-        from cloning.lane.place import read_lane  # which loads torch
+def reference_lines(recording: Recording, by_lane: bool = True) -> list[ReferenceLine]:
+    """Return the reference lines of the stretches to replay.
 
-        lane = read_lane(recording, whole)
-        offset, yaw, trusted = lane.offset, lane.yaw, lane.trusted
+    by_lane: the lane centre where its estimate is trusted, without the parts where the human driver is off the road;
+    otherwise, and elsewhere, the human driver's path.
+    """
+    lines, driven = [], stretches(recording)
+    if by_lane:
+        from cloning.lane.place import estimate_lane_position  # which loads torch
+
+        lane = estimate_lane_position(recording, driven)
+        offset, yaw, trusted = lane.lateral_offset, lane.heading_error, lane.trusted
     else:
         offset = yaw = trusted = np.zeros(len(recording))
-    for stretch in whole:
+    for stretch in driven:
         rows = stretch.rows
         sure = np.asarray(trusted[rows], bool)
         if sure.mean() < MIN_TRUSTED:
             n = len(stretch)
-            found.append(Reference(stretch, np.zeros(n), np.zeros(n), lane=False))
+            lines.append(ReferenceLine(stretch, np.zeros(n), np.zeros(n), is_lane_centre=False))
             continue
-        at, known = np.arange(len(sure)), np.flatnonzero(sure)
-        filled = [np.interp(at, known, values[rows][sure].astype(float)) for values in (offset, yaw)]
-        on_road = np.r_[False, np.abs(filled[0]) < OFF_ROAD, False]
+        every, known = np.arange(len(sure)), np.flatnonzero(sure)
+        offsets, yaws = (np.interp(every, known, values[rows][sure].astype(float)) for values in (offset, yaw))
+        on_road = np.r_[False, np.abs(offsets) < OFF_ROAD, False]
         starts, ends = (np.flatnonzero(np.diff(on_road.astype(int)) == sign) for sign in (1, -1))
         for a, b in zip(starts.tolist(), ends.tolist(), strict=True):
-            if b - a >= 2 * SAMPLE_RATE:
+            if b - a >= MIN_ROWS:
                 part = stretch
                 if b - a < len(stretch):
                     part = Stretch.of(recording, slice(rows.start + a, rows.start + b))
-                found.append(Reference(part, filled[0][a:b], filled[1][a:b], lane=True))
-    return found
+                lines.append(ReferenceLine(part, offsets[a:b], yaws[a:b], is_lane_centre=True))
+    return lines
 
 
-class Course:
-    """Where the car is beside the human's way, from row to row of a stretch: the state that steering moves.
+class ReplayedCar:
+    """The pose of the driver's car relative to the human driver's, integrated over the rows of a stretch.
 
-    right: m of the rear axle's middle to the right of the human's; yaw: radians to the human's, right positive.
+    right: m from the human driver's rear axle to the car's, right positive; yaw: radians to the human driver's heading.
     """
 
-    def __init__(self, recording: Recording, reference: Reference):
-        rows = reference.rows
-        self.reference = reference
-        self.speed = np.abs(recording.speed[rows].astype(float)) * MPH
-        self.human = recording.steering[rows].astype(float)
-        self.pause = np.diff(recording.time[rows])
+    def __init__(self, recording: Recording, line: ReferenceLine):
+        rows = line.rows
+        self.line = line
+        self.speed = np.abs(recording.speed[rows].astype(float)) * MPH  # m/s, the human driver's
+        self.human_steering = recording.steering[rows].astype(float)
+        self.seconds = np.diff(recording.time[rows])
         self.right = self.yaw = 0.0
-        # Curvatures driven by the human and by the car, 1/m: both lag behind the steering alike.
-        self.humans = self.own = float(curvature(self.human[0]))
+        # Curvatures driven, 1/m: both lag behind the steering in the same way.
+        self.human_curvature = self.curvature = float(curvature(self.human_steering[0]))
 
-    def __len__(self):
-        return len(self.human)
+    def __len__(self) -> int:
+        return len(self.human_steering)
 
-    def beside(self) -> float:
-        """m of the car's middle to the right of the human's."""
+    def offset_from_human(self) -> float:
+        """Return the offset of the car's middle from the human driver's path, m."""
         return self.right + REAR_AXLE * np.sin(self.yaw)
 
-    def distance(self, at: int) -> float:
-        return float(self.reference.offset[at] + self.beside())
+    def offset(self, at: int) -> float:
+        """Return the offset of the car's middle from the reference line at a row of the stretch, m."""
+        return float(self.line.offset[at] + self.offset_from_human())
 
     def set_back(self, at: int) -> None:
-        """Onto the reference and along it, turning as the human; where that is the human's way, exactly so."""
-        self.own = self.humans
-        self.yaw = float(-self.reference.yaw[at])
-        self.right = float(-self.reference.offset[at] - REAR_AXLE * np.sin(self.yaw))
+        """Put the car onto the reference line and along it, with the human driver's curvature.
 
-    def go_on(self, at: int, steering: float) -> None:
-        """To the next row. The car keeps abreast of the human, so that on the inside of a bend it is slower."""
-        pause = float(self.pause[at])
-        self.humans = lagged_curvature(self.humans, float(curvature(self.human[at])), pause)
-        self.own = lagged_curvature(self.own, float(curvature(steering)), pause)
-        step = self.speed[at] * pause
-        own = step * (1 - self.humans * self.right) / np.cos(self.yaw)
-        turned = self.own * own - self.humans * step
-        self.right += own * np.sin(self.yaw + turned / 2)
-        self.yaw = float(np.clip(self.yaw + turned, -1.2, 1.2))  # nobody asks for views to the back
+        If the line is the human driver's path, the pose is then exactly the human driver's.
+        """
+        self.curvature = self.human_curvature
+        self.yaw = float(-self.line.yaw[at])
+        self.right = float(-self.line.offset[at] - REAR_AXLE * np.sin(self.yaw))
+
+    def move(self, at: int, steering: float) -> None:
+        """Drive from a row to the next one, level with the human driver: on the inside of a bend more slowly."""
+        seconds = float(self.seconds[at])
+        human = float(curvature(self.human_steering[at]))
+        self.human_curvature = lagged_curvature(self.human_curvature, human, seconds)
+        self.curvature = lagged_curvature(self.curvature, float(curvature(steering)), seconds)
+        human_step = self.speed[at] * seconds
+        step = human_step * (1 - self.human_curvature * self.right) / np.cos(self.yaw)
+        turn = self.curvature * step - self.human_curvature * human_step
+        self.right += step * np.sin(self.yaw + turn / 2)
+        self.yaw = float(np.clip(self.yaw + turn, -MAX_YAW, MAX_YAW))
 
 
-class Moment:
-    """One row's turn to steer. What the car sees is made when it is asked for."""
+class ReplayFrame:
+    """What a driver is given at one row: the view from the car's pose, warped only when it is asked for."""
 
-    def __init__(self, recording: Recording, views: Views, course: Course, at: int):
-        self.views, self.at, self.pose = views, at, (course.right, course.yaw)
-        self.row = course.reference.rows.start + at
+    def __init__(self, recording: Recording, views: Views, car: ReplayedCar, at: int):
+        self.views, self.at, self.pose = views, at, (car.right, car.yaw)
+        self.row = car.line.rows.start + at
         self.speed = float(recording.speed[self.row])  # mph
-        self.human = float(course.human[at])  # -1..1
+        self.human_steering = float(car.human_steering[at])  # -1..1
 
     @functools.cached_property
-    def seen(self) -> np.ndarray:
-        """uint8 (160, 320, 3), RGB."""
-        return self.views.seen_from(self.at, *self.pose) if any(self.pose) else self.recorded
+    def view(self) -> np.ndarray:
+        """The view from the car, uint8 (160, 320, 3), RGB."""
+        return self.views.view_from(self.at, *self.pose) if any(self.pose) else self.recorded
 
     @property
     def recorded(self) -> np.ndarray:
-        """The human's frame, uint8 (160, 320, 3), RGB."""
+        """The human driver's frame, uint8 (160, 320, 3), RGB."""
         return self.views.frame(self.at, 0)
 
     def jpeg(self) -> bytes:
-        """What the car sees; the recorded file itself where it stands where the human did."""
+        """Return the view as JPEG; at the human driver's pose, the recorded file itself."""
         if not any(self.pose):
             return self.views.jpeg(self.at)
-        picture = cv2.cvtColor(self.seen, cv2.COLOR_RGB2BGR)
-        return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, VIEW_JPEG_QUALITY])[1].tobytes()
+        bgr = cv2.cvtColor(self.view, cv2.COLOR_RGB2BGR)
+        return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, VIEW_JPEG_QUALITY])[1].tobytes()
+
+
+Driver = Callable[[ReplayFrame], float]  # from what it sees to steering, -1..1
+Watcher = Callable[[ReplayFrame, Drive], None]
 
 
 def drive(
-    recording: Recording,
-    references: list[Reference],
-    limit: float,
-    steer: Callable[[Moment], float],
-    watch: Callable[[Moment, Drive], None] | None = None,
+    recording: Recording, lines: list[ReferenceLine], limit: float, driver: Driver, watch: Watcher | None = None
 ) -> Drive:
-    """Drive a recording by `steer`, which gives the steering, -1..1; `watch` is called after each row, if given."""
+    """Replay a recording at one limit, in m; `watch` is called after each row."""
     done = Drive(limit)
-    for reference in references:
-        course, views = Course(recording, reference), Views(recording, reference.stretch)
-        for at in range(len(course)):
-            if abs(off := course.distance(at)) > limit:
+    for line in lines:
+        car, views = ReplayedCar(recording, line), Views(recording, line.stretch)
+        for at in range(len(car)):
+            if abs(offset := car.offset(at)) > limit:
                 if at:
-                    done.interventions[len(done.row)] = off
-                course.set_back(at)
-            moment = Moment(recording, views, course, at)
-            steering = float(np.float32(steer(moment)))  # the network's own, however many digits the wire gave it
-            done.row.append(moment.row)
-            done.time.append(float(course.pause[at - 1]) if at else 0.0)
-            done.distance.append(course.distance(at))
-            done.beside.append(course.beside())
+                    done.interventions[len(done.row)] = offset
+                car.set_back(at)
+            frame = ReplayFrame(recording, views, car, at)
+            steering = float(np.float32(driver(frame)))  # float32 as in the network, whatever the wire's digits
+            done.row.append(frame.row)
+            done.seconds.append(float(car.seconds[at - 1]) if at else 0.0)
+            done.offset.append(car.offset(at))
+            done.offset_from_human.append(car.offset_from_human())
             done.steering.append(steering)
-            done.human.append(moment.human)
+            done.human_steering.append(frame.human_steering)
             if watch:
-                watch(moment, done)
-            if at + 1 < len(course):
-                course.go_on(at, steering)
+                watch(frame, done)
+            if at + 1 < len(car):
+                car.move(at, steering)
     return done

@@ -1,179 +1,252 @@
-"""What replays of recordings came to: as figures, as text, as a picture and as a film."""
+"""Metrics of replayed recordings: as a report, as text, as a plot and as a film."""
 
 import io
 from pathlib import Path
+from typing import TypedDict
 
 import cv2
 import numpy as np
 
-from cloning.errors import SimulatorError
-from cloning.film import FilmWriter
+from cloning.film import DriveFilm
+from cloning.outputs import write_output
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
-from cloning.replay.replay import Drive, Moment, Reference, drive
-from simulator.report import put
+from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, drive
 
-SMOOTHED = 9  # rows over which steering is averaged before it is compared
+SMOOTHED_ROWS = 9  # rows (0.6 s) over which steering is averaged before it is correlated
+LISTED = 10  # interventions that the text lists for each limit
+HUMAN = "the human"  # the report's key of the human driver's own steering
 
 
-def percentages(done: Drive) -> dict:
-    """Of one drive: autonomy in percent, interventions, metres from the reference."""
-    away = np.abs(done.distance)
+class DrivingMetrics(TypedDict):
+    """The metrics of one drive: autonomy in percent, and absolute offsets from the reference line in metres."""
+
+    autonomy_percent: float
+    interventions: int
+    distance_mean_m: float
+    distance_p95_m: float
+
+
+class SteeringMetrics(TypedDict):
+    """Steering, -1..1, compared with the human driver's.
+
+    error: root mean squared difference; correlation: of both, averaged over nine rows; None if either is constant.
+    """
+
+    error: float
+    correlation: float | None
+
+
+class Intervention(TypedDict):
+    """Where a drive was set back: the centre image, seconds driven, and metres right of the reference line."""
+
+    image: str
+    seconds: float
+    metres: float
+
+
+class LimitReport(DrivingMetrics):
+    """The metrics of the drive at one limit; compared: those of drivers that look at no image."""
+
+    steering: SteeringMetrics
+    where: list[Intervention]
+    compared: dict[str, DrivingMetrics]
+
+
+class ReplayReport(TypedDict):
+    """The report of one recording.
+
+    reference_asked: "lane" or "human"; reference: rows measured from the lane centre, and from the human's way (the
+    human driver's path); limits: by the limit in metres; steering_compared: that of drivers that look at no image.
+    """
+
+    recording: str
+    rows: int
+    rows_driven: int
+    stretches: int
+    seconds: float
+    reference_asked: str
+    reference: dict[str, int]
+    limits: dict[str, LimitReport]
+    steering_compared: dict[str, SteeringMetrics]
+
+
+def driving_metrics(done: Drive) -> DrivingMetrics:
+    """Return the metrics of one drive."""
+    distance = np.abs(done.offset)
     return {
         "autonomy_percent": round(100 * done.autonomy(), 2),
         "interventions": len(done.interventions),
-        "distance_mean_m": round(float(away.mean()), 3),
-        "distance_p95_m": round(float(np.percentile(away, 95)), 3),
+        "distance_mean_m": round(float(distance.mean()), 3),
+        "distance_p95_m": round(float(np.percentile(distance, 95)), 3),
     }
 
 
-def figures(recording: Recording, references: list[Reference], drives: list[Drive], asked: str) -> dict:
-    """The replay report of a recording: seconds, metres to the right, steering -1..1.
+def steering_metrics(steering: np.ndarray, human: np.ndarray) -> SteeringMetrics:
+    """Compare steering with the human driver's: float (n,) each, -1..1."""
+    smooth, smooth_human = (
+        np.convolve(values, np.ones(SMOOTHED_ROWS) / SMOOTHED_ROWS, "valid") for values in (steering, human)
+    )
+    varies = np.ptp(smooth) > 0 and np.ptp(smooth_human) > 0
+    return {
+        "error": round(float(np.sqrt(np.mean((steering - human) ** 2))), 4),
+        "correlation": round(float(np.corrcoef(smooth, smooth_human)[0, 1]), 3) if varies else None,
+    }
 
+
+def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list[Drive], asked: str) -> ReplayReport:
+    """Return the report of a recording's drives, one per limit, with those of three yardsticks.
+
+    The yardsticks are steering 0, the recording's mean steering, and the human driver's own steering.
     asked: the reference that was asked for, "lane" or "human".
     """
-    human = np.array(drives[0].human)
+    human = np.array(drives[0].human_steering)
     mean = float(recording.steering.mean())
-    blind = {
-        "steering 0": lambda moment: 0.0,
-        "mean steering": lambda moment: mean,
-        "the human": lambda moment: moment.human,
+    yardsticks: dict[str, Driver] = {
+        "steering 0": lambda frame: 0.0,
+        "mean steering": lambda frame: mean,
+        HUMAN: lambda frame: frame.human_steering,
     }
-    rows = sum(len(reference.stretch) for reference in references)
-    by_lane = sum(len(reference.stretch) for reference in references if reference.lane)
+    rows = sum(len(line.stretch) for line in lines)
+    by_lane = sum(len(line.stretch) for line in lines if line.is_lane_centre)
+
+    def limit_report(done: Drive) -> LimitReport:
+        return {
+            **driving_metrics(done),
+            "steering": steering_metrics(np.array(done.steering), human),
+            "where": [
+                {
+                    "image": recording.name(done.row[at]),
+                    "seconds": round(sum(done.seconds[: at + 1]), 2),
+                    "metres": round(offset, 2),
+                }
+                for at, offset in done.interventions.items()
+            ],
+            "compared": {
+                name: driving_metrics(drive(recording, lines, done.limit, driver))
+                for name, driver in yardsticks.items()
+            },
+        }
+
     return {
         "recording": str(recording.folder),
         "rows": len(recording),
         "rows_driven": rows,
-        "stretches": len(references),
-        "seconds": round(sum(drives[0].time), 2),
+        "stretches": len(lines),
+        "seconds": round(sum(drives[0].seconds), 2),
         "reference_asked": asked,
         "reference": {"lane centre": by_lane, "human's way": rows - by_lane},
-        "limits": {
-            f"{done.limit:g}": percentages(done)
-            | {
-                "steering": against(np.array(done.steering), human),
-                "where": [
-                    {
-                        "image": recording.name(done.row[at]),
-                        "seconds": round(sum(done.time[: at + 1]), 2),
-                        "metres": round(off, 2),
-                    }
-                    for at, off in done.interventions.items()
-                ],
-                "compared": {
-                    who: percentages(drive(recording, references, done.limit, steer)) for who, steer in blind.items()
-                },
-            }
-            for done in drives
-        },
+        "limits": {f"{done.limit:g}": limit_report(done) for done in drives},
         "steering_compared": {
-            "steering 0": against(np.zeros_like(human), human),
-            "mean steering": against(np.full_like(human, mean), human),
+            "steering 0": steering_metrics(np.zeros_like(human), human),
+            "mean steering": steering_metrics(np.full_like(human, mean), human),
         },
     }
 
 
-def against(steering: np.ndarray, human: np.ndarray) -> dict:
-    """The root of the mean squared difference from the human's steering, and, of both averaged over nine rows, the
-    correlation (None where one is constant)."""
-    smooth = [np.convolve(values, np.ones(SMOOTHED) / SMOOTHED, "valid") for values in (steering, human)]
-    varies = all(np.ptp(values) > 0 for values in smooth)
-    return {
-        "error": round(float(np.sqrt(np.mean((steering - human) ** 2))), 4),
-        "correlation": round(float(np.corrcoef(*smooth)[0, 1]), 3) if varies else None,
-    }
-
-
-def text(report: dict) -> str:
-    reference = " and ".join(f"the {what} in {rows} rows" for what, rows in report["reference"].items() if rows)
+def report_text(report: ReplayReport) -> str:
+    """Return a report as lines for a terminal."""
+    by_lane, by_human = report["reference"]["lane centre"], report["reference"]["human's way"]
+    references = [f"the lane centre in {by_lane} rows"] if by_lane else []
+    references += [f"the human driver's path in {by_human} rows"] if by_human else []
+    stretches = "1 stretch" if report["stretches"] == 1 else f"{report['stretches']} stretches"
     lines = [
-        f"{report['recording']}: {report['seconds']:.1f} s driven in {report['stretches']} stretches "
-        f"({report['rows_driven']} of {report['rows']} rows); off-centre is counted from {reference}"
+        f"{report['recording']}: replayed {report['seconds']:.1f} s in {stretches} ({report['rows_driven']} of "
+        f"{report['rows']} rows); offsets are measured from {' and '.join(references)}"
     ]
-    if report["reference_asked"] == "lane" and report["reference"]["human's way"]:
-        lines.append("the lane's centre is not trusted where the human's way stands for it: an unknown road?")
-    for limit, one in report["limits"].items():
+    if report["reference_asked"] == "lane" and by_human:
+        lines.append("  the lane centre cannot be estimated reliably where the human driver's path is used instead")
+    for limit, metrics in report["limits"].items():
         lines.append(
-            f"at {limit} m: autonomy {one['autonomy_percent']:.1f} %, {one['interventions']} interventions; "
-            f"off-centre {one['distance_mean_m']:.2f} m on average, 95 %: {one['distance_p95_m']:.2f} m"
+            f"limit {limit} m: autonomy {metrics['autonomy_percent']:.1f} %, {metrics['interventions']} interventions; "
+            f"distance from the reference: mean {metrics['distance_mean_m']:.2f} m, "
+            f"95th percentile {metrics['distance_p95_m']:.2f} m"
         )
-        others = (
-            f"{who} {other['autonomy_percent']:.0f} % ({other['interventions']})"
-            for who, other in one["compared"].items()
+        yardsticks = (
+            f"{_plain(name)} {other['autonomy_percent']:.0f} % ({other['interventions']})"
+            for name, other in metrics["compared"].items()
         )
-        lines.append("  for comparison: " + ", ".join(others))
-        lines += [f"  {at['seconds']:.1f} s: {at['metres']:+.2f} m, {at['image']}" for at in one["where"][:10]]
-        if len(one["where"]) > 10:
-            lines.append(f"  … and {len(one['where']) - 10} more")
-    first, others = next(iter(report["limits"].values()))["steering"], report["steering_compared"]
-    errors = ", ".join(f"{who}: {other['error']:.3f}" for who, other in others.items())
+        lines.append("  yardsticks, autonomy (interventions): " + ", ".join(yardsticks))
+        lines += [
+            f"  intervention at {at['seconds']:.1f} s: {abs(at['metres']):.2f} m to the "
+            f"{'right' if at['metres'] > 0 else 'left'}, {at['image']}"
+            for at in metrics["where"][:LISTED]
+        ]
+        if len(metrics["where"]) > LISTED:
+            lines.append(f"  … and {len(metrics['where']) - LISTED} more interventions")
+    limit, metrics = next(iter(report["limits"].items()))
+    steering = metrics["steering"]
+    errors = ", ".join(f"{name} {other['error']:.3f}" for name, other in report["steering_compared"].items())
+    correlation = "undefined (constant steering)" if steering["correlation"] is None else steering["correlation"]
     lines.append(
-        f"steering: error {first['error']:.3f} ({errors}), correlation with the human's, both averaged over "
-        f"{SMOOTHED} rows: {first['correlation']}"
+        f"steering compared with the human driver's, at limit {limit} m: RMS error {steering['error']:.3f} "
+        f"(yardsticks: {errors}); correlation, both smoothed over {SMOOTHED_ROWS} rows: {correlation}"
     )
     return "\n".join(lines)
 
 
-def picture(path: str, recording: Recording, drives: list[Drive]) -> None:
-    """Distance from the reference and steering over the recording, interventions marked. Raises SimulatorError."""
+def _plain(name: str) -> str:
+    """Return a yardstick's name in the text: the report's keys stay as earlier versions wrote them."""
+    return "human driver" if name == HUMAN else name
+
+
+def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> None:
+    """Plot offsets and steering over time, with the interventions, into a PNG file. Raises OutputError."""
     from matplotlib.figure import Figure  # large, and needed only here
 
     figure = Figure(figsize=(12, 2.6 * (len(drives) + 1)), layout="constrained")
     axes = figure.subplots(len(drives) + 1, 1, sharex=True)
     for ax, done in zip(axes, drives, strict=False):
-        seconds, distance = np.cumsum(done.time), np.array(done.distance)
-        distance[np.flatnonzero(np.diff(done.row) > 1) + 1] = np.nan  # breaks are not joined
+        seconds, offset = np.cumsum(done.seconds), np.array(done.offset)
+        human_offset = offset - done.offset_from_human
+        offset[np.flatnonzero(np.diff(done.row) > 1) + 1] = np.nan  # no line across a break
         ax.axhspan(-done.limit, done.limit, color="0.93")
-        ax.plot(seconds, distance, linewidth=0.9, label="the model")
-        ax.plot(seconds, np.array(done.distance) - done.beside, linewidth=0.7, color="0.5", label="the human")
+        ax.plot(seconds, offset, linewidth=0.9, label="model")
+        ax.plot(seconds, human_offset, linewidth=0.7, color="0.5", label="human driver")
         for at in done.interventions:
             ax.axvline(seconds[at], color="tab:red", linewidth=0.8)
         ax.set(
-            ylabel="m right of the centre",
-            title=f"{len(done.interventions)} interventions at {done.limit:g} m: "
-            f"autonomy {100 * done.autonomy():.1f} %",
+            ylabel="m right of the reference",
+            title=f"limit {done.limit:g} m: autonomy {100 * done.autonomy():.1f} %, "
+            f"{len(done.interventions)} interventions",
         )
         ax.legend(loc="upper right", fontsize=8)
-    seconds = np.cumsum(drives[-1].time)
-    axes[-1].plot(seconds, drives[-1].steering, linewidth=0.8, label="the model")
-    axes[-1].plot(seconds, drives[-1].human, linewidth=0.6, color="0.5", label="the human")
+    seconds = np.cumsum(drives[-1].seconds)
+    axes[-1].plot(seconds, drives[-1].steering, linewidth=0.8, label="model")
+    axes[-1].plot(seconds, drives[-1].human_steering, linewidth=0.6, color="0.5", label="human driver")
     axes[-1].set(xlabel="s", ylabel="steering")
     axes[-1].legend(loc="upper right", fontsize=8)
     file = io.BytesIO()
     figure.suptitle(recording.folder.name)
     figure.savefig(file, format="png", dpi=90)
-    put(path, file.getvalue())
+    write_output(path, file.getvalue())
 
 
-class SideBySide:
-    """A film of a replay: what the model saw with its steering to the left, the human's frame to the right."""
+class ReplayFilm(DriveFilm):
+    """A film of a replay: the model's view and steering on the left, the human driver's on the right."""
 
     def __init__(self, path: str):
-        """Raises SimulatorError."""
-        try:
-            self.film = FilmWriter(Path(path), SAMPLE_RATE, quality=24, preset="veryfast")
-        except OSError as error:
-            raise SimulatorError(f"{path}: no film can be written there ({error.strerror})") from error
+        """Open the film. Raises OutputError."""
+        super().__init__(path, SAMPLE_RATE, quality=24)
 
-    def watch(self, moment: Moment, done: Drive) -> None:
-        said = f"{done.distance[-1]:+.2f} m   steering {done.steering[-1]:+.3f}   limit {done.limit:g} m"
+    def watch(self, frame: ReplayFrame, done: Drive) -> None:
+        """Append the row that was just driven."""
+        if self.error:
+            return
+        caption = f"{done.offset[-1]:+.2f} m   steering {done.steering[-1]:+.3f}   limit {done.limit:g} m"
         if done.interventions:
-            said += f"   interventions {len(done.interventions)}"
-        pictures = [
-            captioned(moment.seen, done.steering[-1], said),
-            captioned(moment.recorded, moment.human, f"the human   steering {moment.human:+.3f}"),
+            caption += f"   interventions {len(done.interventions)}"
+        views = [
+            captioned(frame.view, done.steering[-1], caption),
+            captioned(frame.recorded, frame.human_steering, f"human driver   steering {frame.human_steering:+.3f}"),
         ]
-        self.film.add(np.hstack(pictures))
-
-    def close(self) -> None:
-        self.film.close()
+        self.add(np.hstack(views))
 
 
-def captioned(frame: np.ndarray, steering: float, said: str) -> np.ndarray:
-    """A frame at twice its size, uint8 (320, 640, 3), RGB, with the way that the steering takes and a line of text."""
+def captioned(frame: np.ndarray, steering: float, caption: str) -> np.ndarray:
+    """Return a frame at twice its size, uint8 (320, 640, 3), RGB, with the steering's path and a line of text."""
     from cloning.pilot.attention import overlay  # which loads torch, and only films need it
 
     shown = overlay(frame, steering)
-    cv2.putText(shown, said, (10, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
+    cv2.putText(shown, caption, (10, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
     return shown

@@ -1,4 +1,4 @@
-"""A recording's frames as the camera would have seen them from beside the path that was driven."""
+"""A recording's frames as the camera would have seen them from next to the path that was driven."""
 
 import functools
 
@@ -6,64 +6,71 @@ import numpy as np
 
 from cloning.recordings.images import decode
 from cloning.recordings.log import Recording
-from cloning.road.camera import BONNET_ROW, CAMERA_OFFSETS, EARLIER_FRAME, warp
-from cloning.road.motion import AXLE_TO_CAMERA, Stretch
+from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, FIRST_BONNET_ROW, camera_position
+from cloning.road.motion import AXLE_TO_CAMERA, Stretch, components, forward_vector, right_of
+from cloning.road.warp import warp
 
 
 class Views:
-    """The frames of a stretch of a recording, as seen from beside its way.
+    """The frames of a stretch of a recording, and views of it from other poses of the car.
 
-    The nearest of the three cameras is taken; what it does not see, beside the car's nose, an earlier frame of the same
-    camera has seen from further back.
+    A view is warped from the nearest of the three cameras. What that one did not see, at the sides of the car's nose,
+    is filled from an earlier frame of the same camera, which was taken further back.
     """
 
     def __init__(self, recording: Recording, stretch: Stretch):
-        self.recording, self.first = recording, stretch.rows.start
-        self.right, self.forward, self.heading, self.driven = (
-            stretch.right,
-            stretch.forward,
-            stretch.heading,
-            stretch.driven,
-        )
+        self.recording, self.stretch = recording, stretch
 
-    @functools.lru_cache(maxsize=64)  # noqa: B019 - lives as long as the stretch is driven
+    @functools.lru_cache(maxsize=64)  # noqa: B019 - lives only while its stretch is driven
     def frame(self, at: int, camera: int) -> np.ndarray:
-        """A recorded frame, uint8 (160, 320, 3), RGB; at: from the stretch's beginning; camera: centre, left, right."""
+        """Return a recorded frame, uint8 (160, 320, 3), RGB.
+
+        at: row of the stretch; camera: 0 centre, 1 left, 2 right.
+        """
         return decode(self.jpeg(at, camera))
 
     def jpeg(self, at: int, camera: int = 0) -> bytes:
-        return self.recording.path(self.first + at, camera).read_bytes()
+        """Return a recorded frame as the file holds it."""
+        return self.recording.path(self.stretch.rows.start + at, camera).read_bytes()
 
-    def seen_from(self, at: int, right: float, yaw: float) -> np.ndarray:
-        """The centre camera's frame if the rear axle stood `right` metres beside its way, turned by `yaw` radians.
+    def view_from(self, at: int, right: float, yaw: float) -> np.ndarray:
+        """Return what the centre camera would see from another pose than the recorded one: uint8 (160, 320, 3), RGB.
 
-        uint8 (160, 320, 3), RGB.
+        right: m from the recorded position of the rear axle to the right; yaw: radians to the recorded heading.
         """
-        heading = self.heading[at]
-        eye = np.array(
-            [
-                self.right[at] + right * np.cos(heading) + AXLE_TO_CAMERA * np.sin(heading + yaw),
-                self.forward[at] - right * np.sin(heading) + AXLE_TO_CAMERA * np.cos(heading + yaw),
-            ]
-        )
-        beside = right + AXLE_TO_CAMERA * np.sin(yaw)
-        camera = int(np.argmin([abs(beside - side) for side in CAMERA_OFFSETS.values()]))
-        made, seen = self._warped(at, camera, eye, heading + yaw)
-        earlier = int(np.searchsorted(self.driven, self.driven[at] - EARLIER_FRAME, "right")) - 1
-        missing = (~seen[:BONNET_ROW]).nonzero()
-        if earlier >= 0 and len(missing[0]):
-            top, left, bottom, end = *np.min(missing, axis=1), *(np.max(missing, axis=1) + 1)
-            before, _ = self._warped(earlier, camera, eye, heading + yaw, (top, bottom, left, end))
-            part = made[top:bottom, left:end]
-            np.copyto(part, before, where=~seen[top:bottom, left:end, None])
-        made[BONNET_ROW:] = self.frame(at, 0)[BONNET_ROW:]
-        return made
+        heading = self.stretch.heading[at] + yaw
+        axle = self._axle(at) + right * right_of(forward_vector(self.stretch.heading[at]))
+        position = camera_position(axle, forward_vector(heading))
+        offset = right + AXLE_TO_CAMERA * np.sin(yaw)
+        camera = int(np.argmin([abs(offset - mounted) for mounted in CAMERA_OFFSETS.values()]))
+        view, seen = self._warp(at, camera, position, heading)
+        driven = self.stretch.driven
+        earlier = int(np.searchsorted(driven, driven[at] - EARLIER_FRAME, "right")) - 1
+        rows, columns = (~seen[:FIRST_BONNET_ROW]).nonzero()
+        if earlier >= 0 and len(rows):
+            top, bottom = int(rows.min()), int(rows.max()) + 1
+            left, right_end = int(columns.min()), int(columns.max()) + 1
+            earlier_view, _ = self._warp(earlier, camera, position, heading, (top, bottom, left, right_end))
+            box = np.s_[top:bottom, left:right_end]
+            np.copyto(view[box], earlier_view, where=~seen[box][..., None])
+        view[FIRST_BONNET_ROW:] = self.frame(at, 0)[FIRST_BONNET_ROW:]
+        return view
 
-    def _warped(self, at: int, camera: int, eye: np.ndarray, heading: float, *box):
-        s, c = np.sin(self.heading[at]), np.cos(self.heading[at])
-        side = list(CAMERA_OFFSETS.values())[camera]
-        stands = np.array(
-            [self.right[at] + AXLE_TO_CAMERA * s + side * c, self.forward[at] + AXLE_TO_CAMERA * c - side * s]
-        )
-        away = eye - stands
-        return warp(self.frame(at, camera), away @ (c, -s), away @ (s, c), heading - self.heading[at], *box)
+    def _axle(self, at: int) -> np.ndarray:
+        """Return the middle of the rear axle, float64 (2,): m, right and forward in the stretch's frame."""
+        return np.array([self.stretch.right[at], self.stretch.forward[at]])
+
+    def _warp(
+        self,
+        at: int,
+        camera: int,
+        position: np.ndarray,
+        heading: float,
+        box: tuple[int, int, int, int] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return a camera's frame warped to another position, (2,), and heading; see `warp`."""
+        forward = forward_vector(self.stretch.heading[at])
+        mounted = list(CAMERA_OFFSETS.values())[camera]
+        moved = components(position - camera_position(self._axle(at), forward, mounted), forward)
+        pose = float(moved[0]), float(moved[1]), float(heading - self.stretch.heading[at])
+        return warp(self.frame(at, camera), *pose, box) if box else warp(self.frame(at, camera), *pose)

@@ -1,1 +1,1 @@
-"""The road: how the car moves, where the two tracks go, and what a camera sees from where."""
+"""Road: how the car moves, the centre lines of the two tracks, and the camera geometry."""

@@ -1,7 +1,8 @@
-"""The simulator's car on the road: how its steering turns it, and the way that a recording's car went."""
+"""The simulator's car on the road: how steering turns it, and the trajectory that a recorded car drove."""
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,32 +17,50 @@ REAR_AXLE = 1.6  # m behind the car's middle
 CAMERA_FORWARD = 1.0  # m before the car's middle: all three cameras
 AXLE_TO_CAMERA = REAR_AXLE + CAMERA_FORWARD  # m from the rear axle's middle, about which the car turns, to the cameras
 MAX_GAP = 0.4  # s: rows further apart are not one drive
-MAX_ACCELERATION = 30.0  # m/s²: the car neither brakes nor speeds up like this; it was set back, or a crash stopped it
-YAW_LAG = 0.15  # s: the car turns as its wheels stand with this time constant, on three recordings alike
-OFF_ROAD = 4.5  # m from the lane's centre at which whoever drives is no longer on the road, and shows no lane
+MAX_ACCELERATION = 30.0  # m/s²: no car brakes or accelerates like this; it was reset, or a crash stopped it
+YAW_LAG = 0.15  # s: time constant with which the car's turning follows its wheels, the same on three recordings
+OFF_ROAD = 4.5  # m from the lane's centre beyond which the human driver has left the road, and frames show no lane
 MIN_TRUSTED = 0.7  # share of a stretch's rows whose lane is trusted; below it, the human's path is the reference
-MIN_SPEED = 1.0  # m/s: slower than walking, the frames say nothing about steering
+MIN_SPEED = 1.0  # m/s: below walking speed the frames say nothing about steering
+
+Values = TypeVar("Values", float, np.ndarray)
 
 
-def curvature(steering):
-    """Of the way at this steering, 1/m, right positive; steering -1..1, a number or an array.
+def forward_vector(heading: np.ndarray | float) -> np.ndarray:
+    """Return the unit vector along a heading: (…, 2), right and forward in the frame where the heading is 0."""
+    return np.stack([np.sin(heading), np.cos(heading)], axis=-1)
 
-    Laid along the tracks' centre lines, real recordings turn by 1.06, 1.05 and 0.99 times this over a whole lap, at
+
+def right_of(forward: np.ndarray) -> np.ndarray:
+    """Return the unit vector to the right of another: (…, 2); both (right, forward) or both (x east, y north)."""
+    return np.stack([forward[..., 1], -forward[..., 0]], axis=-1)
+
+
+def components(vector: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """Return a vector's components to the right of and along a unit vector: (…, 2); all in the same frame."""
+    right = vector[..., 0] * forward[..., 1] - vector[..., 1] * forward[..., 0]
+    return np.stack([right, vector[..., 0] * forward[..., 0] + vector[..., 1] * forward[..., 1]], axis=-1)
+
+
+def curvature(steering: Values) -> Values:
+    """Return the curvature of the path at a steering, 1/m, right positive; steering: -1..1.
+
+    Compared with the tracks' centre lines, real recordings turn by 1.06, 1.05 and 0.99 times this over a whole lap, at
     30 mph and at 15 alike: the car does not understeer noticeably.
     """
     return np.tan(np.radians(FULL_LOCK) * steering) / WHEELBASE
 
 
-def steering_for(bend):
-    """The steering, -1..1, that drives a curvature in 1/m, right positive."""
+def steering_for(bend: Values) -> Values:
+    """Return the steering, -1..1, that drives a curvature in 1/m, right positive."""
     return np.clip(np.degrees(np.arctan(WHEELBASE * bend)) / FULL_LOCK, -1, 1)
 
 
 def lagged_curvature(turning: float, bend: float, pause: float) -> float:
-    """The curvature that the car drives `pause` seconds later, 1/m, while its wheels stand for the curvature `bend`.
+    """Return the curvature that the car drives after `pause` seconds with its wheels at the curvature `bend`, 1/m.
 
-    The yaw seen in the far background of successive frames fits a lag of the first order with 0.15 s on all three real
-    recordings, and halves what is left of the differences on the one that was driven by keys.
+    turning: 1/m, the curvature driven before. The yaw between successive frames, measured in their far background, fits
+    a first-order lag of 0.15 s on all three real recordings; on the one driven by keyboard it halves the residual.
     """
     return turning + (bend - turning) * (1 - math.exp(-pause / YAW_LAG))
 
@@ -51,7 +70,7 @@ class Stretch:
     """Rows of a recording that follow one another without a break, and the car's trajectory over them.
 
     rows            of the recording
-    right, forward  float64 (n,): m, of the rear axle's middle, in the frame in which it stands in the first row
+    right, forward  float64 (n,): m, of the rear axle's middle, in the frame of its pose in the first row
     heading         float64 (n,): radians, right positive, 0 in the first row
     driven          float64 (n,): m since the first row
     """
@@ -67,7 +86,7 @@ class Stretch:
 
     @staticmethod
     def of(recording: Recording, rows: slice) -> "Stretch":
-        """The trajectory from the rows' steering, speed and time stamps."""
+        """Integrate the trajectory from the rows' steering, speed and time stamps."""
         speed = recording.speed[rows].astype(float) * MPH
         pause = np.diff(recording.time[rows])
         step, bends = speed[:-1] * pause, curvature(recording.steering[rows].astype(float))
@@ -77,25 +96,25 @@ class Stretch:
         turn = np.array(turning[1:]) * step
         heading = np.r_[0.0, np.cumsum(turn)]
         middle = heading[:-1] + turn / 2
-        right, forward = (np.r_[0.0, np.cumsum(step * along(middle))] for along in (np.sin, np.cos))
+        right, forward = (np.r_[0.0, np.cumsum(step * component(middle))] for component in (np.sin, np.cos))
         return Stretch(rows, right, forward, heading, np.r_[0.0, np.cumsum(step)])
 
 
 def stretches(recording: Recording) -> list[Stretch]:
-    """The drives between a recording's breaks: gaps in time, jumps in speed, standing. Each at least two seconds."""
+    """Split a recording at gaps in time, jumps in speed and standstills; each stretch is at least 2 s long."""
     speed = np.abs(recording.speed.astype(float)) * MPH
     pause = np.diff(recording.time)
-    whole = (
+    continuous = (
         (pause > 0)
         & (pause < MAX_GAP)
         & (np.abs(np.diff(speed)) < MAX_ACCELERATION * np.maximum(pause, 1 / SAMPLE_RATE))
     )
     moving = speed > MIN_SPEED
-    joined = whole & moving[1:] & moving[:-1]
+    joined = continuous & moving[1:] & moving[:-1]
     starts = np.flatnonzero(np.r_[True, ~joined])
     ends = np.r_[starts[1:], len(speed)]
     return [
-        Stretch.of(recording, slice(a, b))
-        for a, b in zip(starts.tolist(), ends.tolist(), strict=True)
-        if b - a >= 2 * SAMPLE_RATE
+        Stretch.of(recording, slice(start, end))
+        for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
+        if end - start >= 2 * SAMPLE_RATE
     ]

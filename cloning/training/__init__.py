@@ -1,1 +1,1 @@
-"""Training: all that model.py needs besides the report's own steps."""
+"""Training: everything that model.py needs besides the steps that the report describes."""

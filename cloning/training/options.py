@@ -1,113 +1,149 @@
-"""model.py's command line: its options, the files that they name, and the run that --resume goes on with."""
+"""The command line of model.py: its options as a typed record, parsed once."""
 
 import argparse
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import TypeVar
 
-from cloning.errors import ModelError
-from cloning.pilot.network import load_checkpoint
+from cloning.compute import DEVICES, is_available
 
-# What --robust sets, where it is not given: poses make every image another, and many small steps learn from them.
-ROBUST = {"batch_size": 16, "learning_rate": 3e-4, "samples_per_epoch": 60_000}
+Number = TypeVar("Number", int, float)
 
 
-def parse(argv: list[str] | None = None) -> tuple[argparse.Namespace, dict]:
-    """The command line's arguments, and of them those that were given."""
-    parser = argparse.ArgumentParser(
-        description="Train NVIDIA's network to steer, from recordings of the Udacity simulator.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        epilog="The defaults are the report's. Interrupt with Ctrl-C at any time; --resume goes on.",
-    )
-    parser.add_argument(
-        "recordings", nargs="*", default=["data"], help="folders with a driving_log.csv, or folders of such folders"
-    )
-    add = parser.add_argument_group("training").add_argument
-    add("--epochs", type=at_least(1, int), default=10, help="epochs in all, also with --resume")
-    add("--batch-size", type=at_least(1, int), default=128, help="observations a batch; each gives 3.7 images")
-    add("--learning-rate", type=at_least(1e-9, float), default=1e-4, help="Adam's")
-    add(
-        "--samples-per-epoch",
-        type=at_least(1, int),
-        default=20224,
-        help="images an epoch, at least; a fifth as many observations validate",
-    )
-    add("--seed", type=at_least(0, int), default=0, help="the same seed gives the same run on a machine")
-    add(
-        "--device",
-        choices=["auto", "cpu", "cuda", "mps"],
-        default="auto",
-        help="auto: an NVIDIA GPU, else Apple's, else the CPU",
-    )
-    add = parser.add_argument_group("observations").add_argument
-    add("--throttle-threshold", type=float, default=0.25, help="rows with less throttle are dropped")
-    add("--side-correction", type=float, default=0.2, help="added to the left camera's steering, taken off the right's")
-    add("--strict", action="store_true", help="stop at an unusable row, instead of leaving it out")
-    add(
-        "--robust",
-        action="store_true",
-        help="instead of dropping rows off throttle, resampling and side cameras: learn to come back onto the lane's "
-        "centre, from frames seen from beside it, in "
-        + ", ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in ROBUST.items())
-        + " unless given",
-    )
-    add = parser.add_argument_group("output").add_argument
-    add("--output", default="model.pt", help="the model; all else is written beside it")
-    add(
-        "--resume",
-        action="store_true",
-        help="go on from the output's -resume.pt, with that run's arguments; --epochs may be raised",
-    )
-    arguments = parser.parse_args(argv)
-    absent = object()  # argparse sets a default only where a namespace has nothing yet
-    given = vars(parser.parse_args(argv, argparse.Namespace(**dict.fromkeys(vars(arguments), absent))))
-    given = {
-        name: value
-        for name, value in given.items()
-        if value is not absent and (name != "recordings" or value is not parser.get_default(name))
-    }  # argparse sets a list's in any case
-    if arguments.robust:
-        for name in {"throttle_threshold", "side_correction"} & given.keys():
-            parser.error(f"--{name.replace('_', '-')} is the recipe's; --robust does without it")
-        vars(arguments).update({name: value for name, value in ROBUST.items() if name not in given})
+@dataclass(frozen=True)
+class Arguments:
+    """The options of a training run, with the report's figures as defaults.
+
+    Every checkpoint holds them as a plain dict, and training_arguments.json lists them. `build_parser` explains each.
+    """
+
+    recordings: list[str] = field(default_factory=lambda: ["data"])
+    epochs: int = 10
+    batch_size: int = 128
+    learning_rate: float = 1e-4
+    samples_per_epoch: int = 20224
+    seed: int = 0
+    device: str = "auto"
+    throttle_threshold: float = 0.25
+    side_correction: float = 0.2
+    strict: bool = False
+    robust: bool = False
+    output: str = "model.pt"
+    resume: bool = False
+
+
+# With --robust every image is warped to another pose, and many small steps learn most from them.
+ROBUST_DEFAULTS = {"batch_size": 16, "learning_rate": 3e-4, "samples_per_epoch": 60_000}
+REPORT_ONLY = ("throttle_threshold", "side_correction")  # options without an effect in a --robust run
+
+
+def option(name: str) -> str:
+    """The option that sets a field of Arguments: batch_size -> --batch-size."""
+    return f"--{name.replace('_', '-')}"
+
+
+def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
+    """Parse the command line: the arguments, and the names of those that were given.
+
+    Exits with status 2 and a message for an argument that is not possible.
+    """
+    parser = build_parser()
+    values = vars(parser.parse_args(argv))
+    given = frozenset(values)
+    if values.get("robust"):
+        for name in REPORT_ONLY:
+            if name in given:
+                parser.error(f"{option(name)} belongs to the report's training; leave it out with --robust")
+        values = {**ROBUST_DEFAULTS, **values}
+    arguments = Arguments(**values)
+    if not is_available(arguments.device):
+        parser.error(f"--device {arguments.device}: torch finds no such GPU on this machine; leave the option out")
     return arguments, given
 
 
-def at_least(least, kind):
-    """A type for argparse: a number of this kind, not below the least."""
+def build_parser() -> argparse.ArgumentParser:
+    """The parser; an option that is not given sets nothing, so that `Arguments` alone defines the defaults."""
+    parser = argparse.ArgumentParser(
+        prog="model.py",
+        description="Train NVIDIA's network to predict steering from recordings of the Udacity simulator.",
+        epilog="The defaults are the report's. Stop a run with Ctrl-C at any time; --resume continues it.",
+        argument_default=argparse.SUPPRESS,
+    )
+    defaults = {item.name: getattr(Arguments(), item.name) for item in fields(Arguments)}
 
-    def number(text: str):
+    def text(name: str, help_text: str) -> str:
+        return f"{help_text} (default: {defaults[name]})"
+
+    parser.add_argument(
+        "recordings",
+        nargs="*",
+        help="folders that hold a driving_log.csv, at any depth (default: data)",
+    )
+    group = parser.add_argument_group("training")
+    group.add_argument(
+        "--epochs", type=at_least(1, int), help=text("epochs", "epochs in total; with --resume it may be raised")
+    )
+    group.add_argument(
+        "--batch-size",
+        type=at_least(1, int),
+        help=text("batch_size", "observations in a batch; each gives 3.7 images on average"),
+    )
+    group.add_argument(
+        "--learning-rate", type=at_least(1e-9, float), help=text("learning_rate", "learning rate of Adam")
+    )
+    group.add_argument(
+        "--samples-per-epoch",
+        type=at_least(1, int),
+        help=text("samples_per_epoch", "images in an epoch, at least; a fifth as many observations validate it"),
+    )
+    group.add_argument(
+        "--seed", type=at_least(0, int), help=text("seed", "the same seed repeats the same run on the same machine")
+    )
+    group.add_argument(
+        "--device",
+        choices=DEVICES,
+        help=text("device", "auto: an NVIDIA GPU if there is one, else Apple's (mps), else the CPU"),
+    )
+    group = parser.add_argument_group("observations")
+    group.add_argument(
+        "--throttle-threshold",
+        type=float,
+        help=text("throttle_threshold", "rows with less throttle are dropped"),
+    )
+    group.add_argument(
+        "--side-correction",
+        type=float,
+        help=text("side_correction", "added to the steering of left images, subtracted from that of right ones"),
+    )
+    group.add_argument("--strict", action="store_true", help="stop at the first unusable row instead of leaving it out")
+    group.add_argument(
+        "--robust",
+        action="store_true",
+        help="train for robustness rather than fidelity to the report: learn recovery steering from frames warped to "
+        "other lateral offsets and headings; sets "
+        + ", ".join(f"{option(name)} {value:g}" for name, value in ROBUST_DEFAULTS.items())
+        + " unless they are given",
+    )
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "--output", help=text("output", "the model file; all other files are written to the same folder")
+    )
+    group.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue the run of this --output with the arguments that it began with; begin it if there is none",
+    )
+    return parser
+
+
+def at_least(least: Number, kind: type[Number]) -> Callable[[str], Number]:
+    """A type for argparse: a finite number of this kind, not below `least`."""
+
+    def number(text: str) -> Number:
         value = kind(text)
         if not least <= value < float("inf"):
             raise argparse.ArgumentTypeError(f"{text} is not a number from {least} up")
         return value
 
-    number.__name__ = kind.__name__
+    number.__name__ = kind.__name__  # argparse names it: "invalid int value"
     return number
-
-
-def model_files(output: str) -> tuple[Path, Path, Path]:
-    """For model.pt: itself, the last epoch's; model-best.pt; and model-resume.pt, which --resume goes on from."""
-    path = Path(output)
-    return path, path.with_stem(f"{path.stem}-best"), path.with_stem(f"{path.stem}-resume")
-
-
-def load_resumed(arguments: argparse.Namespace, given: dict) -> dict | None:
-    """The checkpoint to go on from, its run's arguments taken over; None to begin. Raises ModelError."""
-    *_, path = model_files(arguments.output)
-    if not arguments.resume:
-        return None
-    if not path.exists():
-        print(f"{path}: nothing to resume yet; the run begins")
-        return None
-    saved = load_checkpoint(path)
-    if "training" not in saved:
-        raise ModelError(f"{path}: holds no state of a run; name the run's --output")
-    free = ("recordings", "epochs", "device", "output", "strict", "resume")  # other recordings are found out later
-    for name, value in saved["arguments"].items():
-        if name in given and name not in free and given[name] != value:
-            raise ModelError(
-                f"{path}: was begun with --{name.replace('_', '-')} {value}, not {given[name]}; "
-                "leave it out, or begin anew without --resume"
-            )
-        if name not in given:
-            setattr(arguments, name, value)
-    return saved

@@ -1,1 +1,1 @@
-"""The wire: the server's and the simulator's end of the socket between them."""
+"""Wire: the server's and the simulator's end of the socket between them."""

@@ -1,7 +1,7 @@
-"""The simulator's end of the wire: Engine.IO over a WebSocket as the real client speaks it, odd as that is.
+"""The simulator's end of the wire: Engine.IO over a WebSocket, with the real client's peculiarities.
 
-It announces Engine.IO 4 but speaks version 3: its own pings, no CONNECT packet. Messages go out as fragments
-of 1016 bytes.
+The real client announces Engine.IO 4 but speaks version 3: it sends the pings, and no CONNECT packet. It sends
+messages in fragments of 1016 bytes.
 """
 
 import base64
@@ -13,138 +13,151 @@ import time
 from dataclasses import dataclass
 
 from wsproto import ConnectionType, WSConnection
-from wsproto.events import CloseConnection, Ping, RejectConnection, Request, TextMessage
+from wsproto.events import CloseConnection, Event, Ping, RejectConnection, Request, TextMessage
 from wsproto.utilities import ProtocolError
 
 from cloning.road.motion import FULL_LOCK
 
 PATH = "/socket.io/?EIO=4&transport=websocket"
+# Engine.IO packets begin with their type; that of a message, 4, is followed by Socket.IO's type.
+OPEN, CLOSE, PING, PONG, MESSAGE = "0", "1", "2", "3", "4"
+CONNECT, DISCONNECT, EVENT = "40", "41", "42"
 FRAGMENT = 1016  # bytes
-PING_EVERY, PONG_WITHIN = 25.0, 60.0  # s
-ANSWERS_WITHIN = 10.0  # s for a server to open a session
-LEAVE_WITHIN = 1.0  # s for a server to hear that the session is over
-RETRY = 0.1  # s between two attempts to connect; the real client makes thousands a second
+PING_INTERVAL, PONG_TIMEOUT = 25.0, 60.0  # s
+CONNECT_TIMEOUT = 10.0  # s to reach a server, and again for it to open a session
+CLOSE_TIMEOUT = 1.0  # s for a server to notice that the session is over
 
 
-class Gone(Exception):
-    """The server went away, or was never there; the message says how."""
+class ConnectionLost(Exception):
+    """The server closed the connection, or was never there; the message says which."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What the server sent in answer: a command (-1..1 each), or "manual", which sets nothing."""
+    """The server's answer to a telemetry: a command, -1..1 each, or None for "manual", which changes nothing."""
 
     steering: float | None = None
     throttle: float | None = None
 
 
-def read(packet: str) -> Answer | None:
-    """The answer in an Engine.IO packet, or None if it holds none that the simulator could use.
+def parse_answer(packet: str) -> Answer | None:
+    """Return the answer in an Engine.IO packet, or None if the simulator could not use it.
 
-    As in the real one the numbers must be strings; anything else is dropped.
+    The numbers must be strings: the real simulator silently ignores anything else. They are clipped to -1..1.
     """
-    if not packet.startswith("42"):
+    if not packet.startswith(EVENT):
         return None
     try:
-        event, data, *_ = [*json.loads(packet[2:]), None]
-    except (ValueError, TypeError):
+        contents = json.loads(packet[len(EVENT) :])
+    except ValueError:
         return None
+    if not isinstance(contents, list) or not contents:
+        return None
+    event, data = contents[0], contents[1] if len(contents) > 1 else None
     if event == "manual":
         return Answer()
     if event != "steer" or not isinstance(data, dict):
         return None
-    values = []
-    for key in ("steering_angle", "throttle"):
-        if not isinstance(data.get(key), str):
-            return None
-        try:
-            value = float(data[key])
-        except ValueError:
-            return None
-        if not math.isfinite(value):
-            return None
-        values.append(max(-1.0, min(1.0, value)))
-    return Answer(*values)
+    steering, throttle = (_number(data.get(key)) for key in ("steering_angle", "throttle"))
+    if steering is None or throttle is None:
+        return None
+    return Answer(steering, throttle)
 
 
-def telemetry(steering: float, throttle: float, speed: float, jpeg: bytes) -> str:
-    """The packet for a frame: steering and throttle -1..1 as last commanded, speed in mph; degrees on the
-    wire."""
+def _number(text: object) -> float | None:
+    if not isinstance(text, str):
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return max(-1.0, min(1.0, value)) if math.isfinite(value) else None
+
+
+def telemetry_packet(steering: float, throttle: float, speed: float, jpeg: bytes) -> str:
+    """Return the telemetry packet for a frame.
+
+    steering, throttle: as last commanded, -1..1 (the packet has the steering in degrees); speed: mph.
+    """
     values = {
         "steering_angle": f"{FULL_LOCK * steering:.4f}",
         "throttle": f"{throttle:.4f}",
         "speed": f"{speed:.4f}",
         "image": base64.b64encode(jpeg).decode(),
     }
-    return "42" + json.dumps(["telemetry", values], separators=(",", ":"))
+    return EVENT + json.dumps(["telemetry", values], separators=(",", ":"))
 
 
-MANUAL = '42["telemetry",null]'  # a person is steering
+MANUAL_TELEMETRY = f'{EVENT}["telemetry",null]'  # while a person steers
 
 
 class Connection:
-    """One connection. Packets are Engine.IO's, as text."""
+    """A connection to the server; sends and receives Engine.IO packets, as text."""
 
-    def __init__(self, host: str, port: int, patient: bool):
-        """patient: write each fragment by itself and leave Nagle's algorithm on, as the real client does.
+    def __init__(self, host: str, port: int, real_timing: bool):
+        """Connect, and wait until the server has opened a session.
 
-        Raises Gone.
+        real_timing: write as the real client does, each fragment on its own and with Nagle's algorithm; otherwise
+        each packet at once. Raises ConnectionLost.
         """
+        address = f"{host}:{port}"
         try:
-            self.socket = socket.create_connection((host, port), timeout=10)
+            self.socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
         except OSError as error:
-            raise Gone(f"no server at {host}:{port} ({error.strerror or error})") from error
-        self.patient = patient
-        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0 if patient else 1)
+            raise ConnectionLost(f"no server at {address} ({error.strerror or error})") from error
+        self.real_timing = real_timing
+        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0 if real_timing else 1)
         self.protocol = WSConnection(ConnectionType.CLIENT)
-        self.packets: list[str] = []
-        self.partial = ""
-        self.pinged, self.waiting = time.monotonic(), None  # of the last ping; since when a pong is due
+        self.packets: list[str] = []  # received, and not yet taken
+        self.partial = ""  # of a fragmented message
+        self.last_ping = time.monotonic()
+        self.pong_due_since: float | None = None
         agent = [(b"user-agent", b"websocket-sharp/1.0")]
-        request = Request(host=f"{host}:{port}", target=PATH, extra_headers=agent)
+        request = Request(host=address, target=PATH, extra_headers=agent)
         try:
             self.socket.sendall(self.protocol.send(request))
-            self._begin(f"{host}:{port}", time.monotonic() + ANSWERS_WITHIN)
+            self._open_session(address)
         except OSError as error:
             self.socket.close()
-            raise Gone(f"{host}:{port} broke off ({error.strerror or error})") from error
+            raise ConnectionLost(f"the connection to {address} broke ({error.strerror or error})") from error
         except BaseException:
             self.socket.close()
             raise
 
-    def _begin(self, address: str, until: float) -> None:
+    def _open_session(self, address: str) -> None:
         """Wait for the server's open packet, then ping, as the real client does before anything else."""
+        until = time.monotonic() + CONNECT_TIMEOUT
         while not self.packets:
-            self._pump(max(0.0, until - time.monotonic()))
+            self._read_socket(max(0.0, until - time.monotonic()))
             if time.monotonic() > until:
-                raise Gone(f"{address} accepts connections but does not answer")
+                raise ConnectionLost(f"{address} accepts connections but does not answer")
         packet = self.packets.pop(0)
-        if not packet.startswith("0"):
-            raise Gone(f"{address} does not speak Engine.IO (it sent {packet!r:.60})")
+        if not packet.startswith(OPEN):
+            raise ConnectionLost(f"{address} does not speak Engine.IO (it sent {packet!r:.60})")
         self.ping()
 
-    def _pump(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for bytes, and take out of them what they hold."""
+    def _read_socket(self, timeout: float) -> None:
+        """Wait up to `timeout` seconds for bytes, and decode them."""
         if not select.select([self.socket], [], [], timeout)[0]:
             return
         try:
             data = self.socket.recv(65536)
         except OSError as error:
-            raise Gone(f"the connection broke ({error.strerror or error})") from error
+            raise ConnectionLost(f"the connection broke ({error.strerror or error})") from error
         if not data:
-            raise Gone("the server closed the connection")
+            raise ConnectionLost("the server closed the connection")
         try:
             self.protocol.receive_data(data)
             for event in self.protocol.events():
-                self._take(event)
+                self._handle(event)
         except ProtocolError as error:
-            raise Gone(f"the server does not speak WebSocket ({error})") from error
+            raise ConnectionLost(f"the server does not speak WebSocket ({error})") from error
 
-    def _take(self, event) -> None:
+    def _handle(self, event: Event) -> None:
         if isinstance(event, RejectConnection):
-            raise Gone(f"the server refuses the connection (HTTP {event.status_code})")
+            raise ConnectionLost(f"the server refuses the connection (HTTP {event.status_code})")
         elif isinstance(event, CloseConnection):
-            raise Gone("the server closed the connection")
+            raise ConnectionLost("the server closed the connection")
         elif isinstance(event, Ping):
             self.socket.sendall(self.protocol.send(event.response()))
         elif isinstance(event, TextMessage):
@@ -154,66 +167,71 @@ class Connection:
                 self.partial = ""
 
     def send(self, packet: str) -> None:
-        """Raises Gone."""
+        """Send a packet in fragments. Raises ConnectionLost."""
         data = packet.encode()
-        pieces = [data[i : i + FRAGMENT].decode() for i in range(0, len(data), FRAGMENT)]
-        last = len(pieces) - 1
+        fragments = [data[i : i + FRAGMENT].decode() for i in range(0, len(data), FRAGMENT)]
+        last = len(fragments) - 1
         try:
             frames = [
-                self.protocol.send(TextMessage(piece, message_finished=i == last)) for i, piece in enumerate(pieces)
+                self.protocol.send(TextMessage(fragment, message_finished=i == last))
+                for i, fragment in enumerate(fragments)
             ]
-            for frame in frames if self.patient else [b"".join(frames)]:
+            for frame in frames if self.real_timing else [b"".join(frames)]:
                 self.socket.sendall(frame)
         except OSError as error:
-            raise Gone(f"the connection broke ({error.strerror or error})") from error
+            raise ConnectionLost(f"the connection broke ({error.strerror or error})") from error
         except ProtocolError as error:
-            raise Gone("the server closed the connection") from error
+            raise ConnectionLost("the server closed the connection") from error
 
     def receive(self, timeout: float) -> str | None:
-        """The next packet, or None after `timeout` seconds without one; pings meanwhile. Raises Gone."""
+        """Return the next packet, or None if none comes within `timeout` seconds; answer and send pings meanwhile.
+
+        Raises ConnectionLost.
+        """
         until = time.monotonic() + timeout
-        self.keep_alive()
+        self._keep_alive()
         while not self.packets:
             left = until - time.monotonic()
-            self._pump(max(0.0, min(left, 1.0)))
+            self._read_socket(max(0.0, min(left, 1.0)))
             if left <= 0:
                 break
-            self.keep_alive()
+            self._keep_alive()
         if not self.packets:
             return None
         packet = self.packets.pop(0)
-        if packet == "3":
-            self.waiting = None
-        elif packet.startswith("2"):
-            self.send("3" + packet[1:])
-        elif packet in ("1", "41"):
-            raise Gone("the server ended the session")
+        if packet == PONG:
+            self.pong_due_since = None
+        elif packet.startswith(PING):
+            self.send(PONG + packet[1:])
+        elif packet in (CLOSE, DISCONNECT):
+            raise ConnectionLost("the server ended the session")
         return packet
 
-    def keep_alive(self) -> None:
+    def _keep_alive(self) -> None:
         now = time.monotonic()
-        if self.waiting is not None and now - self.waiting > PONG_WITHIN:
-            raise Gone(f"the server did not answer a ping within {PONG_WITHIN:.0f} s")
-        if now - self.pinged > PING_EVERY:
+        if self.pong_due_since is not None and now - self.pong_due_since > PONG_TIMEOUT:
+            raise ConnectionLost(f"the server did not answer a ping within {PONG_TIMEOUT:.0f} s")
+        if now - self.last_ping > PING_INTERVAL:
             self.ping()
 
     def ping(self) -> None:
-        self.send("2")
-        self.pinged = time.monotonic()
-        if self.waiting is None:
-            self.waiting = self.pinged
+        """Send a ping. Raises ConnectionLost."""
+        self.send(PING)
+        self.last_ping = time.monotonic()
+        if self.pong_due_since is None:
+            self.pong_due_since = self.last_ping
 
     def close(self) -> None:
-        """Take leave as the real client does, and let the server finish what it is sending."""
+        """End the session as the real client does, and let the server finish sending."""
         try:
-            self.send("41")
-            self.send("1")
+            self.send(DISCONNECT)
+            self.send(CLOSE)
             self.socket.sendall(self.protocol.send(CloseConnection(code=1000)))
             self.socket.shutdown(socket.SHUT_WR)
-            self.socket.settimeout(LEAVE_WITHIN)
+            self.socket.settimeout(CLOSE_TIMEOUT)
             while self.socket.recv(65536):
                 pass
-        except (Gone, OSError, ProtocolError):
-            return  # it is gone already
+        except (ConnectionLost, OSError, ProtocolError):
+            return  # the server has already closed the connection
         finally:
             self.socket.close()

@@ -1,100 +1,124 @@
-"""A conversation with drive.py, one frame under way at a time: what driving and replaying have in common."""
+"""A session with drive.py, one telemetry in flight at a time: the part that driving and replaying share."""
 
 import sys
 import time
 
-from cloning.errors import SimulatorError
-from cloning.wire.client import RETRY, Answer, Connection, Gone, read
+from tqdm import tqdm
 
-OPENS = 2  # telemetry is sent twice at the start, since the real client's "open" fires twice
-GREETING = 1.0  # s for a server to give its first command
+from cloning.errors import SimulatorError
+from cloning.wire.client import CONNECT, MESSAGE, Answer, Connection, ConnectionLost, parse_answer
+
+OPENS = 2  # telemetries sent at the start: the real client's "open" event fires twice
+GREETING_TIMEOUT = 1.0  # s for a server to send its first command
+RETRY_INTERVAL = 0.1  # s between two attempts to connect; the real client makes thousands a second
 
 
 class ClientSession:
-    """Sends telemetry and takes the answers, connecting again when the server goes away."""
+    """Sends telemetry and receives the answers, and connects again when the connection is lost."""
 
-    def __init__(self, host: str, port: int, wait: float, patient: bool = False):
-        """wait: seconds of patience with a server that is not there or does not answer usably.
-
-        patient: see Connection.
-        """
-        self.address, self.wait, self.patient = (host, port), wait, patient
+    def __init__(self, host: str, port: int, wait: float, real_timing: bool = False):
+        """wait: seconds to wait for a server that is not there, or for a usable answer; real_timing: see Connection."""
+        self.address, self.wait, self.real_timing = (host, port), wait, real_timing
         self.round_trips: list[float] = []  # s
-        self.dropped = self.reconnections = 0
-        self.wire: Connection | None = None
-        self.tokens = 1  # frames under way
+        self.unusable = self.reconnections = 0
+        self._connection: Connection | None = None
+        self._in_flight = 1  # telemetries sent before the next answer is due
 
-    def connect(self) -> Connection:
-        """Try until the server is there and has opened a session. Raises SimulatorError when patience is
-        at its end."""
-        until, said = time.monotonic() + self.wait, False
-        while True:
+    @property
+    def connected(self) -> bool:
+        """Whether a connection is open."""
+        return self._connection is not None
+
+    @property
+    def connection(self) -> Connection:
+        """The open connection. Raises ConnectionLost if there is none."""
+        if self._connection is None:
+            raise ConnectionLost("not connected")
+        return self._connection
+
+    def connect(self) -> None:
+        """Try to connect until the server has opened a session. Raises SimulatorError after `wait` seconds."""
+        until, announced = time.monotonic() + self.wait, False
+        while self._connection is None:
             try:
-                return Connection(*self.address, patient=self.patient)
-            except Gone as error:
+                self._connection = Connection(*self.address, real_timing=self.real_timing)
+            except ConnectionLost as error:
                 if time.monotonic() > until:
-                    raise SimulatorError(f"{error}; is `python drive.py model.pt` running?") from None
-                if not said:
-                    print(f"{error}; trying again for {self.wait:.0f} s", file=sys.stderr)
-                    said = True
-                time.sleep(RETRY)
+                    raise SimulatorError(f"{error}; start `python drive.py model.pt` first") from None
+                if not announced:
+                    _print(f"{error}; trying again for {self.wait:.0f} s")
+                    announced = True
+                time.sleep(RETRY_INTERVAL)
 
-    def usable(self, packet: str) -> Answer | None:
-        answer = read(packet)
-        if answer is None and packet.startswith("4") and packet != "40":
-            self.dropped += 1
+    def parse(self, packet: str) -> Answer | None:
+        """Return the answer in a packet, or None; count messages that hold none."""
+        answer = parse_answer(packet)
+        if answer is None and packet.startswith(MESSAGE) and packet != CONNECT:
+            self.unusable += 1
         return answer
 
-    def listen(self) -> None:
-        """Hear what the server says of its own accord at the start.
+    def receive_greeting(self) -> None:
+        """Receive what the server sends unasked at the start: its first command and CONNECT.
 
-        The first frame is sent three times, as by the real client: for its two opens, and in answer to the command
-        that the server gives on its own.
+        The real client sends the first frame three times: for each of its two "open" events, and in answer to the
+        first command, if the server sends one.
         """
-        self.tokens = OPENS
-        while (packet := self.wire.receive(GREETING)) is not None:
-            if self.usable(packet):
-                self.tokens += 1
-            if packet.startswith("40"):
+        self._in_flight = OPENS
+        while (packet := self.connection.receive(GREETING_TIMEOUT)) is not None:
+            if self.parse(packet):
+                self._in_flight += 1
+            if packet.startswith(CONNECT):
                 break
 
-    def early(self) -> Answer:
-        """What came of itself since the last answer, so that it is never mistaken for the next frame's."""
+    def receive_unasked(self) -> Answer:
+        """Return the last command that came unasked, so that it is not taken for the answer to the next telemetry."""
         latest = Answer()
-        while (packet := self.wire.receive(0)) is not None:
-            latest = self.usable(packet) or latest
+        while (packet := self.connection.receive(0)) is not None:
+            latest = self.parse(packet) or latest
         return latest
 
-    def exchange(self, packet: str) -> Answer:
-        """The answer to a telemetry packet. Raises SimulatorError when patience is at its end, Gone with the
-        connection."""
+    def request_answer(self, packet: str) -> Answer:
+        """Send a telemetry packet and return its answer.
+
+        Raises SimulatorError after `wait` seconds without one, ConnectionLost.
+        """
         sent = time.perf_counter()
-        for _ in range(self.tokens):
-            self.wire.send(packet)
-        for _ in range(self.tokens):
-            answer = self._await()
+        for _ in range(self._in_flight):
+            self.connection.send(packet)
+        for _ in range(self._in_flight):
+            answer = self._receive_answer()
             self.round_trips.append(time.perf_counter() - sent)
-        self.tokens = 1
+        self._in_flight = 1
         return answer
 
-    def _await(self) -> Answer:
+    def _receive_answer(self) -> Answer:
         until = time.monotonic() + self.wait
         while True:
-            packet = self.wire.receive(max(0.0, until - time.monotonic()))
+            packet = self.connection.receive(max(0.0, until - time.monotonic()))
             if packet is None:
-                raise SimulatorError(
-                    f"no usable answer in {self.wait:.0f} s ({self.dropped} unusable ones so far); "
-                    "steer must carry strings, see drive.py"
-                )
-            answer = self.usable(packet)
-            if answer:
+                raise self.no_answer()
+            if answer := self.parse(packet):
                 return answer
 
-    def reconnect(self, error: Gone) -> None:
+    def no_answer(self) -> SimulatorError:
+        """Return the error for a server that sends nothing usable."""
+        return SimulatorError(
+            f"no usable answer in {self.wait:.0f} s ({self.unusable} unusable answers so far); "
+            "`steer` must contain strings, as drive.py sends them"
+        )
+
+    def count_reconnection(self, error: ConnectionLost) -> None:
+        """Count a lost connection and say that a new one will be made."""
         self.reconnections += 1
-        print(f"{error}; connecting again", file=sys.stderr)
+        _print(f"{error}; connecting again")
 
     def close(self) -> None:
-        if self.wire:
-            self.wire.close()
-            self.wire = None
+        """Close the connection, if one is open."""
+        if self._connection:
+            self._connection.close()
+            self._connection = None
+
+
+def _print(message: str) -> None:
+    """Print a message to stderr, above a progress bar if there is one."""
+    tqdm.write(f"simulator: {message}", file=sys.stderr)

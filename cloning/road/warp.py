@@ -1,0 +1,128 @@
+"""Frames as the camera would have seen them from another pose, warped by the homographies of `camera.py`."""
+
+import functools
+
+import cv2
+import numpy as np
+
+from cloning.recordings.format import FRAME
+from cloning.road.camera import (
+    CAMERA_MATRIX,
+    FAR_SLOPE,
+    FIRST_BONNET_ROW,
+    FROM_PIXELS,
+    camera_position,
+    homographies,
+)
+from cloning.road.motion import components, forward_vector
+
+FIRST_GROUND_ROW, FIRST_ROW_WITHOUT_SKY = 57, 66  # the first row with any ground, and the first without sky
+SOURCE_ROWS = slice(45, FIRST_BONNET_ROW)  # of a recorded frame: all that `CroppedView` warps from
+
+
+def _shifted(top: int, left: int = 0) -> np.ndarray:
+    """Return the translation that makes this row and column the first: float64 (3, 3)."""
+    return np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1.0]])
+
+
+def _shows_ground(shape: tuple[int, int], from_pixels: np.ndarray) -> np.ndarray:
+    """Return which pixels show ground near enough to move with the camera: bool (rows, columns)."""
+    columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
+    directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ from_pixels.T
+    return directions[..., 1] > FAR_SLOPE * directions[..., 2]
+
+
+@functools.cache
+def ground_mask() -> np.ndarray:
+    """Return uint8 (160, 320): 255 where a frame shows ground near enough to move with the camera, else 0."""
+    return np.where(_shows_ground(FRAME[:2], FROM_PIXELS), 255, 0).astype(np.uint8)
+
+
+@functools.cache
+def road_mask() -> np.ndarray:
+    """Return uint8 (160, 320): 255 where a frame shows what is before the car, 0 on the bonnet and at the border."""
+    mask = np.zeros(FRAME[:2], np.uint8)
+    mask[1:FIRST_BONNET_ROW, 1:-1] = 255
+    return mask
+
+
+def warp(
+    frame: np.ndarray,
+    right: float,
+    forward: float,
+    yaw: float,
+    box: tuple[int, int, int, int] = (0, FRAME[0], 0, FRAME[1]),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a frame as seen from this pose relative to its camera, and which of its pixels were really seen.
+
+    frame: uint8 (160, 320, 3); box: top, bottom, left and right of the part that is wanted, the ends exclusive.
+    Returns uint8 (rows, columns, 3) and bool (rows, columns); an unseen pixel repeats the nearest one at the border.
+    """
+    top, bottom, left, end = box
+    width = end - left
+    ground, sky = homographies(right, forward, yaw)
+    warped = np.empty((bottom - top, width, 3), np.uint8)
+    seen = np.ones(warped.shape[:2], bool)
+    if top < FIRST_ROW_WITHOUT_SKY:
+        height = min(bottom, FIRST_ROW_WITHOUT_SKY) - top
+        matrix = _shifted(top, left) @ sky
+        warped[:height] = cv2.warpPerspective(frame, matrix, (width, height), borderMode=cv2.BORDER_REFLECT_101)
+    first = max(top, FIRST_GROUND_ROW)
+    if first < bottom:
+        matrix, size = _shifted(first, left) @ ground, (width, bottom - first)
+        below = cv2.warpPerspective(frame, matrix, size, borderMode=cv2.BORDER_REPLICATE)
+        mask = ground_mask()[first:bottom, left:end]
+        cv2.copyTo(below, mask, warped[first - top :])
+        seen[first - top :] = (cv2.warpPerspective(road_mask(), matrix, size) == 255) | (mask == 0)
+    return warped, seen
+
+
+class CroppedView:
+    """What a network that crops its frames sees from another pose, warped from a recorded frame's `SOURCE_ROWS`.
+
+    Only the cropped rows are warped, and only from the rows that they need: this is done for every training image.
+    """
+
+    def __init__(self, crop: tuple[int, int]) -> None:
+        """Prepare the warps; crop: the rows that the network cuts off the top and the bottom of a frame."""
+        top, bottom = crop
+        self.columns, self.rows = FRAME[1], FRAME[0] - top - bottom
+        self.sky_rows = FIRST_ROW_WITHOUT_SKY - top
+        to_view = _shifted(top) @ CAMERA_MATRIX
+        # The cameras are turned and rolled, so a flipped frame is not what they would see of the mirrored world. The
+        # second matrix gives that.
+        self.to_pixels = np.stack([to_view, to_view @ np.diag([-1.0, 1, 1])])
+        self.from_pixels = FROM_PIXELS @ _shifted(-SOURCE_ROWS.start)
+        ground = [_shows_ground((self.sky_rows, self.columns), np.linalg.inv(matrix)) for matrix in self.to_pixels]
+        self.sky = [np.where(mask, 0, 255).astype(np.uint8) for mask in ground]
+
+    def homographies(
+        self, position: np.ndarray, heading: np.ndarray, axle: np.ndarray, offset: np.ndarray, mirrored: np.ndarray
+    ) -> np.ndarray:
+        """Return the homographies from n recorded frames to n views: float64 (n, 2, 3, 3), for the ground and the sky.
+
+        position: (n, 2), m right and forward, and heading: (n,), radians, of the view; axle: (n, 3), right, forward,
+        heading of the recorded car's rear axle; offset: (n,), m, the mounting of the camera that took the frame;
+        mirrored: bool (n,), whether the view is of the mirrored world.
+        """
+        along = forward_vector(axle[:, 2])
+        away = position - axle[:, :2] - camera_position(np.zeros(2), along, offset)
+        right, forward = components(away, along).T
+        to_pixels = self.to_pixels[mirrored.astype(int)]
+        return homographies(right, forward, heading - axle[:, 2], to_pixels, self.from_pixels)
+
+    def warp(self, rows: np.ndarray, matrices: np.ndarray, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return a view, uint8 (75, 320, 3), and 255 where it was really seen, uint8 (75, 320).
+
+        rows: uint8 (90, 320, 3), `SOURCE_ROWS` of a frame; matrices: float64 (2, 3, 3), of `homographies`.
+        """
+        ground, sky, size = *matrices, (self.columns, self.rows)
+        view = cv2.warpPerspective(rows, ground, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        seen = cv2.warpPerspective(
+            road_mask()[SOURCE_ROWS], ground, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+        )
+        size = self.columns, self.sky_rows
+        far = cv2.warpPerspective(rows, sky, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        cv2.copyTo(far, self.sky[mirrored], view[: self.sky_rows])
+        np.bitwise_or(seen[: self.sky_rows], self.sky[mirrored], out=seen[: self.sky_rows])
+        return view, seen

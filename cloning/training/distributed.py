@@ -1,0 +1,68 @@
+"""The processes of a run that torchrun started, each with its share of every batch; alone, a run is rank 0 of 1."""
+
+import os
+import sys
+from collections.abc import Callable
+from typing import TypeVar, cast
+
+import torch
+import torch.distributed as dist
+
+from cloning.compute import choose_device
+from cloning.errors import UserError
+
+Result = TypeVar("Result")
+
+
+def rank() -> int:
+    """This process's number; rank 0 reads the recordings, prints, and writes the files."""
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+def world() -> int:
+    """How many processes share every batch."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def join_processes(device_name: str) -> None:
+    """Join the other processes, if torchrun started this one."""
+    if "RANK" not in os.environ:
+        return
+    device = choose_device(device_name)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+
+
+def from_first_rank(make: Callable[[], Result]) -> Result:
+    """What `make` returns on rank 0, on every rank. Raises its UserError or OSError on every rank, too."""
+    outcome: list[Result | UserError | OSError | None] = [None]
+    if rank() == 0:
+        try:
+            outcome = [make()]
+        except (UserError, OSError) as error:
+            outcome = [error]
+    if dist.is_initialized():
+        dist.broadcast_object_list(outcome)
+    if isinstance(outcome[0], (UserError, OSError)):
+        raise outcome[0]
+    return cast(Result, outcome[0])
+
+
+def summed(values: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """The values, summed over all processes."""
+    if dist.is_initialized():
+        values = values.to(device)
+        dist.all_reduce(values)
+    return values
+
+
+def leave_processes(status: int) -> int:
+    """Leave the other processes, if there are any, and end this one with the status; else return it."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
+        # gloo's threads outlive the group; if one frees its last tensor while Python shuts down, the process aborts.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status

@@ -1,0 +1,122 @@
+"""What a training run prints and logs: tables of recordings, epochs and errors."""
+
+import csv
+import io
+import itertools
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from cloning.compute import threads
+from cloning.errors import RecordingError
+from cloning.files import write
+from cloning.pilot.network import Network, layer_table
+from cloning.recordings.format import LOG
+from cloning.recordings.log import Recording
+from cloning.training.checkpoint import Row
+from cloning.training.distributed import world
+
+LEARNED = 0.3  # correlation with the labels, from which on a model has learned something
+
+
+class Counts(NamedTuple):
+    """Rows of one recording: read from the csv, unusable, dropped on purpose, and kept."""
+
+    recording: str
+    read: int
+    unusable: int
+    dropped: int
+    kept: int
+
+    @staticmethod
+    def of(recording: Recording, kept: int) -> "Counts":
+        """The counts of a checked recording, of which so many rows are kept."""
+        usable = len(recording)
+        return Counts(str(recording.folder), recording.read, recording.read - usable, usable - kept, kept)
+
+
+def total(counts: list[Counts]) -> Counts:
+    """The sums over all recordings."""
+    read, unusable, dropped, kept = (int(sum(column)) for column in list(zip(*counts, strict=True))[1:])
+    return Counts("total", read, unusable, dropped, kept)
+
+
+def recordings_table(counts: list[Counts], dropped: str) -> str:
+    """A line for each recording, and one for all; dropped: the title of that column."""
+    width = max(len(row.recording) for row in counts)
+    lines = [f"\n{'recording':{width}}  rows read  unusable  {dropped}  kept"]
+    for name, read, unusable, off, kept in [*counts, total(counts)]:
+        lines.append(f"{name:{width}}  {read:9,}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
+    return "\n".join(lines)
+
+
+def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> None:
+    """Write the unusable rows of all recordings, if any, to a csv file; strict: raise RecordingError instead."""
+    rejected = [(recording.folder / LOG, *row) for recording in recordings for row in recording.rejected]
+    if rejected and strict:
+        path, line, _, detail = rejected[0]
+        raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {len(rejected)} unusable rows)")
+    if rejected:
+        write(file, csv_bytes(("file", "line", "kind", "detail"), rejected))
+        print(f"{len(rejected)} unusable rows are left out; {file} lists them")
+
+
+def csv_bytes(header: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes:
+    """A csv file, UTF-8; file names that are no valid text keep their bytes."""
+    text = io.StringIO()
+    csv.writer(text).writerows([header, *rows])
+    return text.getvalue().encode(errors="surrogateescape")
+
+
+def history_csv(history: list[Row]) -> bytes:
+    """The contents of training_log.csv: a line for each finished epoch."""
+    return csv_bytes(history[0], [row.values() for row in history])
+
+
+def run_header(network: Network, device: torch.device, precision: torch.dtype) -> str:
+    """The report's table of layers, and what computes them."""
+    processes = f", {world()} processes" if world() > 1 else ""
+    name = str(precision).removeprefix("torch.")
+    return f"{layer_table(network)}\n\n{device}, {name}, {threads()} threads{processes}"
+
+
+def epoch_line(row: Row, samples_per_epoch: int) -> str:
+    """A finished epoch, in the format of the report's log."""
+    return (
+        f"{row['images']}/{samples_per_epoch} [{'=' * 30}] - {row['seconds']:.0f}s - "
+        f"loss: {row['loss']:.4f} - val_loss: {row['val_loss']:.4f}"
+    )
+
+
+def error_table(
+    labels: np.ndarray, mean: float, models: Mapping[str, np.ndarray], edges: tuple[float, ...], label_source: str
+) -> str:
+    """Mean squared error by range of |label|, and the correlation with the labels, of constant steering and of models.
+
+    labels: steering, float32 (n,); mean: of the training labels; models: name -> predictions, float32 (n,), the last
+    epoch's model first; edges: of the ranges, ascending; label_source: whose steering the label is.
+    """
+    predictions = {"steer 0": np.zeros_like(labels), "steer mean": np.full_like(labels, mean), **models}
+    lines = [f"\n{'validation: mean squared error':32} {'rows':>6}" + "".join(f"{name:>15}" for name in predictions)]
+    size = np.abs(labels)
+    for low, high in [*itertools.pairwise(edges), (edges[0], edges[-1])]:
+        rows = (size >= low) & ((size < high) | (high == edges[-1]))
+        if rows.any():
+            errors = "".join(f"{np.mean((guess - labels)[rows] ** 2):15.4f}" for guess in predictions.values())
+            lines.append(f"{f'steering of {low:g} to {high:g}':32} {rows.sum():6,}{errors}")
+    correlations = {name: correlation(guess, labels) for name, guess in predictions.items()}
+    values = "".join(f"{value:15.2f}" for value in correlations.values())
+    lines.append(f"{f'correlation with the {label_source}':39}{values}")
+    last = next(iter(models))
+    if not correlations[last] > LEARNED:
+        lines.append(f"{last} hardly follows the {label_source}: train longer, or record more turns.")
+    return "\n".join(lines)
+
+
+def correlation(predicted: np.ndarray, labels: np.ndarray) -> float:
+    """Pearson's correlation; nan for a constant, which correlates with nothing."""
+    with np.errstate(invalid="ignore"):
+        return float(np.corrcoef(predicted, labels)[0, 1])

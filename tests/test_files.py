@@ -1,0 +1,72 @@
+"""Files are written completely or not at all."""
+
+import errno
+import os
+
+import pytest
+
+from cloning.files import write, written_whole
+
+
+@pytest.mark.parametrize("per_process", [False, True])
+def test_a_file_appears_only_when_it_is_complete(tmp_path, per_process):
+    path = tmp_path / "film.mp4"
+    path.write_bytes(b"old")
+    with written_whole(path, per_process) as temporary:
+        temporary.write_bytes(b"new")
+        assert temporary.parent == tmp_path
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"new"
+    assert os.listdir(tmp_path) == ["film.mp4"]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, RuntimeError, ValueError])
+def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path, error):
+    path = tmp_path / "film.mp4"
+    path.write_bytes(b"old")
+    with pytest.raises(error), written_whole(path) as temporary:
+        temporary.write_bytes(b"half")
+        raise error
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["film.mp4"]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, "No space left on device"),
+        OSError(errno.ENOSPC, "No space left on device", "temporary"),
+        OSError("100 requested and 7 written"),  # NumPy's, without a number
+    ],
+)
+def test_a_full_disk_names_the_file_that_the_user_knows(tmp_path, error):
+    path = tmp_path / "film.mp4"
+    with pytest.raises(OSError) as raised, written_whole(path) as temporary:
+        temporary.write_bytes(b"half")
+        if error.filename:
+            error.filename = str(temporary)
+        raise error
+    assert raised.value.filename == str(path)
+    assert raised.value.strerror in ("No space left on device", "100 requested and 7 written")
+    assert raised.value.errno and os.listdir(tmp_path) == []
+
+
+def test_a_missing_folder_names_the_file_that_the_user_knows(tmp_path):
+    path = tmp_path / "nowhere" / "model.pt"
+    with pytest.raises(FileNotFoundError) as raised:
+        write(path, b"data")
+    assert raised.value.filename == str(path)
+
+
+def test_an_error_in_another_file_keeps_its_name(tmp_path):
+    with pytest.raises(FileNotFoundError) as raised, written_whole(tmp_path / "film.mp4") as temporary:
+        temporary.write_bytes(b"half")
+        (tmp_path / "frame.jpg").read_bytes()
+    assert raised.value.filename == str(tmp_path / "frame.jpg")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_block_that_writes_nothing_changes_nothing(tmp_path):
+    with written_whole(tmp_path / "film.mp4"):
+        pass
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,128 @@
+"""The repository itself: imports go one way, documents name what exists, and the package carries its data files."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("cloning", "simulator", "tools")
+SCRIPTS = ("model.py", "drive.py", "video.py")
+OPTIONAL = {"keras"}  # tools/bench_training.py compares with it where it is installed
+WRITTEN = [*ROOT.glob("*.md"), ROOT / "data" / "README.md"]
+DOCUMENTS = [*WRITTEN, ROOT / "tools" / "scoreboard.md"]  # tools/scoreboard.py writes this one
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+WRONG_IMPORTS = {  # contract -> the files that break it, and with what import
+    "tools import simulator, which imports cloning": {"cloning/recordings/log.py": "simulator.run"},
+    "the rooms of cloning import downwards": {"cloning/recordings/log.py": "cloning.road.track"},
+    "packages do not import the scripts": {"simulator/run.py": "drive"},
+    "no import cycles": {
+        "cloning/road/track.py": "cloning.road.camera",
+        "cloning/road/camera.py": "cloning.road.track",
+    },
+}
+
+
+def lint_imports(root: Path) -> subprocess.CompletedProcess:
+    command = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    return subprocess.run(
+        [sys.executable, "-c", command, "--no-logo", "--no-cache"],
+        cwd=root,
+        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+        capture_output=True,
+        encoding="utf-8",
+    )
+
+
+@pytest.fixture
+def sources(tmp_path) -> Path:
+    """A copy of the packages' Python files and of pyproject.toml, which a test may change."""
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            copy = tmp_path / path.relative_to(ROOT)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, copy)
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    return tmp_path
+
+
+def test_imports_go_one_way(sources):
+    done = lint_imports(sources)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_contract_finds_a_wrong_import(sources):
+    assert set(WRONG_IMPORTS) == {contract["name"] for contract in PROJECT["tool"]["importlinter"]["contracts"]}
+    for files in WRONG_IMPORTS.values():
+        for file, module in files.items():
+            with (sources / file).open("a", encoding="utf-8") as source:
+                source.write(f"\nimport {module}\n")
+    done = lint_imports(sources)
+    assert done.returncode == 1
+    for contract in WRONG_IMPORTS:
+        assert f"{contract} BROKEN" in done.stdout
+
+
+def imported_packages(tree: ast.Module) -> set[str]:
+    """The top-level names that a file imports, at its top or within a function."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.split(".")[0])
+    return names
+
+
+def test_requirements_are_what_the_code_imports():
+    files = [ROOT / script for script in SCRIPTS]
+    files += [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    imported = set().union(*(imported_packages(ast.parse(path.read_text(encoding="utf-8"))) for path in files))
+    own = {*PACKAGES, *(Path(script).stem for script in SCRIPTS)}
+    foreign = imported - own - set(sys.stdlib_module_names) - OPTIONAL
+    distributions = packages_distributions()
+    used = {distributions[name][0].lower() for name in foreign}
+    required = {line.split("==")[0] for line in (ROOT / "requirements.txt").read_text().split()}
+    assert used == required
+
+
+def test_the_readme_lists_every_requirement():
+    table = (ROOT / "README.md").read_text(encoding="utf-8").split("## Dependencies")[1]
+    for file in ("requirements.txt", "requirements-dev.txt"):
+        for line in (ROOT / file).read_text().splitlines():
+            name = line.split("==")[0]
+            if "==" in line and not re.match("pandas-stubs|types-", name):
+                assert re.search(rf"\b{name}\b", table), name
+
+
+def test_the_package_carries_every_data_file():
+    patterns = PROJECT["tool"]["setuptools"]["package-data"]["*"]
+    carried = {path for name in PACKAGES for pattern in patterns for path in (ROOT / name).rglob(pattern)}
+    needed = {path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()}
+    needed = {path for path in needed if path.suffix not in (".py", ".pyc")}
+    assert {path.name for path in needed} >= {"lake.csv", "jungle.csv", "lane.pt", "shipped.pt"}
+    assert needed == carried
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_documents_name_what_exists(document):
+    text = document.read_text(encoding="utf-8")
+    for link in re.findall(r"\]\((?!https?:)([^)#]+)", text):
+        assert (document.parent / link).exists(), link
+    for tool in re.findall(r"python -m tools\.([a-z_]+)", text):
+        assert (ROOT / "tools" / f"{tool}.py").exists(), tool
+    for path in re.findall(r"`((?:cloning|simulator|tools|tests)/[a-z_/.]*)`", text):
+        assert (ROOT / path).exists(), path
+
+
+@pytest.mark.parametrize("document", WRITTEN, ids=lambda path: str(path.relative_to(ROOT)))
+def test_lines_of_documents_are_at_most_120_characters(document):
+    lines = document.read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if len(line) > 120 and not line.startswith("|")] == []
