@@ -279,6 +279,8 @@ def main() -> None:
     )
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.samples < 5 * BATCH_IMAGES or min(args.rounds, args.steps) < 1:
+        parser.error(f"needs at least {5 * BATCH_IMAGES} --samples (five batches), one round and one step")
     try:
         with tempfile.TemporaryDirectory() as folder:
             if args.part:
