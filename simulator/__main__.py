@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from cloning.errors import UserError
 from cloning.outputs import check_folders, run_all, write_json
 from cloning.replay.autonomy import LIMITS
+from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.track import ROADS, Track
 
 if TYPE_CHECKING:
@@ -26,8 +27,8 @@ def positive(text: str) -> float:
 def mph(text: str) -> float:
     """Parse a set speed."""
     value = float(text)
-    if not 1 <= value <= 30:
-        raise argparse.ArgumentTypeError("must be 1 to 30 mph; 30 is the car's top speed")
+    if not 1 <= value <= TOP_SPEED_MPH:
+        raise argparse.ArgumentTypeError(f"must be 1 to {TOP_SPEED_MPH:g} mph, the car's top speed")
     return value
 
 
@@ -45,7 +46,7 @@ def add_record(commands: "Subparsers") -> None:
     parser.set_defaults(run=record)
     parser.add_argument("folder", help="the new recording: IMG/ and driving_log.csv")
     parser.add_argument("--laps", type=positive, default=1, help="default 1")
-    parser.add_argument("--speed", type=mph, default=30.0, help="set speed in mph, 1 to 30 (default)")
+    parser.add_argument("--speed", type=mph, default=TOP_SPEED_MPH, help="set speed in mph, 1 to 30 (default)")
     parser.add_argument("--recovery", action="store_true", help="record only recoveries from the road's sides")
     parser.add_argument("--seed", type=natural, default=0, help="of the expert's wandering in its lane (default 0)")
     add_road(parser)
