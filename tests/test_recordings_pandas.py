@@ -180,3 +180,16 @@ def test_the_tolerant_reader_takes_no_plain_line_once_a_decimal_point_was_seen(t
     np.testing.assert_array_equal(recording.speed, np.float32([0, 0.5, 9, 9, 1e-5]))
     assert recording.name(4, 1) == "left_4.jpg"
     assert recording.repairs == {"extra columns ignored": [1, 4]}
+
+
+@pytest.mark.parametrize("word", ["True", "false", "1_0", "1e", "", "nan", "0x1", "--1", "1 2"])
+@pytest.mark.parametrize("column", range(4))
+def test_words_are_no_numbers_even_if_a_whole_column_has_them(tmp_path, word, column):
+    numbers = ["0.5", "1", "0", "9"]
+    plain_line = "a.jpg,b.jpg,c.jpg," + ",".join(numbers)
+    numbers[column] = word
+    (tmp_path / "driving_log.csv").write_text(plain_line + f"\na.jpg,b.jpg,c.jpg,{','.join(numbers)}" * 3)
+    recording = read_recording(tmp_path)
+    accepted = word == "1_0" and column == 3  # float() takes underscores
+    np.testing.assert_array_equal(recording.lines, [1, 2, 3, 4] if accepted else [1])
+    assert len(recording.rejected) == (0 if accepted else 3)

@@ -6,6 +6,7 @@ Which lines are plain is decided by their bytes, before pandas sees them; the to
 import codecs
 import csv
 import io
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
 
 BLOCK = 2 << 20  # bytes read at a time, about 10,000 lines: enough for pandas, whose calls take 1 ms each
 COMMA, QUOTE, CARRIAGE_RETURN, NEW_LINE, DELETE = b',"\r\n\x7f'
+NEGATIVE_ZERO = re.compile(rb"-0+(?![0-9.])")  # loses its sign in a column that pandas takes for integers
 SUFFIXES = (b".jpg", b".JPG", b".jpeg", b".JPEG")
 LEAST, GREATEST = np.array([RANGES[name] for name in NUMBERS], float).T
 
@@ -71,18 +73,17 @@ def read_plain(block: bytes, starts: np.ndarray, first_line: int) -> tuple[np.nd
 
     starts: as `line_starts` gives them; first_line: the number of the block's first line in the csv.
     A line is plain if the tolerant reader would read the same row from it for certain. If any number in the block
-    cannot be read, no line of it counts as plain.
+    cannot be read, or is -0, no line of it counts as plain.
     """
     is_plain = _has_seven_fields(block, starts)
     if not is_plain.all():
         block = np.frombuffer(block, np.uint8)[np.repeat(is_plain, np.diff(starts))].tobytes()
-    try:
-        table = _read_table(block)
-    except ValueError:  # not a number, or no lines
+    table = None if not block or NEGATIVE_ZERO.search(block) else _read_table(block)
+    if table is None or any(table[name].dtype.kind not in "if" for name in NUMBERS):  # words such as True
         return np.zeros_like(is_plain), PlainRows(np.empty((0, 3), "S1"), np.empty((0, 4)), np.empty(0, np.int32))
     paths = np.column_stack([table[camera].to_numpy().astype(bytes) for camera in CAMERAS])
     names = np.strings.slice(paths, np.strings.rfind(paths, b"/") + 1, paths.itemsize)
-    numbers = np.column_stack([table[name].to_numpy() for name in NUMBERS])
+    numbers = np.column_stack([table[name].to_numpy(float) for name in NUMBERS])
     is_image = np.logical_or.reduce([np.strings.endswith(names, suffix) for suffix in SUFFIXES])
     is_image &= np.strings.find(names, bytes([DELETE])) < 0
     in_range = (numbers >= LEAST) & (numbers <= GREATEST)  # nan is in no range
@@ -103,16 +104,13 @@ def _has_seven_fields(block: bytes, starts: np.ndarray) -> np.ndarray:
 
 
 def _read_table(text: bytes) -> pd.DataFrame:
-    """Plain lines as a table of COLUMNS; Windows paths have become Unix paths.
-
-    Raises ValueError for a number that cannot be read, and for a text without lines.
-    """
+    """Plain lines as a table of COLUMNS: Unix paths, and numbers as int64 or float64, where they are numbers."""
     return pd.read_csv(
         io.BytesIO(text.translate(TO_ASCII)),
         engine="c",
         header=None,
         names=list(COLUMNS),
-        dtype={**dict.fromkeys(CAMERAS, object), **dict.fromkeys(NUMBERS, float)},
+        dtype=dict.fromkeys(CAMERAS, object),  # not float for the numbers: it would take True for 1
         skipinitialspace=True,
         quoting=csv.QUOTE_NONE,
         na_filter=False,
