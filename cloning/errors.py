@@ -1,8 +1,8 @@
-"""What the user can mend: each error's message names the file (and line) and the remedy; commands print it and end."""
+"""Errors that the user can correct: the message names the file, the line and the remedy; commands print it and end."""
 
 
 class UserError(Exception):
-    """Something that the user can mend; the message says what and how."""
+    """An error that the user can correct; the message says what and how."""
 
 
 class RecordingError(UserError):
@@ -14,12 +14,12 @@ class ModelError(UserError):
 
 
 class FolderError(UserError):
-    """A folder that frames cannot be saved in."""
+    """A folder in which frames cannot be saved."""
 
 
 class SimulatorError(UserError):
-    """The stand-in simulator, its window or its server cannot go on."""
+    """The stand-in simulator, its window or its connection cannot continue."""
 
 
 class OutputError(UserError):
-    """A file that the user asked for and that cannot be written."""
+    """A file that the user asked for cannot be written."""

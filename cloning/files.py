@@ -21,6 +21,8 @@ def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part" if per_process else f".{path.name}.part")
     try:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)  # of a process that was killed
         yield temporary
         if temporary.exists():
             os.replace(temporary, path)

@@ -66,6 +66,13 @@ def test_an_error_in_another_file_keeps_its_name(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+def test_what_a_killed_process_left_is_not_taken_for_the_file(tmp_path):
+    (tmp_path / ".film.mp4.part").write_bytes(b"half")
+    with written_whole(tmp_path / "film.mp4"):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
 def test_a_block_that_writes_nothing_changes_nothing(tmp_path):
     with written_whole(tmp_path / "film.mp4"):
         pass

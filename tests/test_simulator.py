@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cloning.errors import SimulatorError
+from cloning.errors import RecordingError
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import RecordingWriter, csharp_number
 from cloning.road.motion import MPH
@@ -339,7 +339,7 @@ def test_a_full_disk_is_reported_and_leaves_whole_rows(tmp_path, monkeypatch):
             raise OSError(28, os.strerror(28))
 
         monkeypatch.setattr("pathlib.Path.write_bytes", full)
-        with pytest.raises(SimulatorError, match="No space left"):
+        with pytest.raises(RecordingError, match="No space left"):
             recording.add(1, images, 0, 1, 0, 10)
     assert len((tmp_path / "full" / "driving_log.csv").read_text().splitlines()) == 1
 

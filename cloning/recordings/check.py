@@ -1,4 +1,4 @@
-"""Check a recording's `IMG/` before it is trained on or replayed."""
+"""Check the images of a recording before it is trained on or replayed."""
 
 import hashlib
 import os
@@ -9,25 +9,26 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from cloning.files import written_whole
 from cloning.recordings.images import decode
 from cloning.recordings.log import Recording
 
 
 def check_images(recording: Recording, threads: int = 2, show_progress: bool = True) -> None:
-    """Look at every image of a recording once; leave out, with name and reason, the rows that cannot be used.
+    """Decode every image of a recording once; leave out the rows whose images cannot be used.
 
-    What was found is kept in the user's cache folder, so that an unchanged file (size and time of change) is not
-    decoded again by a later run. Sets `digests`; adds to `rejected`.
+    The results are kept in the user's cache folder, so that a later run does not decode an unchanged file (same size
+    and time of change) again. Sets `digests`; adds file, line and reason to `rejected`.
     """
     names, folder = recording.names, recording.folder / "IMG"
     states = _file_states(folder, names)
     cache = _cache_file(folder)
-    reasons, digests, fresh = _remembered(cache, names, states)
+    reasons, digests, fresh = _read_cache(cache, names, states)
     reasons[states[:, 0] < 0] = b"missing"
     todo = np.flatnonzero(fresh & (states[:, 0] >= 0))
     if len(todo):
 
-        def examine(at):
+        def examine(at: int) -> tuple[bytes, int]:
             try:
                 jpeg = (folder / os.fsdecode(names[at])).read_bytes()
                 decode(jpeg)
@@ -45,12 +46,12 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
                 disable=None if show_progress else True,
             ) as bar,
         ):
-            todo_left = iter(todo)
-            while part := list(islice(todo_left, 4096)):  # in pieces: a future for each of millions is too many
+            remaining = iter(todo)
+            while part := list(islice(remaining, 4096)):  # a future for each of millions at once is too many
                 for at, (reason, digest) in zip(part, pool.map(examine, part), strict=True):
                     reasons[at], digests[at] = reason, digest
                     bar.update()
-        _remember(cache, names, states, reasons, digests)
+        _write_cache(cache, names, states, reasons, digests)
     recording.digests = digests
     bad = reasons != b""
     unusable = bad[recording.images]
@@ -68,7 +69,7 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
 
 
 def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
-    """Size in bytes and time of change in ns of each named file, -1 where it is missing: int64 (m, 2)."""
+    """Size in bytes and time of change in ns of each named file, -1 if it is missing: int64 (m, 2)."""
     states = np.full((len(names), 2), -1, np.int64)
     if not folder.is_dir():
         return states
@@ -88,8 +89,8 @@ def _cache_file(folder: Path) -> Path:
     return home / "behavioral-cloning" / f"{name}.npz"
 
 
-def _remembered(cache: Path, names, states):
-    """Of each file: why it cannot be used (b"" if it can), its digest, and whether it must be looked at (again)."""
+def _read_cache(cache: Path, names: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each file: why it cannot be used (b"" if it can), its digest, and whether it is new or changed."""
     reasons, digests, fresh = np.zeros(len(names), "S80"), np.zeros(len(names), np.uint64), np.ones(len(names), bool)
     try:
         with np.load(cache) as old:
@@ -99,16 +100,14 @@ def _remembered(cache: Path, names, states):
     except FileNotFoundError:
         pass  # the first run on this folder
     except (OSError, ValueError, KeyError, EOFError) as error:
-        print(f"{cache}: unreadable ({error}); all images are checked anew")
+        print(f"{cache}: unreadable ({error}); all images are checked again")
     return reasons, digests, fresh
 
 
-def _remember(cache: Path, names, states, reasons, digests) -> None:
-    beside = cache.with_suffix(f".{os.getpid()}.npz")
+def _write_cache(cache: Path, names: np.ndarray, states: np.ndarray, reasons: np.ndarray, digests: np.ndarray) -> None:
     try:
         cache.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(beside, names=names, states=states, reasons=reasons, digests=digests)
-        os.replace(beside, cache)
+        with written_whole(cache, per_process=True) as temporary, open(temporary, "wb") as file:
+            np.savez(file, names=names, states=states, reasons=reasons, digests=digests)
     except OSError as error:
-        beside.unlink(missing_ok=True)
         print(f"{cache}: {error.strerror}: the next run has to check the images again")

@@ -1,11 +1,9 @@
-"""Read folders recorded in the Udacity simulator: their `driving_log.csv`, in every shape that it has in the wild.
+"""Read the folders that the Udacity simulator records: `driving_log.csv`, in every shape that people have it in.
 
 A number that cannot be read for certain is never guessed: its row is left out, with file, line and remedy.
 """
 
-import csv
 import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,15 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from cloning.errors import RecordingError
-from cloning.recordings.format import CAMERAS, COLUMNS, LOG, RANGES, SAMPLE_RATE
-
-WRITTEN = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE)  # a number as the simulator writes it
-
+from cloning.recordings.format import COLUMNS, LOG, SAMPLE_RATE
+from cloning.recordings.plain import PlainRows, as_narrow_as_possible, line_starts, read_blocks, read_plain
+from cloning.recordings.tolerant import TolerantReader
 
 WHERE_TO_GET_RECORDINGS = (
     "Record some in the simulator (training mode, button R), or unpack the public sample data "
     "there: data/README.md says how. A recording is a folder with driving_log.csv and IMG/."
 )
+FINDINGS_SHOWN = 5  # of each kind, so that a damaged recording does not fill the screen
+STAMP_LENGTH = 23  # characters of yyyy_MM_dd_HH_mm_ss_fff
+STAMP_SEPARATORS = [4, 7, 10, 13, 16, 19]  # where its underscores are
 
 
 @dataclass
@@ -31,14 +31,17 @@ class Recording:
     folder   where `driving_log.csv` and `IMG/` are
     names    bytes (m,): file names in `IMG/`, sorted, each once
     images   int32 (n, 3): centre, left and right image of a row, indices into `names`
-    steering, throttle, brake, speed  float32 (n,): steering -1..1 (right positive), throttle -1..1, brake -1..1, mph
+    steering float32 (n,): -1..1, right is positive
+    throttle float32 (n,): -1..1
+    brake    float32 (n,): -1..1
+    speed    float32 (n,): mph
     time     float64 (n,): seconds since 1970 on the recording machine; where names have no time stamps, since the
              csv's beginning
     lines    int32 (n,): line in the csv, from 1
-    read     rows found in the csv, usable or not
+    read     rows in the csv, usable or not
     repairs  what was read otherwise than written: kind -> [rows, first line]
     rejected rows left out: (line, kind, detail)
-    digests  uint64 (m,): of the files' contents, once checked
+    digests  uint64 (m,): of the image files' contents, once checked
     """
 
     folder: Path
@@ -51,15 +54,15 @@ class Recording:
     time: np.ndarray
     lines: np.ndarray
     read: int
-    repairs: dict = field(default_factory=dict)
-    rejected: list = field(default_factory=list)
+    repairs: dict[str, list[int]] = field(default_factory=dict)
+    rejected: list[tuple[int, str, str]] = field(default_factory=list)
     digests: np.ndarray | None = None
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.lines)
 
     def keep(self, rows: np.ndarray) -> None:
-        """Keep these rows only: a mask or indices."""
+        """Keep these rows only, in this order: a mask or indices."""
         for column in ("images", "steering", "throttle", "brake", "speed", "time", "lines"):
             setattr(self, column, getattr(self, column)[rows])
 
@@ -73,7 +76,10 @@ class Recording:
 
 
 def find_folders(given: list[str]) -> list[Path]:
-    """The folders with a driving_log.csv among and below those given, each once. Raises RecordingError."""
+    """The folders with a driving_log.csv among and below those given, each once.
+
+    Raises RecordingError for a folder that does not exist, or has no recording in or below it.
+    """
     folders: dict[Path, Path] = {}
     for name in given:
         path = Path(name)
@@ -88,65 +94,99 @@ def find_folders(given: list[str]) -> list[Path]:
 
 
 def logs_below(path: Path) -> Iterator[Path]:
-    """Also through symbolic links: recordings are large, and often lie on another disk."""
-    been = set()
+    """Each driving_log.csv at any depth, through symbolic links too: recordings are often on another disk."""
+    visited = set()
     for folder, below, files in os.walk(path, followlinks=True):
-        if (real := os.path.realpath(folder)) in been:
+        if (real := os.path.realpath(folder)) in visited:
             below.clear()  # a link leads back up
             continue
-        been.add(real)
+        visited.add(real)
         if LOG in files:
             yield Path(folder) / LOG
 
 
 def print_findings(recording: Recording) -> None:
-    """What was read otherwise than written, and what was left out: file, line, remedy; five a kind."""
+    """Print what was read otherwise than written, and what was left out: file, line, remedy; five of each kind."""
     path = recording.folder / LOG
-    for kind, (count, line) in recording.repairs.items():
-        print(f"{path}: line {line}: {kind} ({count} rows; read so, check that it is meant)")
-    kinds: dict[str, list] = {}
+    for kind, (rows, line) in recording.repairs.items():
+        print(f"{path}: line {line}: {kind} ({rows} rows are read this way; check that it is meant)")
+    kinds: dict[str, list[tuple[int, str]]] = {}
     for line, kind, detail in recording.rejected:
         kinds.setdefault(kind, []).append((line, detail))
-    for found in kinds.values():
-        for line, detail in found[:5]:
+    for rejected in kinds.values():
+        for line, detail in rejected[:FINDINGS_SHOWN]:
             print(f"{path}: line {line}: left out: {detail}")
-        if len(found) > 5:
-            print(f"{path}: … and {len(found) - 5} more of this kind")
+        if len(rejected) > FINDINGS_SHOWN:
+            print(f"{path}: … and {len(rejected) - FINDINGS_SHOWN} more of this kind")
 
 
-# --------------------------------------------------------------------------------------------------
-# driving_log.csv
-
-
-def read_recording(folder) -> Recording:
-    """Read a folder's `driving_log.csv`; images are looked for in the folder's own `IMG/`, whatever the csv's paths.
+def read_recording(folder: str | Path) -> Recording:
+    """Read a folder's `driving_log.csv`; images are in the folder's own `IMG/`, whatever paths the csv has.
 
     Raises RecordingError for a file that is no such csv, or has no usable row.
     """
     folder = Path(folder)
     path = folder / LOG
-    parser = _Parser(path)
-    with open(path, encoding=_encoding(path), errors="surrogateescape", newline="") as file:
-        for line, text in enumerate(file, 1):
-            parser.line(line, text)
-    parser.finish()
-    if not parser.lines:
-        first = "; ".join(f"line {line}: {detail}" for line, _, detail in parser.rejected[:3]) or "the file has no rows"
+    reader, plain = _read_rows(path)
+    lines = np.concatenate([np.array(reader.lines, np.int32), *(rows.lines for rows in plain)])
+    if not len(lines):
+        first = "; ".join(f"line {line}: {detail}" for line, _, detail in reader.rejected[:3]) or "the file has no rows"
         raise RecordingError(f"{path}: no usable row ({first}). A row is {','.join(COLUMNS)}")
-    names, images = np.unique(np.array(parser.names, dtype=bytes), return_inverse=True)
-    images = images.astype(np.int32).reshape(-1, 3)
-    lines = np.array(parser.lines, np.int32)
-    columns = np.ascontiguousarray(np.array(parser.numbers, np.float32).reshape(-1, 4).T)
+    numbers = np.concatenate([np.reshape(reader.numbers, (-1, 4)), *(rows.numbers for rows in plain)])
+    columns = np.ascontiguousarray(numbers.astype(np.float32).T)
+    names = np.concatenate([np.array(reader.names, bytes).reshape(-1, 3), *(rows.names for rows in plain)])
+    read = reader.rows + sum(len(rows.lines) for rows in plain)
+    del numbers, plain
+    names, images = _unique(names)
     time = _time_stamps(names[images[:, 0]])
     if np.isnan(time).any():
         time = lines / float(SAMPLE_RATE)
-    recording = Recording(folder, names, images, *columns, time, lines, parser.read, parser.repairs, parser.rejected)
-    recording.keep(np.lexsort((lines, time)))  # sessions are merged out of date order in the wild
+    steering, throttle, brake, speed = columns
+    recording = Recording(
+        folder, names, images, steering, throttle, brake, speed, time, lines, read, reader.repairs, reader.rejected
+    )
+    recording.keep(np.lexsort((lines, time)))  # people merge sessions out of date order
     return recording
 
 
+def _read_rows(path: Path) -> tuple[TolerantReader, list[PlainRows]]:
+    """Have pandas read the plain lines, and the tolerant reader all others in the order of the file."""
+    reader = TolerantReader(path)
+    plain: list[PlainRows] = []
+    encoding = _encoding(path)
+    if encoding == "utf-8":
+        first_line = 1
+        for block in read_blocks(path):
+            starts = line_starts(block)
+            plain.append(_read_block(reader, block, starts, first_line))
+            first_line += len(starts) - 1
+    else:
+        with open(path, encoding=encoding, errors="surrogateescape", newline="") as text:
+            for number, line in enumerate(text, 1):
+                reader.read_line(number, line)
+    reader.finish()
+    return reader, plain
+
+
+def _read_block(reader: TolerantReader, block: bytes, starts: np.ndarray, first_line: int) -> PlainRows:
+    """Return a block's plain rows, once plain lines have one meaning only; give all other lines to the reader."""
+
+    def read_tolerantly(at: int) -> None:
+        text = block[starts[at] : starts[at + 1]].decode("utf-8", "surrogateescape")
+        reader.read_line(first_line + at, text)
+
+    first = 0
+    while first < len(starts) - 1 and not reader.settled:
+        read_tolerantly(first)
+        first += 1
+    is_plain, rows = read_plain(block[starts[first] :], starts[first:] - starts[first], first_line + first)
+    for at in np.flatnonzero(~is_plain):
+        read_tolerantly(first + int(at))
+    return rows
+
+
 def _encoding(path: Path) -> str:
-    """The csv's encoding from its first bytes. Raises RecordingError for what is no text."""
+    """The csv's encoding from its first bytes. Raises RecordingError for a file that is not text."""
     try:
         with open(path, "rb") as file:
             start = file.read(4)
@@ -156,198 +196,36 @@ def _encoding(path: Path) -> str:
         raise RecordingError(f"{path}: line 1: an Excel workbook under a csv's name; open it and save it as CSV")
     if start == b"\x00\x05\x16\x07":
         raise RecordingError(f"{path}: line 1: a macOS resource file (AppleDouble), not the csv; copy the real {LOG}")
-    return "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    return "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
 
 
-class _Parser:
-    """Rows from lines. A row whose columns are not certain waits until the whole file has been seen."""
+def _unique(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sort a row's names and keep each once: bytes (m,), and int32 (n, 3), the place of each name in it.
 
-    def __init__(self, path: Path):
-        self.path, self.read, self.columns = path, 0, None
-        self.names: list[bytes] = []  # three a row
-        self.numbers: list[float] = []  # four a row
-        self.lines: list[int] = []
-        self.repairs: dict[str, list[int]] = {}
-        self.rejected: list[tuple[int, str, str]] = []
-        self.waiting: list[tuple[int, list[str], list[str]]] = []
-        self.points = False  # a number with a decimal point was seen
-        self.commas = False  # a fraction behind a decimal comma was seen
-
-    def line(self, line: int, text: str) -> None:
-        fields = text.split(",")
-        if len(fields) == 7 and '"' not in text and self.columns in (None, COLUMNS):
-            names = [_base_name(value) for value in fields[:3]]
-            if _is_image(names[0]) and _is_image(names[1]) and _is_image(names[2]):
-                self.read += 1
-                self.points = self.points or "." in fields[3] or "." in fields[6]
-                return self.row(line, names, fields[3:])
-        self.odd_line(line, text)
-
-    def odd_line(self, line: int, text: str) -> None:
-        """A line that is not seven plain columns: blank, a header, quoted, tabs, extra columns, decimal commas."""
-        text = text.strip("\r\n")
-        if not text.strip("\0 \t,;"):
-            if "\0" in text:
-                self.reject(line, "binary zeros", "the file was cut off while it was written; delete the line")
-            return
-        if text.startswith(("<<<<<<<", "=======", ">>>>>>>")):
-            return self.reject(line, "merge conflict", f"{text[:20]!r}: resolve the merge, delete the line")
-        delimiter = max(",;\t", key=text.count) if text.count(",") < 6 else ","
-        fields = [value.strip() for value in next(csv.reader([text], delimiter=delimiter))]
-        names = [_base_name(value) for value in fields]
-        images = [at for at, name in enumerate(names) if _is_image(name)]
-        if not images and not self.read and self.columns is None:
-            self.columns = self.header(line, fields)
-            return None
-        self.read += 1
-        if delimiter != ",":
-            self.repair("tab-separated" if delimiter == "\t" else "separated by semicolons", line)
-            if any("," in value for value in fields[images[-1] + 1 :] if images):
-                self.repair("decimal commas", line)
-                fields = [value.replace(",", ".") for value in fields]
-        if self.columns and len(fields) == len(self.columns):
-            by_name = dict(zip(self.columns, fields, strict=True))
-            return self.row(line, [_base_name(by_name[name]) for name in CAMERAS], [by_name[n] for n in COLUMNS[3:]])
-        if len(images) != 3:
-            found = "1 image name" if len(images) == 1 else f"{len(images)} image names"
-            return self.reject(
-                line,
-                "not a row",
-                f"{found} where center, left and right are expected; record again, or add the columns",
-            )
-        names, tokens = [names[at] for at in images], fields[images[-1] + 1 :]
-        self.points = self.points or any("." in token for token in tokens)
-        self.commas = self.commas or any(
-            token.isdigit() and (len(token) > 3 or token[0] == "0" < token[1:]) for token in tokens[1:]
-        )
-        if len(tokens) == 4:
-            return self.row(line, names, tokens)
-        if len(tokens) < 4:
-            return self.reject(
-                line,
-                "columns missing",
-                f"{len(tokens)} numbers where steering, throttle, brake, "
-                "speed are expected; record again, or add the columns",
-            )
-        self.waiting.append((line, names, tokens))
-        return None
-
-    def header(self, line: int, fields: list[str]) -> tuple[str, ...]:
-        """The names of the columns as COLUMNS has them, other columns under their own."""
-        columns = tuple(_column(value) or f"{value} ({at})" for at, value in enumerate(fields))
-        known = [name for name in columns if name in COLUMNS]
-        if known != list(dict.fromkeys(known)) or "center" not in known or "steering" not in known:
-            raise RecordingError(
-                f"{self.path}: line {line}: neither a row nor a header with center and steering: "
-                f"{','.join(fields)[:80]!r}; a header is {','.join(COLUMNS)}"
-            )
-        if len(set(known)) < len(COLUMNS):  # some are not named: their places must be the usual ones
-            start = columns.index("center")
-            usual = (*columns[:start], *COLUMNS, *columns[start + 7 :])
-            if len(columns) < start + 7 or any(a != b for a, b in zip(columns, usual, strict=True) if a in COLUMNS):
-                missing = [name for name in COLUMNS if name not in known]
-                raise RecordingError(f"{self.path}: line {line}: the header lacks {', '.join(missing)}; add them")
-            columns = usual
-            self.repair("header lacks names; usual places taken", line)
-        return columns
-
-    def row(self, line: int, names: list[str], tokens: list[str]) -> None:
-        """Take a row whose columns are certain, if its four numbers are numbers and in range."""
-        try:
-            numbers = [float(token) for token in tokens]
-        except ValueError:
-            return self.reject(line, "not a number", f"{','.join(tokens).strip()!r}; correct or delete the row")
-        steering, throttle, brake, speed = numbers
-        if -1 <= steering <= 1 and -1 <= throttle <= 1 and -1 <= brake <= 1 and -100 <= speed <= 100:
-            self.names += [name.encode(errors="surrogateescape") for name in names]
-            self.numbers += numbers
-            self.lines.append(line)
-            return None
-        name, value = next(
-            (name, value)
-            for name, value in zip(RANGES, numbers, strict=True)
-            if not RANGES[name][0] <= value <= RANGES[name][1]
-        )  # nan is in no range
-        lost = " (has its decimal point been lost?)" if name == "speed" else ""
-        return self.reject(
-            line,
-            f"{name} out of range",
-            f"{name} {value:g} is not in {RANGES[name][0]}..{RANGES[name][1]}{lost}; correct or delete the row",
-        )
-
-    def finish(self) -> None:
-        """Decide the rows with more than four numbers, now that it is known how the file writes fractions."""
-        for line, names, tokens in self.waiting:
-            if self.points:
-                self.repair("extra columns ignored", line)
-                self.row(line, names, tokens[:4])
-                continue
-            readings = _decimal_commas(tokens) if self.commas else []
-            readings = [r for r in readings if not (float(r[1]) and float(r[2]))]  # one pedal at a time
-            if len(readings) == 1:
-                self.repair("decimal commas", line)
-                self.row(line, names, readings[0])
-            else:
-                self.reject(
-                    line,
-                    "ambiguous columns",
-                    f"{','.join(tokens)!r} can be read in {len(readings)} ways; "
-                    "write decimal points, or delete the extra columns",
-                )
-
-    def reject(self, line: int, kind: str, detail: str) -> None:
-        self.rejected.append((line, kind, detail))
-
-    def repair(self, kind: str, line: int) -> None:
-        self.repairs.setdefault(kind, [0, line])[0] += 1
-
-
-def _base_name(path: str) -> str:
-    return path.strip().replace("\\", "/").rsplit("/", 1)[-1]
-
-
-def _is_image(name: str) -> bool:
-    return name[-4:].lower() == ".jpg" or name[-5:].lower() == ".jpeg"
-
-
-def _column(name: str) -> str | None:
-    """The simulator's name for a header's: `Center`, `camera_center`, `ct_path`, `SteeringAngle` …"""
-    name = name.lower().replace("centre", "center")
-    words = {"ct": "center", "lt": "left", "rt": "right", "angle": "steering", "steer": "steering", "reverse": "brake"}
-    for column in COLUMNS:
-        if column in name:
-            return column
-    return next((column for word, column in words.items() if name.startswith(word)), None)
-
-
-def _decimal_commas(tokens: list[str], names=COLUMNS[3:]) -> list[list[str]]:
-    """All ways to read tokens, torn at decimal commas, as steering, throttle, brake and speed in their ranges.
-
-    The simulator writes neither leading nor closing zeros: a fraction never ends with 0.
+    As np.unique, but sorted camera by camera with timsort: 0.3 instead of 1.7 s for a million rows in order of time.
     """
-    if not tokens or not names:
-        return [] if tokens or names else [[]]
-    readings, (least, greatest) = [], RANGES[names[0]]
-    for size in range(1, min(len(tokens), 2) + 1):
-        number = ".".join(tokens[:size])
-        if WRITTEN.fullmatch(number) and least <= float(number) <= greatest:
-            readings += [[number, *rest] for rest in _decimal_commas(tokens[size:], names[1:])]
-    return readings
+    flat = names.T.ravel()
+    order = flat.argsort(kind="stable")
+    flat = flat[order]
+    is_first = np.append(True, flat[1:] != flat[:-1])
+    images = np.empty(len(flat), np.int32)
+    images[order] = np.cumsum(is_first) - 1
+    unique = flat[is_first]
+    return as_narrow_as_possible(unique), np.ascontiguousarray(images.reshape(3, -1).T)
 
 
 def _time_stamps(names: np.ndarray) -> np.ndarray:
     """Seconds since 1970 from names like center_2018_07_16_17_11_43_382.jpg, nan for others: float64 (m,)."""
-    stamps = np.full((len(names), 23), ord(" "), np.uint8)
-    for start in range(0, len(names), 65536):  # in pieces: a name is 36 bytes, a Python string of it 90
-        part = [name.rsplit(b".", 1)[0][-23:].rjust(23) for name in names[start : start + 65536].tolist()]
-        stamps[start : start + len(part)] = np.frombuffer(b"".join(part), np.uint8).reshape(-1, 23)
-    separators = [4, 7, 10, 13, 16, 19]
-    digits = np.delete(stamps, separators, axis=1)
-    good = ((digits >= ord("0")) & (digits <= ord("9"))).all(1) & (stamps[:, separators] == ord("_")).all(1)
-    stamps[:, separators] = np.frombuffer(b"--T::.", np.uint8)
+    ends = np.strings.rfind(names, b".")
+    stamps = np.strings.slice(names, np.maximum(ends - STAMP_LENGTH, 0), ends).astype(f"S{STAMP_LENGTH}")
+    characters = stamps.view(np.uint8).reshape(-1, STAMP_LENGTH)
+    digits = np.delete(characters, STAMP_SEPARATORS, axis=1)
+    is_stamp = ((digits >= ord("0")) & (digits <= ord("9"))).all(1)
+    is_stamp &= (characters[:, STAMP_SEPARATORS] == ord("_")).all(1)
+    characters[:, STAMP_SEPARATORS] = np.frombuffer(b"--T::.", np.uint8)
     time = np.full(len(names), np.nan)
     try:
-        time[good] = stamps[good].view("S23").ravel().astype("M8[ms]").astype(np.int64) / 1000
-    except ValueError:  # a thirteenth month: the names are somebody's own
+        time[is_stamp] = stamps[is_stamp].astype("M8[ms]").astype(np.int64) / 1000
+    except ValueError:  # a thirteenth month: the names are not the simulator's
         return np.full(len(names), np.nan)
     return time

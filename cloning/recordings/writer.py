@@ -1,17 +1,17 @@
-"""Recordings as the simulator writes them: IMG/ with three cameras' JPEGs, and driving_log.csv."""
+"""Write recordings as the simulator does: IMG/ with three cameras' JPEGs, and driving_log.csv."""
 
 import math
 import os
 import re
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Self
 
-from cloning.errors import SimulatorError
+from cloning.errors import RecordingError
 from cloning.recordings.format import CAMERAS, LOG, SAMPLE_RATE
 
-EPOCH = datetime(
-    2018, 1, 1, 12
-)  # when a recording with seed 0 begins: file names must not depend on the day they are made
+# When a recording with seed 0 begins: the same command makes the same file names on any day.
+EPOCH = datetime(2018, 1, 1, 12)
 
 
 def csharp_number(value: float) -> str:
@@ -20,33 +20,35 @@ def csharp_number(value: float) -> str:
 
 
 class RecordingWriter:
-    """Writes samples into a folder. A row follows its three whole images, so a kill at any time leaves a
-    readable folder."""
+    """Writes samples into a folder.
+
+    A row is written after its three images are complete, so a process killed at any time leaves a readable folder.
+    """
 
     def __init__(self, folder: str | Path, begin: datetime = EPOCH):
-        """begin: the moment of simulated second 0, for the images' names.
+        """Start a recording; begin: the moment of simulated second 0, for the images' names.
 
-        Raises SimulatorError if the folder holds a recording already, or cannot be made.
+        Raises RecordingError if the folder holds a recording already, or cannot be made.
         """
         self.folder = Path(folder).absolute()
         self.images = self.folder / "IMG"
         log = self.folder / LOG
         if log.exists():
-            raise SimulatorError(f"{log} exists already: give another folder, or delete this one")
+            raise RecordingError(f"{log} exists already: give another folder, or delete this one")
         try:
             self.images.mkdir(parents=True, exist_ok=True)
             self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
         except OSError as error:
-            raise SimulatorError(f"{self.folder}: {error.strerror}; give a folder that can be written") from error
+            raise RecordingError(f"{self.folder}: {error.strerror}; give a folder that can be written") from error
         self.begin = begin
         self.rows = 0
 
     def add(
         self, time: float, images: list[bytes], steering: float, throttle: float, brake: float, speed: float
     ) -> None:
-        """images: JPEGs of center, left, right; time: simulated seconds; speed: mph.
+        """Write a sample; time: simulated seconds; images: JPEGs of center, left, right; speed: mph.
 
-        Raises SimulatorError, with nothing half-written, if the disk is full.
+        Raises RecordingError, with nothing half-written, if the disk is full.
         """
         moment = (self.begin + timedelta(seconds=time)).strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
         paths = [self.images / f"{name}_{moment}.jpg" for name in CAMERAS]
@@ -61,27 +63,29 @@ class RecordingWriter:
             for path in paths:
                 path.unlink(missing_ok=True)
             os.ftruncate(self.log.fileno(), size)
-            raise SimulatorError(f"{self.folder}: {error.strerror}; the {self.rows} rows before are whole") from error
+            raise RecordingError(f"{self.folder}: {error.strerror}; the {self.rows} rows before are whole") from error
         self.rows += 1
 
     def close(self) -> None:
+        """Close driving_log.csv."""
         self.log.close()
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
 class Clock:
-    """Tells the steps, 0.02 s each, after which a sample is due: 15 a second."""
+    """Tells after which simulation steps (0.02 s each) a sample is due: 15 a second."""
 
     def __init__(self, start: float = 0.0):
-        """start: simulated seconds; the first sample is due at once."""
+        """start: simulated seconds; the first sample is due then."""
         self.taken = math.ceil(start * SAMPLE_RATE - 1e-9)
 
     def due(self, time: float) -> bool:
+        """Whether a sample is due at this time (simulated seconds); if so, it counts as taken."""
         if time * SAMPLE_RATE < self.taken - 1e-9:
             return False
         self.taken += 1
