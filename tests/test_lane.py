@@ -51,7 +51,7 @@ UNSEEN = 1003  # a look that the network was not trained on
 def drive(tmp_path_factory):
     """A rendered drive on the lake in look 0: the recording, and the true lateral offset of each row, m."""
     folder = tmp_path_factory.mktemp("lane") / "lake"
-    run = record(folder, Track("lake"), 0.12, 30, seed=3)
+    run, _ = record(folder, Track("lake"), 0.12, 30, seed=3)
     recording = read_recording(folder)
     steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
     return recording, np.array(run.trajectory.offset)[steps]

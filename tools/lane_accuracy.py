@@ -72,7 +72,7 @@ def measure_drives(network: LaneNetwork, laps: float) -> None:
     for name in TRACKS:
         for look in UNSEEN:
             with tempfile.TemporaryDirectory() as folder:
-                run = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
+                run, _ = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
                 recording = read_recording(folder)
                 position = fuse_detections(recording, detect_centres(recording, network))
             step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
