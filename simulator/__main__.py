@@ -157,8 +157,8 @@ def add_road(parser: argparse.ArgumentParser) -> None:
         "--look",
         type=natural,
         default=0,
-        help="number of the look; 0 (default): like the real simulator; any other: other light, colours, textures, plants "
-        "and shadows",
+        help="look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
+        "textures and plants",
     )
 
 
