@@ -99,7 +99,7 @@ class LakeTerrain:
         self.rolling = textures.clouds(random, 256, 24, 5)  # a pixel is 4 m; `height` scales the values
 
     def nearest_road(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return distance to the centre line, s in the land's tables, and side of the road, for positions (n, 2) in m."""
+        """Return distance to the centre line, s in the land's tables, and side, for positions (n, 2), all in m."""
         distance, nearest = self.tree.query(positions)
         right = np.einsum("ij,ij->i", positions - self.track.points[nearest, :2], self.track.rightward[nearest])
         return distance, (nearest * self.track.step + self.shift) % self.track.length, np.where(right < 0, LEFT, RIGHT)
