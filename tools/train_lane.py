@@ -192,10 +192,7 @@ class RealRecording:
         self.breaks = np.flatnonzero((pause <= 0) | (pause > MAX_GAP))
 
     def later(self, row: int, driven: float) -> tuple[int, tuple[float, float, float]]:
-        """Return the row `driven` m later, or the last one before a break, and its pose relative to this row.
-
-        The pose is m to the right, m forward, yaw in radians.
-        """
+        """Return the row `driven` m later, or the last before a break, and its pose: m right, m forward, yaw."""
         last = self.breaks[np.searchsorted(self.breaks, row)]
         later = min(int(np.searchsorted(self.driven, self.driven[row] + driven)), int(last))
         right, forward = components(self.position[later] - self.position[row], forward_vector(self.heading[row]))
@@ -294,10 +291,7 @@ def transform(centres: torch.Tensor, poses: torch.Tensor) -> tuple[torch.Tensor,
 
 
 def consistency_loss(first: torch.Tensor, second: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-    """Return the loss for the differences between two cameras' detections where both see the lane.
-
-    first, second: float32 (n, 5), m to the right of each camera; poses: float32 (n, 4), see `Pose`.
-    """
+    """Return the loss of two cameras' detections, float32 (n, 5), for their differences where both see the lane."""
     right, ahead = transform(first, poses)
     ahead = ahead.detach()
     distances = torch.from_numpy(DISTANCES_AHEAD)
@@ -363,24 +357,22 @@ def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
 def parse(argv: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(
-        prog="train_lane",
-        description=(__doc__ or "").split("\n\n")[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        prog="train_lane", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
-    parser.add_argument("--looks", type=int, default=24, help="number of looks in which each track is rendered")
+    parser.add_argument("--looks", type=int, default=24, help="looks in which each track is rendered (default 24)")
     parser.add_argument(
-        "--frames", type=int, default=200, help="frames of the lake in each look; the jungle gets twice as many"
+        "--frames",
+        type=int,
+        default=200,
+        help="frames of the lake per look; the jungle gets twice as many (default 200)",
     )
     parser.add_argument(
-        "--steps", type=int, default=2400, help="batches of 96 rendered frames and 40 pairs of real ones"
+        "--steps", type=int, default=2400, help="batches of 96 rendered frames and 40 real pairs (default 2400)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same network on the same machine")
+    parser.add_argument("--seed", type=int, default=0, help="of all random choices (default %(default)s)")
     parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("lane.pt"),
-        help="file for the weights; to ship them, copy it to cloning/lane/lane.pt",
+        "--output", type=Path, default=Path("lane.pt"), help="file for the weights (default %(default)s)"
     )
     return parser.parse_args(argv)
 
