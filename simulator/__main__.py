@@ -267,7 +267,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"simulator: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\nsimulator: stopped; the files written so far are complete", file=sys.stderr)
+        print("\nsimulator: stopped; the files that it has written are complete", file=sys.stderr)
         return 130
 
 

@@ -62,7 +62,7 @@ class Run:
     """
 
     def __init__(self, track: Track, start: str = "training"):
-        """start: the mode of the real simulator at whose start the car stands, "training" or "autonomous"."""
+        """start: the mode of the real simulator whose starting position is used, "training" or "autonomous"."""
         self.track = track
         self.car = Car(build_physics(track))
         self.s, self.offset = track.starts[start], 0.0

@@ -193,8 +193,8 @@ def test_expert_drives_a_lap_on_the_road(name, direction):
 
 def test_only_the_recovery_driver_pauses_the_recording():
     track = Track("lake")
-    assert Expert(track).recording
-    assert not Recovery(track).recording
+    assert Expert(track).recordable
+    assert not Recovery(track).recordable
 
 
 @pytest.mark.parametrize(

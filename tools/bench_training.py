@@ -100,8 +100,8 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
     started = time.perf_counter()
     with mock.patch.object(run, "write_pictures", between_batches):
         run.train()
-    whole = time.perf_counter() - started - spent
-    return {"a": run.progress.history[0]["images"] / whole, "b": steps * fixed_batch.total / spent}
+    epoch_seconds = time.perf_counter() - started - spent
+    return {"a": run.progress.history[0]["images"] / epoch_seconds, "b": steps * fixed_batch.total / spent}
 
 
 def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray", "np.ndarray"]:

@@ -144,11 +144,11 @@ class PhotometricAugmentation:
         yaws = np.radians(rng.normal(0, 4, 512))
         poses = zip(rng.normal(0, 0.8, 512), yaws, strict=True)
         self.masks = [visible_mask(strip_homography(right, yaw)) for right, yaw in poses]
-        self.whole = np.ones((rows, columns, 1), np.uint8)
+        self.full_mask = np.ones((rows, columns, 1), np.uint8)
 
     def mask(self, rng: np.random.Generator, share: float) -> np.ndarray:
         """Sample a mask, uint8 (32, 160, 1); with probability `share` it hides a border, as warping does."""
-        return self.masks[rng.integers(len(self.masks))] if rng.random() < share else self.whole
+        return self.masks[rng.integers(len(self.masks))] if rng.random() < share else self.full_mask
 
     def apply(self, strip: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Return a strip, uint8 (32, 160, 3), with other light and colours."""

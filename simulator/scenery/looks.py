@@ -18,7 +18,7 @@ class Look:
     spots    factor of the contrast of larger spots in the asphalt
     sheen    relative gain in brightness of asphalt far ahead
     stripes  metres of kerb for one red and one white stripe
-    relief   factor of the heights beside the road
+    relief   factor of the heights next to the road
     shift    metres by which hills, soils and water are shifted along the road
     plants   factor of the number of trees and bushes
     shadows  number of shadows at random places on the road; None: those of the real simulator
@@ -45,7 +45,7 @@ def make_look(number: int, light: Light, palette: Palette) -> Look:
     random = np.random.default_rng([number, 7])
     azimuth, elevation = random.uniform(0, 2 * np.pi), np.radians(random.uniform(18, 70))
     sun = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
-    overcast = random.uniform(0, 0.7)  # share of the sunlight that comes from the whole sky instead
+    overcast = random.uniform(0, 0.7)  # share of the sunlight that clouds scatter over the sky
     strength = random.uniform(0.65, 1.15) * random.uniform(0.92, 1.08, 3)
     sunlight = np.array(light.sunlight) * strength * (1 - overcast)
     fill = (np.array(light.fill) * random.uniform(0.8, 1.1) + 0.5 * overcast * np.array(light.sunlight)) * strength
@@ -69,7 +69,7 @@ def make_look(number: int, light: Light, palette: Palette) -> Look:
 def vary(random: np.random.Generator, colour: np.ndarray) -> Colour:
     """Return a variant of a colour (3,): darker or lighter, greyer, and tinted.
 
-    It is greyer, because a network that tells road from land only by grey fails on the real road, whose edges are grey
+    It is greyer, because a network that recognises the road only by its grey fails on the real road, whose edges are grey
     or blue too.
     """
     greyer = random.uniform(0, 0.9)

@@ -162,7 +162,7 @@ def plants(
 ) -> Mesh:
     """Return two crossed upright images of a plant at each place.
 
-    places: (n, 3), m, where each stands on the ground; heights, widths: (n,), m; colours: (n, 3).
+    places: (n, 3), m, the point on the ground; heights, widths: (n,), m; colours: (n, 3).
     """
     turn = random.uniform(0, np.pi, len(places))[:, None] + np.array([0, np.pi / 2])
     sideways = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)  # (n, 2, 3)
