@@ -98,8 +98,7 @@ def record(
                 run.step(*expert.drive(run))
                 if clock.due(run.time) and expert.recordable:
                     images = pool.submit(_render, track.name, look, run.car.node.get_transform())
-                    throttle, brake = max(0.0, run.throttle), max(0.0, -run.throttle)
-                    pending.append(Row(run.time, images, run.steering, throttle, brake, run.speed_mph))
+                    pending.append(Row(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph))
                     if len(pending) > 2 * renderers:
                         write()
                     bar.update(round(max(0.0, run.travelled)) - bar.n)

@@ -86,6 +86,11 @@ class Run:
         return self.car.speed / MPH
 
     @property
+    def throttle_and_brake(self) -> tuple[float, float]:
+        """Throttle and brake of the last step, each 0..1, as recordings have them."""
+        return max(0.0, self.throttle), max(0.0, -self.throttle)
+
+    @property
     def laps(self) -> int:
         """Number of finished laps."""
         return len(self.lap_times)

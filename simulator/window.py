@@ -161,7 +161,7 @@ class Window(ShowBase):
         """Render the cameras and add a row to the recording."""
         run = self.simulation
         images = [jpeg(frame) for frame in self.cameras.frames(run.car.node.get_transform())]
-        recording.add(run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph)
+        recording.add(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph)
 
     def do_record(self) -> None:
         """Start or stop recording."""

@@ -69,8 +69,8 @@ def make_look(number: int, light: Light, palette: Palette) -> Look:
 def vary(random: np.random.Generator, colour: np.ndarray) -> Colour:
     """Return a variant of a colour (3,): darker or lighter, greyer, and tinted.
 
-    It is greyer, because a network that recognises the road only by its grey fails on the real road, whose edges are grey
-    or blue too.
+    It is greyer, because a network that recognises the road only by its grey fails on the real road, whose edges are
+    grey or blue, too.
     """
     greyer = random.uniform(0, 0.9)
     colour = (1 - greyer) * colour + greyer * colour.mean()
