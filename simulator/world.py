@@ -154,9 +154,8 @@ class MeshGroup:
             goal = np.array(haze.colour, np.float32) * (255 / self.brightness)
             colours = colours + (goal - colours) * share
         if self.mesh.sheen:
-            colours = colours * (
-                1 + self.mesh.sheen * np.clip(1 - SHEEN_START / np.maximum(distance, SHEEN_START), 0, 1)
-            )
+            share = np.clip(1 - SHEEN_START / np.maximum(distance, SHEEN_START), 0, 1)
+            colours = colours * (1 + self.mesh.sheen * share)
         rgba = _rgba(colours)
         for cell in self.cells:
             cell.set_colours(rgba[cell.used])
@@ -177,9 +176,8 @@ class Scene:
             by_texture.setdefault(id(mesh.texture), []).append(mesh)
         self.groups = [MeshGroup(merge(meshes), self.root) for meshes in by_texture.values()]
         for i, group in enumerate(self.groups):
-            group.root.set_bin(
-                "fixed", i
-            )  # otherwise the engine sorts by memory address, which differs from run to run
+            # Without a fixed order the engine sorts by memory address, which differs from run to run.
+            group.root.set_bin("fixed", i)
         self.sky = MeshGroup(scenery.sky, self.root).root
         self.sky.set_bin("background", 0)
         self.sky.set_depth_write(False)
@@ -188,9 +186,8 @@ class Scene:
         self.car.set_bin("fixed", len(self.groups))
         MeshGroup(scenery.bonnet, self.car).root.hide(OUTSIDE)
         MeshGroup(scenery.body, self.car).root.hide(INSIDE)
-        self.viewpoints: dict[
-            float, tuple[int, int]
-        ] = {}  # step -> the grid point for which colours were computed last
+        # Step -> the grid point for which colours were computed last.
+        self.viewpoints: dict[float, tuple[int, int]] = {}
 
     def move_car(self, transform: TransformState) -> None:
         """Move the car, and update haze, sheen and sky for its position.
