@@ -1,1 +1,1 @@
-"""Behavioral cloning: everything that training, driving and replaying need, apart from the three commands."""
+"""Behavioral cloning: what the commands model.py, drive.py and video.py and the stand-in simulator are made of."""

@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 from cloning.errors import SimulatorError
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.writer import Clock
+from cloning.recordings.writer import SampleClock
 from cloning.wire.client import (
     CONNECT,
     MANUAL_TELEMETRY,
@@ -94,7 +94,7 @@ class Client(ClientSession):
     def _drive_in_lockstep(self, goal: float, bar: tqdm) -> None:
         """Let simulated time wait for each answer: 15 frames per simulated second."""
         self.receive_greeting()
-        clock = Clock(self.run.time + 1 / SAMPLE_RATE)
+        clock = SampleClock(self.run.time + 1 / SAMPLE_RATE)
         while self.run.travelled < goal:
             self.obey(self.receive_unasked())
             begin = time.perf_counter()

@@ -37,7 +37,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def recording(folder):
-    return replay.load(folder)
+    return replay.load_recording(folder)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cloning.errors import SimulatorError, UserError
-from cloning.recordings.format import LOG, SAMPLE_RATE
+from cloning.recordings.format import DRIVING_LOG, SAMPLE_RATE
 from cloning.road.track import ROADS, Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
@@ -70,7 +70,7 @@ def recording(track: str, laps: float) -> Speed:
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             raise SimulatorError(f"{' '.join(command)} ended with {process.returncode}: run it to see its message")
-        rows = (Path(folder) / "out" / LOG).read_text(encoding="utf-8").count("\n")
+        rows = (Path(folder) / "out" / DRIVING_LOG).read_text(encoding="utf-8").count("\n")
     simulated = rows / SAMPLE_RATE
     return Speed(simulated / wall, simulated / (usage.ru_utime + usage.ru_stime), peak)
 

@@ -27,7 +27,7 @@ from cloning.lane.place import centre_ahead
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
-    SHIPPED,
+    SHIPPED_WEIGHTS,
     STRIP_SHAPE,
     STRIP_TO_LEVEL,
     LaneNetwork,
@@ -364,7 +364,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "--steps", type=int, default=2400, help="batches of 96 rendered frames and 40 pairs of real ones"
     )
     parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same network on the same machine")
-    parser.add_argument("--output", type=Path, default=SHIPPED, help="file for the weights")
+    parser.add_argument("--output", type=Path, default=SHIPPED_WEIGHTS, help="file for the weights")
     return parser.parse_args(argv)
 
 

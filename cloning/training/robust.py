@@ -40,8 +40,11 @@ from cloning.training.options import Arguments
 LOOKAHEAD = 6.0  # m along the lane's centre, to the point that the label steers for
 STEEPEST_FROM = 1.0  # m of lateral offset: from further away the car returns at the same angle as from here
 HEADING_CHORD = 3.0  # m before and behind: the lane's heading is that of the chord between
-MAX_OFFSET = 2.0  # m: the lateral offsets of sampled poses are uniform between - and + this
-YAW_DEVIATION, MAX_YAW = np.radians(8), np.radians(25)  # of the heading errors of sampled poses, normally distributed
+MAX_POSE_OFFSET = 2.0  # m: the lateral offsets of sampled poses are uniform between - and + this
+YAW_DEVIATION, MAX_POSE_YAW = (
+    np.radians(8),
+    np.radians(25),
+)  # of the heading errors of sampled poses, normally distributed
 MAX_SHIFT = 2.4  # m from the recorded trajectory: further to the side the frames show too little of the road
 CAMERA_REACH = 1.7  # m: a camera within this distance of a pose may supply its image
 STRAIGHT_WEIGHT = 0.2  # of an observation whose label is 0; |label| is added to it
@@ -164,8 +167,10 @@ class Lanes:
         The camera is random, too, so that traces of warping in an image do not tell the side that it was taken from.
         """
         n = len(self)
-        offset = np.clip(rng.uniform(-MAX_OFFSET, MAX_OFFSET, n), self.offset - MAX_SHIFT, self.offset + MAX_SHIFT)
-        yaw = np.clip(rng.normal(0, YAW_DEVIATION, n), -MAX_YAW, MAX_YAW)
+        offset = np.clip(
+            rng.uniform(-MAX_POSE_OFFSET, MAX_POSE_OFFSET, n), self.offset - MAX_SHIFT, self.offset + MAX_SHIFT
+        )
+        yaw = np.clip(rng.normal(0, YAW_DEVIATION, n), -MAX_POSE_YAW, MAX_POSE_YAW)
         eye = offset - self.offset + AXLE_TO_CAMERA * (np.sin(yaw) - np.sin(self.yaw))
         distance = np.abs(eye[:, None] - list(CAMERA_OFFSETS.values()))
         near = distance <= np.maximum(CAMERA_REACH, distance.min(1, keepdims=True))
