@@ -11,6 +11,7 @@ from cloning.outputs import check_folders, run_all, write_json
 from cloning.replay.autonomy import LIMITS
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.track import ROADS, Track
+from cloning.wire.protocol import PORT
 
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -118,7 +119,7 @@ def add_window(commands: "Subparsers") -> None:
 def add_server(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where drive.py is."""
     parser.add_argument("--host", default="127.0.0.1", help="where drive.py runs (default 127.0.0.1)")
-    parser.add_argument("--port", type=int, default=4567, help="default 4567")
+    parser.add_argument("--port", type=int, default=PORT, help=f"default {PORT}")
 
 
 def add_wait(parser: argparse.ArgumentParser) -> None:

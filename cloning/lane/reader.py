@@ -26,7 +26,9 @@ from cloning.road.motion import AXLE_TO_CAMERA, MAX_GAP, REAR_AXLE, Stretch
 
 SHIPPED_WEIGHTS = Path(__file__).with_name("lane.pt")
 STRIP_SHAPE = (32, 160, 3)  # rows, columns, RGB
-FIRST_ROW = 60  # of the level frame that a strip shows: the horizon; 64 rows further down the JPEG's blocks mix in the bonnet
+FIRST_ROW = (
+    60  # of the level frame that a strip shows: the horizon; 64 rows below it the bonnet tints the JPEG's blocks
+)
 DISTANCES_AHEAD = np.array([3.0, 4.5, 6.5, 9.0, 13.0], np.float32)  # m from the camera
 MOUNT_OFFSETS = np.array(list(CAMERA_OFFSETS.values()), np.float32)  # m to the right: centre, left, right
 STRIPS_PER_PIECE = 48  # that a thread computes at once
@@ -197,9 +199,8 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> tuple[np.ndarray, np.n
 
     centres: float32 (n, 3, 5), m to the right of the car's middle line.
     """
-    camera_error = _smooth(centres[:, 1:] - centres[:, :1])[
-        ..., :2
-    ]  # only the nearest two distances: further ahead a metre is few pixels
+    # Only at the two nearest distances: further ahead a metre is few pixels.
+    camera_error = _smooth(centres[:, 1:] - centres[:, :1])[..., :2]
     right, forward, heading = stretch.right, stretch.forward, stretch.heading
     ahead = DISTANCES_AHEAD + AXLE_TO_CAMERA  # of the rear axle, whose trajectory is known
     s, c = np.sin(heading)[:, None], np.cos(heading)[:, None]

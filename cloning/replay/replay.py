@@ -30,9 +30,7 @@ from cloning.road.motion import (
     stretches,
 )
 
-MAX_YAW_FROM_HUMAN = (
-    1.2  # radians: views further to the side cannot be warped from the frames
-)
+MAX_YAW_FROM_HUMAN = 1.2  # radians: views further to the side cannot be warped from the frames
 
 
 @dataclass(frozen=True)
