@@ -81,10 +81,8 @@ def test_a_shifted_car_comes_back_and_stays(monkeypatch, steering, right, yaw):
 
 def test_the_label_grows_with_offset_and_yaw(monkeypatch):
     one = lanes(monkeypatch).take(np.array([50]))
-    by_place = [
-        float(one.steering(right, 0.0)[0])
-        for right in np.linspace(-robust.MAX_LABEL_OFFSET, robust.MAX_LABEL_OFFSET, 9)
-    ]
+    limit = robust.MAX_LABEL_OFFSET
+    by_place = [float(one.steering(right, 0.0)[0]) for right in np.linspace(-limit, limit, 9)]
     by_yaw = [float(one.steering(0.0, yaw)[0]) for yaw in np.linspace(-0.2, 0.2, 9)]
     for found in (by_place, by_yaw):
         assert (np.diff(found) < 0).all()
