@@ -1,1 +1,1 @@
-"""Behavioral cloning: what the commands model.py, drive.py and video.py and the stand-in simulator are made of."""
+"""Behavioral cloning: the code shared by model.py, drive.py, video.py and the stand-in simulator."""

@@ -96,7 +96,7 @@ class TolerantReader:
         text = text.strip("\r\n")
         if not text.strip("\0 \t,;"):
             if "\0" in text:
-                self._reject(line, "binary zeros", "the file was cut short while it was written; delete the line")
+                self._reject(line, "binary zeros", "the file was cut off while it was written; delete the line")
             return
         if text.startswith(MERGE_MARKERS):
             return self._reject(line, "merge conflict", f"{text[:20]!r}: resolve the merge, delete the line")
