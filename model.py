@@ -67,8 +67,8 @@ Kind = TypeVar("Kind", bound=Observations)  # the report's or those of --robust
 def read_observations(kind: type[Kind], folders: list[Path], arguments: Arguments, rejected_file: Path) -> Kind:
     """Read and filter the recordings (steps 2 to 4 of the report), and print the numbers of rows.
 
-    Unusable rows are listed in `rejected_file`. Raises RecordingError if too few rows are left or, with --strict, if a
-    row is unusable.
+    Unusable rows are listed in `rejected_file`. Raises RecordingError if too few rows are left,
+    and with --strict if a row is unusable.
     """
     parts, counts = [], []
     for folder in folders:

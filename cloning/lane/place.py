@@ -38,10 +38,7 @@ INITIAL_COVARIANCE = np.diag([4.0**2, 4.0, 0.05])
 SLOPE_STEP = 0.5  # m before and behind a distance ahead, over which the centre line's slope is taken
 DISTANCES_WITH_NEIGHBOURS = np.r_[DISTANCES_AHEAD, DISTANCES_AHEAD - SLOPE_STEP, DISTANCES_AHEAD + SLOPE_STEP]
 VISIBLE_POINTS = np.arange(-6, 40)  # indices, relative to the car, of a track's points that the camera may see
-PROFILE_LENGTH, PROFILE_STEP = (
-    200.0,
-    2.0,
-)  # m: trajectory compared with the tracks' headings, and its step
+PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m: part of the trajectory whose heading is compared, and its step
 SEARCH = ((8, 150), (2, 600))  # two rounds: number of the best candidates that the filter follows, and rows
 # A shorter stretch may resemble a bend of any track.
 MIN_LOCALISED_ROWS = 300

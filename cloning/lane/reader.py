@@ -26,9 +26,7 @@ from cloning.road.motion import AXLE_TO_CAMERA, MAX_GAP, REAR_AXLE, Stretch
 
 SHIPPED_WEIGHTS = Path(__file__).with_name("lane.pt")
 STRIP_SHAPE = (32, 160, 3)  # rows, columns, RGB
-FIRST_ROW = (
-    60  # of the level frame that a strip shows: the horizon; 64 rows below it the bonnet tints the JPEG's blocks
-)
+FIRST_ROW = 60  # of the level frame that a strip shows: the horizon; the bonnet tints the JPEG 64 rows further down
 DISTANCES_AHEAD = np.array([3.0, 4.5, 6.5, 9.0, 13.0], np.float32)  # m from the camera
 MOUNT_OFFSETS = np.array(list(CAMERA_OFFSETS.values()), np.float32)  # m to the right: centre, left, right
 STRIPS_PER_PIECE = 48  # that a thread computes at once

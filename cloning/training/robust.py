@@ -42,10 +42,8 @@ LOOKAHEAD = 6.0  # m along the lane's centre, to the point that the recovery ste
 MAX_LABEL_OFFSET = 1.0  # m: from a larger lateral offset the car returns at the same angle as from this one
 HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far behind to so far ahead
 MAX_POSE_OFFSET = 2.0  # m: the lateral offsets of sampled poses are uniform between - and + this
-YAW_DEVIATION, MAX_POSE_YAW = (
-    np.radians(8),
-    np.radians(25),
-)  # radians: of the heading errors of sampled poses, normally distributed
+# Radians: standard deviation and limit of the heading errors of sampled poses, which are normally distributed.
+YAW_DEVIATION, MAX_POSE_YAW = np.radians(8), np.radians(25)
 MAX_SHIFT = 2.4  # m from the recorded trajectory: further away the frames show too little of the road
 CAMERA_REACH = 1.7  # m: a camera this near to a pose may supply its image
 STRAIGHT_WEIGHT = 0.2  # sampling weight on a straight; elsewhere |steering along the lane| is added
