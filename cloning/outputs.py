@@ -13,7 +13,7 @@ def check_folders(*paths: str | None) -> None:
     """Raise OutputError if the folder of an output file is missing; call it before the work that makes the output."""
     for path in paths:
         if path and not Path(path).absolute().parent.is_dir():
-            raise OutputError(f"{path}: its folder does not exist; make it first")
+            raise OutputError(f"{path}: no such folder to write it in; make the folder first")
 
 
 def write_output(path: str | Path, data: bytes) -> None:
