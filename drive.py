@@ -17,24 +17,27 @@ import sys
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any
+from wsgiref.types import WSGIEnvironment
 
 import numpy as np
 import torch
 
 from cloning.errors import UserError
-from cloning.pilot.network import SHIPPED, Network, load_model, steer
+from cloning.pilot.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.recordings.format import FRAME
+from cloning.road.motion import TOP_SPEED_MPH
+from cloning.wire.protocol import PORT
 
 try:
     from cloning.pilot import page
-    from cloning.pilot.telemetry import Unusable, decimal_separator, format_number, parse_telemetry
+    from cloning.pilot.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
     from cloning.wire import server as wire
-except UserError as error:  # the socket libraries have other versions
+except UserError as error:  # wrong versions of the socket libraries
     sys.exit(f"drive.py: {error}")
 
-DEFAULT_MODEL = Path("model.pt")  # where `python model.py` writes it
+DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
+SET_SPEED = 9.0  # mph, as in Udacity's drive.py
 log = logging.getLogger("drive")
 
 
@@ -43,54 +46,54 @@ log = logging.getLogger("drive")
 
 
 class SpeedController:
-    """The original's PI controller: throttle = 0.1 e + 0.002 Σe, e = set speed - speed (mph), within -1..1.
+    """The PI controller of Udacity's drive.py: throttle = 0.1 e + 0.002 Σe, where e = set speed - speed in mph.
 
-    The sum is frozen while the throttle is at its limit, so that a wait or a hill does not wind it up.
+    The sum is not changed while the throttle is at its limit, so that it does not wind up on a hill.
     """
 
     PROPORTIONAL, INTEGRAL = 0.1, 0.002
 
     def __init__(self, set_speed: float):
         """set_speed: mph."""
-        self.set_speed, self.sum = set_speed, 0.0
+        self.set_speed, self.error_sum = set_speed, 0.0
 
     def throttle(self, speed: float) -> float:
-        """Throttle -1..1 at this speed in mph; call it once a frame."""
+        """Return the throttle, -1..1, at this speed in mph; call it once per frame."""
         error = self.set_speed - speed
-        throttle = self.PROPORTIONAL * error + self.INTEGRAL * (self.sum + error)
+        throttle = self.PROPORTIONAL * error + self.INTEGRAL * (self.error_sum + error)
         if abs(throttle) <= 1:
-            self.sum += error
+            self.error_sum += error
         return min(1.0, max(-1.0, throttle))
 
 
 class Session:
-    """One connected simulator: its speed controller, its saved frames and its figures."""
+    """A connected simulator: its speed controller, its saved frames and the figures for the page."""
 
-    def __init__(self, server: "DriveServer", environ: dict[str, Any]):
+    def __init__(self, server: "DriveServer", environ: WSGIEnvironment):
         """environ: the WSGI environment of the connection."""
         self.server, self.environ = server, environ
         self.controller = SpeedController(server.set_speed)
-        self.folder: saved_frames.Folder | None = None
-        self.separator = "."  # decimal separator of the simulator's culture, and the only one that it reads
-        self.steering = np.float32(0)  # of the last answer
-        self.frame: np.ndarray | None = None  # the last one
+        self.folder: saved_frames.SessionFolder | None = None
+        self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
+        self.steering = np.float32(0)  # of the last answer, -1..1
+        self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
         self.driven = self.unusable = 0  # frames
-        self.history: deque[page.DrivenFrame] = deque(maxlen=page.HISTORY)
-        self.began = time.perf_counter()
-        self.warned: set[str] = set()  # kinds of warnings logged
+        self.history: deque[page.DrivenFrame] = deque(maxlen=page.HISTORY_FRAMES)
+        self.started = time.perf_counter()
+        self.warned: set[str] = set()  # kinds of warnings logged: see OncePerKind
 
     def answer(self, message: object) -> dict[str, str]:
-        """The answer to a telemetry message: steering -1..1 and throttle -1..1 as strings. Never raises."""
-        arrived = self.arrived()
+        """Return the answer to a telemetry message: steering and throttle, -1..1, as strings. Never raises."""
+        arrived = self.arrival_time()
         throttle = 0.0
         try:
             self.separator = decimal_separator(message, self.separator)
             telemetry = parse_telemetry(message)
             self.steering = steer(self.server.network, telemetry.image)
             throttle = self.controller.throttle(telemetry.speed)
-        except Exception as error:  # of any kind: without an answer the car would stand still
+        except Exception as error:  # whatever it is: without an answer the car would stand still
             self.unusable += 1
-            reason = str(error) if isinstance(error, Unusable) else f"{type(error).__name__}: {error}"
+            reason = str(error) if isinstance(error, UnusableTelemetry) else f"{type(error).__name__}: {error}"
             log.warning(
                 f"a frame can't be used: {reason}; the answer repeats the last steering with throttle 0",
                 extra={"warned": self.warned},
@@ -99,7 +102,7 @@ class Session:
             self.frame = telemetry.image
             self.driven += 1
             if self.server.saver:
-                self.folder = self.folder or self.server.saver.folder()
+                self.folder = self.folder or self.server.saver.start_session()
                 self.folder.save(telemetry.jpeg)
             latency = (time.perf_counter() - arrived) * 1000
             self.history.append(page.DrivenFrame(time.time(), float(self.steering), telemetry.speed, throttle, latency))
@@ -108,13 +111,13 @@ class Session:
             "throttle": format_number(throttle, self.separator),
         }
 
-    def arrived(self) -> float:
-        """time.perf_counter() when the first fragment of the current message was read."""
-        websocket = self.environ.get("drive.websocket")  # none while a client uses HTTP polling
+    def arrival_time(self) -> float:
+        """Return the time.perf_counter() at which the first fragment of the current message was read."""
+        websocket = self.environ.get("drive.websocket")  # None if the client uses HTTP polling
         return websocket.arrived if websocket else time.perf_counter()
 
     def summary(self) -> str:
-        """How many frames came and where they are saved, for the line at the end of the session."""
+        """Return a line about the whole session: its numbers of frames, and where they are saved."""
         saved = f"; driven frames saved in {self.folder.path}" if self.folder else ""
         return f"session ended: {self.driven} frames driven, {self.unusable} unusable{saved}"
 
@@ -124,10 +127,10 @@ class Session:
 
 
 class DriveServer:
-    """Serves steering to any number of simulators, and the page to any browser on this machine."""
+    """Serves steering to any number of simulators, and the page to browsers."""
 
-    def __init__(self, network: Network, set_speed: float = 9.0, saver: saved_frames.Saver | None = None):
-        """set_speed: mph. saver: where frames are saved, if they are."""
+    def __init__(self, network: Network, set_speed: float = SET_SPEED, saver: saved_frames.FrameSaver | None = None):
+        """set_speed: mph; saver: saves the frames, or None."""
         self.network, self.set_speed, self.saver = network, set_speed, saver
         self.sessions: dict[str, Session] = {}
         self.socket = wire.Server()
@@ -135,22 +138,22 @@ class DriveServer:
         self.socket.on("telemetry", self.telemetry)
         self.socket.on("disconnect", self.disconnect)
         self.app = wire.refuse_other_sites(wire.socketio.WSGIApp(self.socket, page.create_app(self)))
-        steer(network, np.zeros(FRAME, np.uint8))  # the first pass is slow; take it before the first frame
+        steer(network, np.zeros(FRAME, np.uint8))  # the first pass is slow: do it before the first frame
 
     def session(self, sid: str) -> Session:
-        """The session of a connection, new for a new one."""
+        """Return the session of a connection; make one for a new connection."""
         if sid not in self.sessions:
             self.sessions[sid] = Session(self, self.socket.environ[sid])
         return self.sessions[sid]
 
     def connect(self, sid: str, *_: object) -> None:
         """Greet a new simulator, which sends telemetry only in answer to a message."""
-        if sid not in self.sessions:  # a client may send CONNECT on top of connecting
+        if sid not in self.sessions:  # a client may also send CONNECT on an open connection
             self.session(sid)
             self.socket.emit("steer", {"steering_angle": "0", "throttle": "0"}, room=sid)
 
     def telemetry(self, sid: str, message: object = None, *_: object) -> None:
-        """Answer each telemetry exactly once: with `steer`, or with `manual` while the human driver steers."""
+        """Answer each telemetry exactly once: with `steer`, or with `manual` if the human driver steers."""
         session = self.session(sid)
         if message is None:
             self.socket.emit("manual", {}, room=sid)
@@ -168,16 +171,16 @@ class DriveServer:
         for sid in list(self.sessions):
             self.disconnect(sid)
 
-    def watched(self) -> Session | None:
-        """The session for the page and the status line: the newest one with driven frames."""
+    def watched_session(self) -> Session | None:
+        """Return the session for the page and the status line: the newest one with driven frames, or None."""
         return next((session for session in reversed(self.sessions.values()) if session.driven), None)
 
 
 class StatusLine:
-    """A line about the watched session: every half second on a terminal, every minute in a log."""
+    """Prints a line about the watched session: every half second on a terminal, every minute to a file."""
 
     def __init__(self, server: DriveServer, terminal: bool):
-        """terminal: whether each line replaces the last one."""
+        """terminal: whether to print to a terminal, where each line replaces the last one."""
         self.server, self.terminal = server, terminal
         self.period = 0.5 if terminal else 60.0  # s
         self.session: Session | None = None
@@ -188,7 +191,7 @@ class StatusLine:
         now = time.perf_counter()
         if now < self.time + self.period:
             return
-        session = self.server.watched()
+        session = self.server.watched_session()
         if session:
             start, end = ("\r", "\033[K") if self.terminal else ("", "\n")
             print(start + self.text(session, now), end=end, file=sys.stderr, flush=True)
@@ -196,8 +199,11 @@ class StatusLine:
         self.session, self.time = session, now
 
     def text(self, session: Session, now: float) -> str:
-        """Rate and mean latency since the last line or the start of the session, and the last frame's figures."""
-        frames, since = (self.frames, self.time) if session is self.session else (0, session.began)
+        """Return the line: means since the last line or the session's start, and the last frame's figures.
+
+        now: time.perf_counter().
+        """
+        frames, since = (self.frames, self.time) if session is self.session else (0, session.started)
         rate = (session.driven - frames) / max(now - since, 1e-3)
         recent = list(itertools.islice(reversed(session.history), max(session.driven - frames, 1)))
         latency, last = statistics.fmean(frame.latency for frame in recent), recent[0]
@@ -209,11 +215,11 @@ class StatusLine:
 
 
 def run(server: DriveServer, listener: socket.socket) -> None:
-    """Serve, with a status line, until Ctrl-C or a signal to terminate."""
+    """Serve, with a status line, until Ctrl-C or a signal that asks to terminate."""
     stopped: list[int] = []
     for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # the last one exists on Windows only
         if hasattr(signal, name):
-            # Only set a mark: python-engineio would catch an exception raised in the middle of a handler.
+            # The handler only notes the signal: python-engineio would catch an exception raised here.
             signal.signal(getattr(signal, name), lambda number, _: stopped.append(number))
     serving = wire.eventlet.spawn(wire.serve, listener, server.app)
     status = StatusLine(server, sys.stderr.isatty())
@@ -221,7 +227,7 @@ def run(server: DriveServer, listener: socket.socket) -> None:
         wire.eventlet.sleep(0.1)
         status.update()
     if serving.dead:
-        serving.wait()  # raises what ended it
+        serving.wait()  # raises the exception that ended it
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -229,18 +235,19 @@ def run(server: DriveServer, listener: socket.socket) -> None:
 
 
 class OncePerKind(logging.Filter):
-    """Passes a warning once, whatever its digits, so that a broken client fills no log.
+    """Passes each kind of warning once, so that a broken client does not fill the log.
 
-    A record with an attribute `warned`, a set, passes once for that set: once per session.
+    Warnings that differ only in digits are of one kind. A record may have an attribute `warned`, a set of the kinds
+    already logged; a session's records have its own, so that each session logs each kind once.
     """
 
     def __init__(self) -> None:
-        """Begin with no warning passed."""
+        """Start with no warnings logged."""
         super().__init__()
         self.warned: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a record is logged."""
+        """Return whether to log a record."""
         if record.levelno < logging.WARNING:
             return True
         warned = getattr(record, "warned", self.warned)
@@ -252,55 +259,62 @@ class OncePerKind(logging.Filter):
 
 
 def choose_model(argument: Path | None, folder: Path | None) -> Path:
-    """The model file to drive with: the one named, or model.pt, or the one that comes with the project.
+    """Return the model file to drive with: the given one, else model.pt if it exists, else the shipped one.
 
-    Raises UserError for a lone argument that is meant as the folder.
+    argument, folder: of the command line. Raises UserError if the only argument is probably meant as the folder.
     """
     if argument is None:
-        return DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED
+        return DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
     if folder is None and not argument.is_file() and argument.suffix != ".pt":
         raise UserError(
-            f"{argument}: not a model file; the model comes first and the folder for the frames second: "
-            f"`python drive.py {DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED} {argument}`"
+            f"{argument}: not a model file; name the model first and the folder for the frames second: "
+            f"`python drive.py {DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL} {argument}`"
         )
     return argument
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
-    """The command line's arguments; None: of this process."""
+    """Parse the command line; arguments: those of this process if None."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "model",
         nargs="?",
         type=Path,
-        help="a model file that model.py wrote (default: model.pt if there is one, else the project's own)",
+        help="model file, written by model.py (default: model.pt if it exists, else the project's own)",
     )
-    parser.add_argument("folder", nargs="?", type=Path, help="save the frames in this folder, which is emptied first")
     parser.add_argument(
-        "--speed", type=float, default=9, help="set speed in mph; the car does at most 30 (default %(default)s)"
+        "folder", nargs="?", type=Path, help="save the frames here; frames saved here earlier are deleted"
+    )
+    parser.add_argument(
+        "--speed",
+        type=float,
+        default=SET_SPEED,
+        help=f"set speed in mph; the car does at most {TOP_SPEED_MPH} (default %(default)g)",
     )
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to listen on (default %(default)s: this machine only; 0.0.0.0: every machine)",
+        help="address to listen on (default %(default)s: this machine only; 0.0.0.0: any machine may connect)",
     )
-    parser.add_argument("--port", type=int, default=4567, help="the simulator uses %(default)s, the default")
+    parser.add_argument(
+        "--port", type=int, default=PORT, help="port to listen on (default %(default)s, which the simulator uses)"
+    )
     parser.add_argument(
         "--device",
         default="cpu",
         choices=["cpu", "cuda"],
-        help="where the network runs (default %(default)s, which is fast enough)",
+        help="device that runs the network (default %(default)s, which is fast enough)",
     )
     args = parser.parse_intermixed_args(arguments)  # the folder may follow options
     if args.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch finds no GPU here; leave it out")
     if not 0 < args.speed < math.inf:
-        parser.error("--speed must be a number of mph above 0")
+        parser.error("--speed must be a number above 0, in mph")
     return args
 
 
 def log_to_stderr() -> None:
-    """Log this program's messages, and each kind of warning once."""
+    """Print the log to stderr, each kind of warning once."""
     handler = logging.StreamHandler()
     handler.addFilter(OncePerKind())
     status_line_end = "\r\033[K" if sys.stderr.isatty() else ""
@@ -312,13 +326,13 @@ def main() -> None:
     """Load the model, listen, and drive until Ctrl-C."""
     args = parse_arguments()
     log_to_stderr()
-    torch.set_num_threads(1)  # a second thread makes one frame slower and less steady
+    torch.set_num_threads(1)  # a second thread would make single frames slower and their latency less regular
     saver = None
     try:
         model = choose_model(args.model, args.folder)
         network = load_model(model, args.device)
         if args.folder:
-            saved_frames.check(args.folder)
+            saved_frames.check_folder(args.folder)
         server = DriveServer(network, args.speed)
         try:
             listener = wire.listen(args.host, args.port)
@@ -328,12 +342,12 @@ def main() -> None:
                 "is another server running? Stop it, or choose another --port"
             ) from None
         if args.folder:
-            server.saver = saver = saved_frames.Saver(args.folder)  # empties the folder, so it comes last
+            server.saver = saver = saved_frames.FrameSaver(args.folder)  # last, because it empties the folder
     except (UserError, OSError) as error:
         sys.exit(f"drive.py: {error}")
     port = listener.getsockname()[1]
     print(
-        f"Driving with {model}{' (the model that comes with the project)' if model == SHIPPED else ''}.\n"
+        f"Driving with {model}{' (the model that comes with the project)' if model == SHIPPED_MODEL else ''}.\n"
         f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
         f"Watch at http://127.0.0.1:{port}/ . Ctrl-C ends.",
         file=sys.stderr,

@@ -7,10 +7,10 @@
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes that share every batch
 
 "The report" is the writeup of Udacity's Behavioral Cloning project that is reproduced here. This file follows it from
-top to bottom: data preprocessing, subdivision, augmentation in a generator, training and validation.
+top to bottom: data preprocessing, data subdivision, augmentation in a generator, training and validation.
 
-A run writes model.pt (of the last epoch, as in the report), model-best.pt (of the lowest validation loss),
-model-resume.pt, training_loss.png, training_log.csv, training_arguments.json and the pictures in diagnostic_images/.
+A run writes model.pt (the last epoch's model, as in the report), model-best.pt (the one with the lowest validation
+loss), model-resume.pt, training_loss.png, training_log.csv, training_arguments.json and pictures in diagnostic_images/.
 """
 
 import functools
@@ -47,17 +47,17 @@ from cloning.training.pieces import PIECE, Batch, SquaredErrors, predict
 from cloning.training.robust import RobustObservations
 from cloning.training.stop import SIGNALS, Interrupted, StopSignals
 
-# The figures of the report's recipe that are not options.
+# The numbers of the report's recipe that are not options.
 STRAIGHT, KEEP_STRAIGHT = 0.02, 0.8  # below this |steering| an observation is kept with this probability
 TURN, JITTER = (0.2, 0.5), 0.01  # within this range of |steering| a copy is added, its angle changed by up to 1 %
-PROBLEM_AREAS, REPEATS = ("-repetitive", "-corrections"), 4  # endings of the names of their recordings
+PROBLEM_AREAS, REPEATS = ("-repetitive", "-corrections"), 4  # a recording whose name ends like this counts so often
 BLOCK_SECONDS, FOLDS = 2.0, 5  # every fifth block of two seconds is for validation
-FLIP, SHADOW = 0.9, 0.8  # probabilities; the unaltered and the brightened image are always added
+FLIP, SHADOW = 0.9, 0.8  # probabilities of these images; the unaltered and the brightened image are always made
 BRIGHTNESS, DARKNESS = (0.4, 1.2), (0.2, 0.5)  # ranges of the factors of HSV value and HLS lightness
-PICTURE_EVERY = 6400  # observations
-SAVE_SECONDS = 30  # between two saved states: a kill loses this much work at most
+PICTURE_EVERY = 6400  # observations between two diagnostic pictures
+SAVE_SECONDS = 30  # between two saved states: the most work that a killed run loses
 
-Kind = TypeVar("Kind", bound=Observations)
+Kind = TypeVar("Kind", bound=Observations)  # the report's or those of --robust
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -65,10 +65,10 @@ Kind = TypeVar("Kind", bound=Observations)
 
 
 def read_observations(kind: type[Kind], folders: list[Path], arguments: Arguments, rejected_file: Path) -> Kind:
-    """Read and filter the recordings (steps 2 to 4 of the report), and print the counts.
+    """Read and filter the recordings (steps 2 to 4 of the report), and print the numbers of rows.
 
-    Images are looked for in the recording's own folder, whatever path its csv has. Unusable rows are listed in
-    `rejected_file`. Raises RecordingError when too few rows are left, and with --strict for the first unusable one.
+    Unusable rows are listed in `rejected_file`. Raises RecordingError if too few rows are left,
+    and with --strict if a row is unusable.
     """
     parts, counts = [], []
     for folder in folders:
@@ -83,50 +83,52 @@ def read_observations(kind: type[Kind], folders: list[Path], arguments: Argument
     print(summary.recordings_table(counts, kind.dropped(arguments)))
     if len(observations) < FOLDS:
         why = kind.too_few if rows.dropped > rows.unusable else f"see {rejected_file}"
-        raise RecordingError(f"{len(observations)} of {rows.read} rows are left, at least {FOLDS} are needed: {why}")
+        raise RecordingError(
+            f"{len(observations)} of {rows.rows_read} rows are left, at least {FOLDS} are needed: {why}"
+        )
     return observations
 
 
 @dataclass
 class ReportObservations(Observations):
-    """The report's steps; with --robust, RobustObservations replaces them with its own."""
+    """Observations for the report's training; with --robust, RobustObservations takes its place."""
 
     label_source: ClassVar[str] = "driver"
     too_few: ClassVar[str] = "--throttle-threshold drops most of them"
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:
-        """What step 3 drops, as the title of a column."""
+        """Return what step 3 drops, as the title of a column."""
         return f"throttle < {arguments.throttle_threshold:g}"
 
     @classmethod
     def select(cls, recording: Recording, arguments: Arguments) -> Self:
         """Step 3: discard observations with little or no throttle; the label is the driver's steering."""
         rows = np.flatnonzero(recording.throttle >= arguments.throttle_threshold).astype(np.int32)
-        number, frame = np.zeros(len(rows), np.int16), center_digests(recording, rows)
-        return cls([recording], number, rows, recording.steering[rows], frame, recording.time[rows])
+        number, digests = np.zeros(len(rows), np.int16), center_digests(recording, rows)
+        return cls([recording], number, rows, recording.steering[rows], digests, recording.time[rows])
 
     def resample(self, seed: int) -> Self:
-        """Steps 5 to 7: under-sample straight driving, over-sample turns with jitter, repeat problem areas."""
+        """Steps 5 to 7: undersample straight driving, oversample turns with jitter, repeat problem areas."""
         rng, size = np.random.default_rng([seed, 1]), np.abs(self.steering)
         kept = np.flatnonzero((size >= STRAIGHT) | (rng.random(len(size)) < KEEP_STRAIGHT))
         turns = np.flatnonzero((size > TURN[0]) & (size <= TURN[1]))
         jittered = self.steering[turns] * (1 + JITTER * rng.uniform(-1, 1, len(turns)))
         rows = np.concatenate([kept, turns])
-        angles = np.concatenate([self.steering[kept], jittered.astype(np.float32)])
+        labels = np.concatenate([self.steering[kept], jittered.astype(np.float32)])
         names = [recording.folder.resolve().name for recording in self.recordings]
         repeats = np.array([REPEATS if name.endswith(PROBLEM_AREAS) else 1 for name in names])
         times = repeats[self.recording[rows]]
-        return self.take(np.repeat(rows, times), np.repeat(angles, times))
+        return self.take(np.repeat(rows, times), np.repeat(labels, times))
 
     def shuffle(self, rng: np.random.Generator) -> np.ndarray:
-        """Step 8: all observations, each once, in random order: int (n,), indices."""
+        """Step 8: return the indices of all observations in random order, int (n,)."""
         return rng.permutation(len(self))
 
     def sample_views(
         self, rows: np.ndarray, cameras: np.ndarray, side_correction: float, rng: np.random.Generator
     ) -> Views:
-        """The image of a random camera for each observation; a side camera's label is corrected."""
+        """Return the given camera's image for each observation; the labels of side cameras are corrected."""
         return CameraViews(self, rows, cameras, side_correction)
 
 
@@ -135,19 +137,19 @@ class ReportObservations(Observations):
 
 
 def split(observations: Observations, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices for training (80 %) and validation (20 %), in blocks of two seconds spread over each recording.
+    """Return the indices for training (80 %) and validation (20 %), in blocks of two seconds of each recording.
 
-    Neighbouring frames are nearly equal, so a random split would validate with what was trained on. All rows of a frame
-    that occurs in several rows or recordings go to the side of the first.
+    Neighbouring frames are nearly equal, so a random split would validate on what was trained on. If several rows have
+    the same frame, all are in the set of the first. Raises RecordingError if there are too few frames.
     """
     n = len(observations)
-    starts = np.ones(n, bool)  # of drives without a break
+    starts = np.ones(n, bool)  # whether a drive without a break starts here
     pause = np.diff(observations.time)
     starts[1:] = (np.diff(observations.recording) != 0) | (pause < 0) | (pause > 1)
     drive = np.cumsum(starts) - 1
     second = observations.time - observations.time[starts][drive]
     block = np.unique(np.stack([drive, second // BLOCK_SECONDS]), axis=1, return_inverse=True)[1].ravel()
-    if block[-1] + 1 < FOLDS:  # a few seconds in total
+    if block[-1] + 1 < FOLDS:  # less than ten seconds in all
         block = np.arange(n) * FOLDS // n
     validation = (block + np.random.default_rng([seed, 0]).integers(FOLDS)) % FOLDS == 0
     _, first, frame = np.unique(observations.frame, return_index=True, return_inverse=True)
@@ -158,42 +160,42 @@ def split(observations: Observations, seed: int) -> tuple[np.ndarray, np.ndarray
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Augmentation
+# Augmentation: from each observation an unaltered, a flipped, a brightened and a shadowed image may be made.
 
 
 class CameraViews(Views):
-    """One camera's image of each observation of a batch, for all four kinds of image."""
+    """One camera's image of each observation of a batch, from which all four kinds of image are made."""
 
     def __init__(self, observations: Observations, rows: np.ndarray, cameras: np.ndarray, side_correction: float):
-        """rows, cameras: int (n,); the left camera's label is `side_correction` higher, the right one's lower."""
+        """rows, cameras: int (n,); side_correction: added to left, subtracted from right labels."""
         self.observations, self.rows, self.cameras = observations, rows, cameras
         self.corrections = np.array([0, side_correction, -side_correction], np.float32)  # centre, left, right
-        angle = observations.steering[rows] + self.corrections[cameras]
-        self.labels = np.stack([angle, -angle, angle, angle], axis=1)
+        label = observations.steering[rows] + self.corrections[cameras]
+        self.labels = np.stack([label, -label, label, label], axis=1)
 
     def images(self, part: np.ndarray) -> list[np.ndarray]:
-        """For each of the four kinds, the images of some of the observations: uint8 (len(part), 75, 320, 3) each."""
+        """Return the images of some observations, int (k,), for each of the four kinds: uint8 (k, 75, 320, 3)."""
         chosen = zip(self.rows[part], self.cameras[part], strict=True)
-        return of_each_kind(np.stack([self.observations.read_cropped(row, camera) for row, camera in chosen]))
+        return kind_inputs(np.stack([self.observations.read_cropped(row, camera) for row, camera in chosen]))
 
     def example(self, i: int) -> Example:
-        """The batch's observation number i, for the diagnostic pictures."""
+        """Return the batch's observation number i for the diagnostic pictures."""
         row, camera = self.rows[i], self.cameras[i]
         frames = [self.observations.read(row, number) for number in range(len(CAMERAS))]
         labels, titles = self.observations.steering[row] + self.corrections, [f"{CAMERAS[camera]} camera", "flipped"]
-        return Example(frames, labels, of_each_kind(frames[camera][None]), 0, titles)
+        return Example(frames, labels, kind_inputs(frames[camera][None]), 0, titles)
 
 
-def of_each_kind(images: np.ndarray) -> list[np.ndarray]:
-    """What unaltered, flipped, brightened and shadowed images are made from: uint8 (n, rows, columns, 3) each."""
+def kind_inputs(images: np.ndarray) -> list[np.ndarray]:
+    """Return the four kinds of image before brightening and shadowing: uint8 (n, rows, columns, 3) each."""
     return [images, images[:, :, ::-1], images, images]
 
 
 def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, to: int, back: int) -> np.ndarray:
-    """Multiply one channel of another colour space, rounded and clipped at 255: uint8 (n, rows, columns, 3).
+    """Multiply one channel of another colour space, rounded and clipped at 255.
 
-    factors: (n,); to, back: OpenCV's codes of conversion. OpenCV gets all images as one tall image, because the
-    interpreter's lock is free during one long call.
+    images: uint8 (n, rows, columns, 3), as the result; factors: (n,); to, back: OpenCV's codes of the conversions.
+    OpenCV is given all images as one tall image, so that other Python threads can run during one long call.
     """
     if not len(images):
         return images
@@ -205,14 +207,14 @@ def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, to: 
 
 
 def brighten(images: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """RGB images, uint8 (n, rows, columns, 3), with their HSV value multiplied, clipped and never wrapped."""
+    """Multiply the HSV value of RGB images, uint8 (n, rows, columns, 3), clipped at 255; factors: (n,)."""
     return multiply_channel(images, 2, factors, cv2.COLOR_RGB2HSV, cv2.COLOR_HSV2RGB)
 
 
 def shade(images: np.ndarray, lines: np.ndarray, left: np.ndarray, factors: np.ndarray, first_row: int) -> np.ndarray:
-    """RGB images, uint8 (n, rows, columns, 3), with the HLS lightness on one side of a line multiplied.
+    """Multiply the HLS lightness of RGB images, uint8 (n, rows, columns, 3), on one side of a line.
 
-    lines: (n, 2), the columns where it meets the top and the bottom edge of the full frame of 160 rows; left: bool
+    lines: (n, 2), the columns at which the line meets the top and bottom of the full frame of 160 rows; left: bool
     (n,), the side; factors: (n,); first_row: the row of the full frame that is the images' first.
     """
     rows = np.arange(first_row, first_row + images.shape[1])
@@ -223,10 +225,10 @@ def shade(images: np.ndarray, lines: np.ndarray, left: np.ndarray, factors: np.n
 
 
 def augment(choices: Choices, part: np.ndarray, images: list[np.ndarray], first_row: int) -> list[Augmented]:
-    """The images of each kind (unaltered, flipped, brightened, shadowed), and which observations have one.
+    """Return the images of the four kinds (unaltered, flipped, brightened, shadowed) that a batch is to have.
 
-    part: indices into the batch; images: what each kind is made from, uint8 (len(part), rows, 320, 3) each; first_row:
-    the row of the full frame that is the images' first.
+    part: int (k,), indices into the batch; images: the four kinds before brightening and shadowing, uint8
+    (k, rows, 320, 3) each; first_row: the row of the full frame that is the images' first.
     """
     unaltered, flipped, bright, dark = images
     flips, shadows = (np.flatnonzero(choices.places[part, kind] >= 0) for kind in (1, 3))
@@ -241,27 +243,27 @@ def augment(choices: Choices, part: np.ndarray, images: list[np.ndarray], first_
 
 
 class Generator:
-    """Endless batches of the training observations: shuffled, a random camera for each, augmented, shuffled.
+    """Makes endless batches: observations in random order, each by a random camera, augmented and shuffled.
 
-    The choices for a batch depend on the seed and its number alone, so that a resumed run, or several processes, make
-    the same batches. The pool's threads make the images, `ahead` batches before they are needed.
+    The choices for a batch depend only on the seed and its number, so that a resumed run, or several processes, make
+    the same batches. The pool's threads make the images, up to `ahead` batches before they are needed.
     """
 
     def __init__(self, observations: Observations, arguments: Arguments, pool: ThreadPoolExecutor, ahead: int):
-        """Make nothing yet; `batches` does."""
+        """pool: makes the images; ahead: number of batches that are made at the same time."""
         self.observations, self.arguments, self.pool, self.ahead = observations, arguments, pool, ahead
         seed = arguments.seed
         self.shuffled = functools.lru_cache(2)(
-            lambda turn: observations.shuffle(np.random.default_rng([seed, 2, turn]))
+            lambda number: observations.shuffle(np.random.default_rng([seed, 2, number]))
         )
 
     def sample(self, number: int) -> Choices:
-        """The random choices for one batch."""
+        """Return the random choices for batch `number`, counted from 0."""
         rng, n = np.random.default_rng([self.arguments.seed, 3, number]), self.arguments.batch_size
         at = np.arange(number * n, (number + 1) * n)
-        turns = at // len(self.observations)
+        passes = at // len(self.observations)  # over all observations, each in another order
         chosen = np.concatenate(
-            [self.shuffled(int(turn))[at[turns == turn] % len(self.observations)] for turn in np.unique(turns)]
+            [self.shuffled(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
         )
         camera = rng.integers(len(CAMERAS), size=n)
         kinds = np.stack([np.ones(n, bool), rng.random(n) < FLIP, np.ones(n, bool), rng.random(n) < SHADOW], axis=1)
@@ -281,41 +283,41 @@ class Generator:
             views=self.observations.sample_views(chosen, camera, self.arguments.side_correction, rng),
         )
 
-    def begin(self, number: int) -> Callable[[], Batch]:
-        """Start making this process's share of a batch; the returned call waits for it."""
+    def start_batch(self, number: int) -> Callable[[], Batch]:
+        """Start making this process's share of batch `number`; return a function that waits for it and returns it."""
         choices = self.sample(number)
         mine = np.arange(self.arguments.batch_size)[rank() :: world()]
         places = choices.places[mine]
-        order = np.sort(places[places >= 0])  # this process's images among all, in the batch's order
-        images, angles = np.empty((len(order), *SEEN_SHAPE), np.uint8), np.empty(len(order), np.float32)
+        order = np.sort(places[places >= 0])  # the places of this process's images among those of the whole batch
+        images, labels = np.empty((len(order), *SEEN_SHAPE), np.uint8), np.empty(len(order), np.float32)
 
         def make(part: np.ndarray) -> None:
             for kind, (which, augmented) in enumerate(augment(choices, part, choices.views.images(part), CROP[0])):
                 at = np.searchsorted(order, choices.places[which, kind])
-                images[at], angles[at] = augmented, choices.views.labels[which, kind]
+                images[at], labels[at] = augmented, choices.views.labels[which, kind]
 
         parts = [self.pool.submit(make, mine[start : start + PIECE]) for start in range(0, len(mine), PIECE)]
 
         def wait() -> Batch:
             for part in parts:
                 part.result()
-            return Batch(images, angles, choices.keep[order], len(choices.keep))
+            return Batch(images, labels, choices.keep[order], len(choices.keep))
 
         return wait
 
     def batches(self, number: int) -> Iterator[Batch]:
-        """The batches from this number on."""
-        begun: deque[Callable[[], Batch]] = deque()
+        """Yield the batches from this number on."""
+        started: deque[Callable[[], Batch]] = deque()
         numbers = itertools.count(number)
 
-        def begin_next() -> None:
-            begun.append(self.begin(next(numbers)))
+        def start_next() -> None:
+            started.append(self.start_batch(next(numbers)))
 
         while True:
-            while len(begun) < self.ahead:
-                begin_next()
-            batch = begun.popleft()()
-            batch.begin_next = begin_next
+            while len(started) < self.ahead:
+                start_next()
+            batch = started.popleft()()
+            batch.start_next = start_next
             yield batch
 
 
@@ -329,7 +331,7 @@ class TrainingRun:
     def __init__(
         self, arguments: Arguments, training: Observations, validation: Observations, resumed: dict | None = None
     ):
-        """Begin a run, or continue the one of a checkpoint. Raises ModelError if it was trained on other data."""
+        """resumed: a checkpoint to continue from, or None. Raises ModelError if it was trained on other data."""
         self.arguments, self.training, self.validation = arguments, training, validation
         self.device = choose_device(arguments.device)
         self.precision = choose_precision(self.device)
@@ -354,7 +356,7 @@ class TrainingRun:
         self.saved_at = time.monotonic()
 
     def train(self) -> None:
-        """Train the epochs that are left, as in the report's log. Raises Interrupted, with the state saved."""
+        """Train the remaining epochs. Raises Interrupted, after saving the state, if a signal stops the run."""
         batches, progress = self.generator.batches(self.progress.number), self.progress
         while len(progress.history) < self.arguments.epochs:
             self.epoch(batches)
@@ -362,7 +364,7 @@ class TrainingRun:
             loss = self.validate()
             progress.seconds += time.monotonic() - started
             is_best, history = progress.finish_epoch(loss), progress.history
-            if rank() == 0:  # the log comes first: a run killed in between repeats the epoch's end, and writes it again
+            if rank() == 0:  # first: a run killed before `save` repeats this
                 write(self.files.log, summary.history_csv(history))
                 write(self.files.losses, loss_picture(history))
             self.save(self.files.last, *[self.files.best] * is_best)
@@ -370,7 +372,7 @@ class TrainingRun:
                 print(summary.epoch_line(history[-1], self.arguments.samples_per_epoch), flush=True)
 
     def epoch(self, batches: Iterator[Batch]) -> None:
-        """Train on batches until the epoch has `samples_per_epoch` images, counted as Keras does."""
+        """Train on whole batches until the epoch has at least `samples_per_epoch` images, as Keras 1 counts."""
         progress, samples = self.progress, self.arguments.samples_per_epoch
         started = time.monotonic() - progress.seconds
         if rank() == 0:
@@ -381,7 +383,7 @@ class TrainingRun:
                 self.write_pictures()
                 batch = next(batches)
                 loss = self.errors(batch)
-                # DistributedDataParallel takes the mean over the processes, each of which has its share of the sum.
+                # DistributedDataParallel takes the mean over the processes, each of which has a share of the sum.
                 (loss * (world() / batch.total)).backward()
                 done = (len(progress.history) + progress.images / samples) / self.arguments.epochs
                 self.optimizer.param_groups[0]["lr"] = self.training.learning_rate(self.arguments, done)
@@ -402,7 +404,7 @@ class TrainingRun:
                     self.save()
 
     def validate(self) -> float:
-        """Mean squared error on the validation sets: 0.2 x samples_per_epoch observations of each, or all it has."""
+        """Return the mean squared error on 0.2 x samples_per_epoch observations, or all, of each validation set."""
         count = min(len(self.validation), self.arguments.samples_per_epoch // 5)
         chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[: max(count, 1)]
         mine = chosen[rank() :: world()]
@@ -413,13 +415,13 @@ class TrainingRun:
         return float(summed(errors / len(self.validation_sets), self.device)) / len(chosen)
 
     def save(self, *models: Path) -> None:
-        """Write these models and the state that --resume needs."""
+        """Write the network to these files, and the state that --resume needs."""
         if rank() == 0:
             self.checkpoint.save(self.progress, *models)
         self.saved_at = time.monotonic()
 
     def write_pictures(self) -> None:
-        """Every 6,400 observations: the first one of the batch, by the three cameras and augmented."""
+        """Write the diagnostic pictures of the batch's first observation, if 6,400 more observations are done."""
         before, now = (n * self.arguments.batch_size for n in (self.progress.number - 1, self.progress.number))
         if rank() or before // PICTURE_EVERY == now // PICTURE_EVERY:
             return
@@ -427,7 +429,7 @@ class TrainingRun:
             write(self.files.pictures / name.format(now // PICTURE_EVERY * PICTURE_EVERY), png)
 
     def summary(self) -> str:
-        """Errors of the last and the best epoch by range of steering, next to those of constant steering."""
+        """Return a table of the errors of the last and the best epoch's models and of constant steering."""
         labels, mean, models = self.validation.steering, self.training.steering.mean(), {}
         for path in (self.files.last, self.files.best):
             network = load_model(path, self.device)
@@ -440,7 +442,7 @@ class TrainingRun:
 
 
 def prepare(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, Observations, Observations, dict | None]:
-    """The completed arguments, the training and the validation observations, and the checkpoint to continue from."""
+    """Return the arguments, the training and validation observations, and the checkpoint to resume or None."""
     arguments, checkpoint = resumed_arguments(arguments, given)
     kind: type[Observations] = RobustObservations if arguments.robust else ReportObservations
     files = RunFiles(arguments.output)
@@ -456,7 +458,7 @@ def prepare(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, Obs
 
 
 def run(arguments: Arguments, given: frozenset[str]) -> None:
-    """Everything that the command does. Raises UserError, OSError, Interrupted, KeyboardInterrupt."""
+    """Read the data, train, and print the summary. Raises UserError, OSError, Interrupted, KeyboardInterrupt."""
     arguments, training, validation, checkpoint = from_first_rank(lambda: prepare(arguments, given))
     training_run = TrainingRun(arguments, training, validation, checkpoint)
     if rank() == 0:
@@ -472,7 +474,7 @@ def run(arguments: Arguments, given: frozenset[str]) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Exit status: 0 done, 1 a file could not be read or written, 2 unusable input, 128 + signal when stopped."""
+    """Run the command; return 0, 1 for a file error, 2 for unusable input, 128 + signal if stopped."""
     arguments, given = parse(argv)
     keep_freed_memory()
     join_processes(arguments.device)

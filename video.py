@@ -2,7 +2,7 @@
 
 python video.py run1                        # run1.mp4, at the rate at which the frames were taken
 python video.py run1 --fps 60
-python video.py run1 --overlay model.pt     # with the steering and what the network looks at
+python video.py run1 --overlay model.pt     # with the model's steering and what it looks at
 """
 
 import argparse
@@ -24,10 +24,10 @@ from cloning.recordings import saved_frames
 from cloning.recordings.format import FRAME, SAMPLE_RATE
 from cloning.recordings.images import jpeg_size
 
-PAUSE = 1.0  # s: a longer gap between two frames is a pause, which says nothing about the rate
-MAX_RATE = 240.0  # frames/s of a film
+MAX_FRAME_GAP = 1.0  # s: a longer gap between two frames is a pause, which does not count for the rate
+MAX_RATE = 240.0  # frames/s that a film is given without --fps
 
-Overlay = Callable[[np.ndarray], np.ndarray]
+Overlay = Callable[[np.ndarray], np.ndarray]  # from a frame to the film's picture, both uint8 (rows, columns, 3), RGB
 
 
 class FilmError(UserError):
@@ -35,7 +35,7 @@ class FilmError(UserError):
 
 
 def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
-    """The folder's frames and their times, in order. Raises FilmError if there are none."""
+    """Return the folder's frames and their times, sorted by time. Raises FilmError if there are none."""
     if not folder.is_dir():
         raise FilmError(f"{folder}: no such folder; `python drive.py model.pt {folder}` saves frames in it")
     frames: list[tuple[datetime, Path]] = []
@@ -48,37 +48,37 @@ def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
             others.append(path.name)
     if not frames:
         raise FilmError(
-            f"{folder}: no frames, which have names like 2018_07_16_17_11_43_382.jpg; "
-            f"`python drive.py model.pt {folder}` saves some"
+            f"{folder}: no frames (files with names like 2018_07_16_17_11_43_382.jpg); "
+            f"`python drive.py model.pt {folder}` saves frames in it"
         )
     if others:
-        report(f"left out, not frames: {abbreviated(sorted(others))}")
+        print_note(f"left out, not frames: {abbreviated(sorted(others))}")
     return sorted(frames)
 
 
 def abbreviated(names: list[str]) -> str:
-    """The first three names and how many more there are."""
+    """Return the first three names, and how many more there are."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def report(message: str) -> None:
-    """Print a message that is not the result."""
+def print_note(message: str) -> None:
+    """Print a message about something that was left out or changed."""
     print(f"video.py: {message}", file=sys.stderr)
 
 
 def frame_rate(times: list[datetime]) -> Fraction:
-    """Frames per second from the frames' times, without pauses, between 1 and 240; a single frame has a recording's.
+    """Return frames per second, 1..240, from the frames' times without pauses; for a single frame, that of recordings.
 
-    The mean rather than the median gap: frames arrive in bunches of two or three.
+    It is the mean, not the median, because frames arrive in bunches of two or three.
     """
     gaps = [(after - before).total_seconds() for before, after in pairwise(times)]
-    gaps = [gap for gap in gaps if gap < PAUSE]
+    gaps = [gap for gap in gaps if gap < MAX_FRAME_GAP]
     rate = min(MAX_RATE, max(1.0, len(gaps) / sum(gaps))) if sum(gaps) else SAMPLE_RATE
     return Fraction(rate).limit_denominator(1000)
 
 
-def read_frame(path: Path) -> np.ndarray | None:
-    """A frame of any size, uint8 (rows, columns, 3), RGB; None if it is unreadable or cut short."""
+def read_saved_frame(path: Path) -> np.ndarray | None:
+    """Return a frame of any size, uint8 (rows, columns, 3), RGB; None if it is unreadable or cut short."""
     try:
         jpeg = path.read_bytes()
         jpeg_size(jpeg)
@@ -87,11 +87,11 @@ def read_frame(path: Path) -> np.ndarray | None:
     return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
 
 
-def film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = None) -> Path:
+def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = None) -> Path:
     """Write `folder`.mp4 next to the folder, and return its path.
 
-    fps: frames/s; None: from the frames' times. overlay: from a frame, uint8 (rows, columns, 3), RGB, to its picture,
-    one size for all. Raises FilmError and OSError.
+    fps: frames/s; None: from the frames' times. overlay: makes each frame's picture; all pictures must have one size.
+    Frames of another size than the first are scaled to it. Raises FilmError, OSError.
     """
     frames = find_frames(folder)
     fps = fps or frame_rate([time for time, _ in frames])
@@ -101,7 +101,7 @@ def film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = No
     writer = FilmWriter(path, fps)
     try:
         for _, frame_path in tqdm(frames, unit="frame", disable=None):
-            frame = read_frame(frame_path)
+            frame = read_saved_frame(frame_path)
             if frame is None:
                 unreadable.append(frame_path.name)
                 continue
@@ -116,16 +116,16 @@ def film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = No
     if not sizes:
         raise FilmError(f"{folder}: none of its {len(frames)} frames is readable; save new ones with drive.py")
     if unreadable:
-        report(f"left out, unreadable: {abbreviated(unreadable)}")
+        print_note(f"left out, unreadable: {abbreviated(unreadable)}")
     if len(sizes) > 1:
-        report(f"{sizes.total() - sizes[first]} frames of another size were scaled to {first[1]}x{first[0]}")
+        print_note(f"{sizes.total() - sizes[first]} frames of another size were scaled to {first[1]}x{first[0]}")
     print(f"{path}: {sizes.total()} frames at {float(fps):.4g} frames/s")
     return path
 
 
 def load_overlay(model_file: Path) -> Overlay:
-    """The overlay with a model's own steering and what it looks at. Raises UserError."""
-    from cloning.pilot import attention  # loads torch, which takes longer than a short film
+    """Return the overlay that shows a model's steering and what it looks at. Raises ModelError."""
+    from cloning.pilot import attention  # imports torch, which takes longer than making a short film
     from cloning.pilot.network import load_model
 
     network = load_model(model_file)
@@ -145,7 +145,7 @@ def load_overlay(model_file: Path) -> Overlay:
 
 
 def parse_rate(text: str) -> Fraction:
-    """A rate of the command line. Raises ValueError unless it is above 0 and at most 1000."""
+    """Parse a rate in frames per second. Raises ValueError unless it is above 0 and at most 1000."""
     rate = Fraction(text)
     if not 0 < rate <= 1000:
         raise ValueError
@@ -153,7 +153,7 @@ def parse_rate(text: str) -> Fraction:
 
 
 def main() -> None:
-    """Make the film that the command line asks for."""
+    """Parse the command line and make the film."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the folder with the frames; the film is FOLDER.mp4")
     parser.add_argument(
@@ -161,9 +161,9 @@ def main() -> None:
     )
     parser.add_argument("--overlay", metavar="MODEL", type=Path, help="draw this model's steering and attention")
     args = parser.parse_args()
-    folder = args.folder if args.folder.name not in ("", "..") else args.folder.resolve()  # so that "." has a name too
+    folder = args.folder if args.folder.name not in ("", "..") else args.folder.resolve()  # a name for "."
     try:
-        film(folder, args.fps, load_overlay(args.overlay) if args.overlay else None)
+        make_film(folder, args.fps, load_overlay(args.overlay) if args.overlay else None)
     except (UserError, OSError) as error:
         sys.exit(f"video.py: {error}")
     except KeyboardInterrupt:

@@ -1,1 +1,1 @@
-"""Behavioral cloning: everything that training, driving and replaying need, apart from the three commands."""
+"""Behavioral cloning: the code shared by model.py, drive.py, video.py and the stand-in simulator."""

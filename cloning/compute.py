@@ -13,7 +13,7 @@ DEVICES = ("auto", "cpu", "cuda", "mps")  # cuda: an NVIDIA GPU; mps: Apple's
 
 
 def is_available(name: str) -> bool:
-    """Whether this machine has one of the DEVICES; `auto` and `cpu` always are."""
+    """Return whether this machine has a device; name: one of the DEVICES, of which `auto` and `cpu` always exist."""
     if name == "cuda":
         return torch.cuda.is_available()
     if name == "mps":
@@ -22,7 +22,10 @@ def is_available(name: str) -> bool:
 
 
 def choose_device(name: str) -> torch.device:
-    """One of the DEVICES, on several GPUs that of this rank; auto: a GPU if there is one, else the CPU."""
+    """Return the device of this name, one of the DEVICES; with several NVIDIA GPUs, the one of this rank.
+
+    auto: a GPU if there is one, else the CPU.
+    """
     if name == "auto":
         name = next((gpu for gpu in ("cuda", "mps") if is_available(gpu)), "cpu")
     if name == "cuda":
@@ -31,7 +34,7 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_precision(device: torch.device) -> torch.dtype:
-    """bfloat16 where the processor has instructions for it (elsewhere it is emulated, and slow), else float32."""
+    """Return bfloat16 if the processor has instructions for it (emulation would be slow), else float32."""
     if device.type == "cuda":
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
@@ -41,8 +44,8 @@ def choose_precision(device: torch.device) -> torch.dtype:
 
 
 def in_precision(precision: torch.dtype, device: torch.device) -> contextlib.AbstractContextManager[object]:
-    """The context in which the network multiplies in this precision; weights and their updates stay float32."""
-    # No weight is used twice in a pass, so that caching their casts would only make the pool's threads wait.
+    """Return the context in which networks compute in this precision; weights and their updates stay float32."""
+    # Without a cache of converted weights: no weight is used twice in a pass, and threads would wait for the cache.
     return torch.autocast(device.type, torch.bfloat16, enabled=precision == torch.bfloat16, cache_enabled=False)
 
 
@@ -51,7 +54,7 @@ def repeatable(device: torch.device) -> None:
     if device.type == "cuda":
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         torch.use_deterministic_algorithms(True, warn_only=True)
-        # A check that costs time and changes no number. torch's stubs lack the attribute.
+        # Filling uninitialised memory costs time and changes no number. torch's stubs lack the attribute.
         torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
 
 
@@ -65,5 +68,5 @@ def keep_freed_memory() -> None:
 
 
 def one_thread() -> None:
-    """Limit this thread to one intra-op thread: the pool's threads, one to a core, leave no core to help it."""
+    """Limit this thread to one intra-op thread, because the threads of its pool already occupy every core."""
     torch.set_num_threads(1)

@@ -1,8 +1,11 @@
-"""Errors that the user can correct: the message names the file, the line and the remedy; commands print it and end."""
+"""Errors that the user can correct.
+
+The message names the file, the line and the remedy. A command prints it to stderr and ends.
+"""
 
 
 class UserError(Exception):
-    """An error that the user can correct; the message says what and how."""
+    """An error that the user can correct; the message says what is wrong and what to do."""
 
 
 class RecordingError(UserError):

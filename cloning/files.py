@@ -1,4 +1,4 @@
-"""Write files so that they are either complete or absent: under a temporary name first, renamed at the end."""
+"""Write files that are either complete or absent: under a temporary name first, renamed at the end."""
 
 import errno
 import os
@@ -13,24 +13,25 @@ def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]
 
     A process killed at any time leaves the old file or the new one, complete. After an exception the temporary file
     is deleted and the old file stays. The block writes and closes the temporary file (which is called `.NAME.part`);
-    if it writes nothing, an existing `path` stays as it is.
+    if the block does not create the temporary file, an existing `path` stays as it is.
 
-    per_process: several processes may write this file at the same time; the last one wins.
+    per_process: give each process its own temporary file, so that several may write `path` at the same time; the last
+    one to finish wins.
     Raises OSError with the name `path`, not the temporary one, for example when the disk is full.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part" if per_process else f".{path.name}.part")
     try:
         with suppress(OSError):
-            temporary.unlink(missing_ok=True)  # of a process that was killed
+            temporary.unlink(missing_ok=True)  # left by a process that was killed
         yield temporary
         if temporary.exists():
             os.replace(temporary, path)
     except BaseException as error:
-        with suppress(OSError):  # the reason why it could not be written matters more
+        with suppress(OSError):  # the first error matters more
             temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename in (None, str(temporary), temporary):
-            reason = error.strerror or str(error)  # NumPy raises OSError with a text alone
+            reason = error.strerror or str(error)  # NumPy's OSError has a message but no errno
             raise OSError(error.errno or errno.EIO, reason, str(path)) from error
         raise
 

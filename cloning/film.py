@@ -25,9 +25,10 @@ class FilmWriter:
     def __init__(self, path: str | Path, rate: Fraction | int, quality: int = 18, preset: str = "medium"):
         """Open the film; it appears at `path` when it is closed.
 
-        rate: frames per second; quality: x264's crf, less is better; preset: x264's. Raises OSError.
+        rate: frames per second; quality: x264's crf, 0..51, lower is better; preset: x264's, slower ones make smaller
+        files. Raises OSError.
         """
-        import av  # large, and needed only here
+        import av  # slow to import, and not needed without a film
 
         self.path, self.rate, self.av = Path(path), rate, av
         self.options = {"crf": str(quality), "preset": preset}
@@ -42,7 +43,7 @@ class FilmWriter:
 
     def add(self, frame: np.ndarray) -> None:
         """Append a frame, uint8 (rows, columns, 3), RGB, of the first frame's size. Raises OSError."""
-        # Each side is even, because yuv420p halves the resolution of colour.
+        # Drop an odd last row or column: yuv420p stores colour at half the resolution.
         frame = np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
         with self._discarded_on_error():
             if self.stream is None:
@@ -51,7 +52,7 @@ class FilmWriter:
             self.container.mux(self.stream.encode(self.av.VideoFrame.from_ndarray(frame, "rgb24")))
 
     def close(self) -> None:
-        """Finish the film and move it to its path; without a frame there is no film. Raises OSError."""
+        """Finish the film and move it to its path; write no film if there is no frame. Raises OSError."""
         if self.stream is None:
             self.discard()
             return
@@ -77,20 +78,22 @@ class FilmWriter:
 
 
 class DriveFilm:
-    """A film of a drive, which continues when the film cannot be: the error is raised at the end, by `close`."""
+    """A film of a drive that never interrupts the drive: `close` raises the error if a frame could not be written."""
 
     def __init__(self, path: str, rate: int, quality: int):
-        """Open the film; rate: frames per second; quality: x264's crf. Raises OutputError."""
+        """Open the film; rate: frames per second; quality: x264's crf, 0..51, lower is better. Raises OutputError."""
         self.path = path
         self.error: OSError | None = None
         try:
-            # A film of a drive is for looking at; with the preset "medium" encoding would take longer than driving.
+            # With the preset "medium", encoding would take longer than driving.
             self.writer = FilmWriter(path, rate, quality, preset="veryfast")
         except OSError as error:
-            raise OutputError(f"{path}: {error.strerror}; give a place where a film can be written") from error
+            raise OutputError(
+                f"{path}: {error.strerror}; name another file, in a folder that can be written"
+            ) from error
 
     def add(self, frame: np.ndarray) -> None:
-        """Append a frame, uint8 (rows, columns, 3), RGB; after an error, do nothing."""
+        """Append a frame, uint8 (rows, columns, 3), RGB; do nothing after an error."""
         if self.error is None:
             try:
                 self.writer.add(frame)
@@ -98,7 +101,7 @@ class DriveFilm:
                 self.error = error
 
     def close(self) -> None:
-        """Finish the film. Raises OutputError if it could not be written; no part of it is left then."""
+        """Finish the film. Raises OutputError if it could not be written; no file is left in that case."""
         try:
             if self.error:
                 raise self.error

@@ -1,4 +1,4 @@
-"""Write the files that a user asked for, such as reports and pictures, with messages that say what to do."""
+"""Write the files that the user asked for, such as reports and pictures; errors say what to do."""
 
 import contextlib
 import json
@@ -10,10 +10,10 @@ from cloning.files import write
 
 
 def check_folders(*paths: str | None) -> None:
-    """Raise OutputError if the folder of a file that will be written is missing: before the work, not after it."""
+    """Raise OutputError if the folder of an output file is missing; call it before the work that makes the output."""
     for path in paths:
         if path and not Path(path).absolute().parent.is_dir():
-            raise OutputError(f"{path}: there is no such folder; make it first")
+            raise OutputError(f"{path}: no such folder to write it in; make the folder first")
 
 
 def write_output(path: str | Path, data: bytes) -> None:
@@ -21,7 +21,7 @@ def write_output(path: str | Path, data: bytes) -> None:
     try:
         write(path, data)
     except OSError as error:
-        raise OutputError(f"{path}: {error.strerror}; give a place that can be written") from error
+        raise OutputError(f"{path}: {error.strerror}; name another file, in a folder that can be written") from error
 
 
 def write_json(path: str | Path, value: Mapping | Sequence) -> None:
@@ -30,9 +30,9 @@ def write_json(path: str | Path, value: Mapping | Sequence) -> None:
 
 
 def run_all(*steps: Callable[[], object]) -> None:
-    """Run every step in order, even if an earlier one fails or is interrupted, so that no output is lost.
+    """Run all steps in order, even if an earlier one fails or is interrupted, so that no output is lost.
 
-    Raises the UserError of a step that failed; that of several holds all their messages.
+    Raises UserError if steps failed, with all their messages; any other exception is raised after the last step.
     """
     failures: list[UserError] = []
 
@@ -42,7 +42,9 @@ def run_all(*steps: Callable[[], object]) -> None:
         except UserError as error:
             failures.append(error)
 
-    with contextlib.ExitStack() as stack:  # calls back in reverse order, and last raises what is no UserError
+    with (
+        contextlib.ExitStack() as stack
+    ):  # runs its callbacks in reverse order, then raises the first exception that is not a UserError
         for step in reversed(steps):
             stack.callback(attempt, step)
     if len(failures) > 1:

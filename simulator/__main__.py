@@ -12,6 +12,7 @@ from cloning.outputs import check_folders, run_all, write_json
 from cloning.replay.autonomy import LIMITS
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.track import ROADS, Track
+from cloning.wire.protocol import PORT
 
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -135,7 +136,7 @@ def add_laps(parser: argparse.ArgumentParser) -> None:
 def add_server(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where drive.py is."""
     parser.add_argument("--host", default="127.0.0.1", help="address of drive.py (default %(default)s)")
-    parser.add_argument("--port", type=int, default=4567, help="port of drive.py (default %(default)s)")
+    parser.add_argument("--port", type=int, default=PORT, help="port of drive.py (default %(default)s)")
 
 
 def add_wait(parser: argparse.ArgumentParser) -> None:

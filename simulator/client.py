@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 from cloning.errors import SimulatorError
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.writer import Clock
+from cloning.recordings.writer import SampleClock
 from cloning.wire.client import (
     CONNECT,
     MANUAL_TELEMETRY,
@@ -94,7 +94,7 @@ class Client(ClientSession):
     def _drive_in_lockstep(self, goal: float, bar: tqdm) -> None:
         """Drive to the goal, in m travelled; simulated time waits for the answer to each of 15 frames per second."""
         self.receive_greeting()
-        clock = Clock(self.run.time + 1 / SAMPLE_RATE)
+        clock = SampleClock(self.run.time + 1 / SAMPLE_RATE)
         while self.run.travelled < goal:
             self.apply(self.receive_unasked())
             begin = time.perf_counter()

@@ -6,7 +6,7 @@ from panda3d.core import Camera, NodePath, TransformState, Vec3
 
 from cloning.film import DriveFilm
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.writer import Clock
+from cloning.recordings.writer import SampleClock
 from simulator.cameras import Buffer, lens
 from simulator.run import Run
 from simulator.world import OUTSIDE, Scene
@@ -32,7 +32,7 @@ class ChaseFilm(DriveFilm):
         """Open the film. Raises OutputError."""
         # At a better quality, rendered frames show no more detail, but the file is five times as large.
         super().__init__(path, SAMPLE_RATE, quality=28)
-        self.scene, self.clock = scene, Clock()
+        self.scene, self.clock = scene, SampleClock()
         self.camera = scene.root.attach_new_node(Camera("film", lens(FILM_ROWS, FILM_COLUMNS)))
         self.camera.node().set_camera_mask(OUTSIDE)
         self.buffer = Buffer(FILM_ROWS, FILM_COLUMNS, [self.camera])

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from cloning.cores import threads
 from cloning.errors import SimulatorError
-from cloning.recordings.writer import EPOCH, Clock, RecordingWriter
+from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
 from simulator import scenery
@@ -80,10 +80,10 @@ def record(
     run = Run(track)
     run.car.speed_limit = speed * MPH
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
-    clock = Clock()
+    clock = SampleClock()
     renderers = min(MAX_RENDERERS, threads())
     with (
-        RecordingWriter(folder, EPOCH + timedelta(days=seed % 10_000)) as recording,
+        RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)) as recording,
         ProcessPoolExecutor(renderers, initializer=_start_renderer) as pool,
         tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None) as bar,
     ):

@@ -18,7 +18,7 @@ from panda3d.core import (
 )
 
 from cloning.errors import SimulatorError
-from cloning.recordings.writer import Clock, RecordingWriter
+from cloning.recordings.writer import RecordingWriter, SampleClock
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
 from cloning.road.motion import MPH
 from cloning.road.track import Track
@@ -91,7 +91,7 @@ class Window(ShowBase):
         if server:
             host, port = server
             self.remote = RemoteDriver(host, port, Cameras(self.scene, ("center",)))
-        self.folder, self.clock, self.recording_on = folder, Clock(), False
+        self.folder, self.clock, self.recording_on = folder, SampleClock(), False
         self.recording: RecordingWriter | None = None
         self.saved = (self.simulation.s, 0.0)  # position to jump back to: m along the track, lateral offset in m
         self.chase = True
@@ -166,9 +166,9 @@ class Window(ShowBase):
     def do_record(self) -> None:
         """Start or stop recording."""
         if self.recording is None:
-            self.recording = RecordingWriter(self.folder, begin=datetime.now())
+            self.recording = RecordingWriter(self.folder, start=datetime.now())
         self.recording_on = not self.recording_on
-        self.clock = Clock(self.simulation.time)
+        self.clock = SampleClock(self.simulation.time)
 
     def do_save(self) -> None:
         """Save the car's position."""

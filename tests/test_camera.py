@@ -5,7 +5,7 @@ import pytest
 import real_recordings
 
 from cloning.recordings.log import read_recording
-from cloning.replay.views import Views
+from cloning.replay.views import StretchViews
 from cloning.road import camera, motion, warp
 
 
@@ -118,7 +118,7 @@ def test_breaks_are_not_driven_over(drawn):
 def test_a_real_centre_frame_warped_to_the_side_cameras_is_theirs(folder):
     recording = read_recording(folder)
     straight = np.flatnonzero(np.abs(recording.steering) < 0.05)[::40]
-    views = Views(recording, motion.Stretch.of(recording, slice(0, len(recording))))
+    views = StretchViews(recording, motion.Stretch.of(recording, slice(0, len(recording))))
     gains = []
     for at in straight:
         for which, side in ((1, camera.CAMERA_OFFSETS["left"]), (2, camera.CAMERA_OFFSETS["right"])):

@@ -15,7 +15,7 @@ from PIL import Image
 import drive
 from cloning.errors import UserError
 from cloning.pilot import attention
-from cloning.pilot.network import SHIPPED, Network
+from cloning.pilot.network import SHIPPED_MODEL, Network
 from cloning.recordings import saved_frames as frames
 from cloning.recordings.images import decode
 
@@ -257,7 +257,7 @@ def test_the_first_rate_of_a_session_counts_from_its_start(session, jpeg, capsys
     session.server.sessions["sid"] = session
     for _ in range(20):
         session.answer(telemetry(jpeg))
-    session.began = time.perf_counter() - 2.0
+    session.started = time.perf_counter() - 2.0
     status.update()
     assert float(capsys.readouterr().err.split()[0]) == pytest.approx(10, rel=0.05)
     status.time, status.session = time.perf_counter() - 61, session  # the next line counts from the last one
@@ -287,7 +287,7 @@ def test_the_folder_may_follow_options(arguments):
 
 def test_which_model_drives(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert drive.choose_model(None, None) == SHIPPED
+    assert drive.choose_model(None, None) == SHIPPED_MODEL
     (tmp_path / "model.pt").touch()
     assert drive.choose_model(None, None) == Path("model.pt")
     assert drive.choose_model(Path("none.pt"), None) == Path("none.pt"), "whose loading tells that it is missing"
@@ -302,8 +302,8 @@ def test_which_model_drives(tmp_path, monkeypatch):
 
 
 def test_each_session_saves_in_a_folder_of_its_own(tmp_path):
-    saver = frames.Saver(tmp_path / "run1")
-    first, second = saver.folder(), saver.folder()
+    saver = frames.FrameSaver(tmp_path / "run1")
+    first, second = saver.start_session(), saver.start_session()
     for n in range(300):  # many within one millisecond
         first.save(b"first %d" % n)
         second.save(b"second %d" % n)
@@ -318,17 +318,17 @@ def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
     folder = tmp_path / "run1"
     folder.mkdir()
     (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
-    frames.empty(folder)
+    frames.empty_folder(folder)
     assert list(folder.iterdir()) == []
     for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "center_2018_07_16_17_11_43_382.jpg"):
         (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
         (folder / foreign).write_bytes(b"mine")
         with pytest.raises(frames.FolderError, match=foreign):
-            frames.empty(folder)
+            frames.empty_folder(folder)
         assert len(list(folder.iterdir())) == 2
         (folder / foreign).unlink()
     with pytest.raises(frames.FolderError, match="not a folder"):
-        frames.empty(Path(__file__))
+        frames.empty_folder(Path(__file__))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import torch
 from drive_process import STOP, script, serving
 
 from cloning.errors import UserError
-from cloning.pilot.network import SHIPPED, load_model, steer
+from cloning.pilot.network import SHIPPED_MODEL, load_model, steer
 from cloning.recordings.images import decode
 from cloning.wire.versions import check_versions
 from tools.simulator_client import Simulator, telemetry
@@ -61,8 +61,8 @@ def test_without_a_model_it_names_and_takes_model_pt_or_the_shipped_one(model_fi
     with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
         simulator.open()
         answer = np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"])
-        assert answer == steer(load_model(SHIPPED), decode(jpegs[0]))
-        assert f"Driving with {SHIPPED} (the model that comes with the project).\n" in process.lines
+        assert answer == steer(load_model(SHIPPED_MODEL), decode(jpegs[0]))
+        assert f"Driving with {SHIPPED_MODEL} (the model that comes with the project).\n" in process.lines
     shutil.copy(model_file, tmp_path / "model.pt")
     with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
         simulator.open()

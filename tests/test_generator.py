@@ -173,7 +173,7 @@ def test_images_and_angles_of_an_observation(generator):
         places = choices.places[i]
         np.testing.assert_array_equal(batch.images[places[0]], jpeg)
         np.testing.assert_allclose(
-            batch.angles[places[places >= 0]], np.array([angle, -angle, angle, angle])[places >= 0], rtol=1e-6
+            batch.labels[places[places >= 0]], np.array([angle, -angle, angle, angle])[places >= 0], rtol=1e-6
         )
         if places[1] >= 0:
             np.testing.assert_array_equal(cv2.flip(batch.images[places[1]], 1), jpeg)  # twice is the identity
@@ -182,9 +182,9 @@ def test_images_and_angles_of_an_observation(generator):
 
 def test_the_benchmarks_batch_is_the_generators(generator):
     made, angles = one_by_one(generator, 3)
-    batch = generator.begin(3)()
+    batch = generator.start_batch(3)()
     assert made.shape == batch.images.shape
-    for ours, theirs in ((batch.images, made), (batch.angles, angles.astype(np.float32))):
+    for ours, theirs in ((batch.images, made), (batch.labels, angles.astype(np.float32))):
         assert sorted(one.tobytes() for one in ours) == sorted(one.tobytes() for one in theirs)
 
 
@@ -205,9 +205,9 @@ def test_two_ranks_make_the_batch_that_one_process_makes(generator, monkeypatch)
     shares = []
     for number in (0, 1):
         monkeypatch.setattr(model, "rank", lambda number=number: number)
-        shares.append(generator.begin(7)())
+        shares.append(generator.start_batch(7)())
     assert [share.total for share in shares] == [whole.total] * 2
-    for name in ("images", "angles", "keep"):
+    for name in ("images", "labels", "keep"):
         both = np.concatenate([getattr(share, name) for share in shares])
         assert sorted(map(bytes, both)) == sorted(map(bytes, getattr(whole, name)))
 

@@ -262,7 +262,7 @@ def test_unusable_weights_are_named_with_the_remedy(tmp_path):
 @pytest.fixture
 def no_weights(tmp_path, monkeypatch):
     """The project without `lane.pt`."""
-    monkeypatch.setattr(reader, "SHIPPED", tmp_path / "lane.pt")
+    monkeypatch.setattr(reader, "SHIPPED_WEIGHTS", tmp_path / "lane.pt")
     load_network.cache_clear()
     yield
     load_network.cache_clear()

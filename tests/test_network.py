@@ -12,7 +12,7 @@ from torch import nn
 
 from cloning.errors import ModelError
 from cloning.files import write
-from cloning.pilot.network import SHIPPED, Network, layer_table, load_model, save_model, steer
+from cloning.pilot.network import SHIPPED_MODEL, Network, layer_table, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.training.pieces import SquaredErrors, squared_errors
 from model import Batch
@@ -85,7 +85,7 @@ def test_pieces_give_the_gradient_of_the_whole_batch(network):
         45,
     )
     cpu = torch.device("cpu")
-    squared_errors(network, torch.float32, cpu, batch.images, batch.angles, batch.keep).backward()
+    squared_errors(network, torch.float32, cpu, batch.images, batch.labels, batch.keep).backward()
     whole = [parameter.grad.clone() for parameter in network.parameters()]
     network.zero_grad()
     with ThreadPoolExecutor(2) as pool:
@@ -168,7 +168,7 @@ def cameras(request, tmp_path_factory) -> list[np.ndarray]:
     folder = tmp_path_factory.mktemp("shipped") / request.param
     command = [sys.executable, "-m", "simulator", "record", str(folder), "--track", request.param, "--laps", "0.1"]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
-    network = load_model(SHIPPED)
+    network = load_model(SHIPPED_MODEL)
     return [
         np.array([steer(network, decode(path.read_bytes())) for path in sorted(folder.glob(f"IMG/{camera}_*.jpg"))])
         for camera in ("center", "left", "right")

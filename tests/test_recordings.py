@@ -221,7 +221,7 @@ def test_a_recording_without_time_stamps_keeps_the_file_order(tmp_path):
 def test_drawn_recording_is_whole(tmp_path):
     found = read_recording(draw_recording(tmp_path / "a b", rows=3))
     check_images(found)
-    assert (found.read, len(found), found.rejected, found.repairs) == (3, 3, [], {})
+    assert (found.rows_read, len(found), found.rejected, found.repairs) == (3, 3, [], {})
 
 
 def test_folders_are_found_below_links_and_each_once(tmp_path):

@@ -37,7 +37,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def recording(folder):
-    return replay.load(folder)
+    return replay.load_recording(folder)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +159,8 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
         [sys.executable, "drive.py", model, "--port", "0"], cwd=ROOT, text=True, stderr=subprocess.PIPE
     )
     try:
-        port = re.search(r":(\d+)\.", server.stderr.readline())[1]
+        said = server.stderr.readline() + server.stderr.readline()  # the model, then the address
+        port = re.search(r"Listening on [\d.]+:(\d+)", said)[1]
         served = run(*folder, "--port", port, "--report", tmp_path / "b.json")
     finally:
         server.terminate()

@@ -145,7 +145,7 @@ def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
     assert "--learning-rate 0.0001, not 0.1" in other.stderr
     changed = run_here(draw_recording(tmp_path / "other", rows=20, seed=1), "--output", output, "--resume")
     assert changed.returncode == 2
-    assert "recordings were others" in changed.stderr
+    assert "the run began with other recordings" in changed.stderr
 
 
 def test_resume_refuses_a_state_that_does_not_fit(begun):

@@ -20,7 +20,8 @@ import pytest
 from cloning.errors import OutputError, SimulatorError
 from cloning.outputs import write_json
 from cloning.road.track import Track
-from cloning.wire.client import FRAGMENT, Answer, parse_answer
+from cloning.wire.client import Answer, parse_answer
+from cloning.wire.protocol import FRAGMENT
 from simulator import report
 from simulator.__main__ import main
 from simulator.client import Client, RemoteDriver, Standstill

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cloning.pilot.telemetry import Unusable, decimal_separator, format_number, parse_number, parse_telemetry
+from cloning.pilot.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_number, parse_telemetry
 
 # -12.3456 with the format "N4", as Mono 6.8 writes it (ar-SA … sv-SE) or a newer runtime does.
 WRITTEN = {
@@ -91,5 +91,5 @@ def test_the_reason_names_the_field():
         ({"speed": "9.0000", "image": "*"}, "not base64"),
         ({"speed": "9.0000", "image": ""}, "empty"),
     ]:
-        with pytest.raises(Unusable, match=reason):
+        with pytest.raises(UnusableTelemetry, match=reason):
             parse_telemetry(message)

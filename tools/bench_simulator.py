@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cloning.errors import SimulatorError, UserError
-from cloning.recordings.format import LOG, SAMPLE_RATE
+from cloning.recordings.format import DRIVING_LOG, SAMPLE_RATE
 from cloning.road.track import ROADS, Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
@@ -72,7 +72,7 @@ def recording(track: str, laps: float) -> Speed:
             raise SimulatorError(
                 f"{' '.join(command)}: exit status {process.returncode}; run it alone to see its message"
             )
-        rows = (Path(folder) / "out" / LOG).read_text(encoding="utf-8").count("\n")
+        rows = (Path(folder) / "out" / DRIVING_LOG).read_text(encoding="utf-8").count("\n")
     simulated = rows / SAMPLE_RATE
     return Speed(simulated / wall, simulated / (usage.ru_utime + usage.ru_stime), peak)
 

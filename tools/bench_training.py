@@ -82,7 +82,7 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
 
     So other load on the machine affects both equally.
     """
-    fixed_batch, write_pictures, turns = run.generator.begin(0)(), run.write_pictures, itertools.count(1)
+    fixed_batch, write_pictures, turns = run.generator.start_batch(0)(), run.write_pictures, itertools.count(1)
     spent, steps = 0.0, 0
 
     def between_batches() -> None:
@@ -112,12 +112,12 @@ def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray",
     import numpy as np
 
     from cloning.recordings.format import FRAME
-    from model import CROP, augment, of_each_kind
+    from model import CROP, augment, kind_inputs
 
     choices, images, angles = generator.sample(number), [], []
     for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
         cropped = generator.observations.read(at, camera)[None, CROP[0] : FRAME[0] - CROP[1]]
-        augmented = augment(choices, np.array([i]), of_each_kind(cropped), CROP[0])
+        augmented = augment(choices, np.array([i]), kind_inputs(cropped), CROP[0])
         for kind, (rows, kind_images) in enumerate(augmented):
             images += list(kind_images)
             angles += [choices.views.labels[i, kind]] * len(rows)

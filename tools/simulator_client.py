@@ -7,7 +7,7 @@ import socket
 import struct
 from types import TracebackType
 
-from cloning.wire.client import FRAGMENT
+from cloning.wire.protocol import FRAGMENT
 
 
 class Simulator:

@@ -1,9 +1,9 @@
-"""The position in the lane at every row of a recording, from its place on one of the two known roads where it has one.
+"""Estimates the position in the lane at every row of a recording, by localising it on a known track if possible.
 
-The centre lines of both tracks are known, so the lane's centre is too, even where no single frame shows it well. An
-extended Kalman filter with a Rauch-Tung-Striebel smoother localises a stretch on a track: steering, speed and time
-stamps predict the rear axle's state, and the lane's centre ahead, as detected by `reader.py`, corrects it. Single
-detections may be wrong.
+The centre lines of both tracks are known. Once a recording is localised on one, the lane's centre is known even where
+no single frame shows it well. An extended Kalman filter with a Rauch-Tung-Striebel smoother localises a stretch:
+steering, speed and time stamps predict the rear axle's state, and the lane's centre ahead, as detected by `reader.py`,
+corrects it. The filter gives less weight to detections that are outliers.
 """
 
 from collections.abc import Iterator
@@ -21,28 +21,28 @@ from cloning.lane.reader import (
 )
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
-from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch
+from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, wrap_angle
 from cloning.road.track import ROADS, Track
 
 # Measurement noise: standard deviation of a detection at each distance ahead, m. Twice that of a single frame, because
 # the errors of consecutive frames are correlated.
 MEASUREMENT_NOISE = (0.3 + 0.08 * DISTANCES_AHEAD) * 2
 OUTLIER_THRESHOLD = 2.0  # standard deviations beyond which a detection gets less weight
-MISSING_DETECTION = 3.0  # standard deviations that count where the track turns out of the camera's view
+MISSING_DETECTION = 3.0  # standard deviations that are counted where the track is out of the camera's view
 # Process noise: standard deviations of (s, lateral offset, heading error) that each row adds: per metre driven, per
-# radian turned, and in any case. A car that turns hard slides.
+# radian turned (a car that turns hard slides), and per row.
 NOISE_PER_METRE, NOISE_PER_RADIAN = np.array([0.03, 0.02, 0]), np.array([0, 0.4, 0.2])
 NOISE_PER_ROW = np.array([0, 0, 0.003])
 # Covariance of the state at a candidate position: m², m², radians²; candidates are up to 4 m off along the track.
 INITIAL_COVARIANCE = np.diag([4.0**2, 4.0, 0.05])
 SLOPE_STEP = 0.5  # m before and behind a distance ahead, over which the centre line's slope is taken
 DISTANCES_WITH_NEIGHBOURS = np.r_[DISTANCES_AHEAD, DISTANCES_AHEAD - SLOPE_STEP, DISTANCES_AHEAD + SLOPE_STEP]
-VISIBLE_POINTS = np.arange(-6, 40)  # of a track, 1 m apart, that may lie at the distances ahead
-PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m of a trajectory whose heading is compared with the tracks', and its step
-SEARCH = ((8, 150), (2, 600))  # in turn: how many of the best candidates the filter follows, over how many rows
-# Stretches shorter than this find a bend that resembles their own on any track.
-MIN_ROWS = 300
-# 300-row pieces of real recordings have -0.25 to 0 on their own track, -0.45 and less on the other.
+VISIBLE_POINTS = np.arange(-6, 40)  # indices, relative to the car, of a track's points that the camera may see
+PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m: part of the trajectory whose heading is compared, and its step
+SEARCH = ((8, 150), (2, 600))  # two rounds: number of the best candidates that the filter follows, and rows
+# A shorter stretch may resemble a bend of any track.
+MIN_LOCALISED_ROWS = 300
+# Stretches of 300 rows of real recordings have -0.25 to 0 on their own track, -0.45 or less on the other.
 MIN_LOG_LIKELIHOOD = -0.35
 
 
@@ -52,7 +52,7 @@ def centre_ahead(
     """Return where a track's centre line lies ahead of a camera: float64 (k,), m to its right.
 
     s: m along the track near which to look; camera: (2,), its x and y, m; heading: radians, as the track's;
-    distances: (k,), m ahead of the camera; nan beyond the point where the track turns back.
+    distances: (k,), m ahead of the camera. The result is nan beyond the point at which the track turns back.
     """
     near = (round(s / track.step) + VISIBLE_POINTS) % len(track.points)
     away = track.points[near, :2] - camera
@@ -65,7 +65,7 @@ def centre_ahead(
 
 @dataclass
 class Localisation:
-    """A stretch of a recording on a known road.
+    """The result of localising a stretch of a recording on a known track.
 
     track           in the direction driven
     states          float64 (n, 3): the rear axle's state in each row: s, m along the track; lateral offset, m to the
@@ -97,8 +97,7 @@ class TrackFilter:
         step, turn, bend = self.step[row], self.turn[row], self.curvature(s)
         slower = max(0.3, 1 - bend * right)  # on the inside of a bend the centre line is the shorter path
         along = step * np.cos(yaw + turn / 2) / slower
-        headings = self.track.at(s).heading - self.track.at(s + along).heading
-        road_turn = (headings + np.pi) % (2 * np.pi) - np.pi
+        road_turn = wrap_angle(self.track.at(s).heading - self.track.at(s + along).heading)
         jacobian = np.array(
             [
                 [1, along * bend / slower, -step * np.sin(yaw)],
@@ -158,7 +157,7 @@ class TrackFilter:
 
 
 def candidate_positions(follower: TrackFilter) -> list[tuple[float, float]]:
-    """Find where on its track a stretch's bends may be, by comparing headings; the best of each few metres.
+    """Find positions on the track at which the road bends like the stretch; only local minima of the deviation.
 
     Returns (deviation, s): the standard deviation of the difference in heading, radians, and m along the track.
     """
@@ -198,7 +197,7 @@ def localise_all(stretches: list[Stretch], centres: np.ndarray) -> Iterator[tupl
     centres: float32 (n, 3, 5): of `reader.detect_centres`, in the recording's rows.
     """
     for stretch in stretches:
-        if len(stretch) >= MIN_ROWS:
+        if len(stretch) >= MIN_LOCALISED_ROWS:
             localisation = localise(stretch, centres[stretch.rows])
             if localisation.log_likelihood > MIN_LOG_LIKELIHOOD:
                 yield stretch.rows, localisation

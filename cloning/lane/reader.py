@@ -1,8 +1,8 @@
 """Estimates the car's lateral offset and heading error in its lane from camera frames, with a small network.
 
-The network detects where the lane's centre lies at some distances ahead of a camera. The car's motion joins the
-detections of successive frames, so that the centre is also known next to the car, where no camera looks: from frames
-taken a second ago. `tools/train_lane.py` trains the network; `lane.pt` holds the weights that come with the project.
+The network detects where the lane's centre lies at some distances ahead of a camera. With the
+car's motion, detections from frames that were taken a second earlier tell the centre next to the car, too, where no
+camera looks. `tools/train_lane.py` trains the network; `lane.pt` holds the weights that come with the project.
 """
 
 import functools
@@ -24,21 +24,21 @@ from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_MATRIX, CAMERA_OFFSETS, LEVEL_CAMERA_MATRIX
 from cloning.road.motion import AXLE_TO_CAMERA, MAX_GAP, REAR_AXLE, Stretch
 
-SHIPPED = Path(__file__).with_name("lane.pt")
+SHIPPED_WEIGHTS = Path(__file__).with_name("lane.pt")
 STRIP_SHAPE = (32, 160, 3)  # rows, columns, RGB
 FIRST_ROW = 60  # of the level frame that a strip shows: the horizon; the bonnet tints the JPEG 64 rows further down
 DISTANCES_AHEAD = np.array([3.0, 4.5, 6.5, 9.0, 13.0], np.float32)  # m from the camera
 MOUNT_OFFSETS = np.array(list(CAMERA_OFFSETS.values()), np.float32)  # m to the right: centre, left, right
-STRIPS_PER_PIECE = 48  # that a thread works through at once
+STRIPS_PER_PIECE = 48  # that a thread computes at once
 
 PAST_ROWS = 40  # earlier rows whose detections may lie next to the car
 FIT_LENGTH = 4.0  # m before and behind the car's middle: detections within this distance decide the fit
 SMOOTHING_ROWS = 15  # one second, over which cameras are compared and residuals averaged
-MAX_CAMERA_ERROR = 0.3  # m, smoothed: from where the side cameras are mounted to where they appear to be
+MAX_CAMERA_ERROR = 0.3  # m, smoothed: difference between the centres that the side cameras and the centre one detect
 MAX_RESIDUAL = 0.9  # m, smoothed: between the detections and the centre line fitted to them
 
-# A strip is a level camera's frame at half the resolution, from FIRST_ROW down. From a strip's pixels to those of the
-# level camera's frame and to those of the real camera's: (3, 3).
+# A strip is a level camera's frame at half the resolution, from FIRST_ROW down. These matrices, (3, 3), lead from a
+# strip's pixels to those of the level camera's frame and to those of the real camera's.
 STRIP_TO_LEVEL = np.array([[2, 0, 0.5], [0, 2, FIRST_ROW + 0.5], [0, 0, 1]])
 STRIP_TO_FRAME = CAMERA_MATRIX @ np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_LEVEL
 
@@ -46,8 +46,8 @@ STRIP_TO_FRAME = CAMERA_MATRIX @ np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_L
 def extract_strip(frame: np.ndarray) -> np.ndarray:
     """Warp a frame's road to what the network sees: uint8 (160, 320, 3) -> uint8 (32, 160, 3).
 
-    At half the resolution, as a camera would see it that looks straight ahead and is not rolled: then the mirror image
-    of a strip is the strip of the mirrored world.
+    The strip has half the resolution and is seen by a camera that looks straight ahead and is not rolled, so that the
+    mirror image of a strip is the strip of the mirrored world.
     """
     return cv2.warpPerspective(
         frame,
@@ -61,7 +61,7 @@ def extract_strip(frame: np.ndarray) -> np.ndarray:
 def normalize(strip: np.ndarray) -> np.ndarray:
     """Scale a strip, uint8, to mean 0 for each colour and a common standard deviation of 1: float32 (32, 160, 3)."""
     mean, deviation = cv2.meanStdDev(strip)
-    scale = 1 / (np.sqrt(np.mean(deviation**2)) + 4)  # + 4: a plain strip's noise must not be amplified
+    scale = 1 / (np.sqrt(np.mean(deviation**2)) + 4)  # + 4, so that the noise of a plain strip is not amplified
     table = (np.arange(256)[:, None] - mean.T) * scale
     return cv2.LUT(strip, table.astype(np.float32)[None])
 
@@ -90,7 +90,7 @@ class LaneNetwork(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack this argument
 
     def forward(self, strips: torch.Tensor) -> torch.Tensor:
-        """Detect the lane's centre; shapes and units stand in the class."""
+        """Detect the lane's centre; shapes and units are in the class's docstring."""
         x = strips.permute(0, 3, 1, 2)  # in memory still channels last
         return self.dense(self.convolutions(x).flatten(1)).float()
 
@@ -103,7 +103,7 @@ class LaneNetwork(nn.Module):
 @functools.cache
 def load_network(path: str | Path | None = None) -> LaneNetwork:
     """Return the network with the weights of a file, or with the shipped ones. Raises ModelError."""
-    path = SHIPPED if path is None else path
+    path = SHIPPED_WEIGHTS if path is None else path
     try:
         weights = torch.load(path, map_location="cpu", weights_only=True)
         network = LaneNetwork()
@@ -121,7 +121,7 @@ def load_network(path: str | Path | None = None) -> LaneNetwork:
 def estimate_centres(strips: np.ndarray, network: LaneNetwork | None = None) -> np.ndarray:
     """Detect the lane's centre in strips, uint8 (n, 32, 160, 3): float32 (n, 5), m to the right of the camera.
 
-    At DISTANCES_AHEAD of it. network: the shipped one if None.
+    The centre is detected at DISTANCES_AHEAD. network: the shipped one if None.
     """
     detector = network or load_network()
     device = torch.device("cpu")
@@ -144,8 +144,8 @@ class LanePosition:
 
     lateral_offset  float32 (n,): m from the lane's centre to the car's middle, right positive
     heading_error   float32 (n,): radians from the road's direction next to the car to the car's, right positive
-    trusted         bool (n,): the cameras' detections agree with their mounting and stay in place while the car drives
-                    on, or the drive was localised on a known road; elsewhere the two values mean nothing
+    trusted         bool (n,): whether the other two values can be relied on: the three cameras' detections agree with
+                    each other and over time, or the row was localised on a known track
     """
 
     lateral_offset: np.ndarray
@@ -170,8 +170,8 @@ def read_strips(recording: Recording) -> np.ndarray:
 def detect_centres(recording: Recording, network: LaneNetwork | None = None) -> np.ndarray:
     """Detect the lane's centre in each row by each camera (centre, left, right): float32 (n, 3, 5).
 
-    m to the right of the camera, at DISTANCES_AHEAD of it. Raises OSError, RecordingError for images that can't be
-    read, ModelError without a usable network.
+    m to the right of the camera, at DISTANCES_AHEAD. Raises OSError, RecordingError for images that can't be read,
+    ModelError without a usable network.
     """
     strips = read_strips(recording).reshape(-1, *STRIP_SHAPE)
     return estimate_centres(strips, network).reshape(-1, 3, len(DISTANCES_AHEAD))
@@ -181,7 +181,7 @@ def fuse_detections(recording: Recording, centres: np.ndarray, stretches: Sequen
     """Estimate the position in the lane from the cameras' detections and the car's motion, on any road.
 
     Detections before a break in time are not used after it. centres: float32 (n, 3, 5), of `detect_centres`;
-    stretches: those of the recording whose trajectory is known already.
+    stretches: of the recording, whose trajectories need not be integrated again.
     """
     centres = centres + MOUNT_OFFSETS[:, None]
     pause = np.diff(recording.time)
@@ -199,7 +199,8 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> tuple[np.ndarray, np.n
 
     centres: float32 (n, 3, 5), m to the right of the car's middle line.
     """
-    camera_error = _smooth(centres[:, 1:] - centres[:, :1])[..., :2]  # nearest: further ahead a metre is few pixels
+    # Only at the two nearest distances: further ahead a metre is few pixels.
+    camera_error = _smooth(centres[:, 1:] - centres[:, :1])[..., :2]
     right, forward, heading = stretch.right, stretch.forward, stretch.heading
     ahead = DISTANCES_AHEAD + AXLE_TO_CAMERA  # of the rear axle, whose trajectory is known
     s, c = np.sin(heading)[:, None], np.cos(heading)[:, None]

@@ -1,4 +1,4 @@
-"""What the network looks at: VisualBackProp (arXiv 1611.05418), and the overlay for the page and the film."""
+"""Visualise what the network looks at, by VisualBackProp (arXiv 1611.05418), and its steering, for page and films."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ GREEN, MAGENTA = (60, 255, 60), (255, 0, 200)  # RGB
 
 
 def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndarray]:
-    """Steering -1..1 for a frame, uint8 (160, 320, 3), RGB, and the attention mask, float32 (160, 320), 0..1.
+    """Return steering, -1..1, and attention mask, float32 (160, 320), 0..1, for a frame, uint8 (160, 320, 3), RGB.
 
     VisualBackProp: the feature maps of each layer are averaged; from the last layer to the first, the average is
     scaled up to the layer below (a transposed convolution with ones) and multiplied with that layer's average.
@@ -23,7 +23,7 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
     maps: list[torch.Tensor] = []
 
     def keep_average(_: nn.Module, __: object, output: torch.Tensor) -> None:
-        # The positive part is what ReLU, which the method is made for, would pass; ELU's negative part is above -1.
+        # Only the positive part: the method is made for ReLU, which passes no other.
         maps.append(output.relu().mean(1, keepdim=True))
 
     layers = [layer for layer in network.convolutions if isinstance(layer, nn.Conv2d)]
@@ -52,16 +52,16 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
 
 
 def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> np.ndarray:
-    """A frame at twice its size, uint8 (320, 640, 3), RGB, with the path ahead at this steering in green.
+    """Return a frame at twice its size, uint8 (320, 640, 3), RGB, with the path ahead at this steering in green.
 
-    steering: -1..1. mask: that of `visual_backprop`, shown in magenta.
+    frame: uint8 (160, 320, 3), RGB; steering: -1..1; mask: of `visual_backprop`, shown in magenta, or None.
     """
     picture = frame.astype(np.float32)
     if mask is not None:
-        strength = np.sqrt(mask)[..., None] * 0.7  # the root makes weak attention visible
+        strength = np.sqrt(mask)[..., None] * 0.7  # the square root makes weak attention visible
         picture = picture * (1 - strength) + np.asarray(MAGENTA, np.float32) * strength
     enlarged = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-    ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides what is nearer
+    ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides the nearer part
     points = project_ground(curvature(steering) * ahead**2 / 2, ahead) * 2
     cv2.polylines(enlarged, [np.round(points).astype(np.int32)], False, GREEN, 3, cv2.LINE_AA)
     return enlarged

@@ -1,4 +1,4 @@
-"""NVIDIA's network and the model file that stores it: everything that driving needs of training."""
+"""NVIDIA's network, the model file that stores it, and the steering computed with it."""
 
 import io
 import platform
@@ -15,20 +15,23 @@ from cloning.files import write
 from cloning.recordings.format import FRAME
 
 FORMAT, VERSION = "behavioral-cloning", 1  # of the model file
-SHIPPED = Path(__file__).with_name("shipped.pt")  # the trained model that comes with the project
-CROP = (60, 25)  # rows cut off the top and the bottom
+SHIPPED_MODEL = Path(__file__).with_name("shipped.pt")  # comes with the project
+CROP = (60, 25)  # rows cut off the top and the bottom of a frame
 UNITS = 4224  # of the flattened layer; dropout keeps half of them
 
 
 class Network(nn.Module):
-    """NVIDIA's network (arXiv 1604.07316) as the report uses it: 559,419 parameters.
+    """NVIDIA's network (arXiv 1604.07316) with dropout, as in the report; 559,419 parameters.
+
+    "The report" is the writeup of Udacity's Behavioral Cloning project that is reproduced here.
 
     forward: frames uint8 (N, 160, 320, 3), RGB, or already cropped (N, 75, 320, 3) -> steering float32 (N,), where
-    -1..1 is the simulator's -25°..25°, positive to the right. keep: bool (N, 4224), what dropout leaves, in training.
+    -1..1 is the simulator's -25°..25°, positive to the right.
+    keep: in training, bool (N, 4224), the units that dropout keeps.
     """
 
     def __init__(self, crop: tuple[int, int] = CROP, scale: float = 127.5, offset: float = 1.0):
-        """Make the layers with random weights.
+        """Make the layers with random weights, from torch's generator.
 
         crop: rows cut off the top and the bottom; a pixel value x enters as x / scale - offset.
         """
@@ -48,7 +51,7 @@ class Network(nn.Module):
         self.dense = nn.ModuleList(nn.Linear(into, out) for into, out in [(UNITS, 100), (100, 50), (50, 10), (10, 1)])
 
     def forward(self, frames: torch.Tensor, keep: torch.Tensor | None = None) -> torch.Tensor:
-        """Steering for frames; the class describes shapes and ranges."""
+        """Compute the steering for frames; shapes and ranges are in the class's docstring."""
         if frames.shape[1] == FRAME[0]:
             frames = frames[:, self.crop[0] : FRAME[0] - self.crop[1]]
         x = frames.permute(0, 3, 1, 2).float().div_(self.scale).sub_(self.offset)  # in memory still channels last
@@ -63,7 +66,7 @@ class Network(nn.Module):
 
 
 def layer_table(network: Network) -> str:
-    """The report's table of layers, with the shapes and counts of this network."""
+    """Return a table of the network's layers, in the format of the report's Keras summary."""
     rows: list[str] = []
     previous, x = "lambda_input_1", torch.zeros(1, FRAME[2], *FRAME[:2])
 
@@ -117,7 +120,7 @@ def save_model(path: Path, network: Network, **more: object) -> None:
 
 
 def versions() -> dict[str, str]:
-    """The versions of Python and of the libraries that the weights and the frames depend on."""
+    """Return the versions of Python and of the libraries on which weights and decoded frames depend."""
     return {
         "python": platform.python_version(),
         "torch": str(torch.__version__),
@@ -127,7 +130,7 @@ def versions() -> dict[str, str]:
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any]:
-    """The contents of a model file, read with weights_only=True. Raises ModelError."""
+    """Return the contents of a model file, read with weights_only=True. Raises ModelError."""
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -147,7 +150,7 @@ def load_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def load_model(path: str | Path, device: str | torch.device = "cpu") -> Network:
-    """The network of a model file, ready to drive. Raises ModelError."""
+    """Return the network of a model file, in evaluation mode on the device. Raises ModelError."""
     saved = load_checkpoint(path)
     try:
         recipe = saved["recipe"]
@@ -162,7 +165,7 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> Network:
 
 
 def steer(network: Network, frame: np.ndarray) -> np.float32:
-    """Steering for a frame, uint8 (160, 320, 3), RGB: -1..1, the number that is sent, shown and drawn.
+    """Return the steering for a frame, uint8 (160, 320, 3), RGB, clipped to -1..1: the number that is sent and shown.
 
     Raises ArithmeticError if the network's output is not finite.
     """

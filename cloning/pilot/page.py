@@ -1,4 +1,4 @@
-"""The page on which to watch the car drive, served by Flask."""
+"""The web page that shows the car driving, made with Flask."""
 
 import base64
 import itertools
@@ -8,17 +8,18 @@ from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple, Protocol
 
-import cv2
 import flask
 import numpy as np
 
 from cloning.pilot import attention
 from cloning.pilot.network import Network
+from cloning.recordings.images import encode
 from cloning.wire import server as wire
 
-HISTORY = 60 * 120  # frames: a minute at 120 frames/s
-SHOWN = 60  # s of driving in the graphs
-PERIOD = 0.1  # s between two pictures
+SHOWN_SECONDS = 60  # of driving in the graphs
+HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
+UPDATE_INTERVAL = 0.1  # s between two pictures
+JPEG_QUALITY = 80  # of the pictures
 
 
 class DrivenFrame(NamedTuple):
@@ -28,14 +29,14 @@ class DrivenFrame(NamedTuple):
     steering: float  # -1..1
     speed: float  # mph
     throttle: float  # -1..1
-    latency: float  # ms in drive.py, from reading the telemetry's first fragment until its answer is ready
+    latency: float  # ms in drive.py, from reading the telemetry's first fragment to its finished answer
 
 
 class Session(Protocol):
     """What the page shows of a connected simulator."""
 
     history: deque[DrivenFrame]
-    frame: np.ndarray | None  # the last one: uint8 (160, 320, 3), RGB
+    frame: np.ndarray | None  # the last driven one: uint8 (160, 320, 3), RGB; None before the first
 
 
 class Server(Protocol):
@@ -44,12 +45,12 @@ class Server(Protocol):
     network: Network
     set_speed: float  # mph
 
-    def watched(self) -> Session | None:
-        """The session to show."""
+    def watched_session(self) -> Session | None:
+        """Return the session to show, or None."""
 
 
 def create_app(server: Server) -> flask.Flask:
-    """The page's web application: `/`, and `/live` with the figures and the picture as server-sent events."""
+    """Return the web application: `/` is the page, `/live` its figures and pictures as server-sent events."""
     app = flask.Flask(__name__)
 
     @app.after_request
@@ -63,7 +64,7 @@ def create_app(server: Server) -> flask.Flask:
 
     @app.get("/")
     def index() -> str:
-        return flask.render_template("index.html", set_speed=server.set_speed)
+        return flask.render_template("index.html", set_speed=server.set_speed, seconds=SHOWN_SECONDS)
 
     @app.get("/live")
     def live() -> flask.Response:
@@ -77,10 +78,14 @@ def create_app(server: Server) -> flask.Flask:
 
 
 def events(server: Server, with_attention: bool) -> Iterator[str]:
-    """Server-sent events: {"session", "rows": [[time, steering, speed, throttle, latency], …], "image"}."""
+    """Yield the figures and the picture as server-sent events, whenever frames have been driven.
+
+    Their JSON is {"session", "rows": [[time, steering, speed, throttle, latency], …], "image"}.
+    with_attention: whether the image shows what the network looks at.
+    """
     shown, last = None, 0.0
     while True:
-        session = server.watched()
+        session = server.watched_session()
         last = last if session is shown else 0.0
         rows = frames_since(session.history, last) if session else []
         if session and rows:
@@ -88,20 +93,19 @@ def events(server: Server, with_attention: bool) -> Iterator[str]:
             event = {"session": id(session), "rows": rows, "image": image(server, session, with_attention)}
             yield f"data: {json.dumps(event)}\n\n"
         else:
-            yield ":\n\n"  # a comment; writing it fails, and so ends this loop, once the page is closed
-        wire.eventlet.sleep(PERIOD)
+            yield ":\n\n"  # a comment: writing it fails once the page is closed, which ends this loop
+        wire.eventlet.sleep(UPDATE_INTERVAL)
 
 
 def frames_since(history: deque[DrivenFrame], last: float) -> list[DrivenFrame]:
-    """The frames of the last minute that are later than `last`, in seconds since 1970."""
-    first = max(last, time.time() - SHOWN)
+    """Return the frames of the last SHOWN_SECONDS that are later than `last`, in seconds since 1970."""
+    first = max(last, time.time() - SHOWN_SECONDS)
     return list(itertools.takewhile(lambda frame: frame.time > first, reversed(history)))[::-1]
 
 
 def image(server: Server, session: Session, with_attention: bool) -> str:
-    """The session's last frame with its overlay, as a data URL."""
+    """Return the session's last frame with its overlay, as a data URL."""
     assert session.frame is not None, "a session with driven frames has a last one"
     mask = attention.visual_backprop(server.network, session.frame)[1] if with_attention else None
     picture = attention.overlay(session.frame, session.history[-1].steering, mask)
-    jpeg = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg.tobytes()).decode()
+    return "data:image/jpeg;base64," + base64.b64encode(encode(picture, JPEG_QUALITY)).decode()

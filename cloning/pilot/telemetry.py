@@ -1,4 +1,4 @@
-"""The simulator's telemetry: the image, the speed, and numbers as every .NET culture writes them."""
+"""Read the simulator's telemetry, with numbers in the format of any .NET culture, and write numbers that it reads."""
 
 import base64
 import math
@@ -11,7 +11,7 @@ import numpy as np
 from cloning.recordings.images import decode
 from cloning.wire.server import MAX_MESSAGE, UNREADABLE
 
-NUMBERS = ("steering_angle", "throttle", "speed")  # degrees, -1..1, mph; the first two are what the car does now
+NUMERIC_FIELDS = ("steering_angle", "throttle", "speed")  # degrees, -1..1, mph; the first two as applied at the moment
 
 # The simulator formats with "N4" of the machine's culture. Mono 6.8 writes -12.3456 as `12.3456-` in 16 Arabic cultures
 # (ar-SA), `- 12.3456` in km-KH and pa-Arab-PK, `- 12,3456` in hr-HR, and 30.5 as `30/5000` in fa-IR. Newer runtimes
@@ -23,12 +23,12 @@ NUMBER = re.compile(
     r"(?:(?P<separator>[.,/\u066b])(?P<decimals>\d+))?(?P<exponent>[eE][-+]?\d+)?"
     r" ?(?P<after>[-)\u2212]?)"
 )
-SIGNS = {"": 1, "+": 1, "-": -1, "()": -1}  # what stands before and after a number
+SIGNS = {"": 1, "+": 1, "-": -1, "()": -1}  # by the characters before and after a number
 MAX_LENGTH = 40  # characters of a number
 
 
-class Unusable(ValueError):
-    """Telemetry that the car cannot be driven with; the message is the reason."""
+class UnusableTelemetry(ValueError):
+    """Telemetry that lacks what driving needs; the message is the reason."""
 
 
 @dataclass(frozen=True)
@@ -48,38 +48,38 @@ class Telemetry:
 def parse_telemetry(message: object) -> Telemetry:
     """Read the image and the speed out of a telemetry message.
 
-    message: the decoded JSON, or UNREADABLE. Raises Unusable. Further fields, readable or not, do not matter.
+    message: the decoded JSON, or UNREADABLE. Other fields are ignored. Raises UnusableTelemetry.
     """
     if message is UNREADABLE:
-        raise Unusable(f"its JSON is incomplete, or it is longer than {MAX_MESSAGE} bytes")
+        raise UnusableTelemetry(f"its JSON is incomplete, or it is longer than {MAX_MESSAGE} bytes")
     if not isinstance(message, dict):
-        raise Unusable("it is not a JSON object")
+        raise UnusableTelemetry("it is not a JSON object")
     for key in ("speed", "image"):
         if key not in message:
-            raise Unusable(f"{key} is missing")
+            raise UnusableTelemetry(f"{key} is missing")
     try:
         speed, _ = parse_number(message["speed"])
     except ValueError as error:
-        raise Unusable("speed is not a number") from error
+        raise UnusableTelemetry("speed is not a number") from error
     try:
         jpeg = base64.b64decode(message["image"], validate=True)
     except (TypeError, ValueError) as error:
-        raise Unusable("the image is not base64") from error
+        raise UnusableTelemetry("the image is not base64") from error
     try:
         return Telemetry(jpeg, decode(jpeg), speed)
     except ValueError as error:
-        raise Unusable(f"the image is unusable: {error}") from error
+        raise UnusableTelemetry(f"the image is unusable: {error}") from error
 
 
 def parse_number(written: object) -> tuple[float, str]:
-    """A finite number and its decimal separator ("" if it has no decimals).
+    """Return a finite number and its decimal separator ("" if it has no decimals).
 
     Raises ValueError for anything that no .NET culture writes for a finite number.
     """
     text = str(written)
     if len(text) > MAX_LENGTH:
         raise ValueError("too long for a number")
-    # Arabic, Hebrew and Persian cultures put invisible marks of the writing direction beside the minus sign.
+    # Arabic, Hebrew and Persian cultures write invisible direction marks next to the minus sign.
     match = NUMBER.fullmatch("".join(character for character in text if unicodedata.category(character) != "Cf"))
     if not match:
         raise ValueError("not a number")
@@ -95,13 +95,13 @@ def parse_number(written: object) -> tuple[float, str]:
 
 
 def decimal_separator(message: object, previous: str) -> str:
-    """The decimal separator of a telemetry message, which is the only one that this simulator reads.
+    """Return the decimal separator of a telemetry message, the only one that its simulator understands.
 
-    previous: the result for a message whose numbers cannot be read or have no decimals.
+    previous: returned for a message whose numbers cannot be read or have no decimals.
     """
     if not isinstance(message, dict):
         return previous
-    for key in NUMBERS:
+    for key in NUMERIC_FIELDS:
         try:
             _, separator = parse_number(message.get(key))
         except ValueError:
@@ -112,5 +112,5 @@ def decimal_separator(message: object, previous: str) -> str:
 
 
 def format_number(value: float | np.floating, separator: str = ".") -> str:
-    """A number as the simulator reads it: without exponent, and exact for a float32."""
+    """Return a number as the simulator reads it: without exponent, and exact for a float32."""
     return np.format_float_positional(np.float32(value), trim="-").replace(".", separator)

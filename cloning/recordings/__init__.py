@@ -1,1 +1,1 @@
-"""Recordings: reads, checks and writes `driving_log.csv` and the images in `IMG/`."""
+"""Recordings: read, check and write `driving_log.csv`, the images in `IMG/`, and the frames that driving saves."""

@@ -1,4 +1,4 @@
-"""Check the images of a recording before it is trained on or replayed."""
+"""Check the images of a recording before training or replaying uses it."""
 
 import hashlib
 import os
@@ -10,22 +10,24 @@ import numpy as np
 from tqdm import tqdm
 
 from cloning.files import written_whole
+from cloning.recordings.format import IMAGE_FOLDER
 from cloning.recordings.images import decode
 from cloning.recordings.log import Recording
 
 
 def check_images(recording: Recording, threads: int = 2, show_progress: bool = True) -> None:
-    """Decode every image of a recording once; leave out the rows whose images cannot be used.
+    """Decode every image of a recording; remove the rows that have an unusable image.
 
-    The results are kept in the user's cache folder, so that a later run does not decode an unchanged file (same size
-    and time of change) again. Sets `digests`; adds file, line and reason to `rejected`.
+    The results are kept in the user's cache folder: an image file that has not changed since (same size and time of
+    change) is not decoded again. Sets `recording.digests`; adds line, kind and detail of each removed row to
+    `recording.rejected`. threads: that decode at the same time.
     """
-    names, folder = recording.names, recording.folder / "IMG"
+    names, folder = recording.names, recording.folder / IMAGE_FOLDER
     states = _file_states(folder, names)
     cache = _cache_file(folder)
-    reasons, digests, fresh = _read_cache(cache, names, states)
+    reasons, digests, changed = _read_cache(cache, names, states)
     reasons[states[:, 0] < 0] = b"missing"
-    todo = np.flatnonzero(fresh & (states[:, 0] >= 0))
+    todo = np.flatnonzero(changed & (states[:, 0] >= 0))
     if len(todo):
 
         def examine(at: int) -> tuple[bytes, int]:
@@ -47,7 +49,9 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
             ) as bar,
         ):
             remaining = iter(todo)
-            while part := list(islice(remaining, 4096)):  # a future for each of millions at once is too many
+            while part := list(
+                islice(remaining, 4096)
+            ):  # in parts, because a future takes memory and there may be millions of images
                 for at, (reason, digest) in zip(part, pool.map(examine, part), strict=True):
                     reasons[at], digests[at] = reason, digest
                     bar.update()
@@ -62,46 +66,49 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
             (
                 int(recording.lines[row]),
                 f"image {reason}",
-                f"IMG/{os.fsdecode(names[image])}: {reason}; copy it again, or delete the row",
+                f"{IMAGE_FOLDER}/{os.fsdecode(names[image])}: {reason}; copy it again, or delete the row",
             )
         )
     recording.keep(~unusable.any(1))
 
 
 def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
-    """Size in bytes and time of change in ns of each named file, -1 if it is missing: int64 (m, 2)."""
+    """Return size in bytes and time of change in ns of each named file, -1 if it is missing: int64 (m, 2)."""
     states = np.full((len(names), 2), -1, np.int64)
     if not folder.is_dir():
         return states
     with os.scandir(folder) as entries:
         while part := list(islice(entries, 8192)):
-            found = np.array([os.fsencode(entry.name) for entry in part])
-            at = np.searchsorted(names, found).clip(max=len(names) - 1)
-            for entry, place in zip(np.array(part)[names[at] == found], at[names[at] == found], strict=True):
-                state = entry.stat()
-                states[place] = state.st_size, state.st_mtime_ns
+            entry_names = np.array([os.fsencode(entry.name) for entry in part])
+            at = np.searchsorted(names, entry_names).clip(max=len(names) - 1)
+            is_wanted = names[at] == entry_names
+            for entry, index in zip(np.array(part)[is_wanted], at[is_wanted], strict=True):
+                status = entry.stat()
+                states[index] = status.st_size, status.st_mtime_ns
     return states
 
 
 def _cache_file(folder: Path) -> Path:
+    """Return the cache file for the images in a folder."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
     return home / "behavioral-cloning" / f"{name}.npz"
 
 
 def _read_cache(cache: Path, names: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For each file: why it cannot be used (b"" if it can), its digest, and whether it is new or changed."""
-    reasons, digests, fresh = np.zeros(len(names), "S80"), np.zeros(len(names), np.uint64), np.ones(len(names), bool)
+    """Return for each file why it is unusable (b"" if it is usable), its digest, and whether it is new or changed."""
+    n = len(names)
+    reasons, digests, changed = np.zeros(n, "S80"), np.zeros(n, np.uint64), np.ones(n, bool)
     try:
         with np.load(cache) as old:
             at = np.searchsorted(old["names"], names).clip(max=len(old["names"]) - 1)
-            fresh = (old["names"][at] != names) | (old["states"][at] != states).any(1)
-            reasons, digests = np.where(fresh, b"", old["reasons"][at]).astype("S80"), old["digests"][at]
+            changed = (old["names"][at] != names) | (old["states"][at] != states).any(1)
+            reasons, digests = np.where(changed, b"", old["reasons"][at]).astype("S80"), old["digests"][at]
     except FileNotFoundError:
         pass  # the first run on this folder
     except (OSError, ValueError, KeyError, EOFError) as error:
-        print(f"{cache}: unreadable ({error}); all images are checked again")
-    return reasons, digests, fresh
+        print(f"{cache}: unreadable ({error}); all images will be checked again")
+    return reasons, digests, changed
 
 
 def _write_cache(cache: Path, names: np.ndarray, states: np.ndarray, reasons: np.ndarray, digests: np.ndarray) -> None:
@@ -110,4 +117,4 @@ def _write_cache(cache: Path, names: np.ndarray, states: np.ndarray, reasons: np
         with written_whole(cache, per_process=True) as temporary, open(temporary, "wb") as file:
             np.savez(file, names=names, states=states, reasons=reasons, digests=digests)
     except OSError as error:
-        print(f"{cache}: {error.strerror}: the next run has to check the images again")
+        print(f"{cache}: {error.strerror}; the next run will check all images again")

@@ -1,9 +1,23 @@
-"""The format of the simulator's recordings: what reading, checking and writing them share."""
+"""The format of the simulator's recordings and of the frames that driving saves, for all that read or write them."""
 
-LOG = "driving_log.csv"
+from datetime import datetime
+
+DRIVING_LOG = "driving_log.csv"
+IMAGE_FOLDER = "IMG"  # next to the csv
 CAMERAS = ("center", "left", "right")  # in the order of a row's images
 NUMBERS = ("steering", "throttle", "brake", "speed")
 COLUMNS = (*CAMERAS, *NUMBERS)
 RANGES = {"steering": (-1, 1), "throttle": (-1, 1), "brake": (-1, 1), "speed": (-100, 100)}  # the car reaches 30 mph
 SAMPLE_RATE = 15  # rows a second
 FRAME = (160, 320, 3)  # rows, columns, RGB of a camera's image
+TIME_STAMP = "%Y_%m_%d_%H_%M_%S_%f"  # in the names of images, with milliseconds in place of microseconds
+
+
+def time_stamp(moment: datetime) -> str:
+    """Return a moment as the names of images contain it, for example 2018_07_16_17_11_43_382."""
+    return moment.strftime(TIME_STAMP)[:-3]
+
+
+def parse_time_stamp(text: str) -> datetime:
+    """Return the moment of a time stamp. Raises ValueError, for example for a thirteenth month."""
+    return datetime.strptime(text + "000", TIME_STAMP)

@@ -1,4 +1,4 @@
-"""Frames: decoded alike in training and in driving, and a recording's `IMG/` checked before it is trained on."""
+"""Encode and decode the JPEGs of frames, in the same way for training, driving and replaying."""
 
 import struct
 from pathlib import Path
@@ -11,9 +11,9 @@ from cloning.recordings.format import FRAME
 
 
 def jpeg_size(jpeg: bytes) -> tuple[int, int]:
-    """Rows and columns of a JPEG from its header, without decoding it.
+    """Return rows and columns of a JPEG from its header, without decoding it.
 
-    Raises ValueError for what is no JPEG, or one that was cut short (no end marker after the scan's start).
+    Raises ValueError if it is not a JPEG, or was cut short (no end marker after the start of the scan).
     """
     if not jpeg:
         raise ValueError("empty")
@@ -33,9 +33,9 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
 
 
 def decode(jpeg: bytes) -> np.ndarray:
-    """A recorded or received JPEG as the network sees it, in training and in driving alike: uint8 (160, 320, 3), RGB.
+    """Decode the JPEG of a recorded or received frame: uint8 (160, 320, 3), RGB.
 
-    Raises ValueError, before decoding, for what is no whole JPEG of 160 rows and 320 columns.
+    Raises ValueError if it is not a whole JPEG of 160 rows and 320 columns; this is checked before decoding.
     """
     rows, columns = jpeg_size(jpeg)
     if (rows, columns) != FRAME[:2]:
@@ -46,10 +46,16 @@ def decode(jpeg: bytes) -> np.ndarray:
     return frame
 
 
+def encode(frame: np.ndarray, quality: int) -> bytes:
+    """Encode a frame, uint8 (rows, columns, 3), RGB, as JPEG; quality: 0..100."""
+    bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
 def read_frame(path: Path) -> np.ndarray:
     """Read and decode a recorded image: uint8 (160, 320, 3), RGB.
 
-    Raises OSError for a file that can't be read, RecordingError for one that isn't a whole JPEG of a frame's size.
+    Raises OSError if the file can't be read, RecordingError if it isn't a whole JPEG of a frame's size.
     """
     try:
         return decode(path.read_bytes())

@@ -1,6 +1,6 @@
-"""Read the folders that the Udacity simulator records: `driving_log.csv`, in every shape that people have it in.
+"""Read recordings of the Udacity simulator, whatever other programs have done to their `driving_log.csv`.
 
-A number that cannot be read for certain is never guessed: its row is left out, with file, line and remedy.
+A number that cannot be read for certain is never guessed: its row is left out and reported with file, line and remedy.
 """
 
 import os
@@ -11,37 +11,36 @@ from pathlib import Path
 import numpy as np
 
 from cloning.errors import RecordingError
-from cloning.recordings.format import COLUMNS, LOG, SAMPLE_RATE
+from cloning.recordings.format import COLUMNS, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE
 from cloning.recordings.plain import PlainRows, as_narrow_as_possible, line_starts, read_blocks, read_plain
 from cloning.recordings.tolerant import TolerantReader
 
 WHERE_TO_GET_RECORDINGS = (
     "Record some in the simulator (training mode, button R), or unpack the public sample data "
-    "there: data/README.md says how. A recording is a folder with driving_log.csv and IMG/."
+    f"there: data/README.md says how. A recording is a folder with {DRIVING_LOG} and {IMAGE_FOLDER}/."
 )
-FINDINGS_SHOWN = 5  # of each kind, so that a damaged recording does not fill the screen
+SHOWN_PER_KIND = 5  # rejected rows that are printed, so that a damaged recording does not fill the screen
 STAMP_LENGTH = 23  # characters of yyyy_MM_dd_HH_mm_ss_fff
 STAMP_SEPARATORS = [4, 7, 10, 13, 16, 19]  # where its underscores are
 
 
 @dataclass
 class Recording:
-    """One folder's rows in the order of their time stamps (of the file where it has none).
+    """The rows of one recording, sorted by their time stamps; without time stamps, in the order of the csv.
 
-    folder   where `driving_log.csv` and `IMG/` are
-    names    bytes (m,): file names in `IMG/`, sorted, each once
-    images   int32 (n, 3): centre, left and right image of a row, indices into `names`
-    steering float32 (n,): -1..1, right is positive
-    throttle float32 (n,): -1..1
-    brake    float32 (n,): -1..1
-    speed    float32 (n,): mph
-    time     float64 (n,): seconds since 1970 on the recording machine; where names have no time stamps, since the
-             csv's beginning
-    lines    int32 (n,): line in the csv, from 1
-    read     rows in the csv, usable or not
-    repairs  what was read otherwise than written: kind -> [rows, first line]
-    rejected rows left out: (line, kind, detail)
-    digests  uint64 (m,): of the image files' contents, once checked
+    folder     contains `driving_log.csv` and `IMG/`
+    names      bytes (m,): file names in `IMG/`, sorted, without duplicates
+    images     int32 (n, 3): indices into `names` of a row's centre, left and right image
+    steering   float32 (n,): -1..1, right positive
+    throttle   float32 (n,): -1..1
+    brake      float32 (n,): -1..1
+    speed      float32 (n,): mph
+    time       float64 (n,): seconds since 1970 by the recording computer's clock; without time stamps, line / 15
+    lines      int32 (n,): line in the csv, from 1
+    rows_read  rows in the csv, usable or not
+    repairs    rows that were interpreted, by kind of repair: kind -> [rows, first line]
+    rejected   rows that were left out: (line, kind, detail)
+    digests    uint64 (m,): of the image files' contents; None before `check_images` has set them
     """
 
     folder: Path
@@ -53,7 +52,7 @@ class Recording:
     speed: np.ndarray
     time: np.ndarray
     lines: np.ndarray
-    read: int
+    rows_read: int
     repairs: dict[str, list[int]] = field(default_factory=dict)
     rejected: list[tuple[int, str, str]] = field(default_factory=list)
     digests: np.ndarray | None = None
@@ -62,71 +61,71 @@ class Recording:
         return len(self.lines)
 
     def keep(self, rows: np.ndarray) -> None:
-        """Keep these rows only, in this order: a mask or indices."""
+        """Keep only these rows, in this order; rows: a mask, bool (n,), or indices."""
         for column in ("images", "steering", "throttle", "brake", "speed", "time", "lines"):
             setattr(self, column, getattr(self, column)[rows])
 
     def name(self, row: int, camera: int = 0) -> str:
-        """The file name of a row's image; camera: 0 centre, 1 left, 2 right."""
+        """Return the file name of a row's image; camera: 0 centre, 1 left, 2 right."""
         return os.fsdecode(self.names[self.images[row, camera]])
 
     def path(self, row: int, camera: int = 0) -> Path:
-        """The file of a row's image; camera: 0 centre, 1 left, 2 right."""
-        return self.folder / "IMG" / self.name(row, camera)
+        """Return the file of a row's image; camera: 0 centre, 1 left, 2 right."""
+        return self.folder / IMAGE_FOLDER / self.name(row, camera)
 
 
 def find_folders(given: list[str]) -> list[Path]:
-    """The folders with a driving_log.csv among and below those given, each once.
+    """Return the recordings (folders with a driving_log.csv) among and below the given folders, without duplicates.
 
-    Raises RecordingError for a folder that does not exist, or has no recording in or below it.
+    Raises RecordingError if a folder does not exist, or if neither it nor a folder below it is a recording.
     """
     folders: dict[Path, Path] = {}
     for name in given:
         path = Path(name)
         if not path.exists():
             raise RecordingError(f"{path}: no such folder. {WHERE_TO_GET_RECORDINGS}")
-        logs = [path / LOG] if (path / LOG).is_file() else sorted(logs_below(path))
+        logs = [path / DRIVING_LOG] if (path / DRIVING_LOG).is_file() else sorted(logs_below(path))
         if not logs:
-            raise RecordingError(f"{path}: no {LOG} in or below it. {WHERE_TO_GET_RECORDINGS}")
+            raise RecordingError(f"{path}: no {DRIVING_LOG} in or below it. {WHERE_TO_GET_RECORDINGS}")
         for log in logs:
             folders.setdefault(log.parent.resolve(), log.parent)
     return list(folders.values())
 
 
 def logs_below(path: Path) -> Iterator[Path]:
-    """Each driving_log.csv at any depth, through symbolic links too: recordings are often on another disk."""
+    """Yield each driving_log.csv below a folder, through symbolic links too: recordings are often on another disk."""
     visited = set()
     for folder, below, files in os.walk(path, followlinks=True):
         if (real := os.path.realpath(folder)) in visited:
-            below.clear()  # a link leads back up
+            below.clear()  # reached a second time, through a link
             continue
         visited.add(real)
-        if LOG in files:
-            yield Path(folder) / LOG
+        if DRIVING_LOG in files:
+            yield Path(folder) / DRIVING_LOG
 
 
 def print_findings(recording: Recording) -> None:
-    """Print what was read otherwise than written, and what was left out: file, line, remedy; five of each kind."""
-    path = recording.folder / LOG
+    """Print a recording's repairs, and the first five rejected rows of each kind, with file, line and remedy."""
+    path = recording.folder / DRIVING_LOG
     for kind, (rows, line) in recording.repairs.items():
         print(f"{path}: line {line}: {kind} ({rows} rows are read this way; check that it is meant)")
     kinds: dict[str, list[tuple[int, str]]] = {}
     for line, kind, detail in recording.rejected:
         kinds.setdefault(kind, []).append((line, detail))
     for rejected in kinds.values():
-        for line, detail in rejected[:FINDINGS_SHOWN]:
+        for line, detail in rejected[:SHOWN_PER_KIND]:
             print(f"{path}: line {line}: left out: {detail}")
-        if len(rejected) > FINDINGS_SHOWN:
-            print(f"{path}: … and {len(rejected) - FINDINGS_SHOWN} more of this kind")
+        if len(rejected) > SHOWN_PER_KIND:
+            print(f"{path}: … and {len(rejected) - SHOWN_PER_KIND} more of this kind")
 
 
 def read_recording(folder: str | Path) -> Recording:
     """Read a folder's `driving_log.csv`; images are in the folder's own `IMG/`, whatever paths the csv has.
 
-    Raises RecordingError for a file that is no such csv, or has no usable row.
+    Raises RecordingError if the file is not such a csv, or has no usable row.
     """
     folder = Path(folder)
-    path = folder / LOG
+    path = folder / DRIVING_LOG
     reader, plain = _read_rows(path)
     lines = np.concatenate([np.array(reader.lines, np.int32), *(rows.lines for rows in plain)])
     if not len(lines):
@@ -135,7 +134,7 @@ def read_recording(folder: str | Path) -> Recording:
     numbers = np.concatenate([np.reshape(reader.numbers, (-1, 4)), *(rows.numbers for rows in plain)])
     columns = np.ascontiguousarray(numbers.astype(np.float32).T)
     names = np.concatenate([np.array(reader.names, bytes).reshape(-1, 3), *(rows.names for rows in plain)])
-    read = reader.rows + sum(len(rows.lines) for rows in plain)
+    rows_read = reader.rows + sum(len(rows.lines) for rows in plain)
     del numbers, plain
     names, images = _unique(names)
     time = _time_stamps(names[images[:, 0]])
@@ -143,14 +142,14 @@ def read_recording(folder: str | Path) -> Recording:
         time = lines / float(SAMPLE_RATE)
     steering, throttle, brake, speed = columns
     recording = Recording(
-        folder, names, images, steering, throttle, brake, speed, time, lines, read, reader.repairs, reader.rejected
+        folder, names, images, steering, throttle, brake, speed, time, lines, rows_read, reader.repairs, reader.rejected
     )
-    recording.keep(np.lexsort((lines, time)))  # people merge sessions out of date order
+    recording.keep(np.lexsort((lines, time)))  # sessions may have been merged in any order
     return recording
 
 
 def _read_rows(path: Path) -> tuple[TolerantReader, list[PlainRows]]:
-    """Have pandas read the plain lines, and the tolerant reader all others in the order of the file."""
+    """Read a csv: plain lines with pandas, all others with the tolerant reader in the order of the file."""
     reader = TolerantReader(path)
     plain: list[PlainRows] = []
     encoding = _encoding(path)
@@ -169,7 +168,10 @@ def _read_rows(path: Path) -> tuple[TolerantReader, list[PlainRows]]:
 
 
 def _read_block(reader: TolerantReader, block: bytes, starts: np.ndarray, first_line: int) -> PlainRows:
-    """Return a block's plain rows, once plain lines have one meaning only; give all other lines to the reader."""
+    """Return the plain rows of a block; the tolerant reader takes all other lines, and all lines until it is settled.
+
+    starts: of the lines, as `line_starts` returns them; first_line: the number of the first line in the csv.
+    """
 
     def read_tolerantly(at: int) -> None:
         text = block[starts[at] : starts[at + 1]].decode("utf-8", "surrogateescape")
@@ -186,7 +188,7 @@ def _read_block(reader: TolerantReader, block: bytes, starts: np.ndarray, first_
 
 
 def _encoding(path: Path) -> str:
-    """The csv's encoding from its first bytes. Raises RecordingError for a file that is not text."""
+    """Return the csv's encoding, judged by its first bytes. Raises RecordingError if it is not text."""
     try:
         with open(path, "rb") as file:
             start = file.read(4)
@@ -195,14 +197,16 @@ def _encoding(path: Path) -> str:
     if start[:2] == b"PK":
         raise RecordingError(f"{path}: line 1: an Excel workbook under a csv's name; open it and save it as CSV")
     if start == b"\x00\x05\x16\x07":
-        raise RecordingError(f"{path}: line 1: a macOS resource file (AppleDouble), not the csv; copy the real {LOG}")
+        raise RecordingError(
+            f"{path}: line 1: a macOS resource file (AppleDouble), not the csv; copy the real {DRIVING_LOG}"
+        )
     return "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
 
 
 def _unique(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sort a row's names and keep each once: bytes (m,), and int32 (n, 3), the place of each name in it.
+    """Return the names, bytes (n, 3), sorted without duplicates, (m,), and the index of each in that: int32 (n, 3).
 
-    As np.unique, but sorted camera by camera with timsort: 0.3 instead of 1.7 s for a million rows in order of time.
+    Like np.unique, but with timsort camera by camera: 0.3 instead of 1.7 s for a million rows in order of time.
     """
     flat = names.T.ravel()
     order = flat.argsort(kind="stable")
@@ -215,7 +219,7 @@ def _unique(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _time_stamps(names: np.ndarray) -> np.ndarray:
-    """Seconds since 1970 from names like center_2018_07_16_17_11_43_382.jpg, nan for others: float64 (m,)."""
+    """Return seconds since 1970 from names like center_2018_07_16_17_11_43_382.jpg, nan for others: float64 (m,)."""
     ends = np.strings.rfind(names, b".")
     stamps = np.strings.slice(names, np.maximum(ends - STAMP_LENGTH, 0), ends).astype(f"S{STAMP_LENGTH}")
     characters = stamps.view(np.uint8).reshape(-1, STAMP_LENGTH)
@@ -226,6 +230,6 @@ def _time_stamps(names: np.ndarray) -> np.ndarray:
     time = np.full(len(names), np.nan)
     try:
         time[is_stamp] = stamps[is_stamp].astype("M8[ms]").astype(np.int64) / 1000
-    except ValueError:  # a thirteenth month: the names are not the simulator's
+    except ValueError:  # such as month 13: the names are not the simulator's
         return np.full(len(names), np.nan)
     return time

@@ -1,6 +1,6 @@
-"""Plain lines of `driving_log.csv`, read by pandas: three image names and four numbers, nothing that needs a decision.
+"""Read the plain lines of `driving_log.csv` with pandas: three image names and four numbers that have one meaning only.
 
-Which lines are plain is decided by their bytes, before pandas sees them; the tolerant reader takes all others.
+The bytes of a line decide whether it is plain, before pandas reads it. The tolerant reader reads all other lines.
 """
 
 import codecs
@@ -16,19 +16,19 @@ import pandas as pd
 
 from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
 
-BLOCK = 2 << 20  # bytes read at a time, about 10,000 lines: enough for pandas, whose calls take 1 ms each
+BLOCK = 2 << 20  # bytes read at a time, about 10,000 lines: so much that the 1 ms of each call of pandas hardly counts
 COMMA, QUOTE, CARRIAGE_RETURN, NEW_LINE, DELETE = b',"\r\n\x7f'
-NEGATIVE_ZERO = re.compile(rb"-0+(?![0-9.])")  # loses its sign in a column that pandas takes for integers
+NEGATIVE_ZERO = re.compile(rb"-0+(?![0-9.])")  # would lose its sign in a column that pandas reads as integers
 SUFFIXES = (b".jpg", b".JPG", b".jpeg", b".JPEG")
 LEAST, GREATEST = np.array([RANGES[name] for name in NUMBERS], float).T
 
-# Control characters: Python takes some of them for blanks where pandas does not.
+# Characters that no plain line contains: quotes, and control characters, some of which are blanks for Python alone.
 ODD = np.zeros(256, bool)
 ODD[:32] = True
 ODD[[CARRIAGE_RETURN, NEW_LINE]] = False
 ODD[[QUOTE, DELETE]] = True
 
-# Windows paths become Unix paths, and what is not ASCII becomes DELETE: folders may have any name, images may not.
+# For pandas, \ becomes / and all that is not ASCII becomes DELETE, which may be in a folder's name but not an image's.
 TO_ASCII = bytes.maketrans(b"\\" + bytes(range(128, 256)), b"/" + bytes([DELETE]) * 128)
 
 
@@ -47,7 +47,7 @@ class PlainRows:
 
 
 def read_blocks(path: Path) -> Iterator[bytes]:
-    """The csv in pieces of whole lines, without the byte order mark that some programs put at the beginning."""
+    """Yield the csv in blocks of whole lines, without the byte order mark that some programs write at its beginning."""
     with open(path, "rb") as file:
         if file.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:
             file.seek(0)
@@ -56,9 +56,9 @@ def read_blocks(path: Path) -> Iterator[bytes]:
 
 
 def line_starts(block: bytes) -> np.ndarray:
-    """Where each line starts, and where the last one ends: int64 (lines + 1,).
+    """Return the index of each line's first byte, and the block's length: int64 (lines + 1,).
 
-    Lines end as in Python's universal newlines: with LF, CRLF or a lone CR.
+    Lines end with LF, CRLF or a single CR, as in Python's universal newlines.
     """
     text = np.frombuffer(block, np.uint8)
     ends = text == NEW_LINE
@@ -69,11 +69,11 @@ def line_starts(block: bytes) -> np.ndarray:
 
 
 def read_plain(block: bytes, starts: np.ndarray, first_line: int) -> tuple[np.ndarray, PlainRows]:
-    """The plain rows of a block, and which of its lines they are: bool (lines,).
+    """Return which lines of a block are plain, bool (lines,), and the rows read from these.
 
-    starts: as `line_starts` gives them; first_line: the number of the block's first line in the csv.
-    A line is plain if the tolerant reader would read the same row from it for certain. If any number in the block
-    cannot be read, or is -0, no line of it counts as plain.
+    starts: as `line_starts` returns them; first_line: the number of the block's first line in the csv.
+    A line is plain if the tolerant reader would certainly read the same row from it. If any number of the block is
+    not a number, or is -0, none of its lines counts as plain.
     """
     is_plain = _has_seven_fields(block, starts)
     if not is_plain.all():
@@ -94,7 +94,7 @@ def read_plain(block: bytes, starts: np.ndarray, first_line: int) -> tuple[np.nd
 
 
 def _has_seven_fields(block: bytes, starts: np.ndarray) -> np.ndarray:
-    """Which lines have seven fields and no odd character: bool (lines,)."""
+    """Return which lines have seven fields and no odd character: bool (lines,)."""
     text = np.frombuffer(block, np.uint8)
     commas = np.diff(np.searchsorted(np.flatnonzero(text == COMMA), starts))
     odd = np.flatnonzero(ODD[text])
@@ -104,13 +104,13 @@ def _has_seven_fields(block: bytes, starts: np.ndarray) -> np.ndarray:
 
 
 def _read_table(text: bytes) -> pd.DataFrame:
-    """Plain lines as a table of COLUMNS: Unix paths, and numbers as int64 or float64, where they are numbers."""
+    """Return plain lines as a table of COLUMNS: paths with /, and the others as int64 or float64 if all are numbers."""
     return pd.read_csv(
         io.BytesIO(text.translate(TO_ASCII)),
         engine="c",
         header=None,
         names=list(COLUMNS),
-        dtype=dict.fromkeys(CAMERAS, object),  # not float for the numbers: it would take True for 1
+        dtype=dict.fromkeys(CAMERAS, object),  # no dtype for the numbers: as float, True would become 1
         skipinitialspace=True,
         quoting=csv.QUOTE_NONE,
         na_filter=False,
@@ -119,5 +119,5 @@ def _read_table(text: bytes) -> pd.DataFrame:
 
 
 def as_narrow_as_possible(names: np.ndarray) -> np.ndarray:
-    """The same names, bytes, in an array only as wide as the longest."""
+    """Return the names, bytes of any shape, in an array whose items are as long as the longest name."""
     return names.astype(f"S{max(1, np.strings.str_len(names).max(initial=0))}")

@@ -1,7 +1,7 @@
-"""Read the lines of `driving_log.csv` that are not plain: headers, quotes, tabs, extra columns, decimal commas, damage.
+"""Read lines of `driving_log.csv` that are not plain: headers, quotes, tabs, extra columns, decimal commas, damage.
 
-The reader decides line by line. A line with more than four numbers waits until the whole file has been seen: only then
-is it known whether the file has decimal points, or commas in their place.
+Most lines are interpreted one by one. A line with more than four numbers has to wait for the end of the file: only then
+is it known whether the file has decimal points or decimal commas.
 """
 
 import csv
@@ -13,7 +13,7 @@ from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
 
 SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE)  # as the simulator writes it
 MERGE_MARKERS = ("<<<<<<<", "=======", ">>>>>>>")  # what git leaves in a file with a conflict
-HEADER_WORDS = {  # other words for the columns, as people's headers begin with them
+HEADER_WORDS = {  # beginnings of other names that headers have for the columns
     "ct": "center",
     "lt": "left",
     "rt": "right",
@@ -24,18 +24,18 @@ HEADER_WORDS = {  # other words for the columns, as people's headers begin with 
 
 
 class TolerantReader:
-    """Collects rows, repairs and rejected rows from lines in the order of the file; call `finish` after the last.
+    """Collects rows, repairs and rejected rows from the lines of a file, in their order; call `finish` at the end.
 
-    rows      rows so far, usable or not
-    names     file names of the images, three for each usable row
-    numbers   steering, throttle, brake, speed of each usable row, one after the other
+    rows      number of rows so far, usable or not
+    names     file names of the images, three for each usable row, in one flat list
+    numbers   steering, throttle, brake, speed of each usable row, in one flat list
     lines     line in the csv of each usable row
-    repairs   what was read otherwise than written: kind -> [rows, first line]
-    rejected  rows left out: (line, kind, detail)
+    repairs   rows that were interpreted, by kind of repair: kind -> [rows, first line]
+    rejected  rows that were left out: (line, kind, detail)
     """
 
     def __init__(self, path: Path):
-        """path: of the csv, for the error messages."""
+        """path: the csv, which error messages name."""
         self.path, self.rows = path, 0
         self.names: list[bytes] = []
         self.numbers: list[float] = []
@@ -49,14 +49,17 @@ class TolerantReader:
 
     @property
     def settled(self) -> bool:
-        """Whether plain lines can no longer change how any other line is read, so that they may be read elsewhere.
+        """Whether plain lines can no longer change how other lines are read, so that pandas may read them.
 
-        After the first row there can be no header, and after the first decimal point no decimal commas.
+        There is no header after the first row, and there are no decimal commas once there is a decimal point.
         """
         return self.rows > 0 and self._points and self._columns in (None, COLUMNS)
 
     def read_line(self, line: int, text: str) -> None:
-        """Read a line; line: its number in the csv, from 1. Raises RecordingError for a first line without meaning."""
+        """Read a line; line: its number in the csv, from 1.
+
+        Raises RecordingError if the first line is neither a row nor a usable header.
+        """
         fields = text.split(",")
         if len(fields) == len(COLUMNS) and '"' not in text and self._columns in (None, COLUMNS):
             names = [_base_name(value) for value in fields[:3]]
@@ -67,14 +70,16 @@ class TolerantReader:
         self._read_odd_line(line, text)
 
     def finish(self) -> None:
-        """Decide the rows with more than four numbers, now that it is known how the file writes fractions."""
+        """Interpret the rows with more than four numbers, because it is known now how the file writes fractions."""
         for line, names, tokens in self._undecided:
             if self._points:
                 self._repair("extra columns ignored", line)
                 self._add_row(line, names, tokens[:4])
                 continue
             readings = _decimal_comma_readings(tokens) if self._commas else []
-            readings = [numbers for numbers in readings if not (float(numbers[1]) and float(numbers[2]))]  # one pedal
+            readings = [
+                numbers for numbers in readings if not (float(numbers[1]) and float(numbers[2]))
+            ]  # never both pedals
             if len(readings) == 1:
                 self._repair("decimal commas", line)
                 self._add_row(line, names, readings[0])
@@ -137,9 +142,9 @@ class TolerantReader:
         return None
 
     def _header(self, line: int, fields: list[str]) -> tuple[str, ...]:
-        """The header's columns under the names of COLUMNS, and other columns under their own.
+        """Return the names of the header's columns: those of COLUMNS where it means them, its own for others.
 
-        Raises RecordingError for a header that lacks columns, except where their places are certain.
+        Raises RecordingError if the header lacks columns, unless their positions are certain.
         """
         columns = tuple(_column(value) or f"{value} ({at})" for at, value in enumerate(fields))
         known = [name for name in columns if name in COLUMNS]
@@ -148,7 +153,7 @@ class TolerantReader:
                 f"{self.path}: line {line}: neither a row nor a header with center and steering: "
                 f"{','.join(fields)[:80]!r}; a header is {','.join(COLUMNS)}"
             )
-        if len(known) < len(COLUMNS):  # some are not named: their places must be the usual ones
+        if len(known) < len(COLUMNS):  # unnamed columns must be at the usual positions
             start = columns.index("center")
             usual = (*columns[:start], *COLUMNS, *columns[start + len(COLUMNS) :])
             if len(columns) != len(usual) or any(
@@ -161,7 +166,7 @@ class TolerantReader:
         return columns
 
     def _add_row(self, line: int, names: list[str], tokens: list[str]) -> None:
-        """Add a row whose columns are certain, if its four numbers are numbers and in range."""
+        """Add a row if its four tokens are numbers in their ranges, else reject it."""
         try:
             numbers = [float(token) for token in tokens]
         except ValueError:
@@ -195,7 +200,7 @@ def _is_image(name: str) -> bool:
 
 
 def _column(name: str) -> str | None:
-    """The column that a header means by `camera_center`, `ct_path`, `SteeringAngle`; None for any other word."""
+    """Return the column that a word such as `camera_center`, `ct_path` or `SteeringAngle` means; None if unknown."""
     name = name.lower().replace("centre", "center")
     for column in COLUMNS:
         if column in name:
@@ -204,9 +209,9 @@ def _column(name: str) -> str | None:
 
 
 def _decimal_comma_readings(tokens: list[str], names: tuple[str, ...] = NUMBERS) -> list[list[str]]:
-    """All ways to join tokens, split at decimal commas, to the numbers of these columns in their ranges.
+    """Return all ways to join tokens, which were split at commas, into numbers of these columns in their ranges.
 
-    The simulator writes neither leading nor trailing zeros: a fraction never ends with 0.
+    The simulator writes no trailing zeros: a fraction never ends with 0.
     """
     if not tokens or not names:
         return [] if tokens or names else [[]]

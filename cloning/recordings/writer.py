@@ -1,5 +1,6 @@
 """Write recordings as the simulator does: IMG/ with three cameras' JPEGs, and driving_log.csv."""
 
+import errno
 import math
 import os
 import re
@@ -8,62 +9,65 @@ from pathlib import Path
 from typing import Self
 
 from cloning.errors import RecordingError
-from cloning.recordings.format import CAMERAS, LOG, SAMPLE_RATE
+from cloning.recordings.format import CAMERAS, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE, time_stamp
 
-# When a recording with seed 0 begins: the same command makes the same file names on any day.
-EPOCH = datetime(2018, 1, 1, 12)
+# The start of a recording with seed 0, so that the same command makes the same file names on any day.
+DEFAULT_START = datetime(2018, 1, 1, 12)
 
 
 def csharp_number(value: float) -> str:
-    """A number as C# writes a float: seven digits, 6.9E-05."""
+    """Return a number as C# writes a float: with seven significant digits, for example 6.9E-05."""
     return re.sub(r"E([+-]\d)$", r"E\g<1>", f"{value:.7G}").replace("-0", "0") if value == 0 else f"{value:.7G}"
 
 
 class RecordingWriter:
-    """Writes samples into a folder.
+    """Writes samples into a folder: three images and a row of `driving_log.csv` each.
 
-    A row is written after its three images are complete, so a process killed at any time leaves a readable folder.
+    The row is written after its images are complete: a process killed at any time leaves a readable recording.
     """
 
-    def __init__(self, folder: str | Path, begin: datetime = EPOCH):
-        """Start a recording; begin: the moment of simulated second 0, for the images' names.
+    def __init__(self, folder: str | Path, start: datetime = DEFAULT_START):
+        """Begin a recording; start: the date and time of simulated second 0, for the names of the images.
 
-        Raises RecordingError if the folder holds a recording already, or cannot be made.
+        Raises RecordingError if the folder already contains a recording, or cannot be made.
         """
         self.folder = Path(folder).absolute()
-        self.images = self.folder / "IMG"
-        log = self.folder / LOG
+        self.images = self.folder / IMAGE_FOLDER
+        log = self.folder / DRIVING_LOG
         if log.exists():
-            raise RecordingError(f"{log} exists already: give another folder, or delete this one")
+            raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
         try:
             self.images.mkdir(parents=True, exist_ok=True)
             self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
         except OSError as error:
-            raise RecordingError(f"{self.folder}: {error.strerror}; give a folder that can be written") from error
-        self.begin = begin
+            raise RecordingError(f"{self.folder}: {error.strerror}; name a folder that can be written") from error
+        self.start = start
         self.rows = 0
 
     def add(
         self, time: float, images: list[bytes], steering: float, throttle: float, brake: float, speed: float
     ) -> None:
-        """Write a sample; time: simulated seconds; images: JPEGs of center, left, right; speed: mph.
+        """Write a sample; time: simulated seconds; images: JPEGs of the centre, left and right camera.
 
-        Raises RecordingError, with nothing half-written, if the disk is full.
+        steering, throttle: -1..1; brake: 0..1; speed: mph. Raises RecordingError if the disk is full; what was written
+        of this sample is then removed.
         """
-        moment = (self.begin + timedelta(seconds=time)).strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
-        paths = [self.images / f"{name}_{moment}.jpg" for name in CAMERAS]
+        stamp = time_stamp(self.start + timedelta(seconds=time))
+        paths = [self.images / f"{name}_{stamp}.jpg" for name in CAMERAS]
         row = ",".join([*map(str, paths), *map(csharp_number, (steering, throttle, brake, speed))]) + "\n"
         size = os.fstat(self.log.fileno()).st_size
         try:
             for path, image in zip(paths, images, strict=True):
                 path.write_bytes(image)
             if self.log.write(row.encode()) != len(row.encode()):
-                raise OSError(28, "No space left on device")
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             for path in paths:
                 path.unlink(missing_ok=True)
             os.ftruncate(self.log.fileno(), size)
-            raise RecordingError(f"{self.folder}: {error.strerror}; the {self.rows} rows before are whole") from error
+            raise RecordingError(
+                f"{self.folder}: {error.strerror}; the {self.rows} rows before it are complete"
+            ) from error
         self.rows += 1
 
     def close(self) -> None:
@@ -77,15 +81,15 @@ class RecordingWriter:
         self.close()
 
 
-class Clock:
-    """Tells after which simulation steps (0.02 s each) a sample is due: 15 a second."""
+class SampleClock:
+    """Tells at which simulation steps a sample is due, 15 a second."""
 
     def __init__(self, start: float = 0.0):
-        """start: simulated seconds; the first sample is due then."""
+        """start: when the first sample is due, simulated seconds."""
         self.taken = math.ceil(start * SAMPLE_RATE - 1e-9)
 
     def due(self, time: float) -> bool:
-        """Whether a sample is due at this time (simulated seconds); if so, it counts as taken."""
+        """Return whether a sample is due at this time, simulated seconds; if so, count it as taken."""
         if time * SAMPLE_RATE < self.taken - 1e-9:
             return False
         self.taken += 1

@@ -1,7 +1,7 @@
-"""Autonomy, NVIDIA's measure of driving (arXiv 1604.07316, section 6): the one definition, for replays and laps."""
+"""Autonomy, NVIDIA's measure of driving (arXiv 1604.07316, section 6), for replays and laps."""
 
-LIMITS = (1.0, 2.5)  # m from the lane centre at which a human takes over: NVIDIA's; the car's side is on the edge line
-INTERVENTION_TIME = 6.0  # s that NVIDIA counts for a human who takes over and brings the car back
+LIMITS = (1.0, 2.5)  # m from the lane centre: NVIDIA's; at the second one, the car's side is on the edge line
+INTERVENTION_TIME = 6.0  # s that NVIDIA counts for an intervention: a human takes over and brings the car back
 
 
 def autonomy(interventions: int, seconds: float) -> float:

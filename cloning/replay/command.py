@@ -12,17 +12,17 @@ from cloning.errors import RecordingError, SimulatorError
 from cloning.outputs import check_folders, run_all, write_json
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.drivers import ModelDriver, ServerDriver
-from cloning.replay.replay import Drive, ReferenceLine, ReplayFrame, Watcher, drive, load, reference_lines
+from cloning.replay.replay import Drive, ReferenceLine, ReplayFrame, Watcher, drive, load_recording, reference_lines
 from cloning.replay.score import ReplayFilm, ReplayReport, replay_report, report_text, write_plot
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user asked for.
+    """The options of the command.
 
     folders                recordings, or folders of recordings
-    model                  a model file to drive with in this process; None: drive.py drives, over the wire
-    host, port, wait       where drive.py is, and seconds to wait for it
+    model                  a model file, to drive with in this process; None: drive.py drives, over the wire
+    host, port, wait       address of drive.py, and seconds to wait for it
     limits                 m from the reference line
     reference              "lane" or "human"
     report, picture, film  files to write, or None; the film shows the drives at the last limit
@@ -43,13 +43,13 @@ class Options:
 def run(options: Options) -> None:
     """Replay the recordings at each limit, print their reports and write the files. Raises UserError.
 
-    After an error or Ctrl-C, the files are still written, with the recordings that were replayed before.
+    After an error or Ctrl-C, the files are still written, with the recordings replayed until then.
     """
     check_folders(options.report, options.picture, options.film)
     folders = find_folders(options.folders)
     in_process = options.model is not None
     driver = ModelDriver(options.model) if options.model else ServerDriver(options.host, options.port, options.wait)
-    # One drive per limit, which may run at the same time; only the one at the last limit is given the film.
+    # One drive per limit; drives may run at the same time, so only the one at the last limit is filmed.
     watchers: dict[float, Watcher | None] = dict.fromkeys(options.limits)
     film = ReplayFilm(options.film) if options.film else None
     if film:
@@ -58,7 +58,7 @@ def run(options: Options) -> None:
 
     def replay_all() -> None:
         for folder in folders:
-            recording = load(folder)
+            recording = load_recording(folder)
             lines = reference_lines(recording, options.reference == "lane")
             if not lines:
                 raise RecordingError(f"{folder}: no two seconds of driving without a break to replay")

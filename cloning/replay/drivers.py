@@ -8,7 +8,7 @@ from cloning.wire.session import ClientSession
 
 
 class ServerDriver(ClientSession):
-    """Sends drive.py the telemetry that the simulator would send, and steers as it answers."""
+    """Sends drive.py the telemetry that the simulator would send, and returns the steering of its answers."""
 
     def __init__(self, host: str, port: int, wait: float):
         """wait: see ClientSession."""
@@ -16,7 +16,7 @@ class ServerDriver(ClientSession):
         self.steering = self.throttle = 0.0  # as last commanded
 
     def __call__(self, frame: ReplayFrame) -> float:
-        """Return the steering, -1..1. Raises SimulatorError if the server is away or does not answer for too long."""
+        """Return the steering, -1..1. Raises SimulatorError if the server is missing, or silent, for too long."""
         packet = telemetry_packet(self.steering, self.throttle, frame.speed, frame.jpeg())
         while True:
             try:
@@ -39,7 +39,7 @@ class ModelDriver:
 
     def __init__(self, model: str):
         """Load the model. Raises ModelError."""
-        import torch  # large, and not needed to drive over the wire
+        import torch  # slow to import, and not needed to drive over the wire
 
         from cloning.pilot.network import load_model, steer
 

@@ -1,8 +1,8 @@
-"""A recording replayed as if a model drove it: NVIDIA's evaluation (arXiv 1604.07316, section 6).
+"""Replay a recording as if a model drove it: NVIDIA's evaluation (arXiv 1604.07316, section 6).
 
-The driver is shown each recorded frame as the camera would see it from the pose to which the driver's steering has
-brought the car. The pose is integrated from the difference between that steering and the human driver's. When the car
-is further from the reference line than a limit, it is set back onto the line and an intervention is counted.
+The driver (a model) is shown each recorded frame as the camera would see it from the car's pose, which is integrated
+from the difference between the model's steering and the human driver's. When the car is further from the reference line
+than a limit, it is set back onto the line and an intervention is counted.
 """
 
 import functools
@@ -10,19 +10,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from cloning.recordings.check import check_images
-from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.images import encode
 from cloning.recordings.log import Recording, read_recording
 from cloning.replay.autonomy import autonomy
-from cloning.replay.views import Views
+from cloning.replay.views import StretchViews
 from cloning.road.camera import VIEW_JPEG_QUALITY
-from cloning.road.motion import MIN_TRUSTED, MPH, OFF_ROAD, REAR_AXLE, Stretch, curvature, lagged_curvature, stretches
+from cloning.road.motion import (
+    MIN_STRETCH_ROWS,
+    MIN_TRUSTED,
+    MPH,
+    OFF_ROAD,
+    REAR_AXLE,
+    Stretch,
+    curvature,
+    lagged_curvature,
+    stretches,
+)
 
-MAX_YAW = 1.2  # radians to the human driver's heading: views further to the side cannot be warped from the frames
-MIN_ROWS = 2 * SAMPLE_RATE  # of a stretch that is replayed: two seconds
+MAX_YAW_FROM_HUMAN = 1.2  # radians: views further to the side cannot be warped from the frames
 
 
 @dataclass(frozen=True)
@@ -32,7 +40,7 @@ class ReferenceLine:
     stretch         of the recording
     offset          float64 (n,): m from the line to the human driver's car, right positive
     yaw             float64 (n,): radians from the line to the human driver's heading, right positive
-    is_lane_centre  otherwise it is the human driver's path, and offset and yaw are 0
+    is_lane_centre  if not, the line is the human driver's path, and offset and yaw are 0
     """
 
     stretch: Stretch
@@ -48,7 +56,7 @@ class ReferenceLine:
 
 @dataclass
 class Drive:
-    """What happened in one replay of a recording at one limit; each list has an entry per row driven.
+    """The result of one replay of a recording at one limit; each list has an entry per row driven.
 
     limit                m from the reference line
     row                  of the recording
@@ -74,23 +82,23 @@ class Drive:
         return autonomy(len(self.interventions), sum(self.seconds))
 
 
-def load(folder: str | Path) -> Recording:
-    """Read a recording, its complete rows without duplicates. Raises RecordingError."""
+def load_recording(folder: str | Path) -> Recording:
+    """Read a recording without unusable rows and without repetitions of the row before. Raises RecordingError."""
     recording = read_recording(folder)
     check_images(recording)
-    recording.keep(np.r_[True, np.diff(recording.images[:, 0]) != 0])  # over-sampled rows follow one another
+    recording.keep(np.r_[True, np.diff(recording.images[:, 0]) != 0])  # copies of oversampled rows follow one another
     return recording
 
 
 def reference_lines(recording: Recording, by_lane: bool = True) -> list[ReferenceLine]:
     """Return the reference lines of the stretches to replay.
 
-    by_lane: the lane centre where its estimate is trusted, without the parts where the human driver is off the road;
-    otherwise, and elsewhere, the human driver's path.
+    by_lane: use the lane centre in stretches in which its estimate is trusted, and leave out the parts in which the
+    human driver is off the road; in other stretches, and if not by_lane, use the human driver's path.
     """
     lines, driven = [], stretches(recording)
     if by_lane:
-        from cloning.lane.place import estimate_lane_position  # which loads torch
+        from cloning.lane.place import estimate_lane_position  # imports torch
 
         lane = estimate_lane_position(recording, driven)
         offset, yaw, trusted = lane.lateral_offset, lane.heading_error, lane.trusted
@@ -108,7 +116,7 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
         on_road = np.r_[False, np.abs(offsets) < OFF_ROAD, False]
         starts, ends = (np.flatnonzero(np.diff(on_road.astype(int)) == sign) for sign in (1, -1))
         for a, b in zip(starts.tolist(), ends.tolist(), strict=True):
-            if b - a >= MIN_ROWS:
+            if b - a >= MIN_STRETCH_ROWS:
                 part = stretch
                 if b - a < len(stretch):
                     part = Stretch.of(recording, slice(rows.start + a, rows.start + b))
@@ -153,7 +161,7 @@ class ReplayedCar:
         self.right = float(-self.line.offset[at] - REAR_AXLE * np.sin(self.yaw))
 
     def move(self, at: int, steering: float) -> None:
-        """Drive from a row to the next one, level with the human driver: on the inside of a bend more slowly."""
+        """Drive from a row to the next one, next to the human driver: on the inside of a bend more slowly."""
         seconds = float(self.seconds[at])
         human = float(curvature(self.human_steering[at]))
         self.human_curvature = lagged_curvature(self.human_curvature, human, seconds)
@@ -162,13 +170,13 @@ class ReplayedCar:
         step = human_step * (1 - self.human_curvature * self.right) / np.cos(self.yaw)
         turn = self.curvature * step - self.human_curvature * human_step
         self.right += step * np.sin(self.yaw + turn / 2)
-        self.yaw = float(np.clip(self.yaw + turn, -MAX_YAW, MAX_YAW))
+        self.yaw = float(np.clip(self.yaw + turn, -MAX_YAW_FROM_HUMAN, MAX_YAW_FROM_HUMAN))
 
 
 class ReplayFrame:
-    """What a driver is given at one row: the view from the car's pose, warped only when it is asked for."""
+    """What a driver is given at one row: speed, and the view from the car's pose, warped when it is first used."""
 
-    def __init__(self, recording: Recording, views: Views, car: ReplayedCar, at: int):
+    def __init__(self, recording: Recording, views: StretchViews, car: ReplayedCar, at: int):
         self.views, self.at, self.pose = views, at, (car.right, car.yaw)
         self.row = car.line.rows.start + at
         self.speed = float(recording.speed[self.row])  # mph
@@ -188,21 +196,23 @@ class ReplayFrame:
         """Return the view as JPEG; at the human driver's pose, the recorded file itself."""
         if not any(self.pose):
             return self.views.jpeg(self.at)
-        bgr = cv2.cvtColor(self.view, cv2.COLOR_RGB2BGR)
-        return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, VIEW_JPEG_QUALITY])[1].tobytes()
+        return encode(self.view, VIEW_JPEG_QUALITY)
 
 
-Driver = Callable[[ReplayFrame], float]  # from what it sees to steering, -1..1
+Driver = Callable[[ReplayFrame], float]  # returns steering, -1..1
 Watcher = Callable[[ReplayFrame, Drive], None]
 
 
 def drive(
     recording: Recording, lines: list[ReferenceLine], limit: float, driver: Driver, watch: Watcher | None = None
 ) -> Drive:
-    """Replay a recording at one limit, in m; `watch` is called after each row."""
+    """Replay a recording at one limit.
+
+    lines: of `reference_lines`; limit: m from the reference line; watch: called after each row, or None.
+    """
     done = Drive(limit)
     for line in lines:
-        car, views = ReplayedCar(recording, line), Views(recording, line.stretch)
+        car, views = ReplayedCar(recording, line), StretchViews(recording, line.stretch)
         for at in range(len(car)):
             if abs(offset := car.offset(at)) > limit:
                 if at:

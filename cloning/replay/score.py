@@ -1,4 +1,4 @@
-"""Metrics of replayed recordings: as a report, as text, as a plot and as a film."""
+"""Replay metrics, as a report, as text, as a plot and as a film."""
 
 import io
 from pathlib import Path
@@ -38,7 +38,7 @@ class SteeringMetrics(TypedDict):
 
 
 class Intervention(TypedDict):
-    """Where a drive was set back: the centre image, seconds driven, and metres right of the reference line."""
+    """An intervention: the centre image's name, seconds driven until then, and metres right of the reference line."""
 
     image: str
     seconds: float
@@ -46,7 +46,7 @@ class Intervention(TypedDict):
 
 
 class LimitReport(DrivingMetrics):
-    """The metrics of the drive at one limit; compared: those of drivers that look at no image."""
+    """The metrics of the drive at one limit; compared: those of the yardsticks, by name."""
 
     steering: SteeringMetrics
     where: list[Intervention]
@@ -56,8 +56,8 @@ class LimitReport(DrivingMetrics):
 class ReplayReport(TypedDict):
     """The report of one recording.
 
-    reference_asked: "lane" or "human"; reference: rows measured from the lane centre, and from the human's way (the
-    human driver's path); limits: by the limit in metres; steering_compared: that of drivers that look at no image.
+    reference_asked: "lane" or "human"; reference: number of rows measured from the lane centre, and from the human's
+    way (the human driver's path); limits: by the limit in metres; steering_compared: of constant steering.
     """
 
     recording: str
@@ -98,7 +98,7 @@ def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list
     """Return the report of a recording's drives, one per limit, with those of three yardsticks.
 
     The yardsticks are steering 0, the recording's mean steering, and the human driver's own steering.
-    asked: the reference that was asked for, "lane" or "human".
+    lines: of `reference_lines`; asked: the reference that the user chose, "lane" or "human".
     """
     human = np.array(drives[0].human_steering)
     mean = float(recording.steering.mean())
@@ -186,20 +186,20 @@ def report_text(report: ReplayReport) -> str:
 
 
 def _plain(name: str) -> str:
-    """Return a yardstick's name in the text: the report's keys stay as earlier versions wrote them."""
+    """Return a yardstick's name in the text: the report's keys remain those of earlier versions."""
     return "human driver" if name == HUMAN else name
 
 
 def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> None:
     """Plot offsets and steering over time, with the interventions, into a PNG file. Raises OutputError."""
-    from matplotlib.figure import Figure  # large, and needed only here
+    from matplotlib.figure import Figure  # slow to import, and not needed without a plot
 
     figure = Figure(figsize=(12, 2.6 * (len(drives) + 1)), layout="constrained")
     axes = figure.subplots(len(drives) + 1, 1, sharex=True)
     for ax, done in zip(axes, drives, strict=False):
         seconds, offset = np.cumsum(done.seconds), np.array(done.offset)
         human_offset = offset - done.offset_from_human
-        offset[np.flatnonzero(np.diff(done.row) > 1) + 1] = np.nan  # no line across a break
+        offset[np.flatnonzero(np.diff(done.row) > 1) + 1] = np.nan  # no line is plotted across a break
         ax.axhspan(-done.limit, done.limit, color="0.93")
         ax.plot(seconds, offset, linewidth=0.9, label="model")
         ax.plot(seconds, human_offset, linewidth=0.7, color="0.5", label="human driver")
@@ -244,8 +244,8 @@ class ReplayFilm(DriveFilm):
 
 
 def captioned(frame: np.ndarray, steering: float, caption: str) -> np.ndarray:
-    """Return a frame at twice its size, uint8 (320, 640, 3), RGB, with the steering's path and a line of text."""
-    from cloning.pilot.attention import overlay  # which loads torch, and only films need it
+    """Return a frame at twice its size, uint8 (320, 640, 3), RGB, with a caption and the path at this steering."""
+    from cloning.pilot.attention import overlay  # imports torch, which only films need
 
     shown = overlay(frame, steering)
     cv2.putText(shown, caption, (10, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)

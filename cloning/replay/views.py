@@ -1,4 +1,4 @@
-"""A recording's frames as the camera would have seen them from next to the path that was driven."""
+"""Show a recording's frames as the centre camera would have seen them from next to the driven path."""
 
 import functools
 
@@ -11,17 +11,17 @@ from cloning.road.motion import AXLE_TO_CAMERA, Stretch, components, forward_vec
 from cloning.road.warp import warp
 
 
-class Views:
-    """The frames of a stretch of a recording, and views of it from other poses of the car.
+class StretchViews:
+    """The frames of a stretch of a recording, and views from other poses of the car.
 
-    A view is warped from the nearest of the three cameras. What that one did not see, at the sides of the car's nose,
-    is filled from an earlier frame of the same camera, which was taken further back.
+    A view is warped from the frame of the nearest of the three cameras. What this camera did not see, next to the
+    bonnet, is filled from its frame EARLIER_FRAME metres further back.
     """
 
     def __init__(self, recording: Recording, stretch: Stretch):
         self.recording, self.stretch = recording, stretch
 
-    @functools.lru_cache(maxsize=64)  # noqa: B019 - lives only while its stretch is driven
+    @functools.lru_cache(maxsize=64)  # noqa: B019 - the object lives only while its stretch is driven
     def frame(self, at: int, camera: int) -> np.ndarray:
         """Return a recorded frame, uint8 (160, 320, 3), RGB.
 
@@ -30,7 +30,7 @@ class Views:
         return decode(self.jpeg(at, camera))
 
     def jpeg(self, at: int, camera: int = 0) -> bytes:
-        """Return a recorded frame as the file holds it."""
+        """Return the bytes of a recorded frame's file."""
         return self.recording.path(self.stretch.rows.start + at, camera).read_bytes()
 
     def view_from(self, at: int, right: float, yaw: float) -> np.ndarray:

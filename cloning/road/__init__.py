@@ -1,1 +1,1 @@
-"""Road: how the car moves, the centre lines of the two tracks, and the camera geometry."""
+"""Road: how the car moves, the two tracks, and the camera geometry."""

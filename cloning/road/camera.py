@@ -1,4 +1,4 @@
-"""The geometry of the car's three cameras: where they are, what they project, and homographies between their poses.
+"""The geometry of the car's three cameras: poses, projection, and homographies between poses.
 
 The ground is flat and everything above the horizon is infinitely far away, as in NVIDIA's evaluation (arXiv 1604.07316,
 section 6). A camera's pose relative to another is (right, forward, yaw): metres, metres, radians, yaw right positive.
@@ -10,8 +10,8 @@ import numpy as np
 from cloning.recordings.format import FRAME
 from cloning.road.motion import AXLE_TO_CAMERA, CAMERA_FORWARD, right_of
 
-# Fitted by warping real centre frames to the side cameras, on both tracks: all recordings agree within 0.01 m,
-# 0.05 degrees and half a row. The simulator's scene file has the same yaw and roll.
+# Fitted by warping real centre frames to the side cameras; recordings of both tracks agree within 0.01 m, 0.05 degrees
+# and half a row. The simulator's scene file has the same yaw and roll.
 VERTICAL_FIELD = 60.0  # degrees
 FOCAL_LENGTH = FRAME[0] / 2 / np.tan(np.radians(VERTICAL_FIELD / 2))  # px
 CAMERA_HEIGHT = 1.255  # m above the ground
@@ -19,9 +19,9 @@ CAMERA_HEIGHT = 1.255  # m above the ground
 CAMERA_PITCH, CAMERA_YAW, CAMERA_ROLL = 7.85, 0.7, 1.2
 CAMERA_OFFSETS = {"center": 0.0, "left": -0.806, "right": 0.825}  # m to the right, in the order of a recording's images
 FIRST_BONNET_ROW = 135  # from this row down the bonnet hides the road
-FAR_SLOPE = 0.004  # of the focal length below the horizon: ground further away than this counts as infinitely far
-EARLIER_FRAME = 3.0  # m: a frame taken this far back shows all the road that is missing 2 m to the side of the path
-VIEW_JPEG_QUALITY = 95  # of a warped frame's JPEG: it has been through the camera's 75 already
+FAR_SLOPE = 0.004  # tangent of the angle below the horizon: ground nearer to the horizon counts as infinitely far
+EARLIER_FRAME = 3.0  # m: a frame taken this far back shows all the road that a view 2 m to the side lacks
+VIEW_JPEG_QUALITY = 95  # of a warped frame, which was compressed at quality 75 when it was recorded
 
 
 def _turn(right: float = 0.0, down: float = 0.0, forward: float = 0.0) -> np.ndarray:
@@ -43,7 +43,7 @@ LEVEL_CAMERA_MATRIX = INTRINSICS @ _turn(right=np.radians(CAMERA_PITCH))
 
 
 def camera_position(axle: np.ndarray, forward: np.ndarray, offset: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return where a camera is when the middle of the car's rear axle is at `axle`: float64 (…, 2).
+    """Return a camera's position for a position of the rear axle's middle: float64 (…, 2).
 
     axle: (…, 2), m, (right, forward) in a trajectory's frame or (x, y) on a track; forward: (…, 2), the unit vector
     along the car in the same frame; offset: (…), m, the camera's mounting to the right of the middle.
@@ -84,8 +84,8 @@ def homographies(
 # --------------------------------------------------------------------------------------------------
 # The stand-in simulator's cameras on its car
 
-# Right, forward and up of the car's middle, m. The car rests 0.025 m above the ground: fitted to real recordings the
-# cameras are 1.26 m above it.
+# m to the right, forward and up from the car's middle, which is 0.025 m above the ground when the car is at rest; in
+# real recordings the cameras are 1.26 m above the ground.
 CAMERA_POSITIONS = {
     "center": (CAMERA_OFFSETS["center"], CAMERA_FORWARD, 1.235),
     "left": (CAMERA_OFFSETS["left"], 0.984, 1.235),
@@ -109,9 +109,10 @@ def mounting_rotation() -> np.ndarray:
 
 
 def height_at_rows(rows: np.ndarray, right: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """Return the height that a point in the car must have to show in a given row of the centre camera's frame.
+    """Return the height at which a point of the car appears in a given row of the centre camera's frame: float64, m.
 
-    rows: of the frame; right, forward: m, of the points, from the car's origin; float64, m above it. All are broadcast.
+    rows: of the frame; right, forward: m from the car's origin to the point, whose height is measured from there, too.
+    The arguments are broadcast.
     """
     _, ahead, up = mounting_rotation()
     x, y, z = np.array(CAMERA_POSITIONS["center"])

@@ -10,30 +10,36 @@ from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 
 MPH = 0.44704  # m/s
-TOP_SPEED_MPH = 30  # at which the simulator clamps the car's speed
+TOP_SPEED_MPH = 30  # the simulator clamps the car's speed to it
 FULL_LOCK = 25.0  # degrees of the front wheels at steering 1
 WHEELBASE = 2.87  # m
 REAR_AXLE = 1.6  # m behind the car's middle
-CAMERA_FORWARD = 1.0  # m before the car's middle: all three cameras
+CAMERA_FORWARD = 1.0  # m from the car's middle forward to the cameras
 AXLE_TO_CAMERA = REAR_AXLE + CAMERA_FORWARD  # m from the rear axle's middle, about which the car turns, to the cameras
-MAX_GAP = 0.4  # s: rows further apart are not one drive
-MAX_ACCELERATION = 30.0  # m/s²: no car brakes or accelerates like this; it was reset, or a crash stopped it
-YAW_LAG = 0.15  # s: time constant with which the car's turning follows its wheels, the same on three recordings
-OFF_ROAD = 4.5  # m from the lane's centre beyond which the human driver has left the road, and frames show no lane
-MIN_TRUSTED = 0.7  # share of a stretch's rows whose lane is trusted; below it, the human's path is the reference
-MIN_SPEED = 1.0  # m/s: below walking speed the frames say nothing about steering
+MAX_GAP = 0.4  # s: rows further apart do not belong to one drive
+MIN_STRETCH_ROWS = 2 * SAMPLE_RATE  # two seconds
+MAX_ACCELERATION = 30.0  # m/s²: no car accelerates or brakes like this, so it was reset or crashed
+YAW_LAG = 0.15  # s: time constant with which the curvature follows the wheels, the same in three recordings
+OFF_ROAD = 4.5  # m from the lane's centre: further away the car has left the road, and frames show no lane
+MIN_TRUSTED = 0.7  # share of a stretch's rows whose lane is trusted; below it, the human driver's path is used instead
+MIN_SPEED = 1.0  # m/s: slower rows are standstills, whose frames tell nothing about steering
 
 Values = TypeVar("Values", float, np.ndarray)
 
 
 def forward_vector(heading: np.ndarray | float) -> np.ndarray:
-    """Return the unit vector along a heading: (…, 2), right and forward in the frame where the heading is 0."""
+    """Return the unit vector along a heading: (…, 2), (right, forward) in the frame in which headings are measured."""
     return np.stack([np.sin(heading), np.cos(heading)], axis=-1)
 
 
 def right_of(forward: np.ndarray) -> np.ndarray:
     """Return the unit vector to the right of another: (…, 2); both (right, forward) or both (x east, y north)."""
     return np.stack([forward[..., 1], -forward[..., 0]], axis=-1)
+
+
+def wrap_angle(angle: Values) -> Values:
+    """Return the same angle in the range -pi to pi; radians."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def components(vector: np.ndarray, forward: np.ndarray) -> np.ndarray:
@@ -45,8 +51,8 @@ def components(vector: np.ndarray, forward: np.ndarray) -> np.ndarray:
 def curvature(steering: Values) -> Values:
     """Return the curvature of the path at a steering, 1/m, right positive; steering: -1..1.
 
-    Compared with the tracks' centre lines, real recordings turn by 1.06, 1.05 and 0.99 times this over a whole lap, at
-    30 mph and at 15 alike: the car does not understeer noticeably.
+    Over a whole lap, three real recordings turn by 1.06, 1.05 and 0.99 times this, at 30 mph as at 15, judged by the
+    tracks' centre lines: the car does not understeer noticeably.
     """
     return np.tan(np.radians(FULL_LOCK) * steering) / WHEELBASE
 
@@ -57,20 +63,21 @@ def steering_for(bend: Values) -> Values:
 
 
 def lagged_curvature(turning: float, bend: float, pause: float) -> float:
-    """Return the curvature that the car drives after `pause` seconds with its wheels at the curvature `bend`, 1/m.
+    """Return the curvature that the car drives after `pause` seconds with its wheels set to the curvature `bend`.
 
-    turning: 1/m, the curvature driven before. The yaw between successive frames, measured in their far background, fits
-    a first-order lag of 0.15 s on all three real recordings; on the one driven by keyboard it halves the residual.
+    turning: the curvature driven before; all in 1/m. The yaw between successive frames, measured in their far
+    background, fits a first-order lag of 0.15 s in three real recordings; where a keyboard steered, the lag halves the
+    residual.
     """
     return turning + (bend - turning) * (1 - math.exp(-pause / YAW_LAG))
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Rows of a recording that follow one another without a break, and the car's trajectory over them.
+    """Consecutive rows of a recording without a break, and the car's trajectory over them.
 
     rows            of the recording
-    right, forward  float64 (n,): m, of the rear axle's middle, in the frame of its pose in the first row
+    right, forward  float64 (n,): m, position of the rear axle's middle, in the frame of its pose in the first row
     heading         float64 (n,): radians, right positive, 0 in the first row
     driven          float64 (n,): m since the first row
     """
@@ -96,7 +103,7 @@ class Stretch:
         turn = np.array(turning[1:]) * step
         heading = np.r_[0.0, np.cumsum(turn)]
         middle = heading[:-1] + turn / 2
-        right, forward = (np.r_[0.0, np.cumsum(step * component(middle))] for component in (np.sin, np.cos))
+        right, forward = (np.r_[0.0, np.cumsum(step * function(middle))] for function in (np.sin, np.cos))
         return Stretch(rows, right, forward, heading, np.r_[0.0, np.cumsum(step)])
 
 
@@ -116,5 +123,5 @@ def stretches(recording: Recording) -> list[Stretch]:
     return [
         Stretch.of(recording, slice(start, end))
         for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
-        if end - start >= 2 * SAMPLE_RATE
+        if end - start >= MIN_STRETCH_ROWS
     ]

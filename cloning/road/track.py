@@ -1,4 +1,4 @@
-"""The two roads: their centre lines, their edges, and the position of a point relative to them."""
+"""The simulator's two tracks: their centre lines and edges, and the position of a point relative to them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-LEFT, RIGHT = -1, 1  # sides of a road; lateral offsets are positive to the right
+from cloning.road.motion import right_of, wrap_angle
+
+LEFT, RIGHT = -1, 1  # sides of a road, with the signs of lateral offsets
 
 
 @dataclass(frozen=True)
@@ -38,14 +40,14 @@ class Section:
 
 @dataclass(frozen=True)
 class Road:
-    """What is known of a track besides its centre line.
+    """The properties of a track besides its centre line.
 
-    forward               direction in which its file lists the points: "cw" or "ccw"
+    forward               direction in which its file lists the points, "cw" or "ccw"; the real simulator's direction
     edge                  metres from the centre line to the edge of the road surface
     bridge                start and end of the bridge, metres along the centre line
-    bridge_edge           as edge, on the bridge; None where it is the same
+    bridge_edge           as edge, on the bridge; None if it is the same
     kerbs, kerb_edge      sections with a kerb, and the edge of the road surface there
-    training, autonomous  x, y where these modes start, in metres; the file's first point if None
+    training, autonomous  x, y at which these modes start, in metres; None: the file's first point
     """
 
     forward: str
@@ -58,7 +60,7 @@ class Road:
     autonomous: tuple[float, float] | None = None
 
 
-# Kerbs and bridges were measured in recordings of the real simulator, aligned to the centre line by their steering.
+# Kerbs and bridges were measured in recordings of the real simulator that were aligned to the centre lines.
 ROADS = {
     "lake": Road(
         forward="ccw",
@@ -93,11 +95,13 @@ class Track:
     curvature  float64 (n,): 1/m, right positive
     grade      float64 (n,): dz/ds
     edges      float64 (n, 2): metres from the centre line to the left and the right edge of the road surface
-    starts     s where the modes "training" and "autonomous" start
+    length     of a lap, m
+    step       between two points, m
+    starts     s at which the modes "training" and "autonomous" start
     """
 
     def __init__(self, name: str, direction: str | None = None):
-        """Load a track; the direction is "cw" or "ccw", by default that of the real simulator."""
+        """Load a track; name: a key of ROADS; direction: "cw", "ccw" or None for that of the real simulator."""
         self.name, road = name, ROADS[name]
         self.direction = direction or road.forward
         listed = np.loadtxt(Path(__file__).with_name(f"{name}.csv"), delimiter=",", skiprows=1)
@@ -117,13 +121,13 @@ class Track:
             self.edges[self._indices(kerb.start, kerb.end), 0 if kerb.side == LEFT else 1] = road.kerb_edge
         if road.bridge_edge is not None:
             self.edges[self._indices(*road.bridge)] = road.bridge_edge
-        if self.direction != road.forward:  # the first point stays the first
+        if self.direction != road.forward:  # the first point remains the first
             self.points = np.roll(self.points[::-1], 1, axis=0)
             self.edges = np.roll(self.edges[::-1, ::-1], 1, axis=0)
         around = np.roll(self.points, -1, axis=0) - np.roll(self.points, 1, axis=0)
         flat = np.linalg.norm(around[:, :2], axis=1)
         tangent = around[:, :2] / flat[:, None]
-        self.rightward = np.column_stack([tangent[:, 1], -tangent[:, 0]])
+        self.rightward = right_of(tangent)
         self.grade = around[:, 2] / flat
         self.heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
         turn = np.diff(np.r_[self.heading, self.heading[0] + self.turns()])
@@ -135,7 +139,7 @@ class Track:
         }
 
     def turns(self) -> float:
-        """Return the radians by which the heading grows over a lap."""
+        """Return by how many radians the heading grows over a lap."""
         return 2 * np.pi * round((self.heading[-1] - self.heading[0]) / (2 * np.pi))
 
     def _indices(self, start: float, end: float) -> np.ndarray:
@@ -153,8 +157,7 @@ class Track:
         i = int(i) % n
         j = (i + 1) % n
         x, y, z = self.points[i] * (1 - part) + self.points[j] * part
-        turn = (self.heading[j] - self.heading[i] + np.pi) % (2 * np.pi) - np.pi
-        heading = self.heading[i] + part * turn
+        heading = self.heading[i] + part * wrap_angle(self.heading[j] - self.heading[i])
         grade = self.grade[i] * (1 - part) + self.grade[j] * part
         return Place(x + np.sin(heading) * right, y - np.cos(heading) * right, z, heading, grade)
 

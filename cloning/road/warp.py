@@ -1,4 +1,4 @@
-"""Frames as the camera would have seen them from another pose, warped by the homographies of `camera.py`."""
+"""Warp frames to what a camera would have seen from another pose, by the homographies of `camera.py`."""
 
 import functools
 
@@ -17,7 +17,7 @@ from cloning.road.camera import (
 from cloning.road.motion import components, forward_vector
 
 FIRST_GROUND_ROW, FIRST_ROW_WITHOUT_SKY = 57, 66  # the first row with any ground, and the first without sky
-SOURCE_ROWS = slice(45, FIRST_BONNET_ROW)  # of a recorded frame: all that `CroppedView` warps from
+SOURCE_ROWS = slice(45, FIRST_BONNET_ROW)  # of a recorded frame: all rows that `CroppedView` reads
 
 
 def _shifted(top: int, left: int = 0) -> np.ndarray:
@@ -40,7 +40,7 @@ def ground_mask() -> np.ndarray:
 
 @functools.cache
 def road_mask() -> np.ndarray:
-    """Return uint8 (160, 320): 255 where a frame shows what is before the car, 0 on the bonnet and at the border."""
+    """Return uint8 (160, 320): 0 on the bonnet and at the border of a frame, else 255."""
     mask = np.zeros(FRAME[:2], np.uint8)
     mask[1:FIRST_BONNET_ROW, 1:-1] = 255
     return mask
@@ -53,10 +53,11 @@ def warp(
     yaw: float,
     box: tuple[int, int, int, int] = (0, FRAME[0], 0, FRAME[1]),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a frame as seen from this pose relative to its camera, and which of its pixels were really seen.
+    """Return a frame warped to this pose relative to its camera, and which of the pixels the camera really saw.
 
-    frame: uint8 (160, 320, 3); box: top, bottom, left and right of the part that is wanted, the ends exclusive.
-    Returns uint8 (rows, columns, 3) and bool (rows, columns); an unseen pixel repeats the nearest one at the border.
+    frame: uint8 (160, 320, 3); right, forward: m; yaw: radians; box: top, bottom, left and right of the part to
+    compute, bottom and right exclusive. Returns uint8 (rows, columns, 3) and bool (rows, columns); a pixel that was not
+    seen repeats the nearest one at the border.
     """
     top, bottom, left, end = box
     width = end - left
@@ -78,9 +79,9 @@ def warp(
 
 
 class CroppedView:
-    """What a network that crops its frames sees from another pose, warped from a recorded frame's `SOURCE_ROWS`.
+    """Warps recorded frames to the rows that a network sees, as from another pose.
 
-    Only the cropped rows are warped, and only from the rows that they need: this is done for every training image.
+    To be fast enough for every training image, it computes only those rows, from a frame's `SOURCE_ROWS`.
     """
 
     def __init__(self, crop: tuple[int, int]) -> None:
@@ -89,8 +90,8 @@ class CroppedView:
         self.columns, self.rows = FRAME[1], FRAME[0] - top - bottom
         self.sky_rows = FIRST_ROW_WITHOUT_SKY - top
         to_view = _shifted(top) @ CAMERA_MATRIX
-        # The cameras are turned and rolled, so a flipped frame is not what they would see of the mirrored world. The
-        # second matrix gives that.
+        # The second matrix is for the mirrored world. A flipped frame does not show what the cameras would see of it,
+        # because they are turned and rolled.
         self.to_pixels = np.stack([to_view, to_view @ np.diag([-1.0, 1, 1])])
         self.from_pixels = FROM_PIXELS @ _shifted(-SOURCE_ROWS.start)
         ground = [_shows_ground((self.sky_rows, self.columns), np.linalg.inv(matrix)) for matrix in self.to_pixels]
@@ -112,9 +113,10 @@ class CroppedView:
         return homographies(right, forward, heading - axle[:, 2], to_pixels, self.from_pixels)
 
     def warp(self, rows: np.ndarray, matrices: np.ndarray, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return a view, uint8 (75, 320, 3), and 255 where it was really seen, uint8 (75, 320).
+        """Return a view, uint8 (75, 320, 3), and a mask, uint8 (75, 320): 255 where the camera really saw it.
 
-        rows: uint8 (90, 320, 3), `SOURCE_ROWS` of a frame; matrices: float64 (2, 3, 3), of `homographies`.
+        rows: uint8 (90, 320, 3), `SOURCE_ROWS` of a frame; matrices: float64 (2, 3, 3), of `homographies`; mirrored:
+        whether they are for the mirrored world.
         """
         ground, sky, size = *matrices, (self.columns, self.rows)
         view = cv2.warpPerspective(rows, ground, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

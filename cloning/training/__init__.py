@@ -1,1 +1,1 @@
-"""Training: everything that model.py needs besides the steps that the report describes."""
+"""Training: what model.py needs besides the report's own steps, from options and checkpoints to --robust."""

@@ -1,9 +1,9 @@
-"""The files of a run: models and the state that --resume continues from, written so that a kill loses no model.
+"""The files of a run: its models, and the state from which --resume continues; no model is lost if it is killed.
 
-A new run leaves the models of an earlier run in place until its own first epoch has ended. Then it renames them to
-model-previous.pt and model-best-previous.pt, or -previous-2, -previous-3 … where that name is taken. The earlier run's
-model-resume.pt makes room at the start, because from then on --resume continues the new run: it is renamed in the same
-way if it holds a finished epoch, and replaced if it does not, since then there is less than an epoch in it.
+A new run leaves an earlier run's models in place until its own first epoch has ended. Then it renames them to
+model-previous.pt and model-best-previous.pt, or to -previous-2, -previous-3 … if that name is taken. The earlier run's
+model-resume.pt has to go at the start, because --resume continues the new run from then on: it is renamed in the same
+way if it contains a finished epoch, and replaced if it does not.
 """
 
 import hashlib
@@ -23,16 +23,16 @@ from cloning.pilot.network import Network, load_checkpoint, save_model, versions
 from cloning.training.observations import Observations
 from cloning.training.options import Arguments, option
 
-Row = dict[str, float]  # of training_log.csv: epoch, images, seconds, loss, val_loss
-NEVER_RESUMED = {"output", "device", "strict", "resume"}  # they say where and how this process runs
-MAY_CHANGE = NEVER_RESUMED | {"recordings", "epochs"}  # between start and --resume; recordings by their fingerprint
+EpochMetrics = dict[str, float]  # a row of training_log.csv: epoch, images, seconds, loss, val_loss
+NEVER_RESUMED = {"output", "device", "strict", "resume"}  # they belong to one process, not to the run
+MAY_CHANGE = NEVER_RESUMED | {"recordings", "epochs"}  # with --resume; a fingerprint checks the recordings' contents
 
 
 class RunFiles:
-    """The paths of what a run leaves: the model, and everything else in the same folder."""
+    """The paths of the files that a run writes: the model's, and all others in the same folder."""
 
     def __init__(self, output: str):
-        """output: the model's file, such as model.pt; the folder need not exist."""
+        """output: the model's file, such as model.pt; its folder need not exist."""
         self.last = Path(output)
         self.best = self.last.with_stem(f"{self.last.stem}-best")
         self.resume = self.last.with_stem(f"{self.last.stem}-resume")
@@ -45,23 +45,23 @@ class RunFiles:
 
 @dataclass
 class Progress:
-    """How far a run has come.
+    """The progress of a run.
 
-    number                 of the next batch, counted over all epochs
+    number                 of the next batch, from 0, counted over all epochs
     images, loss, seconds  so far in this epoch; loss is the sum of squared errors
-    history                a row for each finished epoch
-    run                    an identifier by which a run knows its own files
+    history                the metrics of each finished epoch
+    run                    a random identifier, by which a run recognises its own files
     """
 
     number: int = 0
     images: int = 0
     loss: float = 0.0
     seconds: float = 0.0
-    history: list[Row] = field(default_factory=list)
+    history: list[EpochMetrics] = field(default_factory=list)
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def finish_epoch(self, val_loss: float) -> bool:
-        """Add the epoch to the history and begin the next one; whether it is the best so far."""
+        """Add the epoch to the history and begin the next one; return whether val_loss is the lowest so far."""
         is_best = val_loss < min((row["val_loss"] for row in self.history), default=float("inf"))
         self.history.append(
             {
@@ -77,9 +77,9 @@ class Progress:
 
 
 def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, dict[str, Any] | None]:
-    """The arguments completed from the checkpoint that --resume names, and this checkpoint; None to begin a run.
+    """Return a run's arguments and, with --resume, its checkpoint, which supplies arguments that are not given.
 
-    given: the names of the arguments on the command line. Raises ModelError.
+    given: the names of the arguments on the command line. The checkpoint is None for a new run. Raises ModelError.
     """
     path = RunFiles(arguments.output).resume
     if not arguments.resume:
@@ -89,20 +89,20 @@ def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Argu
         return arguments, None
     saved = load_checkpoint(path)
     if "training" not in saved:
-        raise ModelError(f"{path}: holds no state to resume; give the --output of the run")
-    began_with: dict[str, Any] = saved["arguments"]
+        raise ModelError(f"{path}: contains no state to resume; give the --output of the run")
+    initial: dict[str, Any] = saved["arguments"]
     for name in sorted(given - MAY_CHANGE):
-        if name in began_with and began_with[name] != getattr(arguments, name):
+        if name in initial and initial[name] != getattr(arguments, name):
             raise ModelError(
-                f"{path}: the run began with {option(name)} {began_with[name]}, not {getattr(arguments, name)}; "
+                f"{path}: the run began with {option(name)} {initial[name]}, not {getattr(arguments, name)}; "
                 "leave the option out, or start a new run without --resume"
             )
     names = {item.name for item in fields(Arguments)} - NEVER_RESUMED - given
-    return replace(arguments, **{name: value for name, value in began_with.items() if name in names}), saved
+    return replace(arguments, **{name: value for name, value in initial.items() if name in names}), saved
 
 
 def fingerprint(*observations: Observations) -> str:
-    """A digest of the images and labels of a run, which a resumed run must share."""
+    """Return a digest of a run's images and labels, which must not change before the run is resumed."""
     digest = hashlib.blake2b(digest_size=16)
     for part in observations:
         digest.update(part.frame.tobytes() + part.steering.tobytes())
@@ -120,12 +120,12 @@ class Checkpoint:
         optimizer: torch.optim.Optimizer,
         data_fingerprint: str,
     ):
-        """network, optimizer: the run's own, whose state is saved and restored."""
+        """network, optimizer: whose state is saved and restored; data_fingerprint: of `fingerprint`."""
         self.files, self.arguments, self.network, self.optimizer = files, arguments, network, optimizer
         self.fingerprint = data_fingerprint
 
     def begin(self, progress: Progress, precision: torch.dtype, resumed: bool) -> None:
-        """Write training_arguments.json, and the first state of a run that is not resumed."""
+        """Write training_arguments.json and, unless the run is resumed, its first state."""
         settings = {**asdict(self.arguments), "precision": str(precision), "versions": versions()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if resumed:
@@ -136,11 +136,11 @@ class Checkpoint:
             self.save(progress)
 
     def save(self, progress: Progress, *models: Path) -> None:
-        """Write these models, and then model-resume.pt with everything that --resume needs. Raises OSError."""
+        """Write the network to these files, then model-resume.pt with all that --resume needs. Raises OSError."""
         more = {"arguments": asdict(self.arguments), "history": progress.history, "run": progress.run}
         if models and len(progress.history) == 1:
             for path in (self.files.last, self.files.best):
-                if path.exists() and _run_of(path) != progress.run:  # its own, if a kill came before model-resume.pt
+                if path.exists() and _run_of(path) != progress.run:  # its own if it was killed in `save`
                     set_aside(path)
         for path in models:
             save_model(path, self.network, **more)
@@ -159,13 +159,16 @@ class Checkpoint:
         )
 
     def restore(self, saved: dict[str, Any]) -> Progress:
-        """Load the state of a checkpoint into network and optimizer. Raises ModelError if it belongs to other data."""
+        """Load a checkpoint into network and optimizer and return its progress.
+
+        Raises ModelError if the run was trained on other data.
+        """
         path = self.files.resume
         try:
             state = saved["training"]
             if state["fingerprint"] != self.fingerprint:
                 raise ModelError(
-                    f"{path}: its recordings were others; restore them, or start a new run without --resume"
+                    f"{path}: the run began with other recordings; restore them, or start a new run without --resume"
                 )
             self.network.load_state_dict(saved["network"])
             self.optimizer.load_state_dict(state["optimizer"])
@@ -178,7 +181,7 @@ class Checkpoint:
 
 
 def set_aside(path: Path) -> None:
-    """Rename an earlier run's file to -previous, -previous-2 …, whichever name is free."""
+    """Rename an earlier run's file: append -previous, or -previous-2 … if that name is taken."""
     endings = itertools.chain(["previous"], (f"previous-{number}" for number in itertools.count(2)))
     previous = next(free for ending in endings if not (free := path.with_stem(f"{path.stem}-{ending}")).exists())
     os.rename(path, previous)
@@ -186,15 +189,15 @@ def set_aside(path: Path) -> None:
 
 
 def _has_finished_epoch(path: Path) -> bool:
-    """Whether a file may hold a run's state that is worth keeping."""
+    """Return whether a file may contain a finished epoch."""
     try:
         return path.exists() and bool(load_checkpoint(path).get("history", True))
     except ModelError:
-        return True  # not known to be worthless
+        return True  # unknown, so keep it
 
 
 def _run_of(path: Path) -> str | None:
-    """The identifier of the run that wrote a model; None for a file that has none."""
+    """Return the identifier of the run that wrote a model; None if the file has none."""
     try:
         return load_checkpoint(path).get("run")
     except ModelError:

@@ -1,4 +1,7 @@
-"""The processes of a run that torchrun started, each with its share of every batch; alone, a run is rank 0 of 1."""
+"""The processes that torchrun started for a run, each with its share of every batch.
+
+Without torchrun there is one process, of rank 0.
+"""
 
 import os
 import sys
@@ -15,12 +18,12 @@ Result = TypeVar("Result")
 
 
 def rank() -> int:
-    """This process's number; rank 0 reads the recordings, prints, and writes the files."""
+    """Return this process's number; rank 0 reads the recordings, prints, and writes the files."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
 def world() -> int:
-    """How many processes share every batch."""
+    """Return the number of processes."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
@@ -35,7 +38,7 @@ def join_processes(device_name: str) -> None:
 
 
 def from_first_rank(make: Callable[[], Result]) -> Result:
-    """What `make` returns on rank 0, on every rank. Raises its UserError or OSError on every rank, too."""
+    """Call `make` on rank 0 and return its result on every rank. Raises its UserError or OSError on every rank."""
     outcome: list[Result | UserError | OSError | None] = [None]
     if rank() == 0:
         try:
@@ -50,7 +53,7 @@ def from_first_rank(make: Callable[[], Result]) -> Result:
 
 
 def summed(values: torch.Tensor, device: torch.device) -> torch.Tensor:
-    """The values, summed over all processes."""
+    """Return the sum of the values of all processes."""
     if dist.is_initialized():
         values = values.to(device)
         dist.all_reduce(values)
@@ -58,10 +61,10 @@ def summed(values: torch.Tensor, device: torch.device) -> torch.Tensor:
 
 
 def leave_processes(status: int) -> int:
-    """Leave the other processes, if there are any, and end this one with the status; else return it."""
+    """Return the exit status; if there are other processes, leave them and exit with it at once."""
     if dist.is_initialized():
         dist.destroy_process_group()
-        # gloo's threads outlive the group; if one frees its last tensor while Python shuts down, the process aborts.
+        # No normal exit: if a thread of gloo frees its last tensor while Python shuts down, the process aborts.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)

@@ -1,4 +1,4 @@
-"""Decoded images kept in memory, because reading and decoding them is half the generator's work."""
+"""Keep decoded images in memory: reading and decoding them is half of the generator's work."""
 
 import itertools
 from collections.abc import Callable, Hashable
@@ -11,18 +11,18 @@ CACHED_IMAGES = 5_000  # 360 MB of cropped images
 
 
 class ImageCache:
-    """Keeps the first `capacity` images that are asked for; the threads of a pool may share it."""
+    """Keeps the first `capacity` images that are requested; threads may share it."""
 
     def __init__(self, rows: int, capacity: int = CACHED_IMAGES):
-        """Reserve room for images of so many rows; the system takes memory only as it is filled."""
+        """Reserve memory, which the system provides as it is filled; rows: of each image; capacity: images."""
         self._images = np.empty((capacity, rows, *FRAME[1:]), np.uint8)
         self._slots: dict[Hashable, int] = {}
         self._free = itertools.count()
 
     def get(self, key: Hashable, read: Callable[[], np.ndarray]) -> np.ndarray:
-        """The image stored under `key`, or else the one that `read` returns: uint8 (rows, 320, 3), not to be changed.
+        """Return the image stored under `key`, else what `read` returns: uint8 (rows, 320, 3), not to be changed.
 
-        Two threads that miss the same key at once both read it and store equal copies.
+        If two threads request the same new key at once, both read the image and store equal copies.
         """
         if (slot := self._slots.get(key)) is not None:
             return self._images[slot]
@@ -33,5 +33,5 @@ class ImageCache:
         return image
 
     def __reduce__(self) -> tuple[type["ImageCache"], tuple[int, int]]:
-        """Pickle no images: another process begins with an empty cache."""
+        """Pickle the cache without its images: in another process it is empty."""
         return ImageCache, (self._images.shape[1], len(self._images))

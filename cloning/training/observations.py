@@ -1,4 +1,7 @@
-"""Observations: the rows that are trained on or validated with, their labels, and access to their images."""
+"""Observations: the rows that training and validation use, with their labels and images.
+
+From an observation of a batch up to four kinds of image are made: unaltered, flipped, brightened and shadowed.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -21,10 +24,10 @@ SEEN_SHAPE = (SEEN_ROWS.stop - SEEN_ROWS.start, *FRAME[1:])  # (75, 320, 3)
 
 
 class ValidationSet(NamedTuple):
-    """Images and labels to validate with.
+    """Images and labels for validation.
 
-    images  rows -> uint8 (len(rows), 75, 320, 3), RGB
-    labels  float32 (n,): steering of all rows, -1..1
+    images  from indices of observations, int (k,), to their images, uint8 (k, 75, 320, 3), RGB
+    labels  float32 (n,): steering of all observations, -1..1
     """
 
     images: Callable[[np.ndarray], np.ndarray]
@@ -35,8 +38,8 @@ class Example(NamedTuple):
     """One observation for the diagnostic pictures.
 
     frames         uint8 (160, 320, 3), RGB: of the centre, left and right camera
-    camera_labels  float32 (3,): their steering
-    images         uint8 (1, rows, 320, 3): what the unaltered, flipped, brightened and shadowed image are made from
+    camera_labels  float32 (3,): their labels
+    images         uint8 (1, rows, 320, 3) each: the four kinds of image before brightening and shadowing
     first_row      the row of the full frame that is the first of `images`
     titles         of the unaltered and the flipped image
     """
@@ -49,33 +52,36 @@ class Example(NamedTuple):
 
 
 class Views(ABC):
-    """The images of a batch's observations before augmentation, and their labels.
+    """The four kinds of image of a batch's observations, before brightening and shadowing, and their labels.
 
-    labels  float32 (n, 4): steering of the unaltered, flipped, brightened and shadowed image of each observation
+    labels  float32 (n, 4): steering, -1..1, of the unaltered, flipped, brightened and shadowed image
     """
 
     labels: np.ndarray
 
     @abstractmethod
     def images(self, part: np.ndarray) -> list[np.ndarray]:
-        """For each of the four kinds, the images of some of the observations: uint8 (len(part), 75, 320, 3) each."""
+        """Return the images of some observations, for each of the four kinds uint8 (k, 75, 320, 3), RGB.
+
+        part: int (k,), indices into the batch.
+        """
 
     @abstractmethod
     def example(self, i: int) -> Example:
-        """The batch's observation number i, for the diagnostic pictures."""
+        """Return the batch's observation number i for the diagnostic pictures."""
 
 
 class Choices(NamedTuple):
-    """The random choices for one batch of n observations, which give m images of four kinds.
+    """The random choices for one batch: n observations, from which m images of four kinds are made.
 
-    observation           int (n,): which observations
-    camera                int (n,): the camera that represents each, 0 centre, 1 left, 2 right
-    places                int (n, 4): place in the batch of each kind of image, -1 where it is not added
+    observation           int (n,): indices of the observations
+    camera                int (n,): the camera whose image is used, 0 centre, 1 left, 2 right
+    places                int (n, 4): place of each kind of image among the m images, -1 if it is not made
     keep                  bool (m, 4224): the units of the flattened layer that dropout keeps
     brightness, darkness  float64 (n,): factors of HSV value and HLS lightness
-    line                  float64 (n, 2): columns where a shadow's edge meets the top and the bottom of the full frame
+    line                  float64 (n, 2): columns at which the shadow's edge meets the top and bottom of the full frame
     left                  bool (n,): whether the shadow is left of that edge
-    views                 the images before augmentation, and the labels
+    views                 the images before brightening and shadowing, and the labels
     """
 
     observation: np.ndarray
@@ -90,9 +96,9 @@ class Choices(NamedTuple):
 
 
 class Augmented(NamedTuple):
-    """Images of one kind.
+    """The images of one kind in a batch.
 
-    which   int (k,): the observations of the batch that have one
+    which   int (k,): indices into the batch of the observations that have one
     images  uint8 (k, rows, 320, 3), RGB
     """
 
@@ -102,7 +108,7 @@ class Augmented(NamedTuple):
 
 @dataclass
 class Observations(ABC):
-    """One entry for each row of a recording that is used, or for a copy of such a row.
+    """Observations in columns: one entry for each row of a recording that is used, or for a copy of it.
 
     recordings  the Recordings that the rows come from
     recording   int16 (n,): index into `recordings`
@@ -111,7 +117,7 @@ class Observations(ABC):
     frame       uint64 (n,): digest of the centre image's file
     time        float64 (n,): seconds
 
-    The methods up to `take` are the steps in which the report's training (in model.py) and --robust (in robust.py)
+    The methods before `take` are the steps in which the report's training (in model.py) and --robust (in robust.py)
     differ.
     """
 
@@ -122,9 +128,9 @@ class Observations(ABC):
     frame: np.ndarray
     time: np.ndarray
 
-    cached_rows: ClassVar[slice] = SEEN_ROWS  # of a frame; they end where SEEN_ROWS end
-    label_source: ClassVar[str]  # whose steering the label is, for the summary
-    too_few: ClassVar[str]  # why few rows are left, when most were dropped by `select`
+    cached_rows: ClassVar[slice] = SEEN_ROWS  # of a frame; must end where SEEN_ROWS end
+    label_source: ClassVar[str]  # whose steering the label is, as the summary calls it
+    too_few: ClassVar[str]  # the reason to print if `select` leaves too few rows
 
     def __post_init__(self) -> None:
         self.cache = ImageCache(self.cached_rows.stop - self.cached_rows.start)
@@ -137,40 +143,44 @@ class Observations(ABC):
     @staticmethod
     @abstractmethod
     def dropped(arguments: Arguments) -> str:
-        """What `select` drops, as the title of a column."""
+        """Return what `select` drops, as the title of a column."""
 
     @classmethod
     @abstractmethod
     def select(cls, recording: Recording, arguments: Arguments) -> Self:
-        """The observations of a recording that are worth training on. Raises RecordingError, ModelError."""
+        """Return the observations of a recording that training uses. Raises RecordingError, ModelError."""
 
     @abstractmethod
     def resample(self, seed: int) -> Self:
-        """Balance the training observations, by leaving some out and repeating others."""
+        """Return the training observations balanced: some left out, others repeated."""
 
     @abstractmethod
     def shuffle(self, rng: np.random.Generator) -> np.ndarray:
-        """The order in which one pass takes the observations: int (n,), indices."""
+        """Return the order of the observations in one pass over them: int (n,), indices."""
 
     @abstractmethod
     def sample_views(
         self, rows: np.ndarray, cameras: np.ndarray, side_correction: float, rng: np.random.Generator
     ) -> Views:
-        """The images of these observations and their labels; cameras: one for each, 0 centre, 1 left, 2 right."""
+        """Return these observations' images and labels, with random choices of rng.
+
+        rows: int (n,), indices of observations; cameras: int (n,), 0 centre, 1 left, 2 right; side_correction: steering
+        that is added to the label of left images and subtracted from that of right ones.
+        """
 
     def validation_sets(self, seed: int) -> list[ValidationSet]:
-        """The sets of images to validate with, one image for each observation in each set: centre images, unaltered."""
+        """Return the sets to validate with, each with an image per observation: one set, of the centre images."""
         return [ValidationSet(self.center, self.steering)]
 
     @staticmethod
     def learning_rate(arguments: Arguments, progress: float) -> float:
-        """Learning rate of the next step, constant; progress: the share of the run that is done, 0..1."""
+        """Return the learning rate of the next step, a constant; progress: the finished share of the run, 0..1."""
         return arguments.learning_rate
 
     # ---- columns
 
     def take(self, rows: np.ndarray, steering: np.ndarray | None = None) -> Self:
-        """These observations, in this order, with other labels if given."""
+        """Return these observations, in this order; rows: indices; steering: float32, other labels if given."""
         return replace(
             self,
             recording=self.recording[rows],
@@ -182,7 +192,7 @@ class Observations(ABC):
 
     @classmethod
     def joined(cls, parts: list[Self]) -> Self:
-        """The observations of several recordings, one part each, as one."""
+        """Join the observations of several recordings; parts: those of one recording each."""
         return replace(
             parts[0],
             recordings=[recording for part in parts for recording in part.recordings],
@@ -196,37 +206,37 @@ class Observations(ABC):
     # ---- images
 
     def path(self, at: int, camera: int) -> Path:
-        """The file of an observation's image; camera: 0 centre, 1 left, 2 right."""
+        """Return the file of an observation's image; camera: 0 centre, 1 left, 2 right."""
         return self.recordings[self.recording[at]].path(self.row[at], camera)
 
     def read(self, at: int, camera: int) -> np.ndarray:
-        """An observation's whole frame: uint8 (160, 320, 3), RGB. Raises RecordingError."""
+        """Return an observation's whole frame: uint8 (160, 320, 3), RGB. Raises RecordingError."""
         return read_checked(self.path(at, camera))
 
     def read_cropped(self, at: int, camera: int) -> np.ndarray:
-        """The `cached_rows` of an observation's frame: uint8, RGB, not to be changed. Raises RecordingError."""
+        """Return the `cached_rows` of an observation's frame: uint8, RGB, not to be changed. Raises RecordingError."""
         return self.crop(self.recording[at], self.row[at], camera)
 
     def crop(self, number: int, row: int, camera: int) -> np.ndarray:
-        """The `cached_rows` of the frame of any row of recording `number`: uint8, RGB, not to be changed."""
+        """Return the `cached_rows` of any frame of recording `number`: uint8, RGB, not to be changed."""
         recording = self.recordings[number]
         key = number, recording.images[row, camera]  # rows may share an image
         return self.cache.get(key, lambda: read_checked(recording.path(row, camera))[self.cached_rows])
 
     def center(self, rows: np.ndarray) -> np.ndarray:
-        """The centre images of these observations as the network sees them: uint8 (len(rows), 75, 320, 3), RGB."""
+        """Return the centre images of these observations, cropped: uint8 (len(rows), 75, 320, 3), RGB."""
         first = SEEN_ROWS.start - self.cached_rows.start
         return np.stack([self.read_cropped(at, 0)[first:] for at in rows])
 
 
 def center_digests(recording: Recording, rows: np.ndarray) -> np.ndarray:
-    """The digests of the centre images of these rows of a checked recording: uint64 (len(rows),)."""
+    """Return the digests of the centre images of these rows of a checked recording: uint64 (len(rows),)."""
     assert recording.digests is not None, "check_images sets the digests"
     return recording.digests[recording.images[rows, 0]]
 
 
 def read_checked(path: Path) -> np.ndarray:
-    """A frame: uint8 (160, 320, 3), RGB. Raises RecordingError if the file is not the one that was checked."""
+    """Return a frame, uint8 (160, 320, 3), RGB. Raises RecordingError if it became unusable after the check."""
     try:
         return decode(path.read_bytes())
     except (OSError, ValueError) as error:

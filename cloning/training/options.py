@@ -1,4 +1,4 @@
-"""The command line of model.py: its options as a typed record, parsed once."""
+"""The command line of model.py."""
 
 import argparse
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import TypeVar
 
 from cloning.compute import DEVICES, is_available
+from cloning.recordings.format import DRIVING_LOG
 
 Number = TypeVar("Number", int, float)
 
@@ -14,7 +15,7 @@ Number = TypeVar("Number", int, float)
 class Arguments:
     """The options of a training run, with the report's figures as defaults.
 
-    Every checkpoint holds them as a plain dict, and training_arguments.json lists them. `build_parser` explains each.
+    Checkpoints contain them as a dict, and training_arguments.json lists them. `build_parser` explains each option.
     """
 
     recordings: list[str] = field(default_factory=lambda: ["data"])
@@ -32,20 +33,20 @@ class Arguments:
     resume: bool = False
 
 
-# With --robust every image is warped to another pose, and many small steps learn most from them.
+# With --robust, many small steps learn most from the warped images.
 ROBUST_DEFAULTS = {"batch_size": 16, "learning_rate": 3e-4, "samples_per_epoch": 60_000}
 REPORT_ONLY = ("throttle_threshold", "side_correction")  # options without an effect in a --robust run
 
 
 def option(name: str) -> str:
-    """The option that sets a field of Arguments: batch_size -> --batch-size."""
+    """Return the option that sets a field of Arguments: batch_size -> --batch-size."""
     return f"--{name.replace('_', '-')}"
 
 
 def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
-    """Parse the command line: the arguments, and the names of those that were given.
+    """Parse the command line; return the arguments, and the names of those that were given.
 
-    Exits with status 2 and a message for an argument that is not possible.
+    argv: of this process if None. Exits with status 2 and a message for an unusable argument.
     """
     parser = build_parser()
     values = vars(parser.parse_args(argv))
@@ -53,7 +54,7 @@ def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
     if values.get("robust"):
         for name in REPORT_ONLY:
             if name in given:
-                parser.error(f"{option(name)} belongs to the report's training; leave it out with --robust")
+                parser.error(f"{option(name)} has no effect with --robust; leave it out")
         values = {**ROBUST_DEFAULTS, **values}
     arguments = Arguments(**values)
     if not is_available(arguments.device):
@@ -62,11 +63,12 @@ def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser; an option that is not given sets nothing, so that `Arguments` alone defines the defaults."""
+    """Return the parser; it sets no defaults, which `Arguments` defines."""
     parser = argparse.ArgumentParser(
         prog="model.py",
         description="Train NVIDIA's network to predict steering from recordings of the Udacity simulator.",
-        epilog="The defaults are the report's. Stop a run with Ctrl-C at any time; --resume continues it.",
+        epilog="The defaults are those of the report of Udacity's Behavioral Cloning project. "
+        "Stop a run with Ctrl-C at any time; --resume continues it.",
         argument_default=argparse.SUPPRESS,
     )
     defaults = {item.name: getattr(Arguments(), item.name) for item in fields(Arguments)}
@@ -77,11 +79,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "recordings",
         nargs="*",
-        help="folders that hold a driving_log.csv, at any depth (default: data)",
+        help="recordings, or folders with recordings at any depth below them; a recording is a folder with a "
+        f"{DRIVING_LOG} (default: data)",
     )
     group = parser.add_argument_group("training")
     group.add_argument(
-        "--epochs", type=at_least(1, int), help=text("epochs", "epochs in total; with --resume it may be raised")
+        "--epochs", type=at_least(1, int), help=text("epochs", "epochs in total; may be raised with --resume")
     )
     group.add_argument(
         "--batch-size",
@@ -94,56 +97,56 @@ def build_parser() -> argparse.ArgumentParser:
     group.add_argument(
         "--samples-per-epoch",
         type=at_least(1, int),
-        help=text("samples_per_epoch", "images in an epoch, at least; a fifth as many observations validate it"),
+        help=text(
+            "samples_per_epoch", "smallest number of images in an epoch; a fifth as many observations validate it"
+        ),
     )
     group.add_argument(
-        "--seed", type=at_least(0, int), help=text("seed", "the same seed repeats the same run on the same machine")
+        "--seed", type=at_least(0, int), help=text("seed", "on the same machine, the same seed repeats the same run")
     )
     group.add_argument(
         "--device",
         choices=DEVICES,
-        help=text("device", "auto: an NVIDIA GPU if there is one, else Apple's (mps), else the CPU"),
+        help=text("device", "cuda: an NVIDIA GPU; mps: Apple's GPU; auto: the first of cuda, mps and cpu that exists"),
     )
     group = parser.add_argument_group("observations")
     group.add_argument(
         "--throttle-threshold",
         type=float,
-        help=text("throttle_threshold", "rows with less throttle are dropped"),
+        help=text("throttle_threshold", "drop rows with less throttle, 0 to 1"),
     )
     group.add_argument(
         "--side-correction",
         type=float,
-        help=text("side_correction", "added to the steering of left images, subtracted from that of right ones"),
+        help=text("side_correction", "steering added to the label of left images, subtracted from that of right ones"),
     )
-    group.add_argument("--strict", action="store_true", help="stop at the first unusable row instead of leaving it out")
+    group.add_argument("--strict", action="store_true", help="fail if a row is unusable, instead of leaving it out")
     group.add_argument(
         "--robust",
         action="store_true",
         help="train for robustness rather than fidelity to the report: learn recovery steering from frames warped to "
-        "other lateral offsets and headings; sets "
+        "other lateral offsets and headings; uses "
         + ", ".join(f"{option(name)} {value:g}" for name, value in ROBUST_DEFAULTS.items())
-        + " unless they are given",
+        + " unless these are given",
     )
     group = parser.add_argument_group("output")
-    group.add_argument(
-        "--output", help=text("output", "the model file; all other files are written to the same folder")
-    )
+    group.add_argument("--output", help=text("output", "model file; all other files are written to its folder"))
     group.add_argument(
         "--resume",
         action="store_true",
-        help="continue the run of this --output with the arguments that it began with; begin it if there is none",
+        help="continue the run of this --output with its original arguments; begin a new run if there is none",
     )
     return parser
 
 
 def at_least(least: Number, kind: type[Number]) -> Callable[[str], Number]:
-    """A type for argparse: a finite number of this kind, not below `least`."""
+    """Return a type for argparse: a finite number of this kind that is at least `least`."""
 
     def number(text: str) -> Number:
         value = kind(text)
         if not least <= value < float("inf"):
-            raise argparse.ArgumentTypeError(f"{text} is not a number from {least} up")
+            raise argparse.ArgumentTypeError(f"{text} is not a finite number of at least {least}")
         return value
 
-    number.__name__ = kind.__name__  # argparse names it: "invalid int value"
+    number.__name__ = kind.__name__  # for argparse's message "invalid int value"
     return number

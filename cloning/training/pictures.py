@@ -1,4 +1,4 @@
-"""The pictures of a training run: frames with their steering, and the losses by epoch."""
+"""Make the pictures of a training run: frames with their steering, and the losses by epoch."""
 
 import io
 from collections.abc import Callable
@@ -10,16 +10,16 @@ from PIL import Image, ImageDraw, ImageFont
 
 from cloning.recordings.format import CAMERAS
 from cloning.road.motion import FULL_LOCK
-from cloning.training.checkpoint import Row
+from cloning.training.checkpoint import EpochMetrics
 from cloning.training.observations import Augmented, Choices
 
 Augment = Callable[[Choices, np.ndarray, list[np.ndarray], int], list[Augmented]]
 
 
-def panel(frame: np.ndarray, title: str, angle: float) -> Image.Image:
-    """A frame at twice its size under a title, with the steering as a number and as the direction of the wheels.
+def panel(frame: np.ndarray, title: str, steering: float) -> Image.Image:
+    """Return a frame at twice its size under a title, with the steering as a number and as the wheels' direction.
 
-    frame: uint8 (rows, columns, 3), RGB; angle: steering -1..1.
+    frame: uint8 (rows, columns, 3), RGB; steering: -1..1.
     """
     height, width = frame.shape[0] * 2, frame.shape[1] * 2
     picture = Image.new("RGB", (width, height + 40), "white")
@@ -28,8 +28,8 @@ def panel(frame: np.ndarray, title: str, angle: float) -> Image.Image:
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(26)
     draw.text((10, 4), title, "black", font)
-    draw.text((width - 10, 4), f"steering {angle + 0:+.3f}", "black", font, anchor="ra")  # + 0 turns -0 into 0
-    heading = np.radians(FULL_LOCK * angle)
+    draw.text((width - 10, 4), f"steering {steering + 0:+.3f}", "black", font, anchor="ra")  # + 0 turns -0 into 0
+    heading = np.radians(FULL_LOCK * steering)
     start, end = (width / 2, height + 10), (width / 2 + 150 * np.sin(heading), height + 10 - 150 * np.cos(heading))
     draw.line([start, end], "black", 9)
     draw.line([start, end], "yellow", 5)
@@ -37,7 +37,7 @@ def panel(frame: np.ndarray, title: str, angle: float) -> Image.Image:
 
 
 def side_by_side(panels: list[Image.Image]) -> bytes:
-    """One PNG of panels of equal size, with a margin."""
+    """Return a PNG of panels of equal size in a row, with margins."""
     width, height = panels[0].size
     whole = Image.new("RGB", (len(panels) * (width + 12) + 12, height + 24), "white")
     for i, picture in enumerate(panels):
@@ -48,16 +48,16 @@ def side_by_side(panels: list[Image.Image]) -> bytes:
 
 
 def batch_pictures(choices: Choices, augment: Augment) -> dict[str, bytes]:
-    """The report's two pictures of a batch's first observation: file name, with {} for the count, -> PNG.
+    """Return the report's two pictures of a batch's first observation: file name, with {} for the count, -> PNG.
 
-    One shows the left, centre and right image, the other the four kinds of image, each with its steering. augment:
-    the function of model.py.
+    One shows the left, centre and right image, the other the four kinds of image, each with its label.
+    augment: model.augment.
     """
-    choices.places[0] = 0  # show every kind of image, also one that was not sampled
+    choices.places[0] = 0  # so that all four kinds of image are made
     example = choices.views.example(0)
     center, left, right = (
-        panel(frame, camera, angle)
-        for frame, camera, angle in zip(example.frames, CAMERAS, example.camera_labels, strict=True)
+        panel(frame, camera, label)
+        for frame, camera, label in zip(example.frames, CAMERAS, example.camera_labels, strict=True)
     )
     images = [kind.images[0] for kind in augment(choices, np.array([0]), example.images, example.first_row)]
     titles = [*example.titles, f"brightness x {choices.brightness[0]:.2f}", f"shadow x {choices.darkness[0]:.2f}"]
@@ -68,8 +68,8 @@ def batch_pictures(choices: Choices, augment: Augment) -> dict[str, bytes]:
     }
 
 
-def loss_picture(history: list[Row]) -> bytes:
-    """Both losses by epoch, with the best validation loss marked: a PNG."""
+def loss_picture(history: list[EpochMetrics]) -> bytes:
+    """Return a PNG of both losses by epoch, with the lowest validation loss marked."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
     epochs, best = [row["epoch"] for row in history], min(history, key=lambda row: row["val_loss"])

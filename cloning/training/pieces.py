@@ -1,4 +1,4 @@
-"""Loss, gradients and predictions; on a CPU in pieces of a batch that fit its cache."""
+"""Compute loss, gradients and predictions, on a CPU in pieces of a batch that fit its cache."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +11,7 @@ from torch import nn
 
 from cloning.compute import in_precision
 
-PIECE = 16  # images: on a CPU their activations fit the cache, which doubles the speed of a whole batch at once
+PIECE = 16  # images: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
 
 
 @dataclass
@@ -19,17 +19,17 @@ class Batch:
     """One process's share of a batch.
 
     images      uint8 (n, 75, 320, 3), RGB, cropped
-    angles      float32 (n,): labels, steering -1..1
+    labels      float32 (n,): steering, -1..1
     keep        bool (n, 4224): the units of the flattened layer that dropout keeps
-    total       images in the whole batch, over all processes
-    begin_next  to be called once this batch's work is in the pool's queue, so that idle cores make the next images
+    total       images in the whole batch, of all processes
+    start_next  starts making a later batch; called when this batch's work is in the pool's queue, to be done before it
     """
 
     images: np.ndarray
-    angles: np.ndarray
+    labels: np.ndarray
     keep: np.ndarray
     total: int
-    begin_next: Callable[[], None] = lambda: None
+    start_next: Callable[[], None] = lambda: None
 
 
 def squared_errors(
@@ -37,20 +37,20 @@ def squared_errors(
     precision: torch.dtype,
     device: torch.device,
     images: np.ndarray,
-    angles: np.ndarray,
+    labels: np.ndarray,
     keep: np.ndarray | None = None,
 ) -> torch.Tensor:
-    """The sum over the images of (predicted - label)²; arrays as in Batch."""
-    frames, labels = torch.from_numpy(images).to(device), torch.from_numpy(angles).to(device)
+    """Return the sum over the images of (predicted - label)², a scalar, float32; arrays as in Batch."""
+    frames, wanted = torch.from_numpy(images).to(device), torch.from_numpy(labels).to(device)
     with in_precision(precision, device):
         predicted = network(frames, None if keep is None else torch.from_numpy(keep).to(device))
-    return ((predicted - labels) ** 2).sum()
+    return ((predicted - wanted) ** 2).sum()
 
 
 class PieceByPiece(torch.autograd.Function):
-    """On a CPU: loss and gradients of a batch in pieces that fit the cache, each by one thread of the pool.
+    """Loss and gradients of a batch on a CPU, in pieces that fit its cache, each computed by one thread of the pool.
 
-    The sums are taken in the order of the pieces, so that the result does not depend on which thread was faster.
+    Sums are taken in the order of the pieces, so that the result does not depend on which thread was faster.
     """
 
     @staticmethod
@@ -62,18 +62,18 @@ class PieceByPiece(torch.autograd.Function):
         batch: Batch,
         *parameters: nn.Parameter,
     ) -> torch.Tensor:
-        """The sum of squared errors; the gradients are computed at once and kept for `backward`."""
+        """Return the sum of squared errors; the gradients are computed, too, and kept for `backward`."""
 
         def piece(start: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
             part = slice(start, start + PIECE)
             with torch.enable_grad():
                 loss = squared_errors(
-                    network, precision, torch.device("cpu"), batch.images[part], batch.angles[part], batch.keep[part]
+                    network, precision, torch.device("cpu"), batch.images[part], batch.labels[part], batch.keep[part]
                 )
             return loss.detach(), torch.autograd.grad(loss, parameters)
 
-        pieces = pool.map(piece, range(0, len(batch.angles), PIECE))
-        batch.begin_next()
+        pieces = pool.map(piece, range(0, len(batch.labels), PIECE))
+        batch.start_next()
         loss, gradients = torch.zeros(()), None
         for piece_loss, piece_gradients in pieces:
             loss += piece_loss
@@ -86,12 +86,12 @@ class PieceByPiece(torch.autograd.Function):
 
     @staticmethod
     def backward(context: Any, scale: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """The gradients of the parameters, times `scale`; the first four inputs have none."""
+        """Return the gradients of the parameters, times `scale`; the first four inputs have none."""
         return None, None, None, None, *torch._foreach_mul(context.gradients, scale)
 
 
 class SquaredErrors(nn.Module):
-    """The sum of a batch's squared errors, as a module that DistributedDataParallel can wrap."""
+    """Sums a batch's squared errors; a module, so that DistributedDataParallel can wrap it."""
 
     def __init__(self, network: nn.Module, precision: torch.dtype, device: torch.device, pool: ThreadPoolExecutor):
         """pool: its threads compute the pieces on a CPU."""
@@ -99,11 +99,11 @@ class SquaredErrors(nn.Module):
         self.network, self.precision, self.device, self.pool = network, precision, device, pool
 
     def forward(self, batch: Batch) -> torch.Tensor:
-        """The sum over this process's images: a scalar, float32."""
+        """Return the sum over this process's images: a scalar, float32."""
         if self.device.type == "cpu":
             return PieceByPiece.apply(self.network, self.precision, self.pool, batch, *self.network.parameters())
-        batch.begin_next()
-        return squared_errors(self.network, self.precision, self.device, batch.images, batch.angles, batch.keep)
+        batch.start_next()
+        return squared_errors(self.network, self.precision, self.device, batch.images, batch.labels, batch.keep)
 
 
 def predict(
@@ -114,7 +114,10 @@ def predict(
     precision: torch.dtype,
     pool: ThreadPoolExecutor,
 ) -> np.ndarray:
-    """The network's steering for these rows, float32 (len(rows),); images: rows -> what the network sees of them."""
+    """Return the network's steering for these observations: float32 (len(rows),).
+
+    rows: int (k,), indices; images: from indices to images, as in ValidationSet; pool: its threads share the work.
+    """
 
     def part(chosen: np.ndarray) -> np.ndarray:
         with torch.inference_mode(), in_precision(precision, device):

@@ -1,10 +1,11 @@
 """The training of `model.py --robust`: recovery steering, learned from frames warped to other poses of the car.
 
-NVIDIA's shifts and rotations by viewpoint transform (arXiv 1604.07316, section 5). The label of a warped frame is the
-steering that drives the car from there back onto the centre of its lane.
+These are NVIDIA's shifts and rotations by viewpoint transform (arXiv 1604.07316, section 5). The label of a warped
+frame, the recovery steering, drives the car from its pose back to the lane's centre.
 
-A pose is that of the middle of the rear axle: metres to the right of the lane's centre and radians to the right of the
-lane's heading. The lane's frame of a row has its origin on the lane's centre next to the recorded car's rear axle.
+A pose is that of the rear axle's middle: lateral offset from the lane's centre (m) and heading error (radians), both
+positive to the right. The lane's frame of a row has its origin on the lane's centre next to the recorded car's rear
+axle, and its forward axis along the lane.
 """
 
 import functools
@@ -37,33 +38,34 @@ from cloning.road.warp import SOURCE_ROWS, CroppedView
 from cloning.training.observations import SEEN_SHAPE, Example, Observations, ValidationSet, Views, center_digests
 from cloning.training.options import Arguments
 
-LOOKAHEAD = 6.0  # m along the lane's centre, to the point that the label steers for
-STEEPEST_FROM = 1.0  # m of lateral offset: from further away the car returns at the same angle as from here
-HEADING_CHORD = 3.0  # m before and behind: the lane's heading is that of the chord between
-MAX_OFFSET = 2.0  # m: the lateral offsets of sampled poses are uniform between - and + this
-YAW_DEVIATION, MAX_YAW = np.radians(8), np.radians(25)  # of the heading errors of sampled poses, normally distributed
-MAX_SHIFT = 2.4  # m from the recorded trajectory: further to the side the frames show too little of the road
-CAMERA_REACH = 1.7  # m: a camera within this distance of a pose may supply its image
-STRAIGHT_WEIGHT = 0.2  # of an observation whose label is 0; |label| is added to it
-TINTED_SHARE = 0.5  # of the images
-SATURATION, TINT = (0.1, 1.5), (0.85, 1.15)  # ranges of their factors; TINT of red, green and blue each
+LOOKAHEAD = 6.0  # m along the lane's centre, to the point that the recovery steering aims at
+MAX_LABEL_OFFSET = 1.0  # m: from a larger lateral offset the car returns at the same angle as from this one
+HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far behind to so far ahead
+MAX_POSE_OFFSET = 2.0  # m: the lateral offsets of sampled poses are uniform between - and + this
+# Radians: standard deviation and limit of the heading errors of sampled poses, which are normally distributed.
+YAW_DEVIATION, MAX_POSE_YAW = np.radians(8), np.radians(25)
+MAX_SHIFT = 2.4  # m from the recorded trajectory: further away the frames show too little of the road
+CAMERA_REACH = 1.7  # m: a camera this near to a pose may supply its image
+STRAIGHT_WEIGHT = 0.2  # sampling weight on a straight; elsewhere |steering along the lane| is added
+TINTED_SHARE = 0.5  # of the images whose colours are changed
+SATURATION, TINT = (0.1, 1.5), (0.85, 1.15)  # ranges of the factors of saturation, and of red, green and blue each
 MIRRORED_SHARE = 0.5  # of the images in a batch
 VIEW = CroppedView(CROP)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# The lane next to the recorded car, and the label
+# The lane next to the recorded car, and the recovery steering
 
 
 @dataclass
 class Lanes:
-    """The lane next to each of n rows of recordings, and an earlier row that shows what a warped frame lacks.
+    """The lane at each of n rows of recordings, and an earlier row that shows what a warped frame lacks.
 
     offset, yaw  float32 (n,): the recorded car's pose
-    goal         float32 (n, 2): the lane's centre `LOOKAHEAD` further on: metres right and forward in the lane's frame
-    known        bool (n,): whether the lane ahead is known; the other columns mean nothing where it is not
-    earlier      int32 (n,): the recording's row `EARLIER_FRAME` metres earlier, or the first one of the drive
-    moved        float32 (n, 3): the rear axle in the earlier row, seen from this one: m right, m forward, heading
+    goal         float32 (n, 2): the lane's centre LOOKAHEAD further on: m right and forward in the lane's frame
+    known        bool (n,): whether the lane ahead is known; if not, ignore the other columns
+    earlier      int32 (n,): the recording's row EARLIER_FRAME metres earlier, or the first one of the stretch
+    moved        float32 (n, 3): the rear axle in the earlier row, relative to this one: m right, m forward, radians
     """
 
     offset: np.ndarray
@@ -78,7 +80,7 @@ class Lanes:
 
     @staticmethod
     def unknown(n: int) -> "Lanes":
-        """Rows without a known lane ahead, as if the car were centred on a straight."""
+        """Return n rows whose lane ahead is unknown, with the values of a car centred on a straight."""
         return Lanes(
             np.zeros(n, np.float32),
             np.zeros(n, np.float32),
@@ -90,7 +92,7 @@ class Lanes:
 
     @staticmethod
     def of(recording: Recording) -> "Lanes":
-        """The lane at every row of a recording, estimated from its frames.
+        """Estimate the lane at every row of a recording from its frames.
 
         Raises OSError, RecordingError for images that can't be read, ModelError without a usable lane network.
         """
@@ -102,22 +104,23 @@ class Lanes:
         return lanes
 
     def _fill(self, stretch: Stretch, offset: np.ndarray, trusted: np.ndarray) -> None:
-        """Set the rows of a stretch; offset: of the car's middle, m right of the lane's centre, where it is trusted."""
+        """Set the rows of a stretch; offset: of the car's middle, m; trusted: rows where it can be relied on."""
         rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
         axle = np.stack([stretch.right, stretch.forward], axis=1)
-        # Of the lane's centre: points in the stretch's frame, and the metres driven at which the car passes them.
+        # Points of the lane's centre in the stretch's frame, and the metres driven at which the car passes them. If too
+        # few rows are trusted, the driven trajectory counts as the lane's centre.
         centre, passed, to_centre = axle, driven, np.zeros(len(driven))
         sure = np.flatnonzero(trusted)
         if len(sure) >= MIN_TRUSTED * len(driven):
             to_centre = np.interp(np.arange(len(driven)), sure, offset[sure])
-            passed = driven + REAR_AXLE  # the estimate holds at the car's middle
+            passed = driven + REAR_AXLE  # the estimate is that of the car's middle
             side = right_of(forward_vector(np.interp(passed, driven, heading)))
             centre = axle + REAR_AXLE * forward_vector(heading) - to_centre[:, None] * side
 
         def centre_at(metres: np.ndarray) -> np.ndarray:
             return np.stack([np.interp(metres, passed, centre[:, i]) for i in (0, 1)], axis=1)
 
-        # The heading of the estimated centre line agrees with the driven trajectory; the estimated yaw would not.
+        # Not the estimated heading error: it would not agree with the driven trajectory as this heading does.
         chord = centre_at(driven + HEADING_CHORD) - centre_at(driven - HEADING_CHORD)
         lane_heading = np.arctan2(*chord.T)
         along = forward_vector(lane_heading)
@@ -134,38 +137,41 @@ class Lanes:
 
     @staticmethod
     def joined(parts: list["Lanes"]) -> "Lanes":
-        """The rows of all parts, one part after the other."""
+        """Return the rows of all parts, one part after the other."""
         return Lanes(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(Lanes)))
 
     def take(self, rows: np.ndarray) -> "Lanes":
-        """These rows, in this order."""
+        """Return these rows, in this order; rows: indices."""
         return Lanes(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def steering(self, offset: float | np.ndarray, yaw: float | np.ndarray) -> np.ndarray:
-        """The recovery steering from a pose at each row, by pure pursuit of the goal: float32 (n,), -1..1."""
-        across = self.goal[:, 0] - np.clip(offset, -STEEPEST_FROM, STEEPEST_FROM)
-        aside = across * np.cos(yaw) - self.goal[:, 1] * np.sin(yaw)
-        return steering_for(2 * aside / (across**2 + self.goal[:, 1] ** 2)).astype(np.float32)
+        """Return the recovery steering from a pose at each row, by pure pursuit of the goal: float32 (n,), -1..1."""
+        right = self.goal[:, 0] - np.clip(offset, -MAX_LABEL_OFFSET, MAX_LABEL_OFFSET)
+        forward = self.goal[:, 1]
+        right_of_car = right * np.cos(yaw) - forward * np.sin(yaw)
+        return steering_for(2 * right_of_car / (right**2 + forward**2)).astype(np.float32)
 
     def weights(self) -> np.ndarray:
-        """The probability with which each row is sampled, higher in bends: float64 (n,), sum 1."""
+        """Return the probability of sampling each row, higher in bends: float64 (n,), sum 1."""
         centred = np.zeros(len(self))
         weights = STRAIGHT_WEIGHT + np.abs(self.steering(centred, centred).astype(float))
         return weights / weights.sum()
 
     def camera_labels(self, row: int) -> np.ndarray:
-        """The recovery steering of the car if its centre camera were where each of the three is: float32 (3,)."""
+        """Return the recovery steering if the centre camera were where each of the three cameras is: float32 (3,)."""
         lane = self.take(np.array([row]))
         return lane.steering(lane.offset + np.array(list(CAMERA_OFFSETS.values())), lane.yaw)
 
     def sample_poses(self, rng: np.random.Generator, mirrored: np.ndarray) -> "Poses":
-        """A random pose for each row, seen by one of the cameras that are not too far from it; mirrored: bool (n,).
+        """Sample a pose for each row, and a camera near it whose frame will be warped; mirrored: bool (n,).
 
-        The camera is random, too, so that traces of warping in an image do not tell the side that it was taken from.
+        The camera is random, so that traces of warping in an image do not tell the side from which it was taken.
         """
         n = len(self)
-        offset = np.clip(rng.uniform(-MAX_OFFSET, MAX_OFFSET, n), self.offset - MAX_SHIFT, self.offset + MAX_SHIFT)
-        yaw = np.clip(rng.normal(0, YAW_DEVIATION, n), -MAX_YAW, MAX_YAW)
+        offset = np.clip(
+            rng.uniform(-MAX_POSE_OFFSET, MAX_POSE_OFFSET, n), self.offset - MAX_SHIFT, self.offset + MAX_SHIFT
+        )
+        yaw = np.clip(rng.normal(0, YAW_DEVIATION, n), -MAX_POSE_YAW, MAX_POSE_YAW)
         eye = offset - self.offset + AXLE_TO_CAMERA * (np.sin(yaw) - np.sin(self.yaw))
         distance = np.abs(eye[:, None] - list(CAMERA_OFFSETS.values()))
         near = distance <= np.maximum(CAMERA_REACH, distance.min(1, keepdims=True))
@@ -176,14 +182,14 @@ class Lanes:
 
 @dataclass
 class Poses:
-    """From where n rows are seen, and how.
+    """The poses from which n rows are seen, with everything that is needed to make their images.
 
     camera    int (n,): the camera whose frame is warped: 0 centre, 1 left, 2 right
-    mirrored  bool (n,): whether the image shows the mirrored world, seen by the same, slightly tilted camera
-    warps     float64 (n, 2, 2, 3, 3): homographies from the `SOURCE_ROWS` of a frame to what the network sees; by the
-              row's own frame and the earlier one, for the ground and for what is infinitely far
+    mirrored  bool (n,): whether the image shows the mirrored world, as seen by the same, slightly rolled camera
+    warps     float64 (n, 2, 2, 3, 3): homographies from a frame's `SOURCE_ROWS` to what the network sees: from the
+              row's own frame and from the earlier one, for the ground and for the sky
     steering  float32 (n,): the label, -1..1
-    colours   float32 (n, 3, 3): matrices by which red, green and blue are multiplied
+    colours   float32 (n, 3, 3): matrices by which (red, green, blue) is multiplied
     """
 
     camera: np.ndarray
@@ -194,9 +200,9 @@ class Poses:
 
     @staticmethod
     def of(lanes: Lanes, offset: np.ndarray, yaw: np.ndarray, camera: np.ndarray, mirrored: np.ndarray) -> "Poses":
-        """These poses at the rows of `lanes`, in true colours; offset, yaw: float (n,); the others as in the class."""
+        """Return the poses at the rows of `lanes`, with unchanged colours; offset, yaw: float (n,), the poses."""
         turn = yaw - lanes.yaw
-        # Relative to the recorded rear axle and along the recorded car: m right, m forward.
+        # The pose relative to the recorded rear axle, in the recorded car's frame: m right, m forward.
         away = offset - lanes.offset
         axle = np.stack([away * np.cos(lanes.yaw), away * np.sin(lanes.yaw)], axis=1)
         eye = camera_position(axle, forward_vector(turn))
@@ -208,13 +214,14 @@ class Poses:
         return Poses(camera, mirrored, np.stack(warps, axis=1), np.where(mirrored, -steering, steering), colours)
 
     def take(self, rows: np.ndarray) -> "Poses":
-        """These rows, in this order."""
+        """Return these rows, in this order; rows: indices."""
         return Poses(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:
-        """What the network sees of one row: uint8 (75, 320, 3), RGB.
+        """Return what the network sees of one row: uint8 (75, 320, 3), RGB.
 
-        read(camera, earlier): the `SOURCE_ROWS` of the row's frame, or of the earlier row's, by this camera, uint8.
+        at: index of the row; read(camera, earlier): returns the `SOURCE_ROWS` of the camera's frame, uint8, in the row
+        or in the earlier one.
         """
         camera, mirrored = int(self.camera[at]), bool(self.mirrored[at])
         image, seen = VIEW.warp(read(camera, False), self.warps[at, 0], mirrored)
@@ -225,7 +232,7 @@ class Poses:
 
 
 def tints(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Random changes of saturation and tint: float32 (n, 3, 3), matrices that RGB colours are multiplied by."""
+    """Sample changes of saturation and tint: float32 (n, 3, 3), matrices by which RGB colours are multiplied."""
     saturation = rng.uniform(*SATURATION, n)[:, None, None]
     tint = rng.uniform(*TINT, (n, 3, 1))
     return (tint * (saturation * np.eye(3) + (1 - saturation) / 3)).astype(np.float32)
@@ -237,9 +244,9 @@ def tints(rng: np.random.Generator, n: int) -> np.ndarray:
 
 @dataclass
 class RobustObservations(Observations):
-    """Observations whose label is the recovery steering, in place of the report's throttle filter and resampling.
+    """Observations labelled with the recovery steering, instead of the report's throttle filter and resampling.
 
-    lanes  the lane at each of the observations
+    lanes  the lane at each observation
     """
 
     lanes: Lanes
@@ -250,16 +257,16 @@ class RobustObservations(Observations):
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:
-        """Rows whose lane ahead is not known are dropped."""
+        """Return what `select` drops, as the title of a column."""
         return "lane ahead unknown"
 
     @classmethod
     def select(cls, recording: Recording, arguments: Arguments) -> Self:
-        """Keep the rows whose lane ahead is known, with the steering that drives along it as label."""
+        """Keep the rows whose lane ahead is known, labelled with the recovery steering from the recorded pose."""
         print(f"estimating the lane in {recording.folder}", flush=True)
-        every = Lanes.of(recording)
-        rows = np.flatnonzero(every.known).astype(np.int32)
-        lanes = every.take(rows)
+        all_lanes = Lanes.of(recording)
+        rows = np.flatnonzero(all_lanes.known).astype(np.int32)
+        lanes = all_lanes.take(rows)
         return cls(
             [recording],
             np.zeros(len(rows), np.int16),
@@ -271,32 +278,32 @@ class RobustObservations(Observations):
         )
 
     def take(self, rows: np.ndarray, steering: np.ndarray | None = None) -> Self:
-        """These observations, in this order, with other labels if given."""
+        """Return these observations, in this order; rows: indices; steering: float32, other labels if given."""
         return replace(super().take(rows, steering), lanes=self.lanes.take(rows))
 
     @classmethod
     def joined(cls, parts: list[Self]) -> Self:
-        """The observations of several recordings, one part each, as one."""
+        """Join the observations of several recordings; parts: those of one recording each."""
         return replace(super().joined(parts), lanes=Lanes.joined([part.lanes for part in parts]))
 
     def resample(self, seed: int) -> Self:
-        """All observations, once: `shuffle` samples bends more often."""
+        """Return all observations once, because `shuffle` samples bends more often."""
         return self
 
     def shuffle(self, rng: np.random.Generator) -> np.ndarray:
-        """As many as there are, sampled with replacement, bends more often: int (n,), indices."""
+        """Sample as many observations as there are, with replacement, bends more often: int (n,), indices."""
         return rng.choice(len(self), len(self), p=self.lanes.weights())
 
     def sample_views(
         self, rows: np.ndarray, cameras: np.ndarray, side_correction: float, rng: np.random.Generator
     ) -> "PoseViews":
-        """A random pose for each of the four kinds of image, half of them in the mirrored world."""
+        """Sample a pose for each observation and each of the four kinds of image; half of the poses are mirrored."""
         lanes = self.lanes.take(rows)
         poses = [lanes.sample_poses(rng, rng.random(len(rows)) < MIRRORED_SHARE) for _ in range(4)]
         return PoseViews(self, rows, poses)
 
     def validation_sets(self, seed: int) -> list[ValidationSet]:
-        """The centre images, and as many images from other poses."""
+        """Return two sets: the centre images, and an image of each observation from a random pose."""
         poses = self.lanes.sample_poses(np.random.default_rng([seed, 5]), np.zeros(len(self), bool))
         return [
             ValidationSet(self.center, self.steering),
@@ -305,20 +312,20 @@ class RobustObservations(Observations):
 
     @staticmethod
     def learning_rate(arguments: Arguments, progress: float) -> float:
-        """Cosine decay to zero over the whole run."""
+        """Return the next step's learning rate: cosine decay to zero; progress: the finished share of the run, 0..1."""
         return arguments.learning_rate * ((1 + math.cos(math.pi * progress)) / 2)
 
     def warped(self, rows: np.ndarray, poses: list[Poses]) -> list[np.ndarray]:
-        """What the network sees of these rows from each of the poses: uint8 (len(rows), 75, 320, 3), RGB, each."""
+        """Return what the network sees of these k observations, for each item of poses: uint8 (k, 75, 320, 3), RGB."""
         images = [np.empty((len(rows), *SEEN_SHAPE), np.uint8) for _ in poses]
         for i, row in enumerate(rows):
             read = functools.cache(functools.partial(self.read_source, row))
-            for into, places in zip(images, poses, strict=True):
-                into[i] = places.view(i, read)
+            for views, kind_poses in zip(images, poses, strict=True):
+                views[i] = kind_poses.view(i, read)
         return images
 
     def read_source(self, at: int, camera: int, earlier: bool) -> np.ndarray:
-        """The `SOURCE_ROWS` of an observation's frame, or of the earlier one's: uint8 (90, 320, 3), RGB."""
+        """Return the `SOURCE_ROWS` of an observation's frame, or of the earlier row's: uint8 (90, 320, 3), RGB."""
         return self.crop(self.recording[at], self.lanes.earlier[at] if earlier else self.row[at], camera)
 
 
@@ -326,16 +333,16 @@ class PoseViews(Views):
     """Images of a batch's observations from a random pose for each kind of image."""
 
     def __init__(self, observations: RobustObservations, rows: np.ndarray, poses: list[Poses]):
-        """rows: int (n,), indices of observations; poses: one for each row, for each of the four kinds of image."""
+        """rows: int (n,), indices of observations; poses: four, one for each kind of image, of n rows each."""
         self.observations, self.rows, self.poses = observations, rows, poses
-        self.labels = np.stack([places.steering for places in poses], axis=1)
+        self.labels = np.stack([kind_poses.steering for kind_poses in poses], axis=1)
 
     def images(self, part: np.ndarray) -> list[np.ndarray]:
-        """For each of the four kinds, the images of some of the observations: uint8 (len(part), 75, 320, 3) each."""
-        return self.observations.warped(self.rows[part], [places.take(part) for places in self.poses])
+        """Return the images of some observations, int (k,), for each of the four kinds: uint8 (k, 75, 320, 3)."""
+        return self.observations.warped(self.rows[part], [kind_poses.take(part) for kind_poses in self.poses])
 
     def example(self, i: int) -> Example:
-        """The batch's observation number i, for the diagnostic pictures."""
+        """Return the batch's observation number i for the diagnostic pictures."""
         row = self.rows[i]
         frames = [self.observations.read(row, camera) for camera in range(len(CAMERAS))]
         labels = self.observations.lanes.camera_labels(row)

@@ -1,4 +1,4 @@
-"""Stopping a run by signal: its state is saved before it ends."""
+"""Stop a run by a signal: the run can save its state before it ends."""
 
 import signal
 from types import FrameType
@@ -12,13 +12,13 @@ class Interrupted(Exception):
 
 
 class StopSignals:
-    """A context that notes Ctrl-C (SIGINT) and SIGTERM instead of ending the process.
+    """A context in which Ctrl-C (SIGINT) and SIGTERM are noted; a second signal raises KeyboardInterrupt.
 
-    received  the number of the signal, 0 before one came; a second signal raises KeyboardInterrupt
+    received  the number of the signal, 0 without one
     """
 
     def __init__(self) -> None:
-        """Note nothing before the context is entered."""
+        """Install no handlers yet; entering the context does."""
         self.received = 0
 
     def __enter__(self) -> "StopSignals":

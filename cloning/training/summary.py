@@ -1,4 +1,4 @@
-"""What a training run prints and logs: tables of recordings, epochs and errors."""
+"""Make the tables that a training run prints and logs: recordings, epochs and errors."""
 
 import csv
 import io
@@ -14,48 +14,48 @@ from cloning.compute import threads
 from cloning.errors import RecordingError
 from cloning.files import write
 from cloning.pilot.network import Network, layer_table
-from cloning.recordings.format import LOG
+from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
-from cloning.training.checkpoint import Row
+from cloning.training.checkpoint import EpochMetrics
 from cloning.training.distributed import world
 
-LEARNED = 0.3  # correlation with the labels, from which on a model has learned something
+MIN_CORRELATION = 0.3  # with the labels; below it, the model has hardly learned anything
 
 
 class Counts(NamedTuple):
-    """Rows of one recording: read from the csv, unusable, dropped on purpose, and kept."""
+    """Counts of a recording's rows: read from the csv, unusable, dropped by `Observations.select`, and kept."""
 
     recording: str
-    read: int
+    rows_read: int
     unusable: int
     dropped: int
     kept: int
 
     @staticmethod
     def of(recording: Recording, kept: int) -> "Counts":
-        """The counts of a checked recording, of which so many rows are kept."""
+        """Return the counts of a checked recording; kept: number of its rows that are kept."""
         usable = len(recording)
-        return Counts(str(recording.folder), recording.read, recording.read - usable, usable - kept, kept)
+        return Counts(str(recording.folder), recording.rows_read, recording.rows_read - usable, usable - kept, kept)
 
 
 def total(counts: list[Counts]) -> Counts:
-    """The sums over all recordings."""
-    read, unusable, dropped, kept = (int(sum(column)) for column in list(zip(*counts, strict=True))[1:])
-    return Counts("total", read, unusable, dropped, kept)
+    """Return the sums over all recordings."""
+    rows_read, unusable, dropped, kept = (int(sum(column)) for column in list(zip(*counts, strict=True))[1:])
+    return Counts("total", rows_read, unusable, dropped, kept)
 
 
 def recordings_table(counts: list[Counts], dropped: str) -> str:
-    """A line for each recording, and one for all; dropped: the title of that column."""
+    """Return a table with a line for each recording and one for all; dropped: the title of that column."""
     width = max(len(row.recording) for row in counts)
     lines = [f"\n{'recording':{width}}  rows read  unusable  {dropped}  kept"]
-    for name, read, unusable, off, kept in [*counts, total(counts)]:
-        lines.append(f"{name:{width}}  {read:9,}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
+    for name, rows_read, unusable, off, kept in [*counts, total(counts)]:
+        lines.append(f"{name:{width}}  {rows_read:9,}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
     return "\n".join(lines)
 
 
 def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> None:
     """Write the unusable rows of all recordings, if any, to a csv file; strict: raise RecordingError instead."""
-    rejected = [(recording.folder / LOG, *row) for recording in recordings for row in recording.rejected]
+    rejected = [(recording.folder / DRIVING_LOG, *row) for recording in recordings for row in recording.rejected]
     if rejected and strict:
         path, line, _, detail = rejected[0]
         raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {len(rejected)} unusable rows)")
@@ -65,26 +65,26 @@ def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> 
 
 
 def csv_bytes(header: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes:
-    """A csv file, UTF-8; file names that are no valid text keep their bytes."""
+    """Return a csv file in UTF-8; bytes of file names that are not UTF-8 are kept."""
     text = io.StringIO()
     csv.writer(text).writerows([header, *rows])
     return text.getvalue().encode(errors="surrogateescape")
 
 
-def history_csv(history: list[Row]) -> bytes:
-    """The contents of training_log.csv: a line for each finished epoch."""
+def history_csv(history: list[EpochMetrics]) -> bytes:
+    """Return the contents of training_log.csv: a line for each finished epoch."""
     return csv_bytes(history[0], [row.values() for row in history])
 
 
 def run_header(network: Network, device: torch.device, precision: torch.dtype) -> str:
-    """The report's table of layers, and what computes them."""
+    """Return the table of layers, and what computes them: device, precision, threads and processes."""
     processes = f", {world()} processes" if world() > 1 else ""
     name = str(precision).removeprefix("torch.")
     return f"{layer_table(network)}\n\n{device}, {name}, {threads()} threads{processes}"
 
 
-def epoch_line(row: Row, samples_per_epoch: int) -> str:
-    """A finished epoch, in the format of the report's log."""
+def epoch_line(row: EpochMetrics, samples_per_epoch: int) -> str:
+    """Return the line for a finished epoch, in the format of the report's log."""
     return (
         f"{row['images']}/{samples_per_epoch} [{'=' * 30}] - {row['seconds']:.0f}s - "
         f"loss: {row['loss']:.4f} - val_loss: {row['val_loss']:.4f}"
@@ -94,10 +94,10 @@ def epoch_line(row: Row, samples_per_epoch: int) -> str:
 def error_table(
     labels: np.ndarray, mean: float, models: Mapping[str, np.ndarray], edges: tuple[float, ...], label_source: str
 ) -> str:
-    """Mean squared error by range of |label|, and the correlation with the labels, of constant steering and of models.
+    """Return a table of mean squared error by range of |label|, and correlation, for constant steering and for models.
 
     labels: steering, float32 (n,); mean: of the training labels; models: name -> predictions, float32 (n,), the last
-    epoch's model first; edges: of the ranges, ascending; label_source: whose steering the label is.
+    epoch's model first; edges: of the ranges, ascending; label_source: whose steering the label is, for the text.
     """
     predictions = {"steer 0": np.zeros_like(labels), "steer mean": np.full_like(labels, mean), **models}
     lines = [f"\n{'validation: mean squared error':32} {'rows':>6}" + "".join(f"{name:>15}" for name in predictions)]
@@ -111,12 +111,12 @@ def error_table(
     values = "".join(f"{value:15.2f}" for value in correlations.values())
     lines.append(f"{f'correlation with the {label_source}':39}{values}")
     last = next(iter(models))
-    if not correlations[last] > LEARNED:
+    if not correlations[last] > MIN_CORRELATION:
         lines.append(f"{last} hardly follows the {label_source}: train longer, or record more turns.")
     return "\n".join(lines)
 
 
 def correlation(predicted: np.ndarray, labels: np.ndarray) -> float:
-    """Pearson's correlation; nan for a constant, which correlates with nothing."""
+    """Return Pearson's correlation, nan if either is constant; predicted, labels: (n,)."""
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(predicted, labels)[0, 1])

@@ -1,1 +1,1 @@
-"""Wire: the server's and the simulator's end of the socket between them."""
+"""Wire: both ends of the socket between server and simulator."""

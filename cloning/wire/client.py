@@ -1,7 +1,7 @@
 """The simulator's end of the wire: Engine.IO over a WebSocket, with the real client's peculiarities.
 
 The real client announces Engine.IO 4 but speaks version 3: it sends the pings, and no CONNECT packet. It sends
-messages in fragments of 1016 bytes.
+long messages in fragments.
 """
 
 import base64
@@ -17,13 +17,12 @@ from wsproto.events import CloseConnection, Event, Ping, RejectConnection, Reque
 from wsproto.utilities import ProtocolError
 
 from cloning.road.motion import FULL_LOCK
+from cloning.wire.protocol import FRAGMENT, PING_INTERVAL, PONG_TIMEOUT
 
 PATH = "/socket.io/?EIO=4&transport=websocket"
-# Engine.IO packets begin with their type; that of a message, 4, is followed by Socket.IO's type.
+# Engine.IO's packet types, with which each packet begins; a message (4) goes on with Socket.IO's type.
 OPEN, CLOSE, PING, PONG, MESSAGE = "0", "1", "2", "3", "4"
 CONNECT, DISCONNECT, EVENT = "40", "41", "42"
-FRAGMENT = 1016  # bytes
-PING_INTERVAL, PONG_TIMEOUT = 25.0, 60.0  # s
 CONNECT_TIMEOUT = 10.0  # s to reach a server, and again for it to open a session
 CLOSE_TIMEOUT = 1.0  # s for a server to notice that the session is over
 
@@ -34,7 +33,7 @@ class ConnectionLost(Exception):
 
 @dataclass(frozen=True)
 class Answer:
-    """The server's answer to a telemetry: a command, -1..1 each, or None for "manual", which changes nothing."""
+    """The server's answer to a telemetry: steering and throttle, -1..1, or None for "manual", which changes nothing."""
 
     steering: float | None = None
     throttle: float | None = None
@@ -88,7 +87,7 @@ def telemetry_packet(steering: float, throttle: float, speed: float, jpeg: bytes
     return EVENT + json.dumps(["telemetry", values], separators=(",", ":"))
 
 
-MANUAL_TELEMETRY = f'{EVENT}["telemetry",null]'  # while a person steers
+MANUAL_TELEMETRY = f'{EVENT}["telemetry",null]'  # while the human driver holds W or S
 
 
 class Connection:
@@ -98,7 +97,7 @@ class Connection:
         """Connect, and wait until the server has opened a session.
 
         real_timing: write as the real client does, each fragment on its own and with Nagle's algorithm; otherwise
-        each packet at once. Raises ConnectionLost.
+        a whole packet at once. Raises ConnectionLost.
         """
         address = f"{host}:{port}"
         try:
@@ -108,8 +107,8 @@ class Connection:
         self.real_timing = real_timing
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0 if real_timing else 1)
         self.protocol = WSConnection(ConnectionType.CLIENT)
-        self.packets: list[str] = []  # received, and not yet taken
-        self.partial = ""  # of a fragmented message
+        self.packets: list[str] = []  # received, but not yet returned by `receive`
+        self.partial = ""  # message of which not all fragments have arrived
         self.last_ping = time.monotonic()
         self.pong_due_since: float | None = None
         agent = [(b"user-agent", b"websocket-sharp/1.0")]
@@ -125,7 +124,7 @@ class Connection:
             raise
 
     def _open_session(self, address: str) -> None:
-        """Wait for the server's open packet, then ping, as the real client does before anything else."""
+        """Wait for the server's open packet, then ping at once, as the real client does."""
         until = time.monotonic() + CONNECT_TIMEOUT
         while not self.packets:
             self._read_socket(max(0.0, until - time.monotonic()))

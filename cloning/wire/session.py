@@ -1,4 +1,4 @@
-"""A session with drive.py, one telemetry in flight at a time: the part that driving and replaying share."""
+"""A session with drive.py that has one telemetry in flight at a time, for driving and for replaying."""
 
 import sys
 import time
@@ -17,7 +17,7 @@ class ClientSession:
     """Sends telemetry and receives the answers, and connects again when the connection is lost."""
 
     def __init__(self, host: str, port: int, wait: float, real_timing: bool = False):
-        """wait: seconds to wait for a server that is not there, or for a usable answer; real_timing: see Connection."""
+        """wait: seconds to wait for a server to appear, or for a usable answer; real_timing: see Connection."""
         self.address, self.wait, self.real_timing = (host, port), wait, real_timing
         self.round_trips: list[float] = []  # s
         self.unusable = self.reconnections = 0
@@ -58,7 +58,7 @@ class ClientSession:
         return answer
 
     def receive_greeting(self) -> None:
-        """Receive what the server sends unasked at the start: its first command and CONNECT.
+        """Receive the messages that the server sends unasked at the start: its first command and CONNECT.
 
         The real client sends the first frame three times: for each of its two "open" events, and in answer to the
         first command, if the server sends one.
@@ -71,7 +71,10 @@ class ClientSession:
                 break
 
     def receive_unasked(self) -> Answer:
-        """Return the last command that came unasked, so that it is not taken for the answer to the next telemetry."""
+        """Return the last command that came unasked, or an empty answer if none did.
+
+        If it were not taken now, it would pass for the answer to the next telemetry.
+        """
         latest = Answer()
         while (packet := self.connection.receive(0)) is not None:
             latest = self.parse(packet) or latest

@@ -1,4 +1,4 @@
-"""The versions of the socket libraries: others refuse the simulator, or ignore its telemetry."""
+"""Check the versions of the socket libraries: most refuse the simulator or ignore its telemetry."""
 
 import importlib.metadata
 import re
@@ -7,7 +7,7 @@ from pathlib import Path
 from cloning.errors import UserError
 
 SOCKET_LIBRARIES = ("python-socketio", "python-engineio", "eventlet")
-# In an installed package this file is missing; there pip has already installed the same versions.
+# Missing in an installed package, but there pip has installed the same versions.
 REQUIREMENTS = Path(__file__).parents[2] / "requirements.txt"
 
 
