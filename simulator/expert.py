@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from cloning.road.motion import FULL_LOCK, WHEELBASE
+from cloning.road.motion import FULL_LOCK, WHEELBASE, wrap_angle
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import CHARACTERISTIC_SPEED, STEP, TOP_SPEED
 from simulator.run import Run
@@ -63,7 +63,7 @@ class Expert:
         goal = self.track.at(run.s + ahead, self.target_offset(run.travelled + ahead))
         position = car.node.get_pos()
         dx, dy = goal.x - position.x, goal.y - position.y
-        bearing = (math.atan2(dy, dx) - car.heading + math.pi) % (2 * math.pi) - math.pi
+        bearing = wrap_angle(math.atan2(dy, dx) - car.heading)
         curvature = 2 * math.sin(bearing) / math.hypot(dx, dy)  # left positive, as headings are
         angle = math.atan(WHEELBASE * curvature * (1 + (speed / CHARACTERISTIC_SPEED) ** 2))
         wanted = max(-1.0, min(1.0, -math.degrees(angle) / FULL_LOCK))
