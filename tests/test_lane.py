@@ -3,6 +3,7 @@
 Thresholds are about 1.25 times what was measured with bfloat16; with float32 the errors differ by less than 0.003.
 """
 
+import copy
 import subprocess
 import sys
 from pathlib import Path
@@ -108,7 +109,7 @@ def test_a_drive_is_localised_on_its_road(drive):
     assert (found.track.name, found.track.direction) == ("lake", "ccw")
     assert found.log_likelihood > MIN_LOG_LIKELIHOOD
     error = found.states[:, 1] + REAR_AXLE * np.sin(found.states[:, 2]) - true[rows]
-    assert np.abs(error).mean() < 0.165  # measured: 0.131
+    assert np.abs(error).mean() < 0.15  # measured: 0.131
     assert localise(stretch, -centres).log_likelihood < MIN_LOG_LIKELIHOOD  # a road that it is not
 
 
@@ -198,7 +199,7 @@ def test_a_known_trajectory_is_not_computed_again(drawn, monkeypatch):
 
 def test_cameras_and_rows_are_fused(drive):
     """Perfect detections of a straight road from a car that drives along it, 0.7 m right of the centre."""
-    recording, _ = drive
+    recording = copy.deepcopy(drive[0])
     recording.steering[:], recording.speed[:] = 0, 30
     seen = np.broadcast_to(-0.7 - MOUNT_OFFSETS[:, None], (len(recording), 3, len(DISTANCES_AHEAD)))
     found = fuse_detections(recording, seen.astype(np.float32))

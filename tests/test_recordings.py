@@ -228,8 +228,11 @@ def test_folders_are_found_below_links_and_each_once(tmp_path):
     for name in ("disk/lake", "disk/more/jungle", "data/own"):
         draw_recording(tmp_path / name, rows=1)
     data = tmp_path / "data"
-    (data / "disk").symlink_to(tmp_path / "disk")
-    (data / "own" / "up").symlink_to(data)
+    try:
+        (data / "disk").symlink_to(tmp_path / "disk")
+        (data / "own" / "up").symlink_to(data)
+    except OSError:
+        pytest.skip("Windows lets only privileged users make symbolic links")
     found = find_folders([str(data), str(tmp_path / "disk" / "lake")])
     assert [folder.relative_to(data).as_posix() for folder in found] == ["disk/lake", "disk/more/jungle", "own"]
     with pytest.raises(RecordingError, match="no such folder"):

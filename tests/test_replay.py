@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT, draw_recording
+from drive_process import serving
 
 from cloning.errors import SimulatorError, UserError
 from cloning.lane.reader import LanePosition
@@ -155,19 +156,12 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     outputs = "--picture", tmp_path / "way.png", "--film", tmp_path / "seen.mp4"
     alone = run(*folder, "--model", model, "--report", tmp_path / "a.json", *outputs)
     assert alone.returncode == 0, alone.stderr
-    server = subprocess.Popen(
-        [sys.executable, "drive.py", model, "--port", "0"], cwd=ROOT, text=True, stderr=subprocess.PIPE
-    )
-    try:
-        port = re.search(r":(\d+)\.", server.stderr.readline())[1]
-        served = run(*folder, "--port", port, "--report", tmp_path / "b.json")
-    finally:
-        server.terminate()
-        server.wait(20)
+    with serving(model) as server:
+        served = run(*folder, "--port", server.port, "--report", tmp_path / "b.json")
     assert served.returncode == 0, served.stderr
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
     assert alone.stdout == served.stdout
-    [report] = json.loads((tmp_path / "a.json").read_text())
+    [report] = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert set(report["limits"]) == {"1", "2.5"} and report["rows_driven"] == 300
     assert report["reference"] == {"lane centre": 0, "human's way": 300} and "cannot be estimated" not in alone.stdout
     one = report["limits"]["1"]
@@ -192,7 +186,7 @@ def test_on_an_unknown_road_the_humans_way_is_the_reference(tmp_path, model):
     assert done.returncode == 0, done.stderr
     assert "from the human driver's path in 60 rows" in done.stdout
     assert "the lane centre cannot be estimated reliably" in done.stdout
-    assert list(json.loads((tmp_path / "r.json").read_text())[0]["limits"]) == ["2"]
+    assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == ["2"]
 
 
 def test_the_same_answer_in_process_as_by_the_network(recording, model):
@@ -232,7 +226,7 @@ def test_a_limit_given_twice_is_driven_once_and_one_drive_writes_the_film(model,
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json"
     done = run("--reference", "human", folder, "--model", model, "--limit", *limits, *outputs)
     assert done.returncode == 0, done.stderr
-    assert list(json.loads((tmp_path / "r.json").read_text())[0]["limits"]) == driven
+    assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == driven
     assert film_frames(tmp_path / "x.mp4") == 60
 
 
@@ -248,7 +242,8 @@ def test_a_full_disk_costs_the_film_alone(folder, model, tmp_path):
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert re.fullmatch(r"simulator: \S+x\.mp4: .*no film was written.*\n", done.stderr)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.png", "r.json"]
-    assert "autonomy" in done.stdout and json.loads((tmp_path / "r.json").read_text())[0]["limits"]["2"]
+    assert "autonomy" in done.stdout
+    assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]["2"]
 
 
 def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording):
@@ -316,7 +311,7 @@ def test_the_score_board_keeps_what_it_has(tmp_path, model):
             timeout=200,
         )
         assert done.returncode == 0, done.stderr
-    lines = (tmp_path / "table.md").read_text().splitlines()
+    lines = (tmp_path / "table.md").read_text(encoding="utf-8").splitlines()
     assert "| course | one | two |" in lines
     rows = [line.split("|")[1:-1] for line in lines if line.startswith("| real lake, 1 m from")]
     assert len(rows) == 1 and rows[0][1] == rows[0][2] and "%" in rows[0][1]

@@ -73,20 +73,15 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, drawn,
     assert not list(tmp_path.glob("*previous*"))  # a run never takes its own files for an earlier run's
 
 
-def test_killed_when_an_epoch_was_just_saved_loses_nothing_of_its_log(finished, drawn, tmp_path, monkeypatch):
+def test_killed_when_an_epoch_was_just_saved_loses_nothing_of_its_log(finished, drawn, tmp_path):
+    killed = [
+        sys.executable,
+        "-c",
+        "import os, model; save = model.TrainingRun.save; "
+        "model.TrainingRun.save = lambda run, *models: (save(run, *models), models and os._exit(9)); model.main()",
+    ]
     arguments = (drawn, *SHORT, "--output", tmp_path / "model.pt", "--resume")
-    with monkeypatch.context() as patch:
-        save = model.TrainingRun.save
-
-        def save_and_die(run, *models):
-            save(run, *models)
-            if models:
-                raise Killed
-
-        patch.setattr(model.TrainingRun, "save", save_and_die)
-        for _ in range(2):
-            with pytest.raises(Killed):
-                run_here(*arguments)
+    assert [run_model(*arguments, command=killed, env=HERE).returncode for _ in range(2)] == [9, 9]
     done = run_here(*arguments)
     assert done.returncode == 0, done.stderr
     assert [row["val_loss"] for row in log(tmp_path)] == [row["val_loss"] for row in log(finished[1])]
@@ -102,7 +97,7 @@ def test_a_signal_ends_cleanly_with_everything_saved(finished, drawn, tmp_path, 
         if line.startswith("Epoch"):
             break
     run.send_signal(number)
-    _, errors = run.communicate(timeout=60)
+    _, errors = run.communicate(timeout=120)
     assert run.returncode == 128 + number
     assert errors.startswith("model.py: ") and "--resume" in errors
     assert "Traceback" not in errors

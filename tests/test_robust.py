@@ -20,7 +20,7 @@ from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FA
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
 from cloning.road.warp import SOURCE_ROWS, ground_mask
 from cloning.training import robust
-from cloning.training.robust import Lanes, Poses
+from cloning.training.robust import Lanes, Poses, RobustObservations
 
 N, SPEED = 300, 20.0  # rows; mph
 
@@ -301,3 +301,31 @@ def test_rows_in_bends_are_sampled_more_often(monkeypatch):
     assert steering > 0.2
     assert weights.sum() == pytest.approx(1)
     assert weights[3] / weights[0] == pytest.approx((robust.STRAIGHT_WEIGHT + steering) / robust.STRAIGHT_WEIGHT)
+
+
+def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monkeypatch):
+    many = lanes(monkeypatch, 0.4)
+    both = Lanes.joined([Lanes.unknown(2000), many.take(np.full(2000, 100))])
+    n, drive = len(both), recording(0.4)
+    rows = np.full(n, 100, np.int32)
+    labels = both.steering(both.offset, both.yaw)
+    everything = RobustObservations([drive], np.zeros(n, int), rows, labels, np.arange(n, dtype=np.uint64), rows, both)
+    turn = everything.shuffle(np.random.default_rng(0))
+    assert len(turn) == n
+    expected = both.weights()[2000:].sum()  # of the rows in a bend
+    assert expected > 0.6
+    assert (turn >= 2000).mean() == pytest.approx(expected, abs=0.03)
+    views = everything.sample_views(turn, np.zeros(n, int), 0.2, np.random.default_rng(1))
+    for poses in views.poses:
+        assert poses.mirrored.mean() == pytest.approx(0.5, abs=0.03)
+
+
+def test_the_label_is_the_recovery_steering_and_not_the_drivers(monkeypatch):
+    """Rows whose lane is 1 m to the left of a car that a human drives straight on."""
+    reading = LanePosition(np.full(N, 1.0), np.zeros(N), np.ones(N, bool))
+    monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
+    monkeypatch.setattr(robust, "center_digests", lambda _, rows: np.zeros(len(rows), np.uint64))
+    selected = RobustObservations.select(recording(0.0), model.Arguments(robust=True))
+    assert (selected.steering < -0.1).all()
+    assert selected.steering == pytest.approx(selected.lanes.steering(1.0, 0.0), abs=1e-4)
+    assert 0.5 * N < len(selected) < N

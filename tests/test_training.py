@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,6 +62,21 @@ def test_training_learns(drawn, tmp_path):
     correlations = next(line.split()[-4:] for line in done.stdout.splitlines() if line.startswith("correlation"))
     assert float(correlations[2]) > 0.95
     assert "hardly follows" not in done.stdout
+
+
+def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(drawn, tmp_path):
+    arguments, training, validation, _ = model.prepare(*model.parse([str(drawn), "--output", str(tmp_path / "m.pt")]))
+    rows = np.loadtxt(drawn / "driving_log.csv", delimiter=",", usecols=(3, 4))
+    assert not set(training.frame) & set(validation.frame)
+    used, driven = {*training.row, *validation.row}, set(np.flatnonzero(rows[:, 1]))  # throttle is 0 in the others
+    assert used <= driven and all(abs(rows[row, 0]) < 0.02 for row in driven - used)
+    assert len(validation) == len(set(validation.row)) < 0.35 * len(set(training.row))
+    times = np.bincount(training.row, minlength=len(rows))[training.row]
+    size = np.abs(rows[training.row, 0])
+    assert set(times[(size > 0.2) & (size <= 0.5)]) == {2} and set(times[size < 0.2]) == {1}
+    run = model.TrainingRun(arguments, training, validation)
+    run.pool.shutdown()
+    assert run.generator.observations is training and run.validation is validation
 
 
 def test_same_seed_same_weights_other_seed_others(finished, drawn, tmp_path):
@@ -202,23 +218,50 @@ TORCHRUN = [
 ]
 
 
+# On one worker of pytest-xdist, where these three share two starts of two processes.
+several_processes = pytest.mark.xdist_group("several processes")
+without_libuv = pytest.mark.skipif(sys.platform == "win32", reason="PyTorch for Windows has no libuv for torchrun")
+
+
 @pytest.fixture(scope="module")
-def two_processes(drawn, tmp_path_factory):
-    """An epoch by two processes, and a second one that they resume with the run's own arguments: output, folder."""
+def two_processes(drawn, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
+    """Two epochs by two processes: what they printed, and their folder; not to be changed."""
     folder = tmp_path_factory.mktemp("two processes")
-    begun = run_model(drawn, *SHORT, "--epochs", 1, "--output", folder / "model.pt", command=TORCHRUN)
-    resumed = run_model("--output", folder / "model.pt", "--resume", "--epochs", 2, command=TORCHRUN)
-    assert (begun.returncode, resumed.returncode) == (0, 0), begun.stderr + resumed.stderr
-    return begun.stdout + resumed.stdout, folder
+    done = run_model(drawn, *SHORT, "--output", folder / "model.pt", command=TORCHRUN)
+    assert done.returncode == 0, done.stderr
+    return done, folder
 
 
-def test_two_processes_train_as_one_also_when_they_resume(finished, two_processes):
-    """Two ranks with half of every batch each end where one process ends, up to rounding."""
-    a, b = weights(finished[1] / "model.pt"), weights(two_processes[1] / "model.pt")
-    for name in a:  # Adam moves a weight by up to 1e-4 a step, of which there were 12
+def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
+    """Adam moves a weight by up to 1e-4 a step, of which there were 12 or more."""
+    a, b = weights(one), weights(other)
+    for name in a:
         assert (a[name] - b[name]).abs().mean() < 2e-6
 
 
+@several_processes
+@without_libuv
+def test_two_processes_train_as_one(finished, two_processes):
+    """Two ranks with half of every batch each end where one process ends."""
+    assert_equal_up_to_rounding(finished[1] / "model.pt", two_processes[1] / "model.pt")
+
+
+@several_processes
+@without_libuv
+def test_two_processes_continue_with_the_runs_own_arguments(finished, two_processes, tmp_path):
+    one, two = (
+        shutil.copytree(folder, tmp_path / name) for (_, folder), name in ((finished, "one"), (two_processes, "two"))
+    )
+    more = ("--resume", "--epochs", 3)
+    assert run_here("--output", one / "model.pt", *more).returncode == 0
+    done = run_model("--output", two / "model.pt", *more, command=TORCHRUN)
+    assert done.returncode == 0, done.stderr
+    assert [row["epoch"] for row in log(two)] == ["1", "2", "3"]
+    assert_equal_up_to_rounding(one / "model.pt", two / "model.pt")
+
+
+@several_processes
+@without_libuv
 def test_two_processes_print_once_and_the_losses_of_both(finished, two_processes):
     logs = [
         [
@@ -227,6 +270,6 @@ def test_two_processes_print_once_and_the_losses_of_both(finished, two_processes
             if "val_loss" in line
             for number in re.findall(r"loss: ([\d.]+)", line)
         ]
-        for output in (finished[0].stdout, two_processes[0])
+        for output in (finished[0].stdout, two_processes[0].stdout)
     ]
     assert len(logs[0]) == 4 and logs[1] == pytest.approx(logs[0], abs=2e-4)  # the global losses; bfloat16 rounds

@@ -56,7 +56,7 @@ def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
 def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
     save(tmp_path / "run1")
     result = subprocess.run(
-        [sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True, text=True, timeout=60
+        [sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
     assert result.returncode == 0 and "run1.mp4: 30 frames at 20 frames/s" in result.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run1", "run1.mp4"]
@@ -74,7 +74,7 @@ def test_what_a_person_would_wish(run, tmp_path):
     folder = tmp_path / "run.1"
     save(folder, 10)
     save(folder, 2, rows=80, columns=160, begin=datetime(2018, 7, 16, 17, 11, 44), first=10)
-    (folder / "notes.txt").write_text("mine")
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
     (folder / "2018_07_16_17_11_44_900.jpg").write_bytes(b"")
     whole = (folder / "2018_07_16_17_11_43_000.jpg").read_bytes()
     (folder / "2018_07_16_17_11_44_901.jpg").write_bytes(whole[: len(whole) // 2])
