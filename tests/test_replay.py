@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import av
 import cv2
@@ -115,6 +116,25 @@ def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
     assert not line.is_lane_centre and not line.offset.any()
 
 
+def test_a_car_is_set_back_onto_the_line_and_along_it(recording):
+    [line] = human(recording)
+    line = replace(line, offset=np.full(300, 0.8), yaw=np.full(300, 0.1), is_lane_centre=True)
+    car = replay.ReplayedCar(recording, line)
+    for row in range(5):
+        car.move(row, 1.0)
+    assert car.offset(5) > 0.8 and car.yaw > 0 and car.curvature > car.human_curvature
+    car.set_back(5)
+    assert car.offset(5) == pytest.approx(0, abs=1e-9)
+    assert car.yaw == pytest.approx(-0.1), "the human's heading is 0.1 to the right of the line's"
+    assert car.curvature == car.human_curvature
+
+
+def road_column(frame: np.ndarray) -> float:
+    """The mean column of the grey road in the rows near the car."""
+    red, _, blue = np.moveaxis(frame[90:130].astype(int), -1, 0)
+    return np.nonzero(np.abs(red - blue) < 35)[1].mean()
+
+
 def test_the_model_sees_the_recorded_file_itself_while_it_is_on_the_humans_way(recording):
     seen = []
 
@@ -122,11 +142,13 @@ def test_the_model_sees_the_recorded_file_itself_while_it_is_on_the_humans_way(r
         seen.append((frame.jpeg(), frame.recorded, frame.view))
         return frame.human_steering + (0.3 if len(seen) == 100 else 0)
 
-    replay.drive(recording, human(recording), 2.5, driver)
+    done = replay.drive(recording, human(recording), 2.5, driver)
     names = [recording.folder / "IMG" / os.fsdecode(recording.names[image]) for image in recording.images[:, 0]]
     assert all(jpeg == path.read_bytes() for (jpeg, *_), path in zip(seen[:100], names, strict=False))
     jpeg, recorded, view = seen[150]
     assert np.abs(view.astype(int) - recorded)[70:130].mean() > 5, "moved"
+    assert done.offset_from_human[150] > 0.1
+    assert road_column(view) < road_column(recorded) - 3, "from further right, the road is further left"
     assert np.abs(decode(jpeg).astype(int) - view)[60:135].mean() < 4, "sent as seen"
 
 

@@ -177,6 +177,24 @@ def test_sampled_poses_are_on_both_sides_and_of_every_camera(monkeypatch):
         assert 0.2 < (poses.steering[poses.camera == camera] > 0).mean() < 0.8
 
 
+@pytest.mark.parametrize("human", [0.0, 1.5, -1.5])
+def test_sampled_poses_are_near_the_lane_and_near_the_recorded_car(monkeypatch, human):
+    """Far from the recorded car, little of the warped frame would be seen."""
+    found, sampled, of = lanes(monkeypatch, offset=human).take(np.full(2000, 100)), [], Poses.of
+
+    def note(lanes, offset, yaw, *more):
+        sampled[:] = offset, yaw
+        return of(lanes, offset, yaw, *more)
+
+    monkeypatch.setattr(Poses, "of", note)
+    found.sample_poses(np.random.default_rng(0), np.zeros(2000, bool))
+    offset, yaw = sampled
+    least = max(-robust.MAX_OFFSET, human - robust.MAX_SHIFT)
+    most = min(robust.MAX_OFFSET, human + robust.MAX_SHIFT)
+    assert (offset.min(), offset.max()) == (pytest.approx(least, abs=0.01), pytest.approx(most, abs=0.01))
+    assert np.abs(yaw).max() <= robust.MAX_YAW and yaw.std() > 0.5 * robust.YAW_DEVIATION
+
+
 # --------------------------------------------------------------------------------------------------
 # The command
 
