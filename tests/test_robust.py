@@ -81,11 +81,11 @@ def test_a_shifted_car_comes_back_and_stays(monkeypatch, steering, right, yaw):
 
 def test_the_label_grows_with_offset_and_yaw(monkeypatch):
     one = lanes(monkeypatch).take(np.array([50]))
-    by_place = [
+    by_offset = [
         float(one.steering(right, 0.0)[0]) for right in np.linspace(-robust.STEEPEST_FROM, robust.STEEPEST_FROM, 9)
     ]
     by_yaw = [float(one.steering(0.0, yaw)[0]) for yaw in np.linspace(-0.2, 0.2, 9)]
-    for found in (by_place, by_yaw):
+    for found in (by_offset, by_yaw):
         assert (np.diff(found) < 0).all()
         assert found[4] == pytest.approx(0, abs=1e-6)
 
@@ -189,10 +189,9 @@ def test_sampled_poses_are_near_the_lane_and_near_the_recorded_car(monkeypatch, 
     monkeypatch.setattr(Poses, "of", note)
     found.sample_poses(np.random.default_rng(0), np.zeros(2000, bool))
     offset, yaw = sampled
-    least = max(-robust.MAX_OFFSET, human - robust.MAX_SHIFT)
-    most = min(robust.MAX_OFFSET, human + robust.MAX_SHIFT)
+    least, most = max(-2.0, human - 2.4), min(2.0, human + 2.4)  # m from the lane's centre and from the recorded car
     assert (offset.min(), offset.max()) == (pytest.approx(least, abs=0.01), pytest.approx(most, abs=0.01))
-    assert np.abs(yaw).max() <= robust.MAX_YAW and yaw.std() > 0.5 * robust.YAW_DEVIATION
+    assert np.degrees(np.abs(yaw).max()) <= 25 and np.degrees(yaw.std()) == pytest.approx(8, abs=0.5)
 
 
 # --------------------------------------------------------------------------------------------------
