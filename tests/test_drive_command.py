@@ -28,7 +28,7 @@ def failing(*arguments, first="") -> str:
     return process.stderr
 
 
-def test_mistakes_are_told(model_file, tmp_path):
+def test_mistakes_are_reported(model_file, tmp_path):
     assert "no such file" in failing(tmp_path / "none.pt")
     torch.save({"weights": [1]}, tmp_path / "foreign.pt")
     assert "not a model of this project" in failing(tmp_path / "foreign.pt")
@@ -43,14 +43,14 @@ def test_mistakes_are_told(model_file, tmp_path):
         port = other.getsockname()[1]
         assert f"can't listen on 127.0.0.1:{port}" in failing(model_file, tmp_path / "run1", "--port", port)
     with serving(model_file) as other:  # two servers must not share a port, which SO_REUSEPORT would let them do
-        said = failing(model_file, tmp_path / "run1", "--port", other.port)
-        assert f"can't listen on 127.0.0.1:{other.port}" in said
+        message = failing(model_file, tmp_path / "run1", "--port", other.port)
+        assert f"can't listen on 127.0.0.1:{other.port}" in message
     assert frame.exists(), "a server that cannot start deletes nothing"
 
 
 def test_other_versions_of_the_socket_libraries_are_refused():
-    said = failing(first="import importlib.metadata; importlib.metadata.version = lambda name: '5.18.1'")
-    assert "python-socketio is 5.18.1 and must be 4.6.1" in said and "pip install -r requirements.txt" in said
+    message = failing(first="import importlib.metadata; importlib.metadata.version = lambda name: '5.18.1'")
+    assert "python-socketio is 5.18.1 and must be 4.6.1" in message and "pip install -r requirements.txt" in message
 
 
 def test_the_versions_come_from_requirements_txt(tmp_path):

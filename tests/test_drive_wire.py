@@ -1,4 +1,4 @@
-"""drive.py as a process, over real sockets: the simulator's conversation, strangers' requests, other clients."""
+"""drive.py as a process, over real sockets: the simulator's session, requests of other sites, other clients."""
 
 import json
 import os
@@ -195,7 +195,7 @@ def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering
                     simulator.receive()
 
 
-def test_ten_thousand_malformed_messages_leave_the_other_driving_untouched(server, jpegs, steering):
+def test_ten_thousand_malformed_messages_do_not_disturb_another_session(server, jpegs, steering):
     junk = ['42["telemetry",{"image":"*"}]', '42["telemetry"', "42{", "9", '42["telemetry",null]', "4", "51-[", "hello"]
     flood = b"".join(fragment for n in range(10_000) for fragment in fragments(junk[n % len(junk)]))
     with Simulator(server.port) as simulator, Simulator(server.port) as stranger:
@@ -226,7 +226,7 @@ def test_ten_thousand_malformed_messages_leave_the_other_driving_untouched(serve
 
 
 # --------------------------------------------------------------------------------------------------
-# Strangers
+# Requests of other sites
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_ten_thousand_malformed_messages_leave_the_other_driving_untouched(serve
         ("", 101),
     ],
 )
-def test_another_origin_can_not_connect(server, header, status):
+def test_another_origin_cannot_connect(server, header, status):
     with Simulator(server.port, headers=header.format(port=server.port)) as stranger:
         assert stranger.status == status
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
-from conftest import ROOT, draw_recording
+from conftest import ROOT, render_recording
 
 from cloning.errors import ModelError, RecordingError
 from cloning.lane import reader
@@ -78,7 +78,7 @@ def test_a_strip_is_the_frame_at_half_the_resolution():
     assert abs(row - 16) <= 2 and abs(column - 80) <= 2
 
 
-def test_light_and_contrast_are_taken_off():
+def test_brightness_and_contrast_are_normalised():
     rng = np.random.default_rng(0)
     picture = rng.integers(40, 120, STRIP_SHAPE).astype(np.uint8)
     brighter = (picture * 2 + 10).astype(np.uint8)
@@ -187,8 +187,8 @@ def test_the_side_cameras_appear_where_they_are_mounted(drive):
         assert appears == pytest.approx(MOUNT_OFFSETS[camera], abs=0.032)  # measured: 0.025
 
 
-def test_a_known_trajectory_is_not_computed_again(drawn, monkeypatch):
-    recording = read_recording(drawn)
+def test_a_known_trajectory_is_not_computed_again(sample_recording, monkeypatch):
+    recording = read_recording(sample_recording)
     centres = np.zeros((len(recording), 3, len(DISTANCES_AHEAD)), np.float32)
     expected, known = fuse_detections(recording, centres), stretches(recording)
     assert [stretch.rows for stretch in known] == [slice(0, len(recording))]
@@ -210,7 +210,7 @@ def test_cameras_and_rows_are_fused(drive):
 
 
 def test_noise_is_an_unknown_road(tmp_path):
-    folder = draw_recording(tmp_path / "noise", rows=40)
+    folder = render_recording(tmp_path / "noise", rows=40)
     rng = np.random.default_rng(0)
     for path in (folder / "IMG").iterdir():
         cv2.imwrite(str(path), rng.integers(0, 256, (160, 320, 3)).astype(np.uint8))
@@ -218,8 +218,8 @@ def test_noise_is_an_unknown_road(tmp_path):
     assert not estimate_lane_position(recording, stretches(recording)).trusted.any()
 
 
-def test_a_drawing_of_another_kind_is_an_unknown_road(drawn):
-    recording = read_recording(drawn)
+def test_frames_of_another_kind_are_an_unknown_road(sample_recording):
+    recording = read_recording(sample_recording)
     assert estimate_lane_position(recording, stretches(recording)).trusted.mean() < 0.35  # measured: 0.267
 
 
@@ -232,10 +232,10 @@ def test_real_recordings_are_trusted(folder):
     assert trusted > (0.98 if "lake" in folder.name else 0.7)  # measured: 1 on two lakes, 0.84 and 0.76 on two jungles
 
 
-def test_training_leaves_weights_that_load(tmp_path, drawn):
+def test_training_leaves_weights_that_load(tmp_path, sample_recording):
     output = tmp_path / "lane.pt"
     done = subprocess.run(
-        [sys.executable, "-m", "tools.train_lane", drawn, *SHORT_TRAINING, "--output", output],
+        [sys.executable, "-m", "tools.train_lane", sample_recording, *SHORT_TRAINING, "--output", output],
         capture_output=True,
         text=True,
         timeout=300,
@@ -265,15 +265,15 @@ def no_weights(tmp_path, monkeypatch):
     load_network.cache_clear()
 
 
-def test_robust_training_without_weights_says_so(no_weights, drawn, tmp_path, capsys):
+def test_robust_training_without_weights_reports_it(no_weights, sample_recording, tmp_path, capsys):
     import model
 
-    assert model.main([str(drawn), "--robust", "--output", str(tmp_path / "model.pt")]) == 2
+    assert model.main([str(sample_recording), "--robust", "--output", str(tmp_path / "model.pt")]) == 2
     assert "lane.pt: no such file" in capsys.readouterr().err
 
 
-def test_a_replay_without_weights_says_so(no_weights, drawn, capsys):
-    assert simulator.main(["replay", str(drawn), "--model", str(PILOT)]) == 2
+def test_a_replay_without_weights_reports_it(no_weights, sample_recording, capsys):
+    assert simulator.main(["replay", str(sample_recording), "--model", str(PILOT)]) == 2
     error = capsys.readouterr().err
     assert "simulator: " in error and "lane.pt: no such file" in error
 

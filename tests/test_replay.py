@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, draw_recording
+from conftest import ROOT, render_recording
 from drive_process import serving
 
 from cloning.errors import SimulatorError, UserError
@@ -34,7 +34,7 @@ except ImportError:  # Windows
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A recording of 20 seconds through bends."""
-    return draw_recording(tmp_path_factory.mktemp("replay") / "lake", rows=300, seed=4)
+    return render_recording(tmp_path_factory.mktemp("replay") / "lake", rows=300, seed=4)
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_bad_drivers_score_badly(recording, driver):
 
 
 def test_the_car_goes_where_geometry_says(recording):
-    """On a straight, a constant steering drives a circle off the human's way, once the car has begun to turn."""
+    """On a straight, a constant steering drives a circle away from the human's path, once the car has begun to turn."""
     recording.steering[:], recording.speed[:] = 0.0, 15
     done = replay.drive(recording, human(recording), 3.0, lambda frame: 0.02)
     at = next(iter(done.interventions))
@@ -88,8 +88,8 @@ def test_the_car_goes_where_geometry_says(recording):
     assert done.interventions[at] > 3 and done.offset[at] == 0
 
 
-def test_in_a_bend_the_inner_way_is_shorter(recording):
-    """Whoever steers a little more than the human in a bend runs a circle of his own, whatever the human's speed."""
+def test_in_a_bend_the_inner_path_is_shorter(recording):
+    """A driver that steers a little more than the human in a bend drives its own circle."""
     recording.steering[:], recording.speed[:] = 0.3, 20
     done = replay.drive(recording, human(recording)[:1], 30.0, lambda frame: 0.32)
     r, own = 1 / curvature(np.float32(0.3)), 1 / curvature(np.float32(0.32))
@@ -135,7 +135,7 @@ def road_column(frame: np.ndarray) -> float:
     return np.nonzero(np.abs(red - blue) < 35)[1].mean()
 
 
-def test_the_model_sees_the_recorded_file_itself_while_it_is_on_the_humans_way(recording):
+def test_the_model_sees_the_recorded_file_itself_on_the_humans_path(recording):
     seen = []
 
     def driver(frame):
@@ -200,8 +200,8 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     assert av.open(str(tmp_path / "seen.mp4")).streams.video[0].width == 1280
 
 
-def test_on_an_unknown_road_the_humans_way_is_the_reference(tmp_path, model):
-    folder, random = draw_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
+def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):
+    folder, random = render_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
     for path in (folder / "IMG").iterdir():
         cv2.imwrite(str(path), random.integers(0, 255, (160, 320, 3), np.uint8))
     done = run(folder, "--model", model, "--limit", "2", "--report", tmp_path / "r.json")
@@ -224,7 +224,7 @@ def test_the_same_answer_in_process_as_by_the_network(recording, model):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["nowhere"], "no such folder"),
         (["FOLDER", "--model", "nothing.pt"], "no such file"),
@@ -232,10 +232,10 @@ def test_the_same_answer_in_process_as_by_the_network(recording, model):
         (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
     ],
 )
-def test_unusable_arguments_are_said(folder, model, arguments, said):
+def test_unusable_arguments_are_reported(folder, model, arguments, message):
     known = {"FOLDER": folder, "MODEL": model}
     done = run(*[known.get(argument, argument) for argument in arguments])
-    assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
 
 
 def film_frames(path) -> int:
@@ -244,7 +244,7 @@ def film_frames(path) -> int:
 
 @pytest.mark.parametrize(("limits", "driven"), [(["1", "1"], ["1"]), (["2", "1", "2"], ["2", "1"])])
 def test_a_limit_given_twice_is_driven_once_and_one_drive_writes_the_film(model, tmp_path, limits, driven):
-    folder = draw_recording(tmp_path / "lake", rows=60)
+    folder = render_recording(tmp_path / "lake", rows=60)
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json"
     done = run("--reference", "human", folder, "--model", model, "--limit", *limits, *outputs)
     assert done.returncode == 0, done.stderr
@@ -282,7 +282,7 @@ def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording):
     assert len(rows) < 110
 
 
-def test_all_outputs_are_tried_and_every_failure_is_said():
+def test_all_outputs_are_tried_and_every_failure_is_reported():
     from cloning.outputs import run_all
 
     done = []
@@ -298,7 +298,7 @@ def test_all_outputs_are_tried_and_every_failure_is_said():
 
 
 def test_a_recording_without_two_seconds_of_driving_is_refused(tmp_path, model):
-    done = run(draw_recording(tmp_path / "short", rows=20), "--model", model)
+    done = run(render_recording(tmp_path / "short", rows=20), "--model", model)
     assert done.returncode == 2 and "two seconds" in done.stderr
 
 
@@ -309,8 +309,8 @@ def test_stretches_are_joined_in_one_report(folder, tmp_path):
     assert len(human(recording)) == 2 and sum(done.seconds) == pytest.approx(298 * 0.067, abs=0.01)
 
 
-def test_the_score_board_keeps_what_it_has(tmp_path, model):
-    folder = draw_recording(tmp_path / "lake", rows=40)
+def test_the_scoreboard_keeps_its_columns(tmp_path, model):
+    folder = render_recording(tmp_path / "lake", rows=40)
     for name, extra in (("one", ["--what", "untrained"]), ("two", [])):
         done = subprocess.run(
             [

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, SHORT, draw_recording, finished_run, run_here, run_model, weights
+from conftest import ROOT, SHORT, finished_run, render_recording, run_here, run_model, weights
 
 import model
 from cloning.lane.reader import LanePosition
@@ -201,11 +201,11 @@ ROBUST = ("--robust", *SHORT)
 
 
 @pytest.fixture(scope="module")
-def finished(drawn, tmp_path_factory):
-    return finished_run(drawn, tmp_path_factory.mktemp("robust"), *ROBUST)
+def finished(sample_recording, tmp_path_factory):
+    return finished_run(sample_recording, tmp_path_factory.mktemp("robust"), *ROBUST)
 
 
-def test_robust_trains_and_says_what_was_left_out(finished, drawn):
+def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording):
     done, folder = finished
     assert "lane ahead unknown" in done.stdout
     row = next(line for line in done.stdout.splitlines() if line.startswith("total"))
@@ -220,8 +220,15 @@ def test_robust_trains_and_says_what_was_left_out(finished, drawn):
     assert (arguments["batch_size"], arguments["learning_rate"]) == (8, 3e-4)  # as given, and as --robust sets it
 
 
-def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, drawn, tmp_path):
-    command = [sys.executable, str(ROOT / "model.py"), str(drawn), *map(str, ROBUST), "--output", tmp_path / "model.pt"]
+def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_recording, tmp_path):
+    command = [
+        sys.executable,
+        str(ROOT / "model.py"),
+        str(sample_recording),
+        *map(str, ROBUST),
+        "--output",
+        tmp_path / "model.pt",
+    ]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert any(line.startswith("Epoch 2") for line in run.stdout)
     run.kill()
@@ -233,7 +240,9 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, drawn, t
 
 
 @pytest.mark.parametrize("options, begins", [([], 1e-4), (["--robust"], 3e-4)])
-def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(drawn, tmp_path, monkeypatch, options, begins):
+def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
+    sample_recording, tmp_path, monkeypatch, options, begins
+):
     steps = []  # (finished epochs, images of this epoch after the step, rate of the step)
 
     def note(run, *models):
@@ -243,7 +252,7 @@ def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(drawn, t
     monkeypatch.setattr(model, "SAVE_SECONDS", -1)
     monkeypatch.setattr(model.TrainingRun, "save", note)
     monkeypatch.setattr(model.TrainingRun, "summary", lambda run: "")  # of model files that are not written
-    done = run_here(drawn, *SHORT, *options, "--output", tmp_path / "model.pt")
+    done = run_here(sample_recording, *SHORT, *options, "--output", tmp_path / "model.pt")
     assert done.returncode == 0, done.stderr
     assert len(steps) > 8
     shares = [  # of the run that was done before each step
@@ -255,8 +264,8 @@ def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(drawn, t
     assert shares[0] == 0 and shares[-1] > 0.8
 
 
-def test_validation_counts_centre_images_and_other_poses_alike(drawn, tmp_path):
-    arguments = model.parse([str(drawn), *map(str, ROBUST), "--output", str(tmp_path / "model.pt")])
+def test_validation_counts_centre_images_and_other_poses_alike(sample_recording, tmp_path):
+    arguments = model.parse([str(sample_recording), *map(str, ROBUST), "--output", str(tmp_path / "model.pt")])
     run = model.TrainingRun(*model.prepare(*arguments)[:3])
     with run.pool:
         both = run.validate()
@@ -269,26 +278,26 @@ def test_validation_counts_centre_images_and_other_poses_alike(drawn, tmp_path):
     assert not np.array_equal(center(np.arange(3)), warped(np.arange(3)))
 
 
-def test_a_missing_lane_network_is_named(drawn, tmp_path):
+def test_a_missing_lane_network_is_named(sample_recording, tmp_path):
     for name in ("cloning", "model.py"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, tmp_path / name)
     (tmp_path / "cloning" / "lane" / "lane.pt").unlink()
-    done = run_model(drawn, *ROBUST, command=[sys.executable, "model.py"], cwd=tmp_path)
+    done = run_model(sample_recording, *ROBUST, command=[sys.executable, "model.py"], cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("model.py: ") and "lane.pt: no such file" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_the_reports_options_do_not_go_with_robust(drawn, tmp_path):
+def test_the_reports_options_do_not_go_with_robust(sample_recording, tmp_path):
     for option in ("--throttle-threshold", "--side-correction"):
-        done = run_here(drawn, "--robust", option, 0.1, "--output", tmp_path / "model.pt")
+        done = run_here(sample_recording, "--robust", option, 0.1, "--output", tmp_path / "model.pt")
         assert done.returncode == 2
         assert f"{option} belongs to the report's training" in done.stderr
 
 
 def test_drives_too_short_are_named(tmp_path):
-    done = run_here(draw_recording(tmp_path / "short", rows=20), *ROBUST, "--output", tmp_path / "model.pt")
+    done = run_here(render_recording(tmp_path / "short", rows=20), *ROBUST, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
     assert "too short" in done.stderr
 

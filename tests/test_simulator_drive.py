@@ -18,7 +18,7 @@ from simulator import report
 from simulator.__main__ import main
 
 
-def test_a_report_that_cannot_be_written_is_said_before_the_drive(tmp_path):
+def test_a_report_that_cannot_be_written_is_reported_before_the_drive(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "simulator", "drive", "--report", str(tmp_path / "no" / "report.json")],
         capture_output=True,
@@ -46,8 +46,8 @@ def test_report_says_what_happened(tmp_path):
         1 - 6 * len(figures["departures"]) / figures["simulated_seconds"], abs=1e-3
     )
     assert figures["frames_per_simulated_second"] == pytest.approx(15, abs=0.5)
-    said = report.report_text(figures)
-    assert f"departures: {len(figures['departures'])}" in said
+    printed = report.report_text(figures)
+    assert f"departures: {len(figures['departures'])}" in printed
     write_json(tmp_path / "report.json", figures)
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8")) == figures
     report.write_picture(tmp_path / "way.png", client.run)

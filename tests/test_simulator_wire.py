@@ -122,13 +122,13 @@ def test_answers_are_read():
     assert parse_answer('42["manual",{}]') == Answer()
 
 
-def test_a_lost_reply_is_said_with_what_came_instead():
+def test_a_lost_reply_is_reported_with_what_came_instead():
     numbers = '42["steer",{"steering_angle":0.0,"throttle":0.5}]'
     with Server(lambda packet, n: [numbers]) as server, pytest.raises(SimulatorError, match="3 unusable"):
         drive(server, wait=0.5)
 
 
-def test_a_missing_server_is_waited_for_then_said():
+def test_a_missing_server_is_waited_for_then_reported():
     closed = socket.create_server(("127.0.0.1", 0))
     port = closed.getsockname()[1]
     closed.close()
@@ -137,7 +137,7 @@ def test_a_missing_server_is_waited_for_then_said():
         Client(run, Blank(), "127.0.0.1", port, 0.5, False).drive(1)
 
 
-def test_a_server_that_is_no_websocket_is_said():
+def test_a_server_that_is_not_a_websocket_is_reported():
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def refuse():
@@ -156,7 +156,7 @@ def test_a_server_that_is_no_websocket_is_said():
 
 @pytest.mark.parametrize("realtime", [False, True])
 @pytest.mark.parametrize("death", [None, "close", ["41"], ["1"]])
-def test_reconnects_and_drives_on(realtime, death):
+def test_reconnects_and_continues(realtime, death):
     deaths = iter([True])
 
     def dies_once(packet, n):
@@ -170,7 +170,7 @@ def test_reconnects_and_drives_on(realtime, death):
 
 
 def test_the_window_sends_null_while_a_person_steers_and_is_never_held_up():
-    """A server that answers at once must not keep the window from being drawn."""
+    """A server that answers at once must not keep the window from being sample_recording."""
 
     def reply(packet, n):
         return ['42["manual",{}]'] if packet.endswith("null]") else [STEER % ("0.5", "0.25")]
@@ -217,7 +217,7 @@ def test_pings_and_leaves_a_server_that_does_not_answer_them(monkeypatch):
     assert server.messages.count("2") >= 3  # not the first alone
 
 
-def test_a_car_that_is_never_driven_is_said(monkeypatch):
+def test_a_car_that_is_never_driven_is_reported(monkeypatch):
     monkeypatch.setattr("simulator.client.STANDSTILL_TIME", 5.0)
     with (
         Server(lambda packet, n: [STEER % ("0", "0")]) as server,

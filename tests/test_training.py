@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import HERE, ROOT, SHORT, draw_recording, log, run_here, run_model, same, weights
+from conftest import HERE, ROOT, SHORT, log, render_recording, run_here, run_model, same, weights
 from PIL import Image
 
 import model
 
 
-def test_what_a_run_prints(finished, drawn):
+def test_what_a_run_prints(finished, sample_recording):
     lines = finished[0].stdout.splitlines()
-    counts = [line.split()[-4:] for line in lines if line.startswith((str(drawn), "total"))]
+    counts = [line.split()[-4:] for line in lines if line.startswith((str(sample_recording), "total"))]
     assert counts == [["60", "0", "6", "54"]] * 2
     assert "Total params: 559,419" in lines
     assert sum(line.startswith("Epoch ") for line in lines) == 2
@@ -53,20 +53,22 @@ def test_what_a_run_leaves(finished):
         assert Image.open(folder / "diagnostic_images" / name).size[0] > 1000
 
 
-def test_training_learns(drawn, tmp_path):
+def test_training_learns(sample_recording, tmp_path):
     """After three seconds it predicts frames that it was not trained on ten times better than the mean steering."""
     faster = ("--learning-rate", 1e-3, "--samples-per-epoch", 700, "--epochs", 3)
-    done = run_here(drawn, *SHORT, *faster, "--output", tmp_path / "model.pt")
-    steering = np.loadtxt(drawn / "driving_log.csv", delimiter=",", usecols=3)
+    done = run_here(sample_recording, *SHORT, *faster, "--output", tmp_path / "model.pt")
+    steering = np.loadtxt(sample_recording / "driving_log.csv", delimiter=",", usecols=3)
     assert float(log(tmp_path)[-1]["val_loss"]) < 0.1 * steering.var()  # the error of steering the mean
     correlations = next(line.split()[-4:] for line in done.stdout.splitlines() if line.startswith("correlation"))
     assert float(correlations[2]) > 0.95
     assert "hardly follows" not in done.stdout
 
 
-def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(drawn, tmp_path):
-    arguments, training, validation, _ = model.prepare(*model.parse([str(drawn), "--output", str(tmp_path / "m.pt")]))
-    rows = np.loadtxt(drawn / "driving_log.csv", delimiter=",", usecols=(3, 4))
+def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_recording, tmp_path):
+    arguments, training, validation, _ = model.prepare(
+        *model.parse([str(sample_recording), "--output", str(tmp_path / "m.pt")])
+    )
+    rows = np.loadtxt(sample_recording / "driving_log.csv", delimiter=",", usecols=(3, 4))
     assert not set(training.frame) & set(validation.frame)
     used, driven = {*training.row, *validation.row}, set(np.flatnonzero(rows[:, 1]))  # throttle is 0 in the others
     assert used <= driven and all(abs(rows[row, 0]) < 0.02 for row in driven - used)
@@ -79,14 +81,14 @@ def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(drawn, tmp
     assert run.generator.observations is training and run.validation is validation
 
 
-def test_same_seed_same_weights_other_seed_others(finished, drawn, tmp_path):
+def test_same_seed_same_weights_other_seed_others(finished, sample_recording, tmp_path):
     for seed in (0, 1):
-        assert run_here(drawn, *SHORT, "--seed", seed, "--output", tmp_path / f"{seed}.pt").returncode == 0
+        assert run_here(sample_recording, *SHORT, "--seed", seed, "--output", tmp_path / f"{seed}.pt").returncode == 0
     assert same(weights(tmp_path / "0.pt"), weights(finished[1] / "model.pt"))
     assert not same(weights(tmp_path / "1.pt"), weights(finished[1] / "model.pt"))
 
 
-def test_no_run_changes_a_tracked_file(drawn, tmp_path):
+def test_no_run_changes_a_tracked_file(sample_recording, tmp_path):
     git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "core.autocrlf=false"]
     if not shutil.which("git"):
         pytest.skip("git is not installed")
@@ -97,7 +99,7 @@ def test_no_run_changes_a_tracked_file(drawn, tmp_path):
         shutil.copytree(ROOT / name, tmp_path / name)
     for command in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "all"]):
         subprocess.run([*git, *command], cwd=tmp_path, check=True)
-    shutil.copytree(drawn, tmp_path / "data" / "lake")
+    shutil.copytree(sample_recording, tmp_path / "data" / "lake")
     damaged = next((tmp_path / "data" / "lake" / "IMG").glob("left*"))
     damaged.write_bytes(b"")  # so that rejected_rows.csv is written, too
     for _ in range(2):
@@ -107,7 +109,7 @@ def test_no_run_changes_a_tracked_file(drawn, tmp_path):
     assert status.stdout == ""
 
 
-def test_it_trains_without_what_only_some_systems_have(drawn, tmp_path):
+def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_path):
     """No SIGTERM, processor affinity, fork or mallopt, as on Windows or macOS."""
     code = (
         "import ctypes, os, signal, sys, torch\n"
@@ -117,14 +119,14 @@ def test_it_trains_without_what_only_some_systems_have(drawn, tmp_path):
         "import model\n"
         "sys.exit(model.main())"
     )
-    arguments = (drawn, *SHORT, "--epochs", 1, "--output", tmp_path / "model.pt")
+    arguments = (sample_recording, *SHORT, "--epochs", 1, "--output", tmp_path / "model.pt")
     done = run_model(*arguments, command=[sys.executable, "-c", code], env=HERE)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "model.pt").exists()
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Arguments and recordings that cannot be
+# Invalid arguments and recordings
 
 
 def test_no_recordings(tmp_path):
@@ -144,8 +146,8 @@ def test_no_recordings(tmp_path):
         (["--batch-size", "x"], "int"),
     ],
 )
-def test_arguments_that_cannot_be(drawn, tmp_path, arguments, words):
-    done = run_here(drawn, *arguments, "--output", tmp_path / "model.pt")
+def test_invalid_arguments(sample_recording, tmp_path, arguments, words):
+    done = run_here(sample_recording, *arguments, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
     assert words in done.stderr
     assert "model.py: " in done.stderr
@@ -153,10 +155,10 @@ def test_arguments_that_cannot_be(drawn, tmp_path, arguments, words):
 
 
 @pytest.mark.parametrize("device", ["cuda", "mps"])
-def test_a_device_that_is_not_there(drawn, tmp_path, monkeypatch, device):
+def test_a_device_that_is_not_there(sample_recording, tmp_path, monkeypatch, device):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    done = run_here(drawn, "--device", device, "--output", tmp_path / "model.pt")
+    done = run_here(sample_recording, "--device", device, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
     assert f"model.py: error: --device {device}: " in done.stderr
     assert not list(tmp_path.iterdir())
@@ -177,7 +179,7 @@ def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path
 
 def test_default_is_every_recording_under_data(tmp_path):
     for i, name in enumerate(("lake", "turn-repetitive")):
-        draw_recording(tmp_path / "data" / name, rows=20, seed=i)
+        render_recording(tmp_path / "data" / name, rows=20, seed=i)
     done = run_here(*SHORT, "--epochs", 1, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     totals = [line.split()[-4:] for line in done.stdout.splitlines() if line.startswith("total")]
@@ -224,10 +226,10 @@ without_libuv = pytest.mark.skipif(sys.platform == "win32", reason="PyTorch for 
 
 
 @pytest.fixture(scope="module")
-def two_processes(drawn, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
+def two_processes(sample_recording, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
     """Two epochs by two processes: what they printed, and their folder; not to be changed."""
     folder = tmp_path_factory.mktemp("two processes")
-    done = run_model(drawn, *SHORT, "--output", folder / "model.pt", command=TORCHRUN)
+    done = run_model(sample_recording, *SHORT, "--output", folder / "model.pt", command=TORCHRUN)
     assert done.returncode == 0, done.stderr
     return done, folder
 
