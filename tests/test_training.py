@@ -218,10 +218,6 @@ TORCHRUN = [
     "--standalone",
     str(ROOT / "model.py"),
 ]
-
-
-# On one worker of pytest-xdist, where these three share two starts of two processes.
-several_processes = pytest.mark.xdist_group("several processes")
 without_libuv = pytest.mark.skipif(sys.platform == "win32", reason="PyTorch for Windows has no libuv for torchrun")
 
 
@@ -241,14 +237,12 @@ def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
         assert (a[name] - b[name]).abs().mean() < 2e-6
 
 
-@several_processes
 @without_libuv
 def test_two_processes_train_as_one(finished, two_processes):
     """Two ranks with half of every batch each end where one process ends."""
     assert_equal_up_to_rounding(finished[1] / "model.pt", two_processes[1] / "model.pt")
 
 
-@several_processes
 @without_libuv
 def test_two_processes_continue_with_the_runs_own_arguments(finished, two_processes, tmp_path):
     one, two = (
@@ -262,7 +256,6 @@ def test_two_processes_continue_with_the_runs_own_arguments(finished, two_proces
     assert_equal_up_to_rounding(one / "model.pt", two / "model.pt")
 
 
-@several_processes
 @without_libuv
 def test_two_processes_print_once_and_the_losses_of_both(finished, two_processes):
     logs = [
