@@ -1,5 +1,5 @@
-# make test   install what is needed into .venv, check the style, run the tests
-# make lint   check only the style, the types and the direction of the imports
+# make test   install what is needed into .venv, then make lint, then run the tests
+# make lint   check the style, the types and the direction of the imports
 # make demo   record, train and drive a lap in the stand-in simulator: about 15 minutes on 2 cores. To continue after an
 #             interruption, run it again.
 

@@ -1,5 +1,5 @@
-"""A stand-in for Udacity's driving simulator: the same roads, car, cameras, recordings and wire, without a screen.
+"""A stand-in for Udacity's driving simulator: the same roads, car, cameras, recordings and protocol, without a screen.
 
-The modules in the order of the data: scenery, world, car, cameras, then record or client, then report.
-`python -m simulator --help` lists its commands.
+The modules in the order of the data: scenery, world, car, run, cameras; then record, or client, film and report.
+`expert` drives recordings; `window` and `controls` let a person drive. `python -m simulator --help` lists the commands.
 """

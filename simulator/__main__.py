@@ -1,8 +1,9 @@
-"""The simulator's commands: python -m simulator record, drive, replay, window."""
+"""The simulator's commands: `python -m simulator record`, `drive`, `replay` and `window`."""
 
 import argparse
 import functools
 import sys
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -17,15 +18,15 @@ if TYPE_CHECKING:
 
 
 def positive(text: str) -> float:
-    """Parse a number above 0."""
+    """Parse a number above 0 and below a million."""
     value = float(text)
     if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError("must be above 0")
+        raise argparse.ArgumentTypeError("must be above 0 and below a million")
     return value
 
 
 def mph(text: str) -> float:
-    """Parse a set speed."""
+    """Parse a set speed in mph."""
     value = float(text)
     if not 1 <= value <= TOP_SPEED_MPH:
         raise argparse.ArgumentTypeError(f"must be 1 to {TOP_SPEED_MPH:g} mph, the car's top speed")
@@ -42,13 +43,22 @@ def natural(text: str) -> int:
 
 def add_record(commands: "Subparsers") -> None:
     """Add the options of `record`."""
-    parser = commands.add_parser("record", help="an expert drives and is recorded, faster than real time")
-    parser.set_defaults(run=record)
-    parser.add_argument("folder", help="the new recording: IMG/ and driving_log.csv")
-    parser.add_argument("--laps", type=positive, default=1, help="default 1")
-    parser.add_argument("--speed", type=mph, default=TOP_SPEED_MPH, help="set speed in mph, 1 to 30 (default)")
-    parser.add_argument("--recovery", action="store_true", help="record only recoveries from the road's sides")
-    parser.add_argument("--seed", type=natural, default=0, help="of the expert's wandering in its lane (default 0)")
+    parser = commands.add_parser("record", help="record an expert driver, faster than real time")
+    parser.set_defaults(run=run_record)
+    parser.add_argument("folder", help="folder for the new recording: IMG/ and driving_log.csv")
+    add_laps(parser)
+    parser.add_argument(
+        "--speed", type=mph, default=TOP_SPEED_MPH, help="set speed in mph, 1 to %(default)s (default %(default)s)"
+    )
+    parser.add_argument(
+        "--recovery", action="store_true", help="record only returns from the sides of the road to the lane centre"
+    )
+    parser.add_argument(
+        "--seed",
+        type=natural,
+        default=0,
+        help="seed of the expert's random lateral offsets, and of the dates in the image names (default 0)",
+    )
     add_road(parser)
 
 
@@ -56,21 +66,21 @@ def add_drive(commands: "Subparsers") -> None:
     """Add the options of `drive`."""
     parser = commands.add_parser(
         "drive",
-        help="drive.py drives; prints a lap report",
-        epilog="Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if it could not be driven or "
-        "a file could not be written.",
+        help="let drive.py drive, and print a lap report",
+        epilog="Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if an error ended the drive "
+        "or a file could not be written.",
     )
-    parser.set_defaults(run=drive)
-    parser.add_argument("--laps", type=positive, default=1, help="default 1")
+    parser.set_defaults(run=run_drive)
+    add_laps(parser)
     add_server(parser)
     add_wait(parser)
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(
         "--lockstep",
         action="store_true",
-        help="simulated time waits for each answer, so that a run is repeatable (default)",
+        help="simulated time waits for each answer, so that a drive is repeatable (default)",
     )
-    pace.add_argument("--realtime", action="store_true", help="simulated time passes with the wall clock")
+    pace.add_argument("--realtime", action="store_true", help="simulated time follows the wall clock")
     parser.add_argument("--report", metavar="FILE", help="write the lap report as JSON")
     parser.add_argument("--picture", metavar="FILE.png", help="plot the track from above with the path driven")
     parser.add_argument("--film", metavar="FILE.mp4", help="film the drive from behind the car")
@@ -79,8 +89,10 @@ def add_drive(commands: "Subparsers") -> None:
 
 def add_replay(commands: "Subparsers") -> None:
     """Add the options of `replay`."""
-    parser = commands.add_parser("replay", help="a model drives real recordings; prints how far it stays on the road")
-    parser.set_defaults(run=replay)
+    parser = commands.add_parser(
+        "replay", help="let a model drive real recordings, and print its autonomy and distance from the lane centre"
+    )
+    parser.set_defaults(run=run_replay)
     parser.add_argument("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
     parser.add_argument("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
     parser.add_argument(
@@ -88,8 +100,8 @@ def add_replay(commands: "Subparsers") -> None:
         type=positive,
         nargs="+",
         default=LIMITS,
-        help="m from the lane centre at which a human would take over; one drive per limit (default 1 2.5: NVIDIA's, "
-        "and where the side of the car is on the edge line)",
+        help="distance in m from the lane centre at which a human would take over; each limit is a drive of its own "
+        "(default 1, as in NVIDIA's evaluation, and 2.5, where the side of the car is on the edge line)",
     )
     parser.add_argument(
         "--reference",
@@ -101,51 +113,57 @@ def add_replay(commands: "Subparsers") -> None:
     add_server(parser)
     add_wait(parser)
     parser.add_argument("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
-    parser.add_argument("--picture", metavar="FILE.png", help="plot offset and steering over time")
-    parser.add_argument("--film", metavar="FILE.mp4", help="film the model's view, at the last limit")
+    parser.add_argument("--picture", metavar="FILE.png", help="plot lateral offset and steering over time")
+    parser.add_argument("--film", metavar="FILE.mp4", help="film what the model sees in the drives at the last limit")
 
 
 def add_window(commands: "Subparsers") -> None:
     """Add the options of `window`."""
-    parser = commands.add_parser("window", help="you drive and record, or watch drive.py drive")
-    parser.set_defaults(run=window)
-    parser.add_argument("--folder", help="of the recording (default data/window-DATE-TIME)")
-    parser.add_argument("--autonomous", action="store_true", help="drive.py drives; W or S takes over")
+    parser = commands.add_parser("window", help="drive and record by hand, or watch drive.py drive")
+    parser.set_defaults(run=run_window)
+    parser.add_argument("--folder", help="folder for the recording (default data/window-DATE-TIME)")
+    parser.add_argument("--autonomous", action="store_true", help="let drive.py drive; W or S takes over")
     add_server(parser)
     add_road(parser)
 
 
+def add_laps(parser: argparse.ArgumentParser) -> None:
+    """Add --laps."""
+    parser.add_argument("--laps", type=positive, default=1, help="laps to drive, such as 0.5 (default 1)")
+
+
 def add_server(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where drive.py is."""
-    parser.add_argument("--host", default="127.0.0.1", help="where drive.py runs (default 127.0.0.1)")
-    parser.add_argument("--port", type=int, default=4567, help="default 4567")
+    parser.add_argument("--host", default="127.0.0.1", help="address of drive.py (default %(default)s)")
+    parser.add_argument("--port", type=int, default=4567, help="port of drive.py (default %(default)s)")
 
 
 def add_wait(parser: argparse.ArgumentParser) -> None:
     """Add --wait."""
     parser.add_argument(
-        "--wait", type=positive, default=60.0, help="seconds to wait for a server or an answer (default 60)"
+        "--wait", type=positive, default=60.0, help="seconds to wait for drive.py or its answer (default 60)"
     )
 
 
 def add_road(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose a track and its look."""
-    parser.add_argument("--track", choices=sorted(ROADS), default="lake", help="default lake")
+    parser.add_argument("--track", choices=sorted(ROADS), default="lake", help="default %(default)s")
     parser.add_argument(
         "--direction",
         choices=("ccw", "cw"),
-        help="default: the simulator's own, ccw on the lake and cw in the jungle",
+        help="default: as in the real simulator, ccw on the lake and cw in the jungle",
     )
     parser.add_argument(
         "--look",
         type=natural,
         default=0,
-        help="0 (default): like the real simulator; others: other light, soils, trees and shadows",
+        help="look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
+        "textures and plants",
     )
 
 
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
-    """Parse the command line; `run` is the function of the command."""
+    """Parse the command line; its `run` is the command's function."""
     parser = argparse.ArgumentParser(
         prog="python -m simulator", description="A stand-in for Udacity's driving simulator."
     )
@@ -155,22 +173,25 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-# Each command imports what it needs itself: `--help` and bad arguments need neither panda3d nor torch.
+# Each function imports what its command needs, because `--help` and wrong arguments need neither panda3d nor torch.
 
 
-def record(args: argparse.Namespace) -> int:
-    """Have the expert drive and record it."""
+def run_record(args: argparse.Namespace) -> int:
+    """Record the expert; print its departures and how fast it was recorded."""
     from simulator.record import record
 
     track = Track(args.track, args.direction)
-    run = record(args.folder, track, args.laps, args.speed, args.seed, args.look, args.recovery)
+    begin = time.perf_counter()
+    run, rows = record(args.folder, track, args.laps, args.speed, args.seed, args.look, args.recovery)
+    pace = run.time / (time.perf_counter() - begin)
     for departure in run.departures:
         print(f"left the road at {departure.s:.0f} m after {departure.time:.1f} s")
+    print(f"{args.folder}: {rows} rows from {run.time:.0f} simulated seconds, at {pace:.1f} times real time")
     return 0
 
 
-def drive(args: argparse.Namespace) -> int:
-    """Have drive.py drive, and write the files that were asked for, even if the drive ends early."""
+def run_drive(args: argparse.Namespace) -> int:
+    """Let drive.py drive, and write the requested files even if the drive ends early."""
     from simulator import report, scenery
     from simulator.cameras import Cameras
     from simulator.client import Client
@@ -200,8 +221,8 @@ def drive(args: argparse.Namespace) -> int:
     return 1 if run.departures else 0
 
 
-def replay(args: argparse.Namespace) -> int:
-    """Have a model drive real recordings."""
+def run_replay(args: argparse.Namespace) -> int:
+    """Let a model drive real recordings."""
     from cloning.replay import command
 
     command.run(
@@ -221,19 +242,19 @@ def replay(args: argparse.Namespace) -> int:
     return 0
 
 
-def window(args: argparse.Namespace) -> int:
-    """Open the window in which a person drives."""
+def run_window(args: argparse.Namespace) -> int:
+    """Open the window in which a person drives or watches."""
     from datetime import datetime
 
     from simulator.window import Window
 
     folder = args.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}"
     server = (args.host, args.port) if args.autonomous else None
-    shown = Window(Track(args.track, args.direction), folder, args.look, server)
+    opened = Window(Track(args.track, args.direction), folder, args.look, server)
     try:
-        shown.run()
+        opened.run()
     finally:
-        shown.finish()
+        opened.finish()
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The car's cameras: renders what they see of a scene, and encodes it as the simulator's JPEG."""
+"""The car's cameras: they render a scene, and frames are encoded as the real simulator's JPEGs."""
 
 import cv2
 import numpy as np
@@ -22,12 +22,12 @@ from cloning.recordings.format import CAMERAS, FRAME
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, MOUNT_PITCH, VERTICAL_FIELD
 from simulator.world import INSIDE, Scene
 
-JPEG_QUALITY = 75  # with colour at half resolution: what the tables of real recordings' images show
-NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m, of the real simulator's cameras
+JPEG_QUALITY = 75  # with colour at half resolution, as the tables in the real simulator's images show
+NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m, as for the real simulator's cameras
 ROWS, COLUMNS = FRAME[:2]
-SUPERSAMPLING = 2  # rows rendered for each row of a frame; without it, the road ahead flickers as the real one does not
+SUPERSAMPLING = 2  # rows rendered for each row of a frame; with 1, the road far ahead flickers, unlike the real one
 
-# Without a transform cache: nearly equal transforms would be replaced by earlier ones, and a frame would depend on the
+# The transform cache is off, because it replaces transforms by nearly equal earlier ones: a frame would depend on the
 # frames before it.
 load_prc_file_data(
     "",
@@ -40,14 +40,14 @@ def lens(rows: int = ROWS, columns: int = COLUMNS) -> PerspectiveLens:
     """Return a lens with the cameras' vertical field of view for images of this shape."""
     perspective = PerspectiveLens()
     perspective.set_near_far(NEAR_PLANE, FAR_PLANE)
-    across = 2 * np.degrees(np.arctan(np.tan(np.radians(VERTICAL_FIELD / 2)) * columns / rows))
-    perspective.set_fov(across, VERTICAL_FIELD)
+    horizontal_field = 2 * np.degrees(np.arctan(np.tan(np.radians(VERTICAL_FIELD / 2)) * columns / rows))
+    perspective.set_fov(horizontal_field, VERTICAL_FIELD)
     return perspective
 
 
 def jpeg(frame: np.ndarray) -> bytes:
-    """Encode a frame, uint8 (rows, columns, 3) RGB, as the simulator does."""
-    done, data = cv2.imencode(
+    """Encode a frame, uint8 (rows, columns, 3) RGB, like the real simulator."""
+    encoded, data = cv2.imencode(
         ".jpg",
         cv2.cvtColor(frame, cv2.COLOR_RGB2BGR),
         [
@@ -57,16 +57,16 @@ def jpeg(frame: np.ndarray) -> bytes:
             cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
         ],
     )
-    if not done:
+    if not encoded:
         raise ValueError("OpenCV cannot encode the frame as JPEG")
     return data.tobytes()
 
 
 class Buffer:
-    """An image rendered without a screen, with one region for each camera, one below the other."""
+    """An image rendered without a screen, with a region for each camera, one below another."""
 
     def __init__(self, rows: int, columns: int, cameras: list[NodePath]):
-        """rows, columns: of each region. Raises SimulatorError."""
+        """rows, columns: of each region. Raises SimulatorError if the renderer cannot be loaded."""
         pipe = GraphicsPipeSelection.get_global_ptr().make_pipe("TinyOffscreenGraphicsPipe", "p3tinydisplay")
         if not pipe:
             raise SimulatorError(
@@ -86,7 +86,7 @@ class Buffer:
             region.set_camera(camera)
 
     def render(self) -> np.ndarray:
-        """Render the regions: uint8 (regions, rows, columns, 3), RGB."""
+        """Render the regions and return them: uint8 (regions, rows, columns, 3), RGB."""
         self.engine.render_frame()
         pixels = np.frombuffer(self.image.get_ram_image_as("RGB"), np.uint8)
         return np.ascontiguousarray(pixels.reshape(-1, self.shape[2], 3)[::-1]).reshape(self.shape)

@@ -1,9 +1,11 @@
-"""The simulator's car as Bullet's ray-cast vehicle.
+"""The simulator's car as a ray-cast vehicle of the Bullet physics engine.
 
-Figures without another source are those of Unity's scene file, in metres, kilograms, newtons and seconds.
+Constants without another source are from the Unity scene of the real simulator, in metres, kilograms, newtons and
+seconds.
 """
 
 import math
+from typing import NamedTuple
 
 from panda3d.bullet import BulletBoxShape, BulletRigidBodyNode, BulletVehicle, BulletWorld, ZUp
 from panda3d.core import NodePath, Point3, TransformState, Vec3
@@ -13,32 +15,39 @@ from cloning.road.track import Place
 
 STEP = 0.02  # s of physics in one step
 TOP_SPEED = TOP_SPEED_MPH * MPH
-# Hub's position to the right, forward and up; radius
-WHEELS = (
-    (-1.0, 1.27, 0.45, 0.335),
-    (1.0, 1.27, 0.45, 0.335),
-    (-1.0, -REAR_AXLE, 0.50, 0.37),
-    (1.0, -REAR_AXLE, 0.50, 0.37),
-)
+
+
+class Wheel(NamedTuple):
+    """A wheel: the position of its hub relative to the car's origin, and its radius, in metres."""
+
+    right: float
+    forward: float
+    up: float
+    radius: float
+
+
+FRONT_WHEELS = (Wheel(-1.0, 1.27, 0.45, 0.335), Wheel(1.0, 1.27, 0.45, 0.335))
+WHEELS = (*FRONT_WHEELS, Wheel(-1.0, -REAR_AXLE, 0.50, 0.37), Wheel(1.0, -REAR_AXLE, 0.50, 0.37))
 MASS = 1000.0
-TORQUE, REVERSE_TORQUE, BRAKE_TORQUE = 2000.0, 150.0, 20000.0  # Nm: all wheels, all wheels, each wheel
-TORQUE_PER_STEP = 60.0  # Nm: traction control lets the torque build up over two thirds of a second
+TORQUE, REVERSE_TORQUE = 2000.0, 150.0  # Nm, of all four wheels together
+BRAKE_TORQUE = 20000.0  # Nm, of each wheel
+TORQUE_PER_STEP = 60.0  # Nm: with traction control the torque builds up over two thirds of a second
 DOWNFORCE = 100.0  # N per m/s
 SETTLING_STEPS = 50  # until the car rests on its springs
-GRIP = 2500.0  # N: braking force of a locked wheel
-# The real car's yaw rate at 30 mph is 0.8 times v/L tan(angle) by regression over single frames, but 1.06 times it over
-# whole laps. An understeering car with this characteristic speed has 0.86 times v/L tan(angle) at 30 mph: within a
-# tenth of the first figure, as close to the second as that allows, and v/L tan(angle) at walking pace.
+MAX_BRAKING_FORCE = 2500.0  # N, of a locked wheel
+# The real car's yaw rate at 30 mph is 0.8 times v / wheelbase * tan(wheel angle) by regression over single frames, but
+# 1.06 times that over whole laps. A car that understeers with this characteristic speed has a factor of 0.86 at 30 mph:
+# within a tenth of the first figure, and no further from the second than necessary. At walking pace its factor is 1.
 CHARACTERISTIC_SPEED = 2.45 * TOP_SPEED  # m/s
-MIN_BRAKING_SPEED = 5 * MPH  # m/s: below, a negative throttle reverses
-HUB_RAISE = 0.2175  # m: the hubs are higher than in Unity, because Bullet fixes the springs' rest length
+MIN_BRAKING_SPEED = 5 * MPH  # m/s: below it, a negative throttle reverses
+HUB_RAISE = 0.2175  # m by which the hubs are higher than in Unity, because Bullet fixes the rest length of the springs
 
 
 class Car:
-    """The car in a physics world; `node` is its pose, `speed_limit` in m/s holds a set speed."""
+    """The car in a physics world; `node` is its pose, `speed_limit` a speed in m/s that it never exceeds."""
 
     def __init__(self, physics: BulletWorld):
-        """physics: with the ground in it, see `world.build_physics`."""
+        """physics: a world that contains the ground, see `world.build_physics`."""
         self.physics = physics
         body = BulletRigidBodyNode("car")
         body.add_shape(BulletBoxShape(Vec3(0.9, 2.0, 0.35)), TransformState.make_pos(Point3(0, -0.15, 0.75)))
@@ -51,19 +60,19 @@ class Car:
         self.vehicle = BulletVehicle(physics, body)
         self.vehicle.set_coordinate_system(ZUp)
         physics.attach(self.vehicle)
-        for right, forward, up, radius in WHEELS:
-            wheel = self.vehicle.create_wheel()
-            wheel.set_chassis_connection_point_cs(Point3(right, forward, up + HUB_RAISE))
-            wheel.set_front_wheel(forward > 0)
-            wheel.set_wheel_direction_cs(Vec3(0, 0, -1))
-            wheel.set_wheel_axle_cs(Vec3(1, 0, 0))
-            wheel.set_wheel_radius(radius)
-            wheel.set_max_suspension_travel_cm(20)
-            wheel.set_suspension_stiffness(70)  # times the mass: 70000 N/m
-            wheel.set_wheels_damping_relaxation(3.5)
-            wheel.set_wheels_damping_compression(3.5)
-            wheel.set_friction_slip(3.0)
-            wheel.set_roll_influence(0.05)
+        for wheel in WHEELS:
+            bullet_wheel = self.vehicle.create_wheel()
+            bullet_wheel.set_chassis_connection_point_cs(Point3(wheel.right, wheel.forward, wheel.up + HUB_RAISE))
+            bullet_wheel.set_front_wheel(wheel in FRONT_WHEELS)
+            bullet_wheel.set_wheel_direction_cs(Vec3(0, 0, -1))
+            bullet_wheel.set_wheel_axle_cs(Vec3(1, 0, 0))
+            bullet_wheel.set_wheel_radius(wheel.radius)
+            bullet_wheel.set_max_suspension_travel_cm(20)
+            bullet_wheel.set_suspension_stiffness(70)  # times the mass: 70000 N/m
+            bullet_wheel.set_wheels_damping_relaxation(3.5)
+            bullet_wheel.set_wheels_damping_compression(3.5)
+            bullet_wheel.set_friction_slip(3.0)
+            bullet_wheel.set_roll_influence(0.05)
         self.torque = 0.0
         self.speed_limit = TOP_SPEED
 
@@ -93,30 +102,30 @@ class Car:
         for _ in range(SETTLING_STEPS):
             for i in range(len(WHEELS)):
                 self.vehicle.apply_engine_force(0, i)
-                self.vehicle.set_brake(GRIP * STEP, i)
+                self.vehicle.set_brake(MAX_BRAKING_FORCE * STEP, i)
             self.physics.do_physics(STEP, 1, STEP)
 
     def step(self, steering: float, throttle: float) -> None:
         """Drive for one physics step.
 
-        steering: -1..1, positive right, 25 degrees at 1; throttle: -1..1, negative brakes, below 5 mph reverses.
+        steering: -1..1, right positive; throttle: -1..1, where a negative value brakes, or reverses below 5 mph.
         """
         speed = self.speed
-        angle = math.tan(math.radians(FULL_LOCK * max(-1.0, min(1.0, steering))))
-        angle /= 1 + (speed / CHARACTERISTIC_SPEED) ** 2
-        for front in (0, 1):
-            self.vehicle.set_steering_value(-math.degrees(math.atan(angle)), front)
+        tangent = math.tan(math.radians(FULL_LOCK * max(-1.0, min(1.0, steering))))
+        tangent /= 1 + (speed / CHARACTERISTIC_SPEED) ** 2
+        for i in range(len(FRONT_WHEELS)):
+            self.vehicle.set_steering_value(-math.degrees(math.atan(tangent)), i)
         rolling_forward = self.vehicle.get_current_speed_km_hour() / 3.6 > 0
         change = TORQUE_PER_STEP if throttle > 0 else -TORQUE_PER_STEP
         self.torque = max(0.0, min(TORQUE, self.torque + change))
         drive, brake = self.torque * max(0.0, min(1.0, throttle)), 0.0
         if throttle < 0:
             if speed > MIN_BRAKING_SPEED and rolling_forward:
-                brake = min(BRAKE_TORQUE * min(1.0, -throttle) / WHEELS[0][3], GRIP) * STEP
+                brake = min(BRAKE_TORQUE * min(1.0, -throttle) / WHEELS[0].radius, MAX_BRAKING_FORCE) * STEP
             else:
                 drive = REVERSE_TORQUE * max(-1.0, throttle)
-        for i, (_, _, _, radius) in enumerate(WHEELS):
-            self.vehicle.apply_engine_force(drive / 4 / radius, i)
+        for i, wheel in enumerate(WHEELS):
+            self.vehicle.apply_engine_force(drive / len(WHEELS) / wheel.radius, i)
             self.vehicle.set_brake(brake, i)
         down = self.node.get_quat().get_up() * (-DOWNFORCE * speed)
         self.body.apply_central_force(down)

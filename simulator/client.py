@@ -1,4 +1,4 @@
-"""The autonomous mode: the car sends its centre camera's frames and drives by the server's answers."""
+"""The autonomous mode: the car sends its centre camera's frames and drives as the server answers."""
 
 import time
 from collections.abc import Callable
@@ -22,46 +22,46 @@ from simulator.cameras import Cameras, jpeg
 from simulator.car import STEP
 from simulator.run import Run
 
-STANDSTILL_TIME = 60.0  # simulated seconds within which the car must have moved by a metre
-MAX_CATCH_UP = 25  # physics steps in a row with which real time is caught up before the server is heard again
-RETRY_INTERVAL = 1.0  # s between two attempts of the window to connect
+STANDSTILL_TIME = 60.0  # simulated seconds within which the car must move by a metre
+MAX_CATCH_UP = 25  # physics steps to catch up with real time, before the next look for an answer
+RECONNECT_INTERVAL = 1.0  # s between two attempts of the window to connect
 
 
 class Standstill(SimulatorError):
-    """The server answers, but the car does not move."""
+    """The server answers, but the car stays where it is."""
 
 
 def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
-    """Return the telemetry packet of this moment; steering and throttle as last commanded, -1..1."""
+    """Return the telemetry packet for the present state; steering and throttle: as last commanded, -1..1."""
     frame = cameras.frames(run.car.node.get_transform())[0]
     return telemetry_packet(steering, throttle, run.speed_mph, jpeg(frame))
 
 
 class Client(ClientSession):
-    """Drives the car by a server's answers, and connects again when the connection is lost."""
+    """Drives the car as a server answers, and connects again when the connection is lost."""
 
     def __init__(self, run: Run, cameras: Cameras, host: str, port: int, wait: float, realtime: bool):
-        """realtime: drive in the wall clock's time, not in lock-step; wait: see ClientSession."""
+        """realtime: simulated time follows the wall clock instead of the answers; wait: see ClientSession."""
         super().__init__(host, port, wait, real_timing=realtime)
         self.run, self.cameras, self.realtime = run, cameras, realtime
         self.watch: Callable[[], None] | None = None  # called after each physics step
         self.steering = self.throttle = 0.0  # as last commanded
-        self.frames = 0  # sent
-        self.own_time = 0.0  # s of wall time in which the simulator itself worked, in lock-step
-        self._moved_at, self._moved_to = 0.0, 0.0  # s and m travelled, when the car had last moved by a metre
+        self.frames = 0  # number of frames sent
+        self.own_time = 0.0  # s of wall time that the simulator itself used, in lock-step
+        self._moved_at, self._moved_to = 0.0, 0.0  # s and m travelled when the car had last moved by a metre
 
     def next_frame(self) -> str:
-        """Return the telemetry packet of this moment, and count it."""
+        """Return the telemetry packet for the present state, and count it."""
         self.frames += 1
         return current_telemetry(self.run, self.cameras, self.steering, self.throttle)
 
-    def obey(self, answer: Answer) -> None:
-        """Take over a command's steering and throttle."""
+    def apply(self, answer: Answer) -> None:
+        """Use the steering and throttle of an answer from now on, if it has any."""
         if answer.steering is not None and answer.throttle is not None:
             self.steering, self.throttle = answer.steering, answer.throttle
 
     def step(self) -> None:
-        """Drive one physics step. Raises Standstill."""
+        """Drive for one physics step. Raises Standstill."""
         self.run.step(self.steering, self.throttle)
         if self.watch:
             self.watch()
@@ -74,7 +74,7 @@ class Client(ClientSession):
             )
 
     def drive(self, laps: float) -> None:
-        """Drive the laps. Raises SimulatorError."""
+        """Drive this number of laps. Raises SimulatorError."""
         goal = laps * self.run.track.length
         drive = self._drive_in_real_time if self.realtime else self._drive_in_lockstep
         with tqdm(total=round(goal), unit="m", unit_scale=True, disable=None) as bar:
@@ -92,17 +92,17 @@ class Client(ClientSession):
         bar.update(round(max(0.0, self.run.travelled)) - bar.n)
 
     def _drive_in_lockstep(self, goal: float, bar: tqdm) -> None:
-        """Let simulated time wait for each answer: 15 frames per simulated second."""
+        """Drive to the goal, in m travelled; simulated time waits for the answer to each of 15 frames per second."""
         self.receive_greeting()
         clock = Clock(self.run.time + 1 / SAMPLE_RATE)
         while self.run.travelled < goal:
-            self.obey(self.receive_unasked())
+            self.apply(self.receive_unasked())
             begin = time.perf_counter()
             packet = self.next_frame()
             self.own_time += time.perf_counter() - begin
             answer = self.request_answer(packet)
             begin = time.perf_counter()
-            self.obey(answer)
+            self.apply(answer)
             self.step()
             while not clock.due(self.run.time) and self.run.travelled < goal:
                 self.step()
@@ -110,12 +110,13 @@ class Client(ClientSession):
             self._show(bar)
 
     def _drive_in_real_time(self, goal: float, bar: tqdm) -> None:
-        """Let simulated time pass with the wall clock; each open and each answer brings about one frame.
+        """Drive to the goal, in m travelled, while simulated time follows the wall clock.
 
-        As in the real simulator, a lost answer means one frame less in flight from then on.
+        A frame is sent for each "open" event and for each answer. So, as in the real simulator, each lost answer leaves
+        one frame less in flight.
         """
-        sent: list[float] = []  # when each telemetry without an answer yet was sent
-        greeted = False  # the commands before CONNECT answer no telemetry
+        sent: list[float] = []  # when each telemetry that has no answer yet was sent
+        greeted = False  # commands that arrive before CONNECT answer no telemetry
         for _ in range(OPENS):
             self.connection.send(self.next_frame())
             sent.append(time.perf_counter())
@@ -135,13 +136,13 @@ class Client(ClientSession):
             last_usable = time.monotonic()
             if sent and greeted:
                 self.round_trips.append(time.perf_counter() - sent.pop(0))
-            self.obey(answer)
+            self.apply(answer)
             self.connection.send(self.next_frame())
             sent.append(time.perf_counter())
 
 
-class Remote:
-    """drive.py as the window's driver: polled once per window frame, and tried again each second while it is away."""
+class RemoteDriver:
+    """drive.py as the window's driver; while it cannot be reached, it is tried again every second."""
 
     def __init__(self, host: str, port: int, cameras: Cameras):
         self.address, self.cameras = (host, port), cameras
@@ -149,13 +150,16 @@ class Remote:
         self.connection: Connection | None = None
         self.state, self.next_try = "not connected", 0.0
 
-    def answer(self, by_hand: bool, run: Run) -> None:
-        """Obey what has arrived, and send a frame for each answer, or null while a person steers."""
+    def poll(self, by_hand: bool, run: Run) -> None:
+        """Use the answers that have arrived, without waiting, and send a telemetry for each.
+
+        by_hand: a person steers, so the telemetry is null. Call this once per window frame.
+        """
         try:
             connection = self.connection or self._connect(run)
             if connection is None:
                 return
-            for _ in range(OPENS + 1):  # not for as long as answers come: the window must be rendered, too
+            for _ in range(OPENS + 1):  # not until no answer is left: the window must be rendered, too
                 packet = connection.receive(0)
                 answer = parse_answer(packet) if packet else None
                 if answer is None:
@@ -172,7 +176,7 @@ class Remote:
     def _connect(self, run: Run) -> Connection | None:
         if time.monotonic() < self.next_try:
             return None
-        self.next_try = time.monotonic() + RETRY_INTERVAL
+        self.next_try = time.monotonic() + RECONNECT_INTERVAL
         self.connection = Connection(*self.address, real_timing=True)
         self.state = "drives"
         for _ in range(OPENS):

@@ -1,14 +1,14 @@
-"""How a person drives: keyboard, mouse and gamepad as in the original recorder, independent of the engine."""
+"""Driving by hand: keyboard, mouse and gamepad as in the real simulator's training mode, without the render engine."""
 
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
 from cloning.road.motion import TOP_SPEED_MPH
 
-KEY_STEP = 0.05  # change of steering in each physics step while a key is held, and back again
+KEY_STEP = 0.05  # change of steering in each physics step: outwards while a key is held, else back to 0
 CRUISE_THROTTLE = 0.4
-DEAD_ZONE = 0.08  # of a stick around its middle
-FULL_DRAG = 0.5  # share of the window's width that the mouse is dragged for full steering
+DEAD_ZONE = 0.08  # share of a stick's travel, around its middle, that counts as 0
+FULL_DRAG = 0.5  # share of the window's width: dragging the mouse this far gives full steering
 HELP = """arrows or WASD   steer, throttle, brake and reverse
 mouse drag       steer
 space            cruise (throttle 0.4) on or off
@@ -23,7 +23,7 @@ gamepad (Logitech F310 and similar): left stick throttle,
 right stick steering, D-pad set speed, A cruise, B record,
 X save position, Y jump back"""
 
-# What a key press or a gamepad button does
+# Key or gamepad button -> action
 ACTIONS = {
     "space": "cruise",
     "pad a": "cruise",
@@ -42,6 +42,7 @@ ACTIONS = {
     "f1": "help",
     "escape": "quit",
 }
+# Direction -> the keys that are held for it
 HELD = {
     "left": ("arrow_left", "a"),
     "right": ("arrow_right", "d"),
@@ -66,19 +67,19 @@ def apply_dead_zone(value: float) -> float:
 
 
 def balance(held: AbstractSet[str], positive: str, negative: str) -> float:
-    """Return 1, -1 or 0 for keys of the positive group held, of the negative group, or of neither or both."""
+    """Return 1 if only keys for the direction `positive` are held, -1 if only keys for `negative`, else 0."""
     return float(not held.isdisjoint(HELD[positive])) - float(not held.isdisjoint(HELD[negative]))
 
 
 class Controls:
-    """The driver's commands: steering and throttle -1..1, cruise control, set speed in mph, and pending actions."""
+    """The person's commands: steering and throttle -1..1, cruise control, set speed in mph, and pending actions."""
 
     def __init__(self) -> None:
         self.steering = self.throttle = 0.0
         self.cruise, self.set_speed = False, TOP_SPEED_MPH
         self.actions: list[str] = []
         self.buttons: set[str] = set()
-        self.drag: tuple[float, float] | None = None  # the mouse position and the steering when the drag began
+        self.drag: tuple[float, float] | None = None  # mouse position and steering when the drag began
 
     def press(self, key: str) -> None:
         """Handle a key or gamepad button that was pressed, such as "r", "space" or "pad a"."""
@@ -93,7 +94,7 @@ class Controls:
             self.actions.append(action)
 
     def take_actions(self) -> list[str]:
-        """Return the actions requested since the last call: record, save, jump, view, help, quit."""
+        """Return the actions requested since the last call, out of record, save, jump, view, help and quit."""
         actions, self.actions = self.actions, []
         return actions
 
@@ -104,7 +105,7 @@ class Controls:
     def step(self, held: AbstractSet[str], mouse: float | None = None, pad: Sticks | None = None) -> None:
         """Update the commands for one physics step.
 
-        held: the keys that are down; mouse: its position across the window, -1..1, while its button is down.
+        held: the keys that are down; mouse: its horizontal position in the window, -1..1, while its button is down.
         """
         for button in sorted(pad.buttons - self.buttons) if pad else ():
             self.press(f"pad {button}")

@@ -1,4 +1,4 @@
-"""The drivers of the recordings: an expert that keeps its lane as a practised human does, and one that recovers."""
+"""The drivers of rendered recordings: an expert that keeps its lane like a practised human, and a recovery driver."""
 
 import math
 
@@ -10,52 +10,53 @@ from simulator.car import CHARACTERISTIC_SPEED, STEP, TOP_SPEED
 from simulator.run import Run
 from simulator.world import GRAVITY
 
-LATERAL_ACCELERATION, DECELERATION = 5.0, 4.0  # m/s²: at most, in bends and before them
-LOOKAHEAD, LOOKAHEAD_TIME = 3.0, 0.45  # m, and s of driving, to the point that the expert steers for
-# Lateral offset: standard deviation and limit in m, shortest wavelength in m. Human drivers are 1 m off on average.
-WANDER, MAX_WANDER, WANDER_LENGTH = 0.9, 1.8, 60.0
+MAX_LATERAL_ACCELERATION, MAX_DECELERATION = 5.0, 4.0  # m/s², in bends and before them
+LOOKAHEAD, LOOKAHEAD_TIME = 3.0, 0.45  # m plus s of driving: distance to the point that the expert steers for
+# The expert's lateral offset varies with this standard deviation, limit and shortest wavelength, all in m. The human
+# drivers of the real recordings are 0.6 m (lake) to 1.6 m (jungle) off the centre on average.
+WANDER, MAX_WANDER, MIN_WAVELENGTH = 0.9, 1.8, 60.0
 STEERING_TIME = 0.12  # s: time constant of the steering
-PREVIEW_TIME = 0.1  # s ahead at which the speed limit is looked up
+PREVIEW_TIME = 0.1  # s: the speed limit is that of the point so far ahead
 
 
 def speed_limits(track: Track, top_speed: float) -> np.ndarray:
     """Return the speed limit at each of the track's points, (n,) m/s: low enough for its bend and those ahead."""
-    limit = np.minimum(top_speed, np.sqrt(LATERAL_ACCELERATION / np.maximum(np.abs(track.curvature), 1e-6)))
-    for _ in range(2):  # the second pass carries braking on across the first point
+    limit = np.minimum(top_speed, np.sqrt(MAX_LATERAL_ACCELERATION / np.maximum(np.abs(track.curvature), 1e-6)))
+    for _ in range(2):  # the second pass continues the braking across the first point
         for i in range(len(limit) - 1, -1, -1):
             after = limit[(i + 1) % len(limit)]
-            limit[i] = min(limit[i], math.sqrt(after * after + 2 * DECELERATION * track.step))
+            limit[i] = min(limit[i], math.sqrt(after * after + 2 * MAX_DECELERATION * track.step))
     return limit
 
 
 class Expert:
-    """Steers by pure pursuit towards the lane's centre, wandering about it.
+    """Steers by pure pursuit along the lane's centre, with a lateral offset that varies slowly.
 
-    recording  whether the present step belongs in a recording
-    target     metres to the right of the lane's centre about which it wanders
+    recordable  whether the present step belongs in a recording
+    target      mean lateral offset in m, right positive
     """
 
     def __init__(self, track: Track, seed: int = 0, top_speed: float = TOP_SPEED, wander: float = WANDER):
-        """top_speed: m/s; wander: standard deviation in m of the lateral offset, which follows from the seed."""
+        """top_speed: m/s; wander: standard deviation of the lateral offset in m; seed: of the lateral offsets."""
         self.track, self.top_speed = track, min(top_speed, TOP_SPEED)
         self.limits = speed_limits(track, self.top_speed)
         random = np.random.default_rng([seed, 1])
-        waves = np.arange(1, max(2, int(track.length / WANDER_LENGTH)) + 1)
-        # wavelengths that do not divide the track's length, so that laps differ
+        waves = np.arange(1, max(2, int(track.length / MIN_WAVELENGTH)) + 1)
+        # Wavelengths that do not divide the track's length, so that laps differ; in radians per m.
         self.waves = 2 * np.pi * (waves * random.uniform(0.9, 1.1, len(waves))) / track.length
         self.phases = random.uniform(0, 2 * np.pi, len(waves))
         self.amplitude = wander * math.sqrt(2 / len(waves))
-        self.recording = True
+        self.recordable = True
         self.target = 0.0
         self.steering = 0.0
 
     def target_offset(self, travelled: float) -> float:
-        """Return the lateral offset in metres that it steers for after so many metres."""
+        """Return the lateral offset in m to steer for after `travelled` m along the track."""
         wander = -self.amplitude * float(np.sin(self.waves * travelled + self.phases).sum())
         return self.target + MAX_WANDER * math.tanh(wander / MAX_WANDER)
 
     def drive(self, run: Run) -> tuple[float, float]:
-        """Return steering and throttle, both -1..1, for the run's next step."""
+        """Return steering and throttle, both -1..1, for the next step of the run."""
         car = run.car
         speed = car.speed
         ahead = LOOKAHEAD + LOOKAHEAD_TIME * speed
@@ -75,33 +76,33 @@ class Expert:
 
 
 class Recovery(Expert):
-    """Drives towards the road's edges and back to the lane's centre; only the returns are for recording."""
+    """Drives towards the edges of the road and back to the lane's centre; only the returns are recorded."""
 
     OUTWARD_SPEED, RETURN_SPEED = 1.2, 2.2  # m/s sideways
-    PAUSE = (1.0, 3.0)  # s on the lane's centre between two returns
-    REACH = (0.55, 0.95)  # share of the distance from the lane's centre to where a wheel would leave the road
-    MARGIN = 1.5  # m from the car's middle to the edge of the road at which it turns back at the latest
+    CENTRED_TIME = (1.0, 3.0)  # s on the lane's centre after a return: shortest and longest
+    TURNING_POINT = (0.55, 0.95)  # least and greatest share of the distance from the lane's centre to the margin
+    MARGIN = 1.5  # m that the car's middle keeps from the edge of the road
     MAX_OUTWARD_TIME = 6.0  # s
 
     def __init__(self, track: Track, seed: int = 0, top_speed: float = TOP_SPEED):
         """top_speed: m/s."""
         super().__init__(track, seed, top_speed, wander=0.0)
         self.random = np.random.default_rng([seed, 2])
-        self.goal, self.until, self.recording = 0.0, self.random.uniform(*self.PAUSE), False
+        self.goal, self.until, self.recordable = 0.0, self.random.uniform(*self.CENTRED_TIME), False
 
     def drive(self, run: Run) -> tuple[float, float]:
-        """Return steering and throttle for the run's next step, and set `recording` on the way back."""
-        if self.recording:
+        """Return steering and throttle for the next step of the run, and set `recordable` during a return."""
+        if self.recordable:
             if abs(run.offset) < 0.25 and self.target == 0:
-                self.recording, self.until = False, run.time + self.random.uniform(*self.PAUSE)
+                self.recordable, self.until = False, run.time + self.random.uniform(*self.CENTRED_TIME)
         elif self.goal:
             if abs(run.offset - self.goal) < 0.2 or run.time > self.until:
-                self.goal, self.recording = 0.0, True
+                self.goal, self.recordable = 0.0, True
         elif run.time > self.until:
             side = self.random.choice((LEFT, RIGHT))
             edge = self.track.edges[self.track.index(run.s), 0 if side == LEFT else 1]
-            self.goal = side * self.random.uniform(*self.REACH) * (edge - self.MARGIN)
+            self.goal = side * self.random.uniform(*self.TURNING_POINT) * (edge - self.MARGIN)
             self.until = run.time + self.MAX_OUTWARD_TIME
-        change = (self.RETURN_SPEED if self.recording else self.OUTWARD_SPEED) * STEP
+        change = (self.RETURN_SPEED if self.recordable else self.OUTWARD_SPEED) * STEP
         self.target += max(-change, min(change, self.goal - self.target))
         return super().drive(run)

@@ -1,4 +1,4 @@
-"""A film of a drive from behind the car, with its speed and steering."""
+"""A film of a drive from behind the car, with speed and steering written on it."""
 
 import cv2
 import numpy as np
@@ -11,17 +11,18 @@ from simulator.cameras import Buffer, lens
 from simulator.run import Run
 from simulator.world import OUTSIDE, Scene
 
-ROWS, COLUMNS = 360, 640
-DISTANCE_BEHIND, HEIGHT_ABOVE, TARGET_HEIGHT = 7.5, 2.9, 1.0  # m
+FILM_ROWS, FILM_COLUMNS = 360, 640
+DISTANCE_BEHIND, HEIGHT_ABOVE = 7.5, 2.9  # m from the car to the camera
+TARGET_AHEAD, TARGET_HEIGHT = 4.0, 1.0  # m from the car to the point that the camera looks at
 
 
 def place_chase_camera(camera: NodePath, transform: TransformState) -> None:
-    """Put a camera behind the car at this transform, level, looking over its roof."""
+    """Put a level camera behind the car at this transform, looking over its roof."""
     ahead = transform.get_quat().get_forward()
     ahead = Vec3(ahead.x, ahead.y, 0.4 * ahead.z)
     ahead.normalize()
     camera.set_pos(transform.get_pos() - ahead * DISTANCE_BEHIND + Vec3(0, 0, HEIGHT_ABOVE))
-    camera.look_at(transform.get_pos() + ahead * 4 + Vec3(0, 0, TARGET_HEIGHT))
+    camera.look_at(transform.get_pos() + ahead * TARGET_AHEAD + Vec3(0, 0, TARGET_HEIGHT))
 
 
 class ChaseFilm(DriveFilm):
@@ -29,12 +30,12 @@ class ChaseFilm(DriveFilm):
 
     def __init__(self, path: str, scene: Scene):
         """Open the film. Raises OutputError."""
-        # Rendered frames show no more detail at a better quality, and these files are a fifth as large.
+        # At a better quality, rendered frames show no more detail, but the file is five times as large.
         super().__init__(path, SAMPLE_RATE, quality=28)
         self.scene, self.clock = scene, Clock()
-        self.camera = scene.root.attach_new_node(Camera("film", lens(ROWS, COLUMNS)))
+        self.camera = scene.root.attach_new_node(Camera("film", lens(FILM_ROWS, FILM_COLUMNS)))
         self.camera.node().set_camera_mask(OUTSIDE)
-        self.buffer = Buffer(ROWS, COLUMNS, [self.camera])
+        self.buffer = Buffer(FILM_ROWS, FILM_COLUMNS, [self.camera])
 
     def watch(self, run: Run) -> None:
         """Append a frame if one is due; call this after each physics step."""

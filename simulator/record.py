@@ -1,4 +1,4 @@
-"""Records laps that the expert drives, faster than real time."""
+"""Record laps that the expert drives, faster than real time."""
 
 import functools
 import multiprocessing
@@ -29,7 +29,7 @@ MAX_RENDERERS = 3  # processes; each uses one core and 50 MB
 
 
 class Row(NamedTuple):
-    """A row of the recording whose images are being rendered: simulated seconds, steering, pedals, and speed in mph."""
+    """A row of the recording whose images are being rendered; time in simulated seconds, speed in mph."""
 
     time: float
     images: Future[list[bytes]]
@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
 
 def _start_renderer() -> None:
-    """In a rendering process: leave Ctrl-C to the recording process, and end when that ends, even if it is killed."""
+    """Make a rendering process ignore Ctrl-C, and end together with the recording process, even if that is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
 
@@ -58,7 +58,7 @@ def _cameras(track: str, look: int) -> Cameras:
 
 
 def _render(track: str, look: int, transform: TransformState) -> list[bytes]:
-    """In a rendering process: return the three cameras' JPEGs, which depend on the car's pose alone."""
+    """Return the three cameras' JPEGs, which depend on the car's pose alone; runs in a rendering process."""
     return [jpeg(frame) for frame in _cameras(track, look).frames(transform)]
 
 
@@ -70,11 +70,12 @@ def record(
     seed: int = 0,
     look: int = 0,
     recovery: bool = False,
-) -> Run:
-    """Record the expert's laps into a new folder and return the run. Raises SimulatorError.
+) -> tuple[Run, int]:
+    """Record the expert's laps into a new folder; return the run and the number of rows.
 
     speed: set speed in mph; recovery: record only returns from the road's edges. The dates in the images' names depend
-    on the seed, not on today, so that the same arguments give the same files.
+    on the seed, not on today's date, so that the same arguments give the same files. Raises RecordingError if the
+    folder cannot be written or holds a recording, SimulatorError if a rendering process is killed.
     """
     run = Run(track)
     run.car.speed_limit = speed * MPH
@@ -95,10 +96,9 @@ def record(
         try:
             while run.travelled < laps * track.length:
                 run.step(*expert.drive(run))
-                if clock.due(run.time) and expert.recording:
+                if clock.due(run.time) and expert.recordable:
                     images = pool.submit(_render, track.name, look, run.car.node.get_transform())
-                    throttle, brake = max(0.0, run.throttle), max(0.0, -run.throttle)
-                    pending.append(Row(run.time, images, run.steering, throttle, brake, run.speed_mph))
+                    pending.append(Row(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph))
                     if len(pending) > 2 * renderers:
                         write()
                     bar.update(round(max(0.0, run.travelled)) - bar.n)
@@ -107,6 +107,6 @@ def record(
         except BrokenExecutor as error:
             raise SimulatorError(
                 f"{folder}: a rendering process was killed, perhaps for lack of memory; "
-                f"the {recording.rows} rows before are whole"
+                f"the {recording.rows} rows recorded before are complete"
             ) from error
-    return run
+    return run, recording.rows

@@ -1,4 +1,4 @@
-"""The lap report: what a drive was like, as JSON, as text and as a picture of the track from above."""
+"""The lap report: the metrics of a drive as JSON and as text, and a picture of the track from above."""
 
 import io
 import math
@@ -9,15 +9,16 @@ import numpy as np
 
 from cloning.outputs import write_output
 from cloning.road.motion import MPH
+from cloning.road.track import LEFT, RIGHT
 from simulator.car import STEP
 from simulator.client import Client
 from simulator.run import Run
 
-JUMP = 3.0  # m between two plotted points: the car was set back, and no line joins them
+JUMP = 3.0  # m: between plotted points further apart the car was set back, so no line joins them
 
 
 class DepartureReport(TypedDict):
-    """Where the car left the road: x to the east, y to the north."""
+    """Where the car left the road; x is east, y is north."""
 
     time_s: float
     along_m: float
@@ -36,9 +37,10 @@ class RoundTrips(TypedDict):
 
 
 class LapReport(TypedDict):
-    """The report of a drive; offsets are absolute distances from the centre line, steering is -1..1.
+    """The metrics of a drive; offsets are absolute distances from the centre line, steering is -1..1.
 
-    The keys from `frames` on are there if a server drove; own_ms_a_frame is the simulator's own time, in lock-step.
+    The keys from `frames` on exist if a server drove. own_ms_a_frame is the time that the simulator itself used, which
+    is measured in lock-step only.
     """
 
     track: str
@@ -62,7 +64,7 @@ class LapReport(TypedDict):
 
 
 def lap_report(run: Run, client: Client | None = None) -> LapReport:
-    """Return the report of a run, with the figures of the client that drove it, if one did."""
+    """Return the report of a run, with the metrics of the client that drove it, if there is one."""
     offset = np.abs(run.trajectory.offset) if run.trajectory.offset else np.zeros(1)
     lap_times = np.diff([0.0, *run.lap_times])
     report: LapReport = {
@@ -140,7 +142,7 @@ def write_picture(path: str | Path, run: Run) -> None:
 
     Raises OutputError.
     """
-    from matplotlib import colors  # large, and needed only here
+    from matplotlib import colors  # here, because loading matplotlib takes long and only this function needs it
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
@@ -150,15 +152,15 @@ def write_picture(path: str | Path, run: Run) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(aspect="equal")
     ring = np.r_[np.arange(len(track.points)), 0]
-    for side, column in ((-1, 0), (1, 1)):
+    for column, side in enumerate((LEFT, RIGHT)):
         edge = track.points[ring, :2] + side * track.rightward[ring] * track.edges[ring, column, None]
         axes.plot(*edge.T, color="0.6", linewidth=0.7)
     every = max(1, round(0.1 / STEP))
     path_driven = np.column_stack([run.trajectory.x, run.trajectory.y])[::every]
     if len(path_driven) > 1:
-        pieces = np.stack([path_driven[:-1], path_driven[1:]], axis=1)
+        segments = np.stack([path_driven[:-1], path_driven[1:]], axis=1)
         joined = np.linalg.norm(np.diff(path_driven, axis=0), axis=1) < JUMP
-        lines = LineCollection(list(pieces[joined]), cmap="viridis", norm=colors.Normalize(0, 4), linewidth=1.8)
+        lines = LineCollection(list(segments[joined]), cmap="viridis", norm=colors.Normalize(0, 4), linewidth=1.8)
         lines.set_array(np.abs(run.trajectory.offset)[::every][:-1][joined])
         axes.add_collection(lines)
         figure.colorbar(lines, ax=axes, label="distance from the centre line, m", shrink=0.7)

@@ -10,18 +10,18 @@ from cloning.road.track import Track
 from simulator.car import STEP, WHEELS, Car
 from simulator.world import build_physics
 
-WHEEL_REACH = 1.95  # m: no wheel is farther from the car's middle
+WHEEL_REACH = 1.95  # m: every wheel's hub is closer to the car's middle
 
 
 @dataclass(frozen=True)
 class Departure:
-    """A wheel left the road.
+    """Where and how fast the car left the road with a wheel.
 
     time   simulated seconds since the start
     s      metres along the track
     speed  m/s
     x, y   the car's position in metres, east and north
-    side   of the road, "left" or "right"
+    side   of the road that it left on, "left" or "right"
     """
 
     time: float
@@ -34,12 +34,12 @@ class Departure:
 
 @dataclass
 class Trajectory:
-    """What the car did, with one entry for each physics step.
+    """The car's motion, with one entry for each physics step.
 
     x, y      position in metres, east and north
-    offset    lateral offset in metres
+    offset    lateral offset in metres, right positive
     speed     m/s
-    steering  -1..1
+    steering  -1..1, right positive
     """
 
     x: list[float] = field(default_factory=list)
@@ -50,16 +50,19 @@ class Trajectory:
 
 
 class Run:
-    """The car on its track, in simulated time, which passes only in `step`.
+    """The car on its track, in simulated time, which only `step` advances.
 
     s, offset   the car's position: metres along the track and to the right of its centre line
     time        simulated seconds
-    travelled   metres along the track since the start, negative behind it
-    distance    metres that the car drove
+    travelled   metres along the track since the start, negative if the car went backwards
+    distance    metres that the car has driven
+    steering    of the last step, -1..1, right positive
+    throttle    of the last step, -1..1, negative brakes
+    lap_times   simulated seconds since the start at which each lap ended
     """
 
     def __init__(self, track: Track, start: str = "training"):
-        """start: the mode of the real simulator whose starting place is used, "training" or "autonomous"."""
+        """start: the mode of the real simulator whose starting position is used, "training" or "autonomous"."""
         self.track = track
         self.car = Car(build_physics(track))
         self.s, self.offset = track.starts[start], 0.0
@@ -81,6 +84,11 @@ class Run:
     def speed_mph(self) -> float:
         """Speed in mph."""
         return self.car.speed / MPH
+
+    @property
+    def throttle_and_brake(self) -> tuple[float, float]:
+        """Throttle and brake of the last step, each 0..1, as recordings have them."""
+        return max(0.0, self.throttle), max(0.0, -self.throttle)
 
     @property
     def laps(self) -> int:
@@ -120,11 +128,11 @@ class Run:
         i = int(self.s / self.track.step)
         edges = self.track.edges[i - 3 : i + 3]
         if abs(self.offset) + WHEEL_REACH < edges.min(initial=WHEEL_REACH if i < 3 else np.inf):
-            return ""  # mostly: no wheel can reach an edge
+            return ""  # the usual case: no wheel can reach an edge
         matrix = self.car.node.get_mat()
-        for right_of_middle, forward, _, _ in WHEELS:
-            wheel = matrix.xform_point((right_of_middle, forward, 0))
-            s, offset = self.track.locate(wheel.x, wheel.y, self.s)
+        for wheel in WHEELS:
+            position = matrix.xform_point((wheel.right, wheel.forward, 0))
+            s, offset = self.track.locate(position.x, position.y, self.s)
             left, right = self.track.edges[self.track.index(s)]
             if offset < -left:
                 return "left"
@@ -133,7 +141,7 @@ class Run:
         return ""
 
     def autonomy(self) -> float:
-        """Return NVIDIA's autonomy, at most 1: see `cloning.replay.autonomy`."""
+        """Return NVIDIA's autonomy, with each departure as an intervention; see `cloning.replay.autonomy`."""
         return autonomy(len(self.departures), self.time)
 
     def roughness(self) -> float:

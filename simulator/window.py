@@ -25,7 +25,7 @@ from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import FAR_PLANE, NEAR_PLANE, Cameras, jpeg
 from simulator.car import STEP
-from simulator.client import Remote
+from simulator.client import RemoteDriver
 from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks
 from simulator.film import place_chase_camera
 from simulator.run import Run
@@ -33,8 +33,7 @@ from simulator.world import INSIDE, OUTSIDE, Scene
 
 SIZE = 960, 540
 FIELD_OF_VIEW = 80  # degrees, horizontal
-MAX_DELAY = 0.2  # s of physics that are made up for after a slow frame; the rest is lost
-
+MAX_DELAY = 0.2  # s of physics that are caught up after a slow frame; the rest is skipped
 
 BUTTONS = {
     "a": GamepadButton.face_a(),
@@ -50,11 +49,11 @@ class Gamepad:
     """The first gamepad that panda3d finds."""
 
     def __init__(self, manager: InputDeviceManager | None = None):
-        """manager: finds the devices, by default panda3d's own."""
+        """manager: finds the devices; panda3d's own by default."""
         self.manager = manager or InputDeviceManager.get_global_ptr()
 
     def read(self) -> Sticks | None:
-        """Return the present state of sticks and buttons, or None while no gamepad is connected."""
+        """Return the state of sticks and buttons, or None while no gamepad is connected."""
         self.manager.update()
         pads = self.manager.get_devices(InputDevice.DeviceClass.gamepad)
         if not len(pads):
@@ -67,12 +66,12 @@ class Gamepad:
 
 
 class Window(ShowBase):
-    """The window and its drive, `simulation` (ShowBase has a method `run`)."""
+    """The window; its run is `simulation`, because ShowBase has a method `run`."""
 
     def __init__(self, track: Track, folder: str | Path, look: int = 0, server: tuple[str, int] | None = None):
         """Open the window. Raises SimulatorError.
 
-        folder: of the recording, created when recording first starts; server: host and port of drive.py if that drives.
+        folder: of the recording, created when recording first starts; server: host and port of drive.py if it drives.
         """
         try:
             super().__init__(windowType="onscreen")
@@ -88,13 +87,13 @@ class Window(ShowBase):
         self.scene.root.reparent_to(self.render)
         self.cameras = Cameras(self.scene)
         self.controls, self.gamepad = Controls(), Gamepad()
-        self.remote: Remote | None = None
+        self.remote: RemoteDriver | None = None
         if server:
             host, port = server
-            self.remote = Remote(host, port, Cameras(self.scene, ("center",)))
+            self.remote = RemoteDriver(host, port, Cameras(self.scene, ("center",)))
         self.folder, self.clock, self.recording_on = folder, Clock(), False
         self.recording: RecordingWriter | None = None
-        self.saved = (self.simulation.s, 0.0)  # metres along the track, lateral offset
+        self.saved = (self.simulation.s, 0.0)  # position to jump back to: m along the track, lateral offset in m
         self.chase = True
         self.camLens.set_near_far(NEAR_PLANE, FAR_PLANE)
         self.camLens.set_fov(FIELD_OF_VIEW)
@@ -132,20 +131,20 @@ class Window(ShowBase):
         return {name for name, handle in keys.items() if watcher.is_button_down(handle)}
 
     def mouse(self) -> float | None:
-        """Return the mouse position across the window, -1..1, or None while its button is up."""
+        """Return the mouse's horizontal position in the window, -1..1, or None while its left button is up."""
         watcher = self.mouseWatcherNode
         if watcher.has_mouse() and watcher.is_button_down(MouseButton.one()):
             return float(watcher.get_mouse_x())
         return None
 
     def tick(self, task: Task) -> int:
-        """Simulate the time since the last frame, and show the result; panda3d calls this before each frame."""
+        """Simulate the time since the last frame and show the result; panda3d calls this before each frame."""
         now = time.monotonic()
         held, mouse, pad = self.held(), self.mouse(), self.gamepad.read()
         by_hand = not self.remote or self.controls.pedals(held) != 0
         if self.remote:
-            self.remote.answer(by_hand, self.simulation)
-        driver: Controls | Remote = self.remote if self.remote and not by_hand else self.controls
+            self.remote.poll(by_hand, self.simulation)
+        driver: Controls | RemoteDriver = self.remote if self.remote and not by_hand else self.controls
         while now - self.simulated_until >= STEP:
             self.simulated_until = max(self.simulated_until + STEP, now - MAX_DELAY)
             self.controls.step(held, mouse, pad)
@@ -162,7 +161,7 @@ class Window(ShowBase):
         """Render the cameras and add a row to the recording."""
         run = self.simulation
         images = [jpeg(frame) for frame in self.cameras.frames(run.car.node.get_transform())]
-        recording.add(run.time, images, run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph)
+        recording.add(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph)
 
     def do_record(self) -> None:
         """Start or stop recording."""
@@ -201,7 +200,7 @@ class Window(ShowBase):
             self.remote.close()
 
     def show(self, by_hand: bool) -> None:
-        """Place the camera and write the status lines; by_hand: whether the person drives."""
+        """Place the camera and write the status lines; by_hand: a person drives."""
         run = self.simulation
         transform = run.car.node.get_transform()
         self.scene.move_car(transform)

@@ -31,11 +31,11 @@ from simulator.scenery.parts import Haze, Scenery
 from simulator.scenery.shapes import Mesh, merge
 
 GRAVITY = 9.81  # m/s²
-GROUND_HALF_WIDTH = 8.0  # m of ground on each side of a climbing road; the car is set back before it reaches the end
-CELL = 120.0  # m: meshes are divided into cells so that the engine can skip those out of view
-INSIDE, OUTSIDE = BitMask32.bit(0), BitMask32.bit(1)  # what the car's own cameras see, and what others see
+GROUND_HALF_WIDTH = 8.0  # m of ground on each side of a road with climbs; the car is set back before it gets so far
+CELL = 120.0  # m: meshes are divided into square cells, so that the engine can skip those that are out of view
+INSIDE, OUTSIDE = BitMask32.bit(0), BitMask32.bit(1)  # cameras in the car, which see its bonnet; others, its body
 HAZE_STEP, SHEEN_STEP = 25.0, 2.0  # m of camera movement after which haze and sheen are computed again
-SHEEN_START = 3.0  # m: closer than this, seen from above, asphalt has no sheen
+SHEEN_START = 3.0  # m from the camera: closer asphalt, seen from above, has no sheen
 
 
 def build_physics(track: Track) -> BulletWorld:
@@ -65,7 +65,10 @@ def _column(name: InternalName, size: int, number_type: int, contents: int) -> G
 
 
 def _vertex_format() -> GeomVertexFormat:
-    """Positions, colours and texture coordinates in three arrays, so that colours can be replaced on their own."""
+    """Return a format with positions, colours and texture coordinates in one array each.
+
+    So the colours can be replaced on their own.
+    """
     vertex_format = GeomVertexFormat()
     vertex_format.add_array(_column(InternalName.get_vertex(), 3, Geom.NT_float32, Geom.C_point))
     vertex_format.add_array(_column(InternalName.get_color(), 4, Geom.NT_uint8, Geom.C_color))
@@ -74,7 +77,7 @@ def _vertex_format() -> GeomVertexFormat:
 
 
 def make_texture(image: np.ndarray, repeat: bool, mipmaps: bool) -> Texture:
-    """Return the engine's texture of an image, uint8 (rows, columns, 3 RGB or 4 RGBA)."""
+    """Return an engine texture with an image, uint8 (rows, columns, 3 RGB or 4 RGBA)."""
     rows, columns, channels = image.shape
     texture = Texture()
     texture_format = Texture.F_rgba if channels == 4 else Texture.F_rgb
@@ -97,10 +100,10 @@ def _rgba(colours: np.ndarray) -> np.ndarray:
 
 
 class MeshCell:
-    """The engine's geometry of those faces of a mesh that lie in one cell."""
+    """The engine's geometry for the faces of a mesh in one cell; `used` are the indices of their points."""
 
     def __init__(self, mesh: Mesh, faces: np.ndarray):
-        """faces: int (m, 3), indices into the mesh's points; `used` are the points that they have."""
+        """faces: int (m, 3), indices into the mesh's points."""
         self.used, faces = np.unique(faces, return_inverse=True)
         self.data = GeomVertexData("cell", _vertex_format(), Geom.UH_static)
         self.data.unclean_set_num_rows(len(self.used))
@@ -123,16 +126,16 @@ class MeshCell:
 
 
 class MeshGroup:
-    """All faces of the scene with the same texture, divided into cells."""
+    """A mesh in the engine, divided into cells."""
 
     def __init__(self, mesh: Mesh, parent: NodePath):
         self.mesh = mesh
         root = parent.attach_new_node("group")
-        cell = np.floor(mesh.points[mesh.faces].mean(axis=1)[:, :2] / CELL).astype(int)
-        keys, which = np.unique(cell, axis=0, return_inverse=True)
-        self.cells = [MeshCell(mesh, mesh.faces[which.ravel() == i]) for i in range(len(keys))]
-        for part in self.cells:
-            root.attach_new_node(part.node)
+        squares = np.floor(mesh.points[mesh.faces].mean(axis=1)[:, :2] / CELL).astype(int)
+        occupied, which = np.unique(squares, axis=0, return_inverse=True)
+        self.cells = [MeshCell(mesh, mesh.faces[which.ravel() == i]) for i in range(len(occupied))]
+        for mesh_cell in self.cells:
+            root.attach_new_node(mesh_cell.node)
         plant = mesh.texture.shape[2] == 4
         root.set_texture(make_texture(mesh.texture, repeat=not plant, mipmaps=not plant))
         root.set_two_sided(True)
@@ -143,15 +146,16 @@ class MeshGroup:
         self.brightness = float(mesh.texture[..., :3].mean()) / 255
 
     def update_colours(self, eye: np.ndarray, haze: Haze | None) -> None:
-        """Apply haze and sheen to the colours as seen from the eye, (3,) in metres."""
-        colours, away = self.colours, np.sqrt(np.square(self.points - eye).sum(axis=1))[:, None]
+        """Apply haze and sheen to the colours, as seen from `eye`: (3,), m."""
+        colours, distance = self.colours, np.sqrt(np.square(self.points - eye).sum(axis=1))[:, None]
         if haze:
             start, end = haze.range
-            share = np.clip((away - start) / (end - start), 0, haze.maximum)
+            share = np.clip((distance - start) / (end - start), 0, haze.maximum)
             goal = np.array(haze.colour, np.float32) * (255 / self.brightness)
             colours = colours + (goal - colours) * share
         if self.mesh.sheen:
-            colours = colours * (1 + self.mesh.sheen * np.clip(1 - SHEEN_START / np.maximum(away, SHEEN_START), 0, 1))
+            share = np.clip(1 - SHEEN_START / np.maximum(distance, SHEEN_START), 0, 1)
+            colours = colours * (1 + self.mesh.sheen * share)
         rgba = _rgba(colours)
         for cell in self.cells:
             cell.set_colours(rgba[cell.used])
@@ -172,7 +176,8 @@ class Scene:
             by_texture.setdefault(id(mesh.texture), []).append(mesh)
         self.groups = [MeshGroup(merge(meshes), self.root) for meshes in by_texture.values()]
         for i, group in enumerate(self.groups):
-            group.root.set_bin("fixed", i)  # else the engine sorts by memory address, which differs from run to run
+            # Without a fixed order the engine sorts by memory address, which differs from run to run.
+            group.root.set_bin("fixed", i)
         self.sky = MeshGroup(scenery.sky, self.root).root
         self.sky.set_bin("background", 0)
         self.sky.set_depth_write(False)
@@ -181,12 +186,13 @@ class Scene:
         self.car.set_bin("fixed", len(self.groups))
         MeshGroup(scenery.bonnet, self.car).root.hide(OUTSIDE)
         MeshGroup(scenery.body, self.car).root.hide(INSIDE)
-        self.viewpoints: dict[float, tuple[int, int]] = {}  # by step: the grid point that colours were computed for
+        # Step -> the grid point for which colours were computed last.
+        self.viewpoints: dict[float, tuple[int, int]] = {}
 
     def move_car(self, transform: TransformState) -> None:
-        """Move the car and bring haze, sheen and sky to its position.
+        """Move the car, and update haze, sheen and sky for its position.
 
-        They depend on the position alone, not on the positions before it.
+        They depend on this position alone, not on earlier ones.
         """
         self.car.set_transform(transform)
         x, y, z = transform.get_pos()

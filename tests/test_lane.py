@@ -4,6 +4,7 @@ Thresholds are about 1.25 times what was measured with bfloat16; with float32 th
 """
 
 import copy
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
-from conftest import ROOT, render_recording
+from conftest import HERE, ROOT, render_recording
 
 from cloning.errors import ModelError, RecordingError
 from cloning.lane import reader
@@ -52,7 +53,7 @@ UNSEEN = 1003  # a look that the network was not trained on
 def drive(tmp_path_factory):
     """A rendered drive on the lake in look 0: the recording, and the true lateral offset of each row, m."""
     folder = tmp_path_factory.mktemp("lane") / "lake"
-    run = record(folder, Track("lake"), 0.12, 30, seed=3)
+    run, _ = record(folder, Track("lake"), 0.12, 30, seed=3)
     recording = read_recording(folder)
     steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
     return recording, np.array(run.trajectory.offset)[steps]
@@ -233,16 +234,19 @@ def test_real_recordings_are_trusted(folder):
 
 
 def test_training_leaves_weights_that_load(tmp_path, sample_recording):
-    output = tmp_path / "lane.pt"
+    shipped = reader.SHIPPED.read_bytes()
     done = subprocess.run(
-        [sys.executable, "-m", "tools.train_lane", sample_recording, *SHORT_TRAINING, "--output", output],
+        [sys.executable, "-m", "tools.train_lane", sample_recording, *SHORT_TRAINING],
+        cwd=tmp_path,
+        env={**os.environ, **HERE},
         capture_output=True,
         text=True,
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
     assert "step 2/2" in done.stdout
-    network = load_network(output)
+    assert reader.SHIPPED.read_bytes() == shipped  # no run changes a tracked file
+    network = load_network(tmp_path / "lane.pt")
     assert isinstance(network, LaneNetwork) and not network.training
     shape = network(torch.zeros(2, *STRIP_SHAPE)).shape
     assert shape == (2, len(DISTANCES_AHEAD))

@@ -193,8 +193,8 @@ def test_expert_drives_a_lap_on_the_road(name, direction):
 
 def test_only_the_recovery_driver_pauses_the_recording():
     track = Track("lake")
-    assert Expert(track).recording
-    assert not Recovery(track).recording
+    assert Expert(track).recordable
+    assert not Recovery(track).recordable
 
 
 @pytest.mark.parametrize(
@@ -242,6 +242,8 @@ def test_recordings_are_as_the_simulators_and_the_same_in_two_processes(tmp_path
     quality_75 = bytes([8, 6, 6, 7, 6, 5, 8, 7])  # how the JPEG standard's luminance table at quality 75 begins
     assert quality_75 in (tmp_path / "a" / "IMG" / rows[0][0]).read_bytes()[:64]
     assert len(rows) == pytest.approx(0.1 * 1138 / 12.4 * 15, rel=0.15)
+    closing = re.search(r"a: (\d+) rows from (\d+) simulated seconds, at [\d.]+ times real time\n$", done.stdout)
+    assert closing and int(closing[1]) == len(rows) and int(closing[2]) == pytest.approx(len(rows) / 15, abs=0.6)
 
 
 def test_renders_on_as_many_cores_as_the_process_may_use(tmp_path, monkeypatch):

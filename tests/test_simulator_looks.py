@@ -75,11 +75,11 @@ def test_recovery_records_only_the_returns():
     expert = Recovery(run.track, seed=1)
     returns, offsets = 0, []
     while run.time < 60:
-        before = expert.recording
+        before = expert.recordable
         run.step(*expert.drive(run))
-        if expert.recording:
+        if expert.recordable:
             offsets.append(abs(run.offset))
-        if before and not expert.recording:
+        if before and not expert.recordable:
             returns += 1
             assert abs(run.offset) < 0.25
             assert offsets[0] > 1.2

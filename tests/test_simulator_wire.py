@@ -15,7 +15,7 @@ from steer_server import STEER, Blank, Server, ahead, drive
 from cloning.errors import SimulatorError
 from cloning.road.track import Track
 from cloning.wire.client import FRAGMENT, Answer, parse_answer
-from simulator.client import Client, Remote, Standstill
+from simulator.client import Client, RemoteDriver, Standstill
 from simulator.run import Run
 
 
@@ -176,11 +176,11 @@ def test_the_window_sends_null_while_a_person_steers_and_is_never_held_up():
         return ['42["manual",{}]'] if packet.endswith("null]") else [STEER % ("0.5", "0.25")]
 
     with Server(reply) as server:
-        remote, run = Remote("127.0.0.1", server.port, Blank()), Run(Track("lake"), "autonomous")
+        remote, run = RemoteDriver("127.0.0.1", server.port, Blank()), Run(Track("lake"), "autonomous")
         for by_hand in (False, True, False):
             before, ticks = len(server.messages), 0
             while len(server.messages) < before + 12:
-                remote.answer(by_hand, run)
+                remote.poll(by_hand, run)
                 ticks += 1
             assert ticks >= 4
         remote.close()
@@ -196,8 +196,8 @@ def test_the_window_looks_for_a_server_without_waiting():
     closed = socket.create_server(("127.0.0.1", 0))
     port = closed.getsockname()[1]
     closed.close()
-    remote = Remote("127.0.0.1", port, Blank())
-    remote.answer(False, Run(Track("lake"), "autonomous"))
+    remote = RemoteDriver("127.0.0.1", port, Blank())
+    remote.poll(False, Run(Track("lake"), "autonomous"))
     assert "no server" in remote.state
     assert (remote.steering, remote.throttle) == (0, 0)
 

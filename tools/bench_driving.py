@@ -3,19 +3,17 @@
     python -m tools.bench_driving model.pt data/lake-ccw                     # one or two minutes
     python -m tools.bench_driving model.pt data/lake-ccw --frames 50000      # shows whether memory use grows
 
-One client per server sends telemetry in lock-step over loopback, in the simulator's fragments and without TCP_NODELAY.
-The lower bound is the time to decode the JPEG and run one forward pass (batch size 1, one thread). The servers take
-turns, so that other load on the machine affects all of them equally. Needs Linux: CPU time and memory are read from
-/proc.
+Each server has a client that sends telemetry over loopback, in the simulator's fragments and without TCP_NODELAY, and
+waits for each answer. The lower bound is the time to decode the JPEG and run one forward pass (batch size 1, one
+thread). The servers take turns, so that other load on the machine affects all of them equally. Needs Linux, because CPU
+time and memory are read from /proc.
 """
 
 import argparse
 import json
-import re
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import urllib.request
 from collections.abc import Iterator, Sequence
@@ -28,37 +26,28 @@ import torch
 from cloning.errors import UserError
 from cloning.pilot.network import Network, load_model
 from cloning.recordings.images import decode
+from tools.server_process import start_server
 from tools.simulator_client import Simulator, fragments, telemetry
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).resolve().parent.parent
 
-TICKS = 100  # per second, the unit of time in /proc/PID/stat
-TURN = 100  # frames that a server answers before it is the next one's turn
+TICKS = 100  # per second: the unit of time in /proc/PID/stat
+TURN = 100  # frames that a server answers in one turn
 WARM_UP = 50  # frames that are not counted
 
 
 class Server:
-    """A server process with a connected client, and what was measured of it."""
+    """A server process with a connected client, and its measurements."""
 
     def __init__(self, name: str, command: Sequence[str | Path]):
         self.name = name
-        self.process = subprocess.Popen([sys.executable, *map(str, command)], stderr=subprocess.PIPE, text=True)
-        self.port = self.listening_port()
+        self.process, self.port = start_server(command)
         self.client = Simulator(self.port)
         self.client.open()
         self.round_trips: list[float] = []  # seconds, measured by the client
         self.latencies: list[float] = []  # seconds, measured by the server
         self.memory: list[float] = []  # MB, after each turn
         self.seconds = self.cpu_time = 0.0  # over all counted frames
-
-    def listening_port(self) -> int:
-        """Read the port that the server prints, and discard all later output."""
-        assert self.process.stderr
-        for line in self.process.stderr:
-            if port := re.search(r"Listening on .*:(\d+)", line):
-                threading.Thread(target=self.process.stderr.read, daemon=True).start()
-                return int(port[1])
-        raise UserError(f"{self.name} ended before it listened on a port; run it alone to see why")
 
     def close(self) -> None:
         """End the client and the server."""
@@ -67,8 +56,8 @@ class Server:
         self.process.wait()
 
     def drive(self, messages: list[list[bytes]], count: bool = True) -> None:
-        """Send these messages, each a list of fragments, in lock-step; measure them if `count`."""
-        self.client.send("2")  # a ping as the simulator sends every 25 s, without which the typical server hangs up
+        """Send messages, each a list of fragments, one after each answer; measure them if `count`."""
+        self.client.send("2")  # a ping: the simulator sends one every 25 s, and without it the typical server closes
         self.client.receive()
         cpu_before, started = self.cpu_seconds(), time.perf_counter()
         for message in messages:
@@ -84,7 +73,7 @@ class Server:
             self.memory.append(self.resident_megabytes())
 
     def cpu_seconds(self) -> float:
-        """Return the server's CPU time so far, user and system, in seconds."""
+        """Return the server's CPU time so far in seconds, user and system."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / TICKS
 
@@ -94,7 +83,7 @@ class Server:
         return int(status.split("VmRSS:")[1].split()[0]) / 1024
 
     def read_latencies(self, frames: int) -> None:
-        """Read the server's own latency of the last frames from the events that feed its page."""
+        """Read the latencies of the last frames, as the server measured them, from the events for its page."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/live", timeout=10) as events:
             rows = json.loads(next(line for line in events if line.startswith(b"data:"))[6:])["rows"]
         self.latencies += [row[-1] / 1000 for row in rows[-frames:]]
@@ -102,7 +91,7 @@ class Server:
 
 @contextmanager
 def open_page(port: int) -> Iterator[None]:
-    """Read the page's events, attention maps included, as a browser does while the page is open."""
+    """Read the page's events with attention maps in another process, as a browser with the open page does."""
     read_events = "import sys, urllib.request\nfor line in urllib.request.urlopen(sys.argv[1]): pass"
     address = f"http://127.0.0.1:{port}/live?attention"
     reader = subprocess.Popen([sys.executable, "-c", read_events, address])
@@ -129,7 +118,7 @@ def milliseconds(times: list[float]) -> str:
 
 
 def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], list[Server]]:
-    """Return the lower bounds in seconds, and the servers with what was measured of them."""
+    """Return the lower bounds in seconds, and the servers with their measurements."""
     messages = [fragments("42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")])) for jpeg in jpegs]
     network, bounds = load_model(model), []
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
@@ -162,12 +151,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="bench_driving", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("model", help="a model file that model.py wrote")
-    parser.add_argument("recording", type=Path, help="recording whose first 500 centre images are sent")
+    parser.add_argument("model", help="a model file of model.py")
+    parser.add_argument("recording", type=Path, help="folder of a recording, whose first 500 centre images are sent")
     parser.add_argument("--frames", type=int, default=3000, help="frames for each server (default %(default)s)")
     args = parser.parse_args()
     if not Path("/proc/self/stat").exists():
-        parser.error("needs Linux, whose /proc tells the CPU time and memory of a process")
+        parser.error("needs Linux, because CPU time and memory are read from /proc")
     jpegs = [path.read_bytes() for path in sorted(args.recording.glob("IMG/center_*.jpg"))[:500]]
     if not jpegs:
         parser.error(f"{args.recording}: no centre images in its IMG/; name a folder that holds driving_log.csv")

@@ -1,12 +1,12 @@
-"""How fast the stand-in simulator is, and how much memory it takes (on Linux).
+"""Measure the speed and the memory use of the stand-in simulator.
 
-    python -m tools.bench_simulator                 # both tracks, a table
-    python -m tools.bench_simulator --laps 0.3      # sooner
+    python -m tools.bench_simulator                 # three laps of each track
+    python -m tools.bench_simulator --laps 0.3      # faster, but less accurate
 
-Recording: three cameras, JPEG and csv, as `python -m simulator record` does it, in a process of its own. Lock-step:
-what the simulator itself adds to a frame, without the server's time and the wire's. "cpu" figures count the processor
-time of all cores, which other load on the machine disturbs less than wall time. Memory is that of all processes that
-record, with shared pages counted once.
+Recording: `python -m simulator record` in a process of its own: three cameras, JPEG and csv. Lock-step: the time that
+the simulator itself needs for a frame, without the server and the transfer. "cpu" is the processor time of all cores;
+other load on the machine disturbs it less than wall time. Memory is that of all recording processes, with shared pages
+counted once. Needs Linux, because memory is read from /proc.
 """
 
 import argparse
@@ -38,7 +38,7 @@ WARM_UP = 20  # frames before the lock-step measurement
 
 @dataclass(frozen=True)
 class Speed:
-    """Simulated seconds per second of wall time and of processor time, and the peak memory in MB."""
+    """Simulated seconds per second of wall time and of processor time, and the peak memory use in MB."""
 
     wall: float
     cpu: float
@@ -46,7 +46,7 @@ class Speed:
 
 
 def memory(pid: int) -> float:
-    """Return the MB that a process and its children hold in memory."""
+    """Return the memory that a process and its children use, in MB."""
     total = 0
     for process in (str(pid), *Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="utf-8").split()):
         text = Path(f"/proc/{process}/smaps_rollup").read_text(encoding="utf-8")
@@ -55,7 +55,7 @@ def memory(pid: int) -> float:
 
 
 def recording(track: str, laps: float) -> Speed:
-    """Record in a process of its own and measure it. Raises SimulatorError."""
+    """Record laps in a process of its own and measure it. Raises SimulatorError."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "simulator", "record", f"{folder}/out", "--track", track, "--laps", str(laps)]
         begin = time.perf_counter()
@@ -69,14 +69,16 @@ def recording(track: str, laps: float) -> Speed:
         wall = time.perf_counter() - begin
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
-            raise SimulatorError(f"{' '.join(command)} ended with {process.returncode}: run it to see its message")
+            raise SimulatorError(
+                f"{' '.join(command)}: exit status {process.returncode}; run it alone to see its message"
+            )
         rows = (Path(folder) / "out" / LOG).read_text(encoding="utf-8").count("\n")
     simulated = rows / SAMPLE_RATE
     return Speed(simulated / wall, simulated / (usage.ru_utime + usage.ru_stime), peak)
 
 
 def lockstep(track: str, frames: int) -> tuple[float, float]:
-    """Return the milliseconds of wall and of processor time for a frame: physics, one camera, JPEG."""
+    """Return the milliseconds of wall time and of processor time for a frame: physics, one camera, JPEG."""
     run = Run(Track(track), "autonomous")
     cameras, expert = Cameras(Scene(scenery.build(track)), ("center",)), Expert(run.track)
 
@@ -95,7 +97,7 @@ def lockstep(track: str, frames: int) -> tuple[float, float]:
 def measure(laps: float, repeat: int) -> None:
     """Measure both tracks and print the table."""
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start")
-    print("track   recording, times real time     memory   lock-step, ms a frame")
+    print("track   recording, times real time     memory   lock-step, ms per frame")
     print("        wall (worst)  cpu (worst)      MB       wall   cpu")
     for track in ROADS:
         runs = [recording(track, laps) for _ in range(repeat)]
@@ -106,15 +108,19 @@ def measure(laps: float, repeat: int) -> None:
             f"{statistics.median(cpu):.1f} ({min(cpu):.1f})        "
             f"{max(run.memory for run in runs):.0f}      {frame_wall:.1f}   {frame_cpu:.1f}"
         )
-    print(f"memory of this process at most {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    print(f"peak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 
 def main() -> int:
     """Parse the command line, measure and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="bench_simulator", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--laps", type=float, default=1.0, help="laps to record on each track (default 1)")
     parser.add_argument("--repeat", type=int, default=3, help="recordings of each track (default 3)")
     args = parser.parse_args()
+    if not Path("/proc/self/smaps_rollup").exists():
+        parser.error("needs Linux, because memory is read from /proc")
     try:
         measure(args.laps, args.repeat)
     except UserError as error:

@@ -1,6 +1,6 @@
 """Measure how fast `model.py` trains, compared with the processor's limit and with a typical training loop.
 
-    python -m tools.bench_training                                  # on a third of a lap that it renders
+    python -m tools.bench_training                                  # on a third of a lap, rendered for this purpose
     python -m tools.bench_training data/lake-ccw data/lake-cw       # on these recordings
 
 (a) an epoch of model.py: generator, optimisation steps, checkpoints, pictures and validation
@@ -9,8 +9,9 @@
     and augments the images one by one
 (k) Keras with the same one-by-one generator, if TensorFlow is installed
 
-The limit for (b) follows from the processor's rate of multiplying two matrices. Each part runs in a process of its own;
-the parts take turns, so that a change of the machine's speed affects all of them. Rates are training images per second.
+The limit for (b) is the rate at which the processor could train if it only multiplied matrices. Each part runs in a
+process of its own; the parts take turns, so that a change of the machine's speed affects all of them. Rates are in
+training images per second.
 """
 
 import argparse
@@ -38,10 +39,10 @@ if TYPE_CHECKING:
     import model
     from cloning.pilot.network import Network
 
-PARTS = ("bound", "ab", "c", "k")
-BATCH_IMAGES = 474  # of a batch of 128 observations, which give 3.7 images each on average
+PARTS = ("limit", "ab", "c", "k")
+BATCH_IMAGES = 474  # images in a batch of 128 observations, at 3.7 images each on average
 NAMES = {
-    "bound": "limit by matrix multiplication",
+    "limit": "limit by matrix multiplication",
     "a": "(a) an epoch of model.py",
     "b": "(b) only the optimisation step",
     "c": "(c) a typical training loop",
@@ -77,11 +78,11 @@ def flops(network: "Network") -> int:
 
 
 def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
-    """Measure (a) and (b) in one process, a step of (b) after every fourth batch of (a).
+    """Measure (a) and (b) in one process, with a step of (b) after every fourth batch of (a).
 
     So other load on the machine affects both equally.
     """
-    bare, write_pictures, turns = run.generator.begin(0)(), run.write_pictures, itertools.count(1)
+    fixed_batch, write_pictures, turns = run.generator.begin(0)(), run.write_pictures, itertools.count(1)
     spent, steps = 0.0, 0
 
     def between_batches() -> None:
@@ -90,7 +91,7 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
         if next(turns) % 4 == 0:
             run.pool.submit(int).result()  # wait for the next batch's images, whose time belongs to (a)
             started = time.perf_counter()
-            (run.errors(bare) / bare.total).backward()
+            (run.errors(fixed_batch) / fixed_batch.total).backward()
             run.optimizer.step()
             run.optimizer.zero_grad()
             synchronize(run.device)
@@ -99,14 +100,14 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
     started = time.perf_counter()
     with mock.patch.object(run, "write_pictures", between_batches):
         run.train()
-    whole = time.perf_counter() - started - spent
-    return {"a": run.progress.history[0]["images"] / whole, "b": steps * bare.total / spent}
+    epoch_seconds = time.perf_counter() - started - spent
+    return {"a": run.progress.history[0]["images"] / epoch_seconds, "b": steps * fixed_batch.total / spent}
 
 
 def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray", "np.ndarray"]:
-    """Make a batch as a typical generator does, one image at a time from its file.
+    """Return a batch made as in a typical generator, one image at a time from its file.
 
-    Returns the images, uint8 (n, 75, 320, 3), and their steering, float32 (n,).
+    images: uint8 (n, 75, 320, 3); labels: float32 (n,).
     """
     import numpy as np
 
@@ -129,7 +130,7 @@ def part_c(run: "model.TrainingRun", steps: int) -> dict[str, float]:
 
     network = run.network
     for parameter in network.parameters():
-        parameter.data = parameter.data.contiguous()  # model.py has them channels last
+        parameter.data = parameter.data.contiguous()  # in model.py they are channels last
     torch.set_num_threads(threads())
     optimizer = torch.optim.Adam(network.parameters(), 1e-4)
     numbers = iter(range(1000))
@@ -179,14 +180,14 @@ def part_k(run: "model.TrainingRun", steps: int) -> dict[str, float]:
     return {"k": rate(step, BATCH_IMAGES, steps, run.device)}
 
 
-def part_bound(run: "model.TrainingRun", _: int) -> dict[str, float]:
-    """Measure the limit: images per second of a step that only multiplies matrices, the best of eight measurements."""
+def part_limit(run: "model.TrainingRun", _: int) -> dict[str, float]:
+    """Measure the limit: images per second if a step only multiplied matrices, the best of eight measurements."""
     import torch
 
     torch.set_num_threads(threads())
     size = 2048 if run.device.type == "cpu" else 8192
     a, b = (torch.randn(size, size, device=run.device).to(run.precision) for _ in "ab")
-    return {"bound": max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size**3 / flops(run.network)}
+    return {"limit": max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size**3 / flops(run.network)}
 
 
 def rate(step: Callable[[], object], images: int, steps: int, device: "torch.device") -> float:
@@ -208,11 +209,11 @@ def synchronize(device: "torch.device") -> None:
         torch.cuda.synchronize(device)
 
 
-PART_FUNCTIONS = {"bound": part_bound, "ab": part_ab, "c": part_c, "k": part_k}
+PART_FUNCTIONS = {"limit": part_limit, "ab": part_ab, "c": part_c, "k": part_k}
 
 
 def measure(part: str, recordings: list[str], samples: int, steps: int, folder: Path) -> dict:
-    """Measure one part in this process; return its rates in images per second and the circumstances."""
+    """Measure one part in this process; return its rates in images per second, memory, device and precision."""
     if part == "ab":
         keep_freed_memory()  # as model.py does
     run = begin(recordings, samples, folder / "model.pt")
@@ -227,7 +228,7 @@ def measure(part: str, recordings: list[str], samples: int, steps: int, folder: 
 
 
 def peak_memory() -> float | None:
-    """Return the peak resident memory of this process in GB, or None on Windows, which does not tell it."""
+    """Return the peak resident memory of this process in GB, or None on Windows, where it is unknown."""
     if sys.platform == "win32":
         return None
     import resource
@@ -248,7 +249,7 @@ def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> Non
             command += ["--samples", str(samples), "--steps", str(steps)]
             process = subprocess.run(command, stdout=subprocess.PIPE, text=True)
             if process.returncode:
-                raise UserError(f"part {part} failed; its own message stands above")
+                raise UserError(f"part {part} failed; its error message is above")
             measured = json.loads(process.stdout.splitlines()[-1])
             for name, value in measured["rates"].items():
                 rates.setdefault(name, []).append(value)
@@ -261,22 +262,22 @@ def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> Non
         cells = (statistics.median(values), min(values), max(values))
         print(f"| {NAMES[name]} | {' | '.join(f'{cell:.0f}' for cell in cells)} | {memory[name]:.2f} |")
     print("\n| ratio in each round | median | least | most |\n|---|---|---|---|")
-    for above, below in (("b", "bound"), ("a", "b"), ("a", "c"), *((("a", "k"),) if "k" in parts else ())):
+    for above, below in (("b", "limit"), ("a", "b"), ("a", "c"), *((("a", "k"),) if "k" in parts else ())):
         ratios = [x / y for x, y in zip(rates[above], rates[below], strict=True)]
         print(f"| {above} / {below} | {statistics.median(ratios):.2f} | {min(ratios):.2f} | {max(ratios):.2f} |")
 
 
 def main() -> None:
-    """Run the benchmark, or one part of it for the process that compares them."""
+    """Run the benchmark, or with --part one part of it, in a process that the benchmark started."""
     parser = argparse.ArgumentParser(
         prog="bench_training", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("recordings", nargs="*", help="recordings; without any, a third of a lap is rendered")
-    parser.add_argument("--rounds", type=int, default=3, help="how often each part is measured (default %(default)s)")
-    parser.add_argument("--samples", type=int, default=20224, help="images per epoch in (a) (default %(default)s)")
     parser.add_argument(
-        "--steps", type=int, default=5, help="batches that are counted in (c) and (k) (default %(default)s)"
+        "recordings", nargs="*", help="folders of recordings; without any, a third of a lap is rendered"
     )
+    parser.add_argument("--rounds", type=int, default=3, help="measurements of each part (default %(default)s)")
+    parser.add_argument("--samples", type=int, default=20224, help="images per epoch in (a) (default %(default)s)")
+    parser.add_argument("--steps", type=int, default=5, help="measured batches in (c) and (k) (default %(default)s)")
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.samples < 5 * BATCH_IMAGES or min(args.rounds, args.steps) < 1:

@@ -1,4 +1,4 @@
-"""The usual server for the simulator, as the benchmark's baseline: Pillow, a broadcast, the libraries' defaults."""
+"""A typical server for the simulator, the baseline of the benchmark: Pillow, broadcast answers, default settings."""
 
 import base64
 import io
@@ -23,7 +23,7 @@ SET_SPEED, PROPORTIONAL = 9.0, 0.1  # mph, throttle per mph
 
 
 def create_server(network: Network) -> socketio.Server:
-    """A server that answers each telemetry with the network's steering, to every client."""
+    """Return a server that answers each telemetry with the network's steering, to all clients."""
     server = socketio.Server()
 
     def send(steering: float, throttle: float) -> None:
@@ -44,14 +44,12 @@ def create_server(network: Network) -> socketio.Server:
 
 
 def main() -> None:
-    """Serve with the model file that the command line names, on a free port."""
+    """Drive with the model file named on the command line, on a free port."""
     logging.disable()
-    torch.set_num_threads(1)  # as in drive.py, so that only the wire differs
+    torch.set_num_threads(1)  # as in drive.py, so that the network takes the same time
     server = create_server(load_model(sys.argv[1]))
     listener = eventlet.listen(("127.0.0.1", 0))
-    print(
-        f"Listening on 127.0.0.1:{listener.getsockname()[1]}.\nThere is no page to watch.", file=sys.stderr, flush=True
-    )
+    print(f"Listening on 127.0.0.1:{listener.getsockname()[1]}.", file=sys.stderr, flush=True)
     eventlet.wsgi.server(listener, socketio.WSGIApp(server, flask.Flask(__name__)), log_output=False)
 
 

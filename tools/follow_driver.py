@@ -2,10 +2,10 @@
 
     python -m tools.follow_driver model.pt data/lake-ccw data/lake-cw
 
-Prints for each recording the correlation of the network's steering on the centre frames with the driver's, frame by
-frame and with both smoothed over nine frames (0.6 s), because a driver's steering is jerkier than the road; and mean
-and standard deviation of the smoothed steering. For a model trained on rendered recordings alone, this tells how much
-the rendered road resembles the real one.
+For each recording it prints the correlation between the network's steering on the centre frames and the driver's,
+frame by frame and with both smoothed over nine frames (0.6 s), because drivers steer less evenly than the road bends.
+It also prints the mean and the standard deviation of both, smoothed. For a model trained only on rendered recordings,
+this shows how similar rendered and real roads are.
 """
 
 import argparse
@@ -42,21 +42,22 @@ def predict(network: Network, folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Print a row of figures for each recording; return the exit status."""
+    """Print a row of metrics for each recording; return the exit status."""
     parser = argparse.ArgumentParser(
         prog="follow_driver", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("model", help="a model of model.py")
-    parser.add_argument("recordings", nargs="+", type=Path, help="folders with a driving_log.csv")
+    parser.add_argument("model", help="a model file of model.py")
+    parser.add_argument("recordings", nargs="+", type=Path, help="folders of recordings, each with a driving_log.csv")
     args = parser.parse_args(argv)
     try:
         network = load_model(args.model)
         print(f"{'':24} correlation, smoothed    network: mean, deviation    driver: mean, deviation")
         for folder in args.recordings:
-            ours, drivers = predict(network, folder)
-            ours_smoothed, drivers_smoothed = smooth(ours), smooth(drivers)
-            correlation, smoothed = np.corrcoef(ours, drivers)[0, 1], np.corrcoef(ours_smoothed, drivers_smoothed)[0, 1]
-            cells = [f"{values.mean():+.3f} {values.std():.3f}" for values in (ours_smoothed, drivers_smoothed)]
+            predicted, driven = predict(network, folder)
+            predicted_smoothed, driven_smoothed = smooth(predicted), smooth(driven)
+            correlation = np.corrcoef(predicted, driven)[0, 1]
+            smoothed = np.corrcoef(predicted_smoothed, driven_smoothed)[0, 1]
+            cells = [f"{values.mean():+.3f} {values.std():.3f}" for values in (predicted_smoothed, driven_smoothed)]
             print(f"{folder.name:24} {correlation:11.2f} {smoothed:9.2f}    {cells[0]:28}{cells[1]}")
     except (UserError, OSError) as error:
         print(f"follow_driver: {error}", file=sys.stderr)

@@ -3,8 +3,8 @@
     python -m tools.lane_accuracy RECORDING …                     # on rendered frames, and on these real recordings
     python -m tools.lane_accuracy RECORDING --picture lane.png    # real frames with the estimated lane drawn in
 
-Rendered frames come with the true position: frames from random poses, and drives, both in looks that the network was
-not trained on. For real recordings only the mounting of the side cameras is known: 0.806 and 0.825 m from the centre.
+For rendered frames the true position is known. Single frames from random poses and whole drives are rendered, in looks
+that the network was not trained on. For real recordings only the position of the side cameras in the car is known.
 """
 
 import argparse
@@ -35,23 +35,24 @@ from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_recording
 from cloning.road.camera import project_ground
 from cloning.road.motion import CAMERA_FORWARD, components, forward_vector, stretches
-from cloning.road.track import Track
+from cloning.road.track import ROADS, Track
 from simulator.car import STEP
 from simulator.record import record
-from tools.train_lane import TRACKS, render_strips
+from simulator.scenery import jungle, lake
+from tools.train_lane import render_strips
 
-UNSEEN = range(1000, 1003)  # looks
-EDGES = {"lake": 3.5, "jungle": 4.1}  # m from the centre to the lines
+UNSEEN_LOOKS = range(1000, 1003)  # the network was not trained on them
+LINE_OFFSETS = {"lake": lake.INNER_LINE, "jungle": jungle.EDGE_LINE}  # m from the lane's centre to its lines
 GREEN, RED = (0, 220, 0), (0, 0, 255)  # BGR
 
 
 def measure_frames(network: LaneNetwork) -> None:
     """Print the errors of single rendered frames from random poses, at each distance ahead."""
     print(f"{'rendered frames, m ahead':34}" + "".join(f"{distance:>8g}" for distance in DISTANCES_AHEAD))
-    for name in TRACKS:
+    for name in ROADS:
         strips, true = (
             np.concatenate(arrays)
-            for arrays in zip(*(render_strips(name, look, 150, 1) for look in UNSEEN), strict=True)
+            for arrays in zip(*(render_strips(name, look, 150, 1) for look in UNSEEN_LOOKS), strict=True)
         )
         estimated = estimate_centres(strips, network)
         slopes = []
@@ -69,10 +70,10 @@ def measure_frames(network: LaneNetwork) -> None:
 
 def measure_drives(network: LaneNetwork, laps: float) -> None:
     """Print the errors on recordings of the stand-in simulator, which logs the true position."""
-    for name in TRACKS:
-        for look in UNSEEN:
+    for name in ROADS:
+        for look in UNSEEN_LOOKS:
             with tempfile.TemporaryDirectory() as folder:
-                run = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
+                run, _ = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
                 recording = read_recording(folder)
                 position = fuse_detections(recording, detect_centres(recording, network))
             step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
@@ -86,7 +87,7 @@ def measure_drives(network: LaneNetwork, laps: float) -> None:
 
 
 def measure_recording(folder: str, network: LaneNetwork) -> None:
-    """Print where the side cameras of a real recording appear to be, its lateral offsets, and the time this takes."""
+    """Print the estimated positions of a real recording's side cameras, its lateral offsets, and the time needed."""
     recording = read_recording(folder)
     started = time.perf_counter()
     strips = read_strips(recording)
@@ -114,15 +115,15 @@ def measure_recording(folder: str, network: LaneNetwork) -> None:
     print(f"  {'ms a row':32}{ms.sum():.2f}: decode {ms[0]:.2f}, network {ms[1]:.2f}, fuse {ms[2]:.2f}")
 
 
-def draw_lane(recording: Recording, position: LanePosition, row: int, edge: float) -> np.ndarray:
-    """Draw the lane's centre (green) and edges (red) into a centre frame, as straight lines up to 12 m ahead.
+def draw_lane(recording: Recording, position: LanePosition, row: int, line_offset: float) -> np.ndarray:
+    """Return a centre frame with the lane's centre (green) and lines (red) as straight lines up to 12 m ahead.
 
-    edge: m from the centre. uint8 (160, 320, 3), BGR.
+    line_offset: m from the lane's centre to its lines. Returns uint8 (160, 320, 3), BGR.
     """
     frame = cv2.cvtColor(read_frame(recording.path(row)), cv2.COLOR_RGB2BGR)
     offset, yaw = position.lateral_offset[row], position.heading_error[row]
     ahead = np.linspace(CAMERA_FORWARD + 2.2, 12, 30)  # m along the lane from the car's middle
-    for line, colour in ((0, GREEN), (-edge, RED), (edge, RED)):
+    for line, colour in ((0, GREEN), (-line_offset, RED), (line_offset, RED)):
         points = np.stack([np.full_like(ahead, line - offset), ahead], axis=1)
         right, forward = components(points, forward_vector(yaw)).T
         visible = forward > CAMERA_FORWARD + 0.3
@@ -133,12 +134,12 @@ def draw_lane(recording: Recording, position: LanePosition, row: int, edge: floa
 
 
 def draw_frames(folder: str, network: LaneNetwork) -> np.ndarray:
-    """Draw the estimated lane into twelve frames of a recording, in three rows of four: uint8 (480, 1280, 3), BGR."""
+    """Return twelve frames of a recording with the estimated lane, in three rows of four: uint8 (480, 1280, 3), BGR."""
     recording = read_recording(folder)
     position = estimate_lane_position(recording, stretches(recording), network)
-    edge = EDGES["jungle" if "jungle" in folder else "lake"]
+    line_offset = LINE_OFFSETS["jungle" if "jungle" in folder else "lake"]
     rows = np.linspace(30, len(recording) - 30, 12).astype(int)
-    frames = [draw_lane(recording, position, row, edge) for row in rows]
+    frames = [draw_lane(recording, position, row, line_offset) for row in rows]
     return np.vstack([np.hstack(frames[k : k + 4]) for k in range(0, 12, 4)])
 
 
@@ -147,8 +148,10 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="lane_accuracy", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("recordings", nargs="*", help="real recordings: folders with a driving_log.csv")
-    parser.add_argument("--network", help="weights (default: those that come with the project)")
+    parser.add_argument("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
+    parser.add_argument(
+        "--network", metavar="lane.pt", help="file with the weights (default: those that come with the project)"
+    )
     parser.add_argument("--laps", type=float, default=0.3, help="length of each rendered drive; 0: none (default 0.3)")
     parser.add_argument("--picture", type=Path, help="write real frames with the estimated lane drawn in")
     args = parser.parse_args(argv)

@@ -1,10 +1,10 @@
-"""How much rendered frames resemble real ones: a table of figures, and frames side by side.
+"""Compare rendered frames with real ones: a table of differences, and a picture with both.
 
     python -m tools.likeness data/lake-ccw --picture side_by_side.png
 
-`cloning.lane.place` tells where on a known road a real recording was driven, and the stand-in simulator renders the
-same places. For each camera: mean colour, mean colour of image rows, and the columns of the lake's inner yellow lines
-relative to where flat geometry has them.
+`cloning.lane.place` locates a real recording on a known road, and the stand-in simulator renders the same places. The
+table compares mean colours, mean colours of image rows, and the columns of the lake's inner yellow lines relative to
+where they would be on flat ground.
 """
 
 import argparse
@@ -29,9 +29,9 @@ from simulator.run import Run
 from simulator.scenery.lake import INNER_LINE
 from simulator.world import Scene
 
-ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
-BANDS = (range(76, 82), range(86, 94), range(104, 116))  # rows in which the lines are searched: far, middle, near
-SEARCH = np.arange(-14, 14.1, 0.5)  # columns around the expected one
+COMPARED_ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
+LINE_ROWS = (range(76, 82), range(86, 94), range(104, 116))  # image rows that are searched for lines: far, middle, near
+SEARCH = np.arange(-14, 14.1, 0.5)  # columns around the expected one that are searched
 
 
 def rear_axle(track: Track, position: np.ndarray) -> tuple[Place, np.ndarray]:
@@ -46,7 +46,7 @@ def rear_axle(track: Track, position: np.ndarray) -> tuple[Place, np.ndarray]:
 
 
 def line_columns(track: Track, position: np.ndarray, offset: float, camera: str, rows: range) -> np.ndarray:
-    """Return the columns at which flat geometry has a line in some rows, nan where it is out of view.
+    """Return the columns where a line on flat ground would be in these rows, nan where it is out of view.
 
     offset: metres from the centre line to the line, right positive.
     """
@@ -61,9 +61,9 @@ def line_columns(track: Track, position: np.ndarray, offset: float, camera: str,
 
 
 def line_offset(frames: np.ndarray, columns: list[np.ndarray], rows: range) -> tuple[float, int]:
-    """Return how many columns right of the expected ones yellow is on average, and in how many rows it was searched.
+    """Return the mean distance in columns from the expected to the yellow ones, right positive, and the number of rows.
 
-    frames: uint8 (n, 160, 320, 3) RGB; columns: for each frame, the expected column in each row.
+    frames: uint8 (n, 160, 320, 3) RGB; columns: the expected column for each frame and row.
     """
     profiles = []
     for frame, expected in zip(frames.astype(np.float32), columns, strict=True):
@@ -93,11 +93,11 @@ def render(track: Track, positions: np.ndarray) -> np.ndarray:
 
 
 def compare(folder: Path, count: int, picture: str | None) -> None:
-    """Print the figures of `count` places of a recording and write the picture. Raises UserError."""
+    """Compare `count` places of a recording, print the table and write the picture. Raises UserError."""
     recording = read_recording(folder)
     drives = list(localise_all(stretches(recording), detect_centres(recording)))
     if not drives:
-        raise RecordingError(f"{folder}: drives on no known road; give a recording of the lake or the jungle")
+        raise RecordingError(f"{folder}: not on a known road; give a recording of the lake or the jungle")
     rows, placed = max(drives, key=lambda drive: drive[0].stop - drive[0].start)
     track = placed.track
     print(f"{track.name}, {track.direction}, {rows.stop - rows.start} rows")
@@ -110,7 +110,7 @@ def compare(folder: Path, count: int, picture: str | None) -> None:
     for c, camera in enumerate(CAMERAS):
         colours = [frames[:, c].mean((0, 1, 2)) for frames in (real, rendered)]
         print_colours(f"{camera}, mean colour RGB", colours)
-    for row in ROWS:
+    for row in COMPARED_ROWS:
         print_colours(f"center, row {row}", [frames[:, 0, row].mean((0, 1)) for frames in (real, rendered)])
     profile = [frames[:, 0].mean((0, 2, 3)) for frames in (real, rendered)]
     print(
@@ -129,20 +129,20 @@ def print_colours(name: str, colours: list[np.ndarray]) -> None:
 
 
 def print_lines(track: Track, positions: np.ndarray, real: np.ndarray, rendered: np.ndarray) -> None:
-    """Print where the inner lines are relative to flat geometry, in columns."""
+    """Print the columns of the inner lines relative to where they would be on flat ground."""
     for c, camera in enumerate(CAMERAS):
         for name, side in (("left", LEFT), ("right", RIGHT)):
-            for band in BANDS:
-                columns = [line_columns(track, position, side * INNER_LINE, camera, band) for position in positions]
-                offsets = [line_offset(frames[:, c], columns, band) for frames in (real, rendered)]
+            for rows in LINE_ROWS:
+                columns = [line_columns(track, position, side * INNER_LINE, camera, rows) for position in positions]
+                offsets = [line_offset(frames[:, c], columns, rows) for frames in (real, rendered)]
                 print(
-                    f"{f'{camera}, {name} line, row {band[len(band) // 2]}':28}"
+                    f"{f'{camera}, {name} line, row {rows[len(rows) // 2]}':28}"
                     + "".join(f"{offset:>+15.1f} (n={n:4})" for offset, n in offsets)
                 )
 
 
 def write_picture(path: str, real: np.ndarray, rendered: np.ndarray) -> None:
-    """Write eight places in two columns, real frames above rendered ones. Raises UserError."""
+    """Write a picture of eight places, real frames above rendered ones. Raises UserError."""
     strips = []
     for i in np.linspace(0, len(real) - 1, 8).astype(int):
         strips.append(np.vstack([np.hstack(frames[i][[1, 0, 2]]) for frames in (real, rendered)]))
@@ -153,10 +153,12 @@ def write_picture(path: str, real: np.ndarray, rendered: np.ndarray) -> None:
 
 def main() -> int:
     """Parse the command line, compare and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recording", type=Path, help="a real recording of the lake or the jungle")
-    parser.add_argument("--frames", type=int, default=120, help="places to compare (default 120)")
-    parser.add_argument("--picture", help="write frames side by side: real above, rendered below")
+    parser = argparse.ArgumentParser(
+        prog="likeness", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recording", type=Path, help="folder of a real recording of the lake or the jungle")
+    parser.add_argument("--frames", type=int, default=120, help="number of places to compare (default 120)")
+    parser.add_argument("--picture", metavar="FILE.png", help="write real frames above rendered ones")
     args = parser.parse_args()
     try:
         compare(args.recording, args.frames, args.picture)

@@ -1,4 +1,4 @@
-"""A client on a raw socket that sends the bytes of the Udacity simulator, for the tests and the benchmark."""
+"""A client on a raw socket that sends the same bytes as the Udacity simulator, for tests and the benchmark."""
 
 import base64
 import json
@@ -11,12 +11,12 @@ from cloning.wire.client import FRAGMENT
 
 
 class Simulator:
-    """The simulator's side of the wire: blocking, without TCP_NODELAY, fragments masked with a random key each."""
+    """The simulator's end of the websocket: blocking, without TCP_NODELAY, each fragment masked with a random key."""
 
     def __init__(self, port: int, host: str = "127.0.0.1", headers: str = "", timeout: float = 20):
-        """Connect and shake hands.
+        """Connect and send the websocket's opening handshake.
 
-        headers: further HTTP headers, each with its line end. timeout: s, of each wait.
+        headers: additional HTTP headers, each with its line end; timeout: s, for each wait.
         """
         self.socket = socket.create_connection((host, port), timeout)
         self.socket.settimeout(timeout)
@@ -53,12 +53,12 @@ class Simulator:
         return taken
 
     def send(self, message: str | bytes, opcode: int = 1) -> None:
-        """Send a message in the simulator's fragments, one system call each, as it does."""
+        """Send a message in fragments, with one system call for each, like the simulator."""
         for fragment in fragments(message, opcode):
             self.socket.sendall(fragment)
 
     def receive(self) -> str:
-        """The next text message. Raises ConnectionError when the server closes, TimeoutError when none comes."""
+        """Return the next text message. Raises ConnectionError if the server closes, TimeoutError if none arrives."""
         opcode, length = self._take(2)
         if opcode == 0x88:
             raise ConnectionError("the server has closed the websocket")
@@ -68,11 +68,11 @@ class Simulator:
         return self._take(length).decode()
 
     def open(self) -> list[str]:
-        """The server's first three packets: 0{…}, the first steer, 40."""
+        """Return the server's first three packets: 0{…}, the first steer, 40."""
         return [self.receive() for _ in range(3)]
 
     def drive(self, telemetry: object) -> dict[str, str]:
-        """Send a telemetry and receive its answer: the data of `steer`."""
+        """Send a telemetry and return its answer, the data of `steer`."""
         self.send("42" + json.dumps(["telemetry", telemetry], separators=(",", ":")))
         event, data = json.loads(self.receive()[2:])
         assert event == "steer", event
@@ -80,7 +80,7 @@ class Simulator:
 
 
 def fragments(message: str | bytes, opcode: int = 1) -> list[bytes]:
-    """A message as masked websocket frames of at most 1016 bytes of payload; opcode: 1 text, 2 binary, 8 close."""
+    """Return a message as masked websocket frames of at most FRAGMENT bytes; opcode: 1 text, 2 binary, 8 close."""
     payload = message.encode() if isinstance(message, str) else message
     frames = []
     for at in range(0, max(len(payload), 1), FRAGMENT):
@@ -97,7 +97,7 @@ def fragments(message: str | bytes, opcode: int = 1) -> list[bytes]:
 def telemetry(
     jpeg: bytes, steering_angle: str = "0.0000", throttle: str = "0.0000", speed: str = "0.0000"
 ) -> dict[str, str]:
-    """The data of a telemetry message: degrees, -1..1, mph, and the image in base64."""
+    """Return the data of a telemetry message; steering_angle in degrees, throttle -1..1, speed in mph."""
     return {
         "steering_angle": steering_angle,
         "throttle": throttle,

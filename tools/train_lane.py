@@ -1,11 +1,12 @@
 """Train the network of `cloning/lane/reader.py`, which detects the lane's centre in camera frames.
 
-    python -m tools.train_lane data/lake-ccw data/jungle     # rendered frames, and these real recordings
+    python -m tools.train_lane data/lake-ccw data/jungle     # on rendered frames and these real recordings
 
-It renders frames of both tracks in many looks from known poses. The pose of real frames is unknown, but the mounting of
-the side cameras is known, 0.81 and 0.83 m from the centre one, and so is how the ground moves when a frame is warped to
-another pose: the network learns these differences from real recordings, and absolute positions from rendered frames.
-Half of all frames are mirrored, which fixes the middle. It writes cloning/lane/lane.pt.
+The network learns absolute positions from rendered frames: both tracks in many looks, from known poses. The pose of a
+real frame is unknown, but differences between poses are known: between the cameras of the car, between two rows of a
+drive, and between two warps of a frame. The network learns these from real recordings. Half of all frames are mirrored,
+so that no side is preferred. The weights are written to lane.pt in the current folder, which git ignores. To ship them,
+measure them with `python -m tools.lane_accuracy --network lane.pt`, then copy the file to cloning/lane/lane.pt.
 """
 
 import argparse
@@ -27,7 +28,6 @@ from cloning.lane.place import centre_ahead
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
-    SHIPPED,
     STRIP_SHAPE,
     STRIP_TO_LEVEL,
     LaneNetwork,
@@ -41,13 +41,13 @@ from cloning.road.camera import LEVEL_CAMERA_MATRIX, camera_position, homographi
 from cloning.road.motion import CAMERA_FORWARD, MAX_GAP, Stretch, components, forward_vector
 from cloning.road.track import Track
 
-TRACKS = {"lake": 1, "jungle": 2}  # relative number of frames: hills and narrow bends are harder
-MAX_OFFSET, MAX_YAW = 3.5, 15.0  # m and degrees: of rendered cars, from the lane's centre and direction
+FRAME_SHARES = {"lake": 1, "jungle": 2}  # relative number of rendered frames: hills and narrow bends are harder
+MAX_OFFSET, MAX_YAW = 3.5, 15.0  # m and degrees: lateral offset and heading error in rendered frames
 WARP_DEVIATION = (0.9, 3.0)  # m and degrees: standard deviations of the poses to which real frames are warped
 RENDERED, PAIRS = 96, 40  # rendered frames and pairs of real frames in a batch
 DISTANCE_WEIGHTS = torch.tensor([1.0, 1.0, 0.9, 0.7, 0.5])  # of the errors at DISTANCES_AHEAD
-HUBER_THRESHOLD = 0.3  # m: a larger error counts in proportion, not by its square
-FLAT_GROUND = 8.0  # m ahead: in a warped frame detections are compared up to here; further off the ground is not flat
+HUBER_THRESHOLD = 0.3  # m: the loss is quadratic in smaller errors and linear in larger ones
+FLAT_GROUND = 8.0  # m ahead: detections in warped frames are compared up to here; further away the ground is not flat
 TRAVEL = (1.0, 8.0)  # m that the car drives between the two frames of a pair
 
 
@@ -56,9 +56,10 @@ TRAVEL = (1.0, 8.0)  # m that the car drives between the two frames of a pair
 
 
 def render_strips(track_name: str, look: int, frames: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render strips, uint8 (n, 32, 160, 3), from random poses; float32 (n, 5): the lane's centre, nan out of sight.
+    """Render strips from random poses, and return them with the true positions of the lane's centre.
 
-    Off the centre, turned, pitching and rolling as a car on its springs does, in both directions of the track.
+    The car is off the lane's centre, turned, and pitches and rolls as on its springs, in both directions of the track.
+    Strips: uint8 (n, 32, 160, 3); centres: float32 (n, 5), m to the right of the camera, nan where it is out of sight.
     """
     from panda3d.core import Point3, TransformState, Vec3
 
@@ -66,11 +67,11 @@ def render_strips(track_name: str, look: int, frames: int, seed: int) -> tuple[n
     from simulator.cameras import Cameras, jpeg
     from simulator.world import Scene
 
-    rng = np.random.default_rng([seed, look, list(TRACKS).index(track_name)])
+    rng = np.random.default_rng([seed, look, list(FRAME_SHARES).index(track_name)])
     cameras = Cameras(Scene(scenery.build(track_name, look)), ("center",))
     tracks = [Track(track_name, direction) for direction in ("ccw", "cw")]
     strips, centres = np.empty((frames, *STRIP_SHAPE), np.uint8), np.empty((frames, len(DISTANCES_AHEAD)), np.float32)
-    positions = np.sort(rng.uniform(0, tracks[0].length, frames))  # in order: haze is computed again every 25 m
+    positions = np.sort(rng.uniform(0, tracks[0].length, frames))  # sorted, because haze is computed again every 25 m
     for k, position in enumerate(positions):
         direction = rng.integers(2)
         track, s = tracks[direction], (position, tracks[0].length - position)[direction]
@@ -95,7 +96,9 @@ def render_all(looks: range, frames: int, seed: int) -> tuple[np.ndarray, np.nda
     Look 0, which resembles the real simulator, gets three times as many frames.
     """
     jobs = [
-        (track, look, frames * share * (1 if look else 3), seed) for look in looks for track, share in TRACKS.items()
+        (track, look, frames * share * (1 if look else 3), seed)
+        for look in looks
+        for track, share in FRAME_SHARES.items()
     ]
     with ProcessPoolExecutor(threads(), mp_context=multiprocessing.get_context("spawn")) as pool:
         strips, centres = zip(*pool.map(render_strips, *zip(*jobs, strict=True)), strict=True)
@@ -110,24 +113,24 @@ LEVEL_FROM_STRIP = np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_LEVEL
 
 
 def strip_homography(right: float, yaw: float) -> np.ndarray:
-    """Return the homography of the ground from a strip to one `right` m further right, turned right by `yaw` radians.
+    """Return the homography of the ground from a strip to that of another pose: float64 (3, 3).
 
-    float64 (3, 3).
+    right: m further right; yaw: radians, turned right.
     """
     return homographies(right, 0.0, yaw, STRIP_FROM_LEVEL, LEVEL_FROM_STRIP)[0]
 
 
 def visible_mask(homography: np.ndarray) -> np.ndarray:
-    """Return uint8 (32, 160, 1): 1 where a warped strip shows what the camera saw, else 0."""
-    seen = np.ones(STRIP_SHAPE[:2], np.uint8)
-    return cv2.warpPerspective(seen, homography, STRIP_SHAPE[1::-1], flags=cv2.INTER_NEAREST, borderValue=0)[..., None]
+    """Return a mask, uint8 (32, 160, 1): 1 where a warped strip has pixels of the original, else 0."""
+    ones = np.ones(STRIP_SHAPE[:2], np.uint8)
+    return cv2.warpPerspective(ones, homography, STRIP_SHAPE[1::-1], flags=cv2.INTER_NEAREST, borderValue=0)[..., None]
 
 
 class PhotometricAugmentation:
-    """Changes light, colours, shadows, noise and blur of strips, and hides parts of them."""
+    """Changes the light, colours, shadows, noise and blur of strips, and hides parts of them."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        """Sample the noise, shadows and masks that strips are later combined with."""
+        """Sample the noise, shadows and masks that are later applied to strips."""
         rows, columns, _ = STRIP_SHAPE
         down, across = np.mgrid[0:rows, 0:columns].astype(np.float32)
         self.noise = rng.normal(0, 10, (64, *STRIP_SHAPE)).round().astype(np.int16)
@@ -141,14 +144,14 @@ class PhotometricAugmentation:
         yaws = np.radians(rng.normal(0, 4, 512))
         poses = zip(rng.normal(0, 0.8, 512), yaws, strict=True)
         self.masks = [visible_mask(strip_homography(right, yaw)) for right, yaw in poses]
-        self.whole = np.ones((rows, columns, 1), np.uint8)
+        self.full_mask = np.ones((rows, columns, 1), np.uint8)
 
     def mask(self, rng: np.random.Generator, share: float) -> np.ndarray:
         """Sample a mask, uint8 (32, 160, 1); with probability `share` it hides a border, as warping does."""
-        return self.masks[rng.integers(len(self.masks))] if rng.random() < share else self.whole
+        return self.masks[rng.integers(len(self.masks))] if rng.random() < share else self.full_mask
 
     def apply(self, strip: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return the same view in other light and colours: uint8 (32, 160, 3)."""
+        """Return a strip, uint8 (32, 160, 3), with other light and colours."""
         if rng.random() < 0.6:
             strip = cv2.multiply(strip, self.shadows[rng.integers(len(self.shadows))], dtype=cv2.CV_8U)
         if rng.random() < 0.2:  # rectangles of one colour
@@ -175,7 +178,7 @@ class PhotometricAugmentation:
 
 
 class RealRecording:
-    """A real recording: strips uint8 (n, 3, 32, 160, 3), and the trajectory of its centre camera."""
+    """A real recording: its strips, uint8 (n, 3, 32, 160, 3), and the trajectory of its centre camera."""
 
     def __init__(self, folder: Path) -> None:
         """Read the recording's images. Raises RecordingError, OSError."""
@@ -196,24 +199,25 @@ class RealRecording:
         return later, (right, forward, self.heading[later] - self.heading[row])
 
 
-Pose = tuple[float, float, float, float]  # m right, m forward, yaw in radians, m ahead up to which detections compare
+# m to the right, m forward, yaw in radians, and m ahead up to which the detections are compared
+Pose = tuple[float, float, float, float]
 Batch = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 class BatchSampler:
-    """Samples training batches, each from its number and the seed alone."""
+    """Samples training batches, which depend only on the seed and the batch's number."""
 
     def __init__(self, strips: np.ndarray, centres: np.ndarray, recordings: list[RealRecording], seed: int) -> None:
-        """Sample from rendered strips and their centres, as of `render_all`, and from real recordings."""
+        """strips, centres: rendered, see `render_all`; recordings: real ones."""
         self.strips, self.centres, self.recordings, self.seed = strips, centres, recordings, seed
         self.augmentation = PhotometricAugmentation(np.random.default_rng([seed, 1]))
 
     def __call__(self, number: int) -> Batch:
         """Return the batch of this number: inputs, signs, centres, poses.
 
-        inputs: float32 (n, 32, 160, 3), 96 rendered strips, then 40 first and 40 second ones of real pairs; signs:
-        float32 (n, 1), -1 where mirrored; centres: float32 (96, 5), of the rendered strips; poses: float32 (40, 4), of
-        the pairs' second cameras relative to the first ones, as of `pair`.
+        inputs: float32 (n, 32, 160, 3), the rendered strips, then the first and then the second strip of each real
+        pair; signs: float32 (n, 1), -1 where mirrored; centres: float32 (RENDERED, 5), of the rendered strips; poses:
+        float32 (PAIRS, 4), of each pair's second camera relative to its first, see `Pose`.
         """
         rng = np.random.default_rng([self.seed, 2, number])
         chosen = rng.integers(0, len(self.strips), RENDERED)
@@ -236,22 +240,23 @@ class BatchSampler:
     def pair(
         self, recording: RealRecording, rng: np.random.Generator
     ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, Pose]:
-        """Sample two views of a place, a mask for both, and the second camera's pose relative to the first.
+        """Sample two strips of a place, a mask for both, and the second camera's pose relative to the first.
 
-        The two come from two cameras at once, from two rows of a drive, or from one frame warped twice. Both get the
-        same mask, so that it does not tell which camera is further right.
+        The strips are from two cameras at once, from two rows of a drive, or from one row, warped twice. Both get the
+        same mask, so that it does not show which camera is further right.
         """
         row, kind = int(rng.integers(len(recording.strips))), rng.random()
         if kind < 0.4:
-            one, other = rng.permutation(3)[:2]
-            views = recording.strips[row, one], recording.strips[row, other]
-            return views, self.augmentation.mask(rng, 0.3), (MOUNT_OFFSETS[other] - MOUNT_OFFSETS[one], 0, 0, np.inf)
+            first, second = rng.permutation(3)[:2]
+            views = recording.strips[row, first], recording.strips[row, second]
+            apart = MOUNT_OFFSETS[second] - MOUNT_OFFSETS[first]
+            return views, self.augmentation.mask(rng, 0.3), (apart, 0, 0, np.inf)
         if kind < 0.7:
             later, (right, forward, yaw) = recording.later(row, rng.uniform(*TRAVEL))
-            one, other = rng.integers(0, 3, 2)
-            views = recording.strips[row, one], recording.strips[later, other]
-            right = right + MOUNT_OFFSETS[other] * np.cos(yaw) - MOUNT_OFFSETS[one]
-            forward = forward - MOUNT_OFFSETS[other] * np.sin(yaw)
+            first, second = rng.integers(0, 3, 2)
+            views = recording.strips[row, first], recording.strips[later, second]
+            right = right + MOUNT_OFFSETS[second] * np.cos(yaw) - MOUNT_OFFSETS[first]
+            forward = forward - MOUNT_OFFSETS[second] * np.sin(yaw)
             return views, self.augmentation.mask(rng, 0.3), (right, forward, yaw, np.inf)
         mask = self.augmentation.mask(rng, 0.5)
         warped, poses = [], []
@@ -265,8 +270,9 @@ class BatchSampler:
             )
             mask = mask & visible_mask(homography)
             poses.append((MOUNT_OFFSETS[camera] + right, yaw))
-        (first, yaw), (second, second_yaw) = poses
-        right, forward = (second - first) * np.cos(yaw), (second - first) * np.sin(yaw)
+        (first_right, yaw), (second_right, second_yaw) = poses
+        apart = second_right - first_right
+        right, forward = apart * np.cos(yaw), apart * np.sin(yaw)
         return (warped[0], warped[1]), mask, (right, forward, second_yaw - yaw, FLAT_GROUND)
 
 
@@ -275,9 +281,9 @@ class BatchSampler:
 
 
 def transform(centres: torch.Tensor, poses: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the lane's centre, (n, 5) as a first camera detects it, relative to a second one: m right, m ahead.
+    """Convert a first camera's lane centres, (n, 5), to m right and m ahead of a second camera, (n, 5) each.
 
-    poses: float32 (n, 4), of the second camera relative to the first.
+    poses: float32 (n, 4), of the second camera relative to the first, see `Pose`.
     """
     right, forward, yaw = poses[:, :3].split(1, dim=1)
     across, along = centres - right, torch.from_numpy(DISTANCES_AHEAD) - forward
@@ -285,7 +291,7 @@ def transform(centres: torch.Tensor, poses: torch.Tensor) -> tuple[torch.Tensor,
 
 
 def consistency_loss(first: torch.Tensor, second: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-    """Return how far apart two cameras detect the same centre, where both see it; first, second: float32 (n, 5)."""
+    """Return the loss of two cameras' detections, float32 (n, 5), for their differences where both see the lane."""
     right, ahead = transform(first, poses)
     ahead = ahead.detach()
     distances = torch.from_numpy(DISTANCES_AHEAD)
@@ -298,7 +304,7 @@ def consistency_loss(first: torch.Tensor, second: torch.Tensor, poses: torch.Ten
 
 
 def masked_loss(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
-    """Return the weighted Huber loss over all true values that are not nan; float32 (n, 5)."""
+    """Return the weighted Huber loss over the true values that are not nan; both float32 (n, 5)."""
     known = ~torch.isnan(true)
     error = torch.where(known, predicted, 0.0) - torch.where(known, true, 0.0)
     losses = torch.nn.functional.smooth_l1_loss(error, torch.zeros_like(error), beta=HUBER_THRESHOLD, reduction="none")
@@ -308,7 +314,7 @@ def masked_loss(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
 def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
     """Train a network with AdamW and a one-cycle learning rate; print a line every 250 steps."""
     torch.manual_seed(batches.seed)
-    one_thread()  # the next batch is prepared in another thread meanwhile
+    one_thread()  # because another thread prepares the next batch at the same time
     device = torch.device("cpu")
     precision = choose_precision(device)
     network = LaneNetwork().train()
@@ -316,10 +322,10 @@ def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps, pct_start=0.15)
     started, sums = time.monotonic(), np.zeros(2)
     with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(batches, 0)
+        next_batch = pool.submit(batches, 0)
         for step in range(steps):
-            inputs, signs, centres, poses = coming.result()
-            coming = pool.submit(batches, step + 1)
+            inputs, signs, centres, poses = next_batch.result()
+            next_batch = pool.submit(batches, step + 1)
             with in_precision(precision, device):
                 predicted = network(torch.from_numpy(inputs))
             predicted = predicted * torch.from_numpy(signs)
@@ -349,22 +355,25 @@ def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
 
 
 def parse(argv: list[str] | None) -> argparse.Namespace:
-    """Read the command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
-        prog="train_lane",
-        description=(__doc__ or "").split("\n\n")[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        prog="train_lane", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("recordings", nargs="*", help="real recordings: folders with a driving_log.csv")
-    parser.add_argument("--looks", type=int, default=24, help="number of looks in which each track is rendered")
+    parser.add_argument("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
+    parser.add_argument("--looks", type=int, default=24, help="looks in which each track is rendered (default 24)")
     parser.add_argument(
-        "--frames", type=int, default=200, help="frames of the lake in each look; the jungle gets twice"
+        "--frames",
+        type=int,
+        default=200,
+        help="frames of the lake per look; the jungle gets twice as many (default 200)",
     )
     parser.add_argument(
-        "--steps", type=int, default=2400, help="batches of 96 rendered frames and 40 pairs of real ones"
+        "--steps", type=int, default=2400, help="batches of 96 rendered frames and 40 real pairs (default 2400)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same network on the same machine")
-    parser.add_argument("--output", type=Path, default=SHIPPED, help="file for the weights")
+    parser.add_argument("--seed", type=int, default=0, help="of all random choices (default %(default)s)")
+    parser.add_argument(
+        "--output", type=Path, default=Path("lane.pt"), help="file for the weights (default %(default)s)"
+    )
     return parser.parse_args(argv)
 
 
@@ -373,7 +382,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parse(argv)
     try:
         recordings = [RealRecording(folder) for folder in find_folders(arguments.recordings)]
-        print(f"rendering {arguments.looks} looks of {' and '.join(TRACKS)}", flush=True)
+        print(f"rendering {arguments.looks} looks of {' and '.join(FRAME_SHARES)}", flush=True)
         strips, centres = render_all(range(arguments.looks), arguments.frames, arguments.seed)
         network = train(BatchSampler(strips, centres, recordings, arguments.seed), arguments.steps)
         weights = network.state_dict().items()

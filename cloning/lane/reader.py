@@ -109,10 +109,12 @@ def load_network(path: str | Path | None = None) -> LaneNetwork:
         network = LaneNetwork()
         network.load_state_dict(weights)
     except FileNotFoundError:
-        raise ModelError(f"{path}: no such file; train the lane network with `python -m tools.train_lane`") from None
+        raise ModelError(
+            f"{path}: no such file; train the lane network with `python -m tools.train_lane --output {path}`"
+        ) from None
     except Exception as error:
         reason = f"holds no weights of the lane network ({type(error).__name__})"
-        raise ModelError(f"{path}: {reason}; train them with `python -m tools.train_lane`") from error
+        raise ModelError(f"{path}: {reason}; train them with `python -m tools.train_lane --output {path}`") from error
     return network.eval()
 
 

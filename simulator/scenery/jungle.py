@@ -10,14 +10,16 @@ from scipy.spatial import cKDTree
 from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
 from simulator.scenery import looks, textures
 from simulator.scenery.looks import Look, Palette
-from simulator.scenery.parts import Scenery, body, bonnet, dome
+from simulator.scenery.parts import Scenery, assemble
 from simulator.scenery.shapes import (
     Light,
     Material,
     Mesh,
     box,
     distances,
+    flatness,
     grid,
+    ground_grid,
     illuminate,
     merge,
     plants,
@@ -25,25 +27,27 @@ from simulator.scenery.shapes import (
     roadside,
     whole_lap,
 )
+from simulator.scenery.textures import Line
 
 ROAD = ROADS["jungle"]  # its bridge crosses the road at 1350 m, 20 m below
 EDGE_LINE = ROAD.edge  # m from the centre line to the white line along the road's edge
-ASPHALT = 4.45  # m from the centre line to the asphalt's end
-DASH, GAP = 6.0, 6.0  # m, of the centre line
+ASPHALT_EDGE = 4.45  # m from the centre line to the end of the asphalt
+DASH, GAP = 6.0, 6.0  # m, of the dashed centre line
+# Sections with guard rails
 RAILS = (Section(LEFT, 0, 45), Section(RIGHT, 880, 940), Section(LEFT, 1440, 1493))
-# Sections with marker posts, besides the bends
-MARKED = (
+# Sections with marker posts, in addition to sharp bends
+POSTS = (
     Section(LEFT, 395, 470),
     Section(RIGHT, 395, 470),
     Section(LEFT, 770, 872),
     Section(RIGHT, 770, 872),
     Section(LEFT, 1075, 1110),
 )
-MARKED_CURVATURE = 1 / 18  # 1/m: sharper bends have posts on their outer side
-CELL = 4.0  # m between the ground's points
-MARGIN = 75.0  # m of ground around the track
+SHARP_CURVATURE = 1 / 18  # 1/m: sharper bends have marker posts on their outer side
+GRID_SPACING = 4.0  # m between the ground's points
+GROUND_MARGIN = 75.0  # m of ground around the track
 CLIFF_DISTANCE, CLIFF_WIDTH = 12.0, 4.0  # m from the centre line to the cliffs' feet, and from there to their tops
-LANE_DISTANCE = 9.5  # m from the centre line within which the ground stays below the road
+CLEAR_DISTANCE = 9.5  # m from the centre line within which the ground stays below the road
 
 PALETTE: Palette = {
     "zenith": (0.22, 0.35, 0.59),
@@ -63,9 +67,8 @@ LIGHT = Light(sun=(0.62, 0.35, 0.70), sunlight=(0.86, 0.82, 0.72), fill=(0.40, 0
 
 
 class JungleTerrain:
-    """The height of the ground around the road, on a grid, and the shadows of the cliffs.
+    """The height of the ground around the road, on a grid, and the shadows that it casts.
 
-    xs, ys     float64 (columns,), (rows,): the grid's coordinates, m
     positions  float64 (rows, columns, 2): m
     distance   float64 (rows, columns): m to the centre line
     height     float64 (rows, columns): m
@@ -73,9 +76,7 @@ class JungleTerrain:
 
     def __init__(self, track: Track, random: Generator):
         self.track = track
-        low, high = track.points[:, :2].min(axis=0) - MARGIN, track.points[:, :2].max(axis=0) + MARGIN
-        self.xs, self.ys = (np.arange(a, b, CELL) for a, b in zip(low, high, strict=True))
-        self.positions = np.stack(np.meshgrid(self.xs, self.ys), axis=-1)
+        self.positions = ground_grid(track, GROUND_MARGIN, GRID_SPACING)
         on_ground = np.ones(len(track.points), bool)
         on_ground[np.round(distances(*ROAD.bridge) / track.step).astype(int)] = False
         points = track.points[on_ground]
@@ -91,13 +92,18 @@ class JungleTerrain:
         crest = np.clip((self.distance - 38) / 12, 0, 1) * (12 + 9 * np.abs(rough))
         cliff = rise * np.round(tall / 4) * 4 + crest  # in terraces of 4 m
         self.height = level + cliff + 0.35 * rough * np.clip((self.distance - 6) / 8, 0, 1)
-        lowest = np.where(away < LANE_DISTANCE, points[near, 2], np.inf).min(axis=-1)
+        lowest = np.where(away < CLEAR_DISTANCE, points[near, 2], np.inf).min(axis=-1)
         self.height = np.minimum(self.height, np.where(np.isfinite(lowest), lowest - 0.7, np.inf))
 
+    def grid_coordinates(self, positions: np.ndarray) -> np.ndarray:
+        """Return the column and the row on the grid, (2, n), fractions included, of positions (n, 2)."""
+        return ((positions - self.positions[0, 0]) / GRID_SPACING).T
+
     def height_at(self, positions: np.ndarray) -> np.ndarray:
-        """Interpolate the height, (n,) metres, at positions (n, 2)."""
-        column = np.clip((positions[:, 0] - self.xs[0]) / CELL, 0, len(self.xs) - 1.001)
-        row = np.clip((positions[:, 1] - self.ys[0]) / CELL, 0, len(self.ys) - 1.001)
+        """Interpolate the height, (n,), at positions (n, 2), in m."""
+        rows, columns = self.height.shape
+        column, row = self.grid_coordinates(positions)
+        column, row = np.clip(column, 0, columns - 1.001), np.clip(row, 0, rows - 1.001)
         i, j = row.astype(int), column.astype(int)
         u, v = row - i, column - j
         z = self.height
@@ -109,7 +115,7 @@ class JungleTerrain:
         )
 
     def sunlit(self, points: np.ndarray, light: Light) -> np.ndarray:
-        """Return 1 for each of the points (n, 3) that the sun reaches and 0 for those in the ground's shadow: (n,)."""
+        """Return, for points (n, 3), 1 where the sun reaches them and 0 in the ground's shadow: (n,)."""
         sun = np.array(light.sun)
         reached = np.ones(len(points), bool)
         for step in range(2, 32):
@@ -118,7 +124,7 @@ class JungleTerrain:
         return reached.astype(float)
 
     def cast_shadows(self, mesh: Mesh, light: Light, darkest: float) -> Mesh:
-        """Darken the mesh's colours in the ground's shadow to the share `darkest`, and return it."""
+        """Multiply the mesh's colours by `darkest` where the ground casts a shadow, and return the mesh."""
         sunlit = self.sunlit(mesh.points + np.array([0, 0, 0.8]), light)[:, None]
         mesh.colours[:] *= darkest + (1 - darkest) * sunlit
         return mesh
@@ -130,44 +136,39 @@ def ground(terrain: JungleTerrain, random: Generator, light: Light, palette: Pal
     points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1).reshape(-1, 3)
     uv = terrain.positions.reshape(-1, 2) / 9.0
     mesh = Mesh(points, np.ones_like(points), uv, grid(rows, columns), textures.rock(random, streak=1.0))
-    flatness = illuminate(mesh, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), face_up=True).colours[:, :1]
-    steep = np.clip((0.86 - flatness) * 5, 0, 1)
+    steep = np.clip((0.86 - flatness(mesh)) * 5, 0, 1)
     tone = 1 + 0.16 * textures.clouds(random, 256, 10, 4)[:rows, :columns].reshape(-1, 1)
     mesh.colours[:] = (np.array(palette["grass"]) * (1 - steep) + np.array(palette["cliff"]) * steep) * tone
     return terrain.cast_shadows(illuminate(mesh, light, face_up=True), light, 0.55)
 
 
 def road_texture(random: Generator, look: Look) -> np.ndarray:
-    """Return asphalt as wide as the road, a dash and a gap long, relative to its colour, which the mesh has."""
-    palette = look.palette
-    texture = textures.asphalt(random, grain=0.03 * look.grain, spots=0.35 * look.spots).astype(float)
-    rows, columns = texture.shape[:2]
-    offset = np.abs((np.arange(columns) + 0.5) / columns * 2 * ASPHALT - ASPHALT)
-    white = np.array(palette["line"]) / palette["asphalt"] * 255
-    texture[:, np.abs(offset - EDGE_LINE) < 0.10] = white
-    texture[: round(rows * DASH / (DASH + GAP)), offset < 0.11] = white
-    return np.clip(texture, 0, 255).astype(np.uint8)
+    """Return asphalt with its lines, as wide as the road and as long as a dash and a gap of the centre line."""
+    white = look.palette["line"]
+    lines = (Line(EDGE_LINE, 0.10, white), Line(0.0, 0.11, white, share=DASH / (DASH + GAP)))
+    asphalt = textures.asphalt(random, grain=0.03 * look.grain, spots=0.35 * look.spots)
+    return textures.paint_lines(asphalt, look.palette["asphalt"], ASPHALT_EDGE, lines)
 
 
 def road(terrain: JungleTerrain, random: Generator, look: Look) -> list[Mesh]:
-    """Return the asphalt with its lines, grassy verges, and the bridge's sides."""
+    """Return the asphalt with its lines, the grassy verges, and the sides of the bridge."""
     track, plain, soil = terrain.track, textures.plain(), textures.soil(random)
     light, palette = look.light, look.palette
-    offsets = np.linspace(-ASPHALT, ASPHALT, 7)
-    across = 0.5 + offsets / (2 * ASPHALT)
+    offsets = np.linspace(-ASPHALT_EDGE, ASPHALT_EDGE, 7)
+    across = 0.5 + offsets / (2 * ASPHALT_EDGE)
     asphalt = Material(palette["asphalt"], road_texture(random, look), DASH + GAP, across)
     meshes = [ribbon(track, whole_lap(track, 1.5), offsets, 0.0, asphalt)]
     grass, deck = Material(palette["grass"], soil, 9.0), Material(palette["deck"], plain, 4.0, across=(0, 1))
     for start, end in ((0.0, ROAD.bridge[0]), (ROAD.bridge[1], track.length)):
         for side in (LEFT, RIGHT):
             s = distances(start, end, 2.5)
-            verge = roadside(track, s, side, (ASPHALT, 6.2, 9.8), (-0.01, -0.08, -0.75), grass)
+            verge = roadside(track, s, side, (ASPHALT_EDGE, 6.2, 9.8), (-0.01, -0.08, -0.75), grass)
             meshes.append(illuminate(verge, light, face_up=True))
-    outer = ASPHALT + 0.25
+    outer = ASPHALT_EDGE + 0.25
     for side in (LEFT, RIGHT):
         for face, heights in (
             ((outer, outer), (0.15, -1.3)),
-            ((ASPHALT, outer), (0.15, 0.15)),
+            ((ASPHALT_EDGE, outer), (0.15, 0.15)),
             ((0, outer), (-1.3, -1.3)),
         ):
             meshes.append(roadside(track, distances(*ROAD.bridge), side, face, heights, deck))
@@ -175,7 +176,7 @@ def road(terrain: JungleTerrain, random: Generator, look: Look) -> list[Mesh]:
 
 
 def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
-    """Return guard rails, marker posts with their boards, and the bridge's piers."""
+    """Return guard rails, marker posts with their boards, and the piers of the bridge."""
     white, meshes = textures.plain(), []
 
     def add_box(s: float, right: float, bottom: float, size: tuple[float, float, float], colour: str) -> None:
@@ -192,9 +193,9 @@ def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
     bends = [
         (-int(np.sign(track.curvature[i])), i * track.step)
         for i in range(0, len(track.points), 9)
-        if abs(track.curvature[i]) > MARKED_CURVATURE
+        if abs(track.curvature[i]) > SHARP_CURVATURE
     ]
-    marked = [(section.side, s) for section in MARKED for s in np.arange(section.start, section.end, 7.0)]
+    marked = [(section.side, s) for section in POSTS for s in np.arange(section.start, section.end, 7.0)]
     for side, post_s in bends + marked:
         add_box(post_s, side * 5.2, -0.5, (0.09, 0.09, 3.1), "post")
         add_box(post_s, side * 5.2, 2.3, (0.10, 0.55, 0.30), "board")
@@ -205,11 +206,10 @@ def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
 
 
 def palms(terrain: JungleTerrain, random: Generator, light: Light, palette: Palette) -> list[Mesh]:
-    """Return palms on the grass beside the road and on the cliffs, and undergrowth at the cliffs' feet."""
+    """Return palms and bushes on the grass next to the road and on the cliffs."""
     low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
     positions = random.uniform(low, high, (5200, 2))
-    row = ((positions[:, 1] - terrain.ys[0]) / CELL).astype(int)
-    column = ((positions[:, 0] - terrain.xs[0]) / CELL).astype(int)
+    column, row = terrain.grid_coordinates(positions).astype(int)
     distance = terrain.distance[row, column]
     chance = np.where(distance < 10.5, 0, np.where(distance < 20, 0.22, 0.16))
     keep = random.uniform(size=len(positions)) < chance
@@ -229,7 +229,7 @@ def palms(terrain: JungleTerrain, random: Generator, light: Light, palette: Pale
 
 
 def scenery(look: int) -> Scenery:
-    """Return the jungle's scenery in a look; the order of the calls fixes what each samples from the random stream."""
+    """Return the jungle's scenery in a look; the calls share a random generator, so their order matters."""
     random = np.random.default_rng(look)
     appearance = looks.make_look(look, LIGHT, PALETTE)
     light, palette = appearance.light, appearance.palette
@@ -240,6 +240,4 @@ def scenery(look: int) -> Scenery:
         *rails_and_posts(terrain.track, light, palette),
         *palms(terrain, random, light, palette),
     ]
-    sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
-    car = palette["bonnet"]
-    return Scenery(meshes, sky, bonnet(car, light), body(car, light), tone=appearance.tone)
+    return assemble(meshes, appearance)

@@ -13,19 +13,20 @@ from numpy.random import Generator
 from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
 from simulator.scenery import lake_terrain, looks, planting, textures
 from simulator.scenery.looks import Look, Palette
-from simulator.scenery.parts import Haze, Scenery, body, bonnet, dome
+from simulator.scenery.parts import Haze, Scenery, assemble
 from simulator.scenery.shapes import Light, Material, Mesh, distances, illuminate, ribbon, roadside, whole_lap
+from simulator.scenery.textures import Line
 
 ROAD = ROADS["lake"]
-ASPHALT = ROAD.kerb_edge  # m from the centre line to the asphalt's end, under the kerbs
-SLABS = 7.0  # m from the centre line to the end of the concrete slabs beside the asphalt
+ASPHALT_EDGE = ROAD.kerb_edge  # m from the centre line to the end of the asphalt, under the kerbs
+SLAB_EDGE = 7.0  # m from the centre line to the end of the concrete slabs next to the asphalt
 INNER_LINE = 3.5  # m from the centre line to the middle of the inner yellow line
-# Sections without concrete: red earth up to the asphalt
+# Sections with red earth instead of concrete next to the asphalt
 VERGES = (Section(RIGHT, 62, 106), Section(RIGHT, 845, 860))
 
 
 class Shadow(NamedTuple):
-    """A soft-edged elliptic shadow on the road: its centre's s and lateral offset, half length and half width, in m."""
+    """An elliptic shadow on the road with a soft edge: s and lateral offset of its centre, and its half axes, in m."""
 
     s: float
     right: float
@@ -72,20 +73,21 @@ HAZE = Haze((0.41, 0.60, 0.85), (100, 600), 0.8)
 
 
 def road_texture(random: Generator, look: Look) -> np.ndarray:
-    """Return asphalt as wide as the road with its double lines, relative to its colour, which the mesh has."""
+    """Return asphalt as wide as the road, with its double lines and the seam between them."""
     palette = look.palette
-    texture = textures.asphalt(random, grain=0.15 * look.grain, spots=look.spots).astype(float)
-    columns = texture.shape[1]
-    offset = np.abs((np.arange(columns) + 0.5) / columns * 2 * ASPHALT - ASPHALT)
-    for line, half_width, name in ((3.72, 0.17, "seam"), (INNER_LINE, 0.05, "line"), (ROAD.edge, 0.04, "outer line")):
-        texture[:, np.abs(offset - line) < half_width] = np.array(palette[name]) / palette["asphalt"] * 255
-    return np.clip(texture, 0, 255).astype(np.uint8)
+    lines = (
+        Line(3.72, 0.17, palette["seam"]),
+        Line(INNER_LINE, 0.05, palette["line"]),
+        Line(ROAD.edge, 0.04, palette["outer line"]),
+    )
+    asphalt = textures.asphalt(random, grain=0.15 * look.grain, spots=look.spots)
+    return textures.paint_lines(asphalt, palette["asphalt"], ASPHALT_EDGE, lines)
 
 
 def road(track: Track, random: Generator, look: Look, soil: np.ndarray, shadows: Sequence[Shadow]) -> list[Mesh]:
     """Return the asphalt with its lines, the roadside, the kerbs and the bridge."""
     s, palette = whole_lap(track, 2.0), look.palette
-    offsets = np.linspace(-ASPHALT, ASPHALT, 7)
+    offsets = np.linspace(-ASPHALT_EDGE, ASPHALT_EDGE, 7)
     shade = np.ones((len(s), len(offsets), 3))
     for shadow in shadows:
         along = ((s - shadow.s + track.length / 2) % track.length - track.length / 2)[:, None] / shadow.half_length
@@ -94,15 +96,20 @@ def road(track: Track, random: Generator, look: Look, soil: np.ndarray, shadows:
     asphalt = Material(
         np.array(palette["asphalt"]) * shade,
         road_texture(random, look),
-        2 * ASPHALT,
-        across=0.5 + offsets / (2 * ASPHALT),
+        2 * ASPHALT_EDGE,
+        across=0.5 + offsets / (2 * ASPHALT_EDGE),
     )
     surface = replace(ribbon(track, s, offsets, 0.0, asphalt), sheen=look.sheen)
     slabs = Material(palette["slab"], textures.concrete(random), 3.0, across=(0, 0.5, 0.9, 1))
-    return [surface, *edges(track, look, slabs, soil), *kerbs(track, look), *bridge(track, random, palette, offsets)]
+    return [
+        surface,
+        *slabs_and_verges(track, look, slabs, soil),
+        *kerbs(track, look),
+        *bridge(track, random, palette, offsets),
+    ]
 
 
-def edges(track: Track, look: Look, slabs: Material, soil: np.ndarray) -> list[Mesh]:
+def slabs_and_verges(track: Track, look: Look, slabs: Material, soil: np.ndarray) -> list[Mesh]:
     """Return the concrete slabs on both sides of the road and the verges between them."""
     light = look.light
     bright = Light(light.sun, scaled(light.sunlight, 1.25), scaled(light.fill, 0.75))
@@ -113,9 +120,9 @@ def edges(track: Track, look: Look, slabs: Material, soil: np.ndarray) -> list[M
         breaks = sorted([*verges, ROAD.bridge])
         starts, ends = [0.0, *(end for _, end in breaks)], [*(start for start, _ in breaks), track.length]
         for start, end in zip(starts, ends, strict=True):
-            s, offsets = distances(start, end, 3.0), (ASPHALT, 5.9, SLABS, SLABS + 0.2)
+            s, offsets = distances(start, end, 3.0), (ASPHALT_EDGE, 5.9, SLAB_EDGE, SLAB_EDGE + 0.2)
             low = roadside(track, s, side, offsets, (0.01, 0.05, 0.08, -0.5), slabs)
-            # Lit as if they rose steeply: the real slabs look white or blue although they lie low.
+            # Lit as if they rose steeply, because the real slabs look white or blue although they are low.
             steep = illuminate(roadside(track, s, side, offsets, (0, 0.9, 1.9, 2.0), slabs), bright, face_up=True)
             meshes.append(replace(low, colours=steep.colours))
         for start, end in verges:
@@ -126,7 +133,7 @@ def edges(track: Track, look: Look, slabs: Material, soil: np.ndarray) -> list[M
 
 
 def scaled(colour: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
-    """Return a colour times a factor."""
+    """Return a colour multiplied by a factor."""
     red, green, blue = colour
     return factor * red, factor * green, factor * blue
 
@@ -153,7 +160,7 @@ def bridge(track: Track, random: Generator, palette: Palette, offsets: np.ndarra
 
 
 def random_shadows(random: Generator, length: float, count: int) -> list[Shadow]:
-    """Return shadows of trees and posts at random places on a track of this length."""
+    """Return shadows at random places on a track of this length."""
     return [
         Shadow(
             s=random.uniform(0, length),
@@ -166,7 +173,7 @@ def random_shadows(random: Generator, length: float, count: int) -> list[Shadow]
 
 
 def scenery(look: int) -> Scenery:
-    """Return the lake's scenery in a look; the order of the calls fixes what each samples from the random stream."""
+    """Return the lake's scenery in a look; the calls share a random generator, so their order matters."""
     random = np.random.default_rng(look)
     track, appearance = Track("lake"), looks.make_look(look, LIGHT, PALETTE)
     light, palette = appearance.light, appearance.palette
@@ -184,6 +191,4 @@ def scenery(look: int) -> Scenery:
         *planting.undergrowth(terrain, random, palette, appearance.plants),
         *planting.pylons(),
     ]
-    sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
-    car = palette["bonnet"]
-    return Scenery(meshes, sky, bonnet(car, light), body(car, light), HAZE, appearance.tone)
+    return assemble(meshes, appearance, HAZE)

@@ -1,4 +1,4 @@
-"""The land around the lake: heights and soils beside the road, as read off frames of the real simulator."""
+"""The land around the lake; heights and soils next to the road were read off frames of the real simulator."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -9,12 +9,12 @@ from scipy.spatial import cKDTree
 from cloning.road.track import LEFT, RIGHT, Section, Track
 from simulator.scenery import textures
 from simulator.scenery.looks import Palette
-from simulator.scenery.shapes import Light, Mesh, grid, illuminate
+from simulator.scenery.shapes import Light, Mesh, flatness, grid, ground_grid, illuminate
 
-CELL = 7.0  # m between the ground's points
+GRID_SPACING = 7.0  # m between the ground's points
 WATER_LEVEL = -1.2  # m
 CLIFF = Section(RIGHT, -45, 55)  # dark rock close to the road
-# Red earth beside the road
+# Red earth next to the road
 EARTH = (
     Section(RIGHT, -45, 110),
     Section(RIGHT, 215, 440),
@@ -23,7 +23,7 @@ EARTH = (
     Section(RIGHT, 843, 864),
     Section(LEFT, 150, 240),
 )
-# Metres along the road and height in metres of the land 25 m beside it
+# Metres along the road, and the height in metres of the land 25 m to this side of it
 HEIGHTS_LEFT = (
     (-20, 2),
     (25, 3),
@@ -76,13 +76,13 @@ HEIGHTS_RIGHT = (
 
 
 def interpolate_round(table: tuple[tuple[float, float], ...], s: np.ndarray, length: float) -> np.ndarray:
-    """Interpolate a table of (s, value) at distances s along a closed track of this length."""
+    """Interpolate a table of (s, value) at the distances s along a closed track of this length."""
     known, value = np.array(table, float).T
     return np.interp(s, np.r_[known - length, known, known + length], np.tile(value, 3))
 
 
 def in_sections(sections: Iterable[Section], s: np.ndarray, side: np.ndarray, length: float) -> np.ndarray:
-    """Return for each s and side whether it lies in one of the sections of a closed track of this length."""
+    """Return whether each s and side lies in one of the sections of a closed track of this length."""
     inside = np.zeros(np.shape(s), bool)
     for section in sections:
         inside |= (side == section.side) & ((s - section.start) % length <= section.end - section.start)
@@ -90,22 +90,22 @@ def in_sections(sections: Iterable[Section], s: np.ndarray, side: np.ndarray, le
 
 
 class LakeTerrain:
-    """The height of the ground and the nearest road as functions of the position."""
+    """The height of the ground, and the nearest point of the road, at any position."""
 
     def __init__(self, track: Track, random: np.random.Generator, relief: float = 1.0, shift: float = 0.0):
-        """relief: factor of the heights; shift: metres by which the land is shifted back along the road."""
+        """relief: factor of the heights; shift: m by which the land is shifted backwards along the road."""
         self.track, self.relief, self.shift = track, relief, shift
         self.tree = cKDTree(track.points[:, :2])
-        self.rolling = textures.clouds(random, 256, 24, 5)  # one metre of height a unit, 4 m a pixel
+        self.rolling = textures.clouds(random, 256, 24, 5)  # a pixel is 4 m; `height` scales the values
 
     def nearest_road(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return, for positions (n, 2), the distance to the centre line, the s of the land's tables, and the side."""
+        """Return distance to the centre line, s in the land's tables, and side, for positions (n, 2), all in m."""
         distance, nearest = self.tree.query(positions)
         right = np.einsum("ij,ij->i", positions - self.track.points[nearest, :2], self.track.rightward[nearest])
         return distance, (nearest * self.track.step + self.shift) % self.track.length, np.where(right < 0, LEFT, RIGHT)
 
     def height(self, positions: np.ndarray) -> np.ndarray:
-        """Return the heights, (n,) metres above the road, at positions (n, 2)."""
+        """Return the heights above the road, (n,), at positions (n, 2), in m."""
         distance, s, side = self.nearest_road(positions)
         length = self.track.length
         left, right = (interpolate_round(table, s, length) for table in (HEIGHTS_LEFT, HEIGHTS_RIGHT))
@@ -128,19 +128,18 @@ class LakeTerrain:
 def ground(
     terrain: LakeTerrain, random: np.random.Generator, light: Light, palette: Palette, soil: np.ndarray
 ) -> list[Mesh]:
-    """Return a fine sheet of ground near the road and a coarse one, slightly lower, farther away."""
+    """Return two sheets of ground: a fine one near the road, and a coarse one further away and slightly lower."""
     tone = textures.clouds(random, 256, 12, 4)
-    points_2d, length = terrain.track.points[:, :2], terrain.track.length
-    low, high = points_2d.min(axis=0) - 230, points_2d.max(axis=0) + 230
+    length = terrain.track.length
     sheets = []
-    for cell, nearest, farthest, lower in ((CELL, 0, 66, 0.0), (2.5 * CELL, 48, 400, 0.4)):
-        xs, ys = (np.arange(a, b, cell) for a, b in zip(low, high, strict=True))
-        positions = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    for spacing, nearest, farthest, lower in ((GRID_SPACING, 0, 66, 0.0), (2.5 * GRID_SPACING, 48, 400, 0.4)):
+        positions = ground_grid(terrain.track, 230, spacing)
+        rows, columns = positions.shape[:2]
+        positions = positions.reshape(-1, 2)
         distance, s, side = terrain.nearest_road(positions)
         points = np.c_[positions, terrain.height(positions) - lower]
-        sheet = Mesh(points, np.ones_like(points), positions / 14.0, grid(len(ys), len(xs)), soil)
-        flatness = illuminate(sheet, Light((0, 0, 1), (1, 1, 1), (0, 0, 0)), face_up=True).colours[:, :1]
-        steep = np.clip((0.93 - flatness) * 6, 0, 1)
+        sheet = Mesh(points, np.ones_like(points), positions / 14.0, grid(rows, columns), soil)
+        steep = np.clip((0.93 - flatness(sheet)) * 6, 0, 1)
         patch = tone[tuple((np.floor(positions / 5).astype(int) % 256).T)][:, None]
         green = 0.35 * np.clip(0.5 + 0.35 * patch, 0, 1)
         colour = np.array(palette["grass"]) * (1 - green) + np.array(palette["green"]) * green

@@ -1,4 +1,4 @@
-"""Looks: what may differ between two renderings of one road, such as time of day, weather, soil and camera."""
+"""Looks: everything that may differ between two renderings of a road, such as light, weather, soil and colours."""
 
 from dataclasses import dataclass
 
@@ -18,11 +18,11 @@ class Look:
     spots    factor of the contrast of larger spots in the asphalt
     sheen    relative gain in brightness of asphalt far ahead
     stripes  metres of kerb for one red and one white stripe
-    relief   factor of the heights beside the road
+    relief   factor of the heights next to the road
     shift    metres by which hills, soils and water are shifted along the road
     plants   factor of the number of trees and bushes
-    shadows  number of shadows on the road; None: those of the real simulator
-    tone     float32 (3, 4): the camera's matrix on (r, g, b, 1), 0..255; None: unchanged colours
+    shadows  number of shadows at random places on the road; None: those of the real simulator
+    tone     float32 (3, 4): the camera's colour matrix, applied to (r, g, b, 1), 0..255; None: unchanged colours
     """
 
     light: Light
@@ -39,13 +39,13 @@ class Look:
 
 
 def make_look(number: int, light: Light, palette: Palette) -> Look:
-    """Return a look of a track, given the light and palette of the real simulator, which look 0 has."""
+    """Return a look of a track; light and palette are those of the real simulator, which look 0 uses as they are."""
     if not number:
         return Look(light, palette)
     random = np.random.default_rng([number, 7])
-    turn, rise = random.uniform(0, 2 * np.pi), np.radians(random.uniform(18, 70))
-    sun = (np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise))
-    overcast = random.uniform(0, 0.7)  # share of the sunlight that comes from the whole sky instead
+    azimuth, elevation = random.uniform(0, 2 * np.pi), np.radians(random.uniform(18, 70))
+    sun = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
+    overcast = random.uniform(0, 0.7)  # share of the sunlight that clouds scatter over the sky
     strength = random.uniform(0.65, 1.15) * random.uniform(0.92, 1.08, 3)
     sunlight = np.array(light.sunlight) * strength * (1 - overcast)
     fill = (np.array(light.fill) * random.uniform(0.8, 1.1) + 0.5 * overcast * np.array(light.sunlight)) * strength
@@ -69,8 +69,8 @@ def make_look(number: int, light: Light, palette: Palette) -> Look:
 def vary(random: np.random.Generator, colour: np.ndarray) -> Colour:
     """Return a variant of a colour (3,): darker or lighter, greyer, and tinted.
 
-    Greyer, because a network that recognizes the road only by being greyer than the land fails on the real one, whose
-    edges are grey or blue too.
+    It is greyer, because a network that recognises the road only by its grey fails on the real road, whose edges are
+    grey or blue, too.
     """
     greyer = random.uniform(0, 0.9)
     colour = (1 - greyer) * colour + greyer * colour.mean()

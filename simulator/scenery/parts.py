@@ -1,4 +1,4 @@
-"""What every scenery consists of: its meshes, sky and haze, and the car's own bonnet and body."""
+"""The parts that both sceneries share: sky, haze, and the car's own bonnet and body."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from cloning.road.camera import height_at_rows
 from simulator.scenery import textures
+from simulator.scenery.looks import Look
 from simulator.scenery.shapes import Colour, Light, Mesh, box, grid, illuminate, merge
 
 
@@ -13,8 +14,8 @@ from simulator.scenery.shapes import Colour, Light, Mesh, box, grid, illuminate,
 class Haze:
     """Haze that grows with the distance.
 
-    range    metres from the camera at which it begins and at which it would hide everything
-    maximum  its largest share of a colour, 0..1
+    range    metres from the camera at which it begins, and at which it would hide everything without `maximum`
+    maximum  largest share of the haze in a colour, 0..1
     """
 
     colour: Colour
@@ -24,7 +25,7 @@ class Haze:
 
 @dataclass(frozen=True)
 class Scenery:
-    """All that the cameras see; bonnet and body move with the car. tone: see `looks.Look`."""
+    """Everything that the cameras see; bonnet and body move with the car, tone is that of `looks.Look`."""
 
     meshes: list[Mesh]
     sky: Mesh
@@ -34,19 +35,28 @@ class Scenery:
     tone: np.ndarray | None = None
 
 
+def assemble(meshes: list[Mesh], look: Look, haze: Haze | None = None) -> Scenery:
+    """Return the scenery of these meshes, with the sky and the car in the light and colours of the look."""
+    palette, light = look.palette, look.light
+    sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
+    colour = palette["bonnet"]
+    return Scenery(meshes, sky, bonnet(colour, light), body(colour, light), haze, look.tone)
+
+
 def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
-    """Return a sky around the viewer; the texture's bottom row lies at the horizon."""
-    turn, rise = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.radians([-8, 0, 5, 10, 20, 40, 88]))
-    points = radius * np.stack([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)], axis=-1)
-    height = np.clip(rise / np.radians(40), 0.01, 0.99)
-    uv = np.stack([turn, height], axis=-1).reshape(-1, 2)
-    return Mesh(points.reshape(-1, 3), np.ones((turn.size, 3)), uv, grid(*turn.shape), texture)
+    """Return a sky around the viewer, radius in m; the bottom row of the texture lies at the horizon."""
+    azimuth, elevation = np.meshgrid(np.linspace(0, 2 * np.pi, 33), np.radians([-8, 0, 5, 10, 20, 40, 88]))
+    flat = np.cos(elevation)
+    points = radius * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    height = np.clip(elevation / np.radians(40), 0.01, 0.99)
+    uv = np.stack([azimuth, height], axis=-1).reshape(-1, 2)
+    return Mesh(points.reshape(-1, 3), np.ones((azimuth.size, 3)), uv, grid(*azimuth.shape), texture)
 
 
 def bonnet(colour: Colour, light: Light) -> Mesh:
     """Return the car's bonnet in the car's coordinates: x right, y forward, z up, in metres.
 
-    Its front edge was fitted to real centre frames: `rows` are the image rows of the edge at lateral positions x.
+    Its front edge was fitted to real centre frames: `rows` are the image rows of the edge at the lateral positions x.
     """
     x = np.linspace(-0.70, 0.63, 43)
     front = 2.10 - 0.40 * (x / 0.64) ** 2
@@ -76,7 +86,7 @@ def bonnet(colour: Colour, light: Light) -> Mesh:
 
 
 def body(colour: Colour, light: Light) -> Mesh:
-    """Return the car as seen from outside, in the same coordinates as the bonnet."""
+    """Return the car as seen from outside, in the coordinates of the bonnet."""
     plain, dark = textures.plain(), (0.08, 0.08, 0.09)
     boxes = [
         box((0, -0.15, 0.35), (1.75, 4.3, 0.45), 0.0, colour, plain),

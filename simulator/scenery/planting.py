@@ -9,11 +9,11 @@ from cloning.road.track import LEFT, RIGHT
 from simulator.scenery import textures
 from simulator.scenery.lake_terrain import WATER_LEVEL, LakeTerrain
 from simulator.scenery.looks import Palette
-from simulator.scenery.shapes import Colour, Light, Mesh, boulder, grid, illuminate, merge, plants
+from simulator.scenery.shapes import Colour, Light, Mesh, boulder, grid, illuminate, merge, plants, quads
 
 
 class Boulder(NamedTuple):
-    """A boulder beside the road: its side, metres along the road and from its centre line, and half axes in metres."""
+    """A boulder next to the road: side, m along the road, m from its centre line, and half axes in m."""
 
     side: int
     s: float
@@ -42,7 +42,7 @@ BOULDERS = (
 
 
 def pines(terrain: LakeTerrain, random: Generator, palette: Palette, density: float) -> list[Mesh]:
-    """Return a forest on the hills to the right and single pines elsewhere; density: factor of their number."""
+    """Return a forest on the hills to the right and scattered pines elsewhere; density: factor of their number."""
     points = terrain.track.points[:, :2]
     low, high = points.min(axis=0) - 210, points.max(axis=0) + 210
     positions = random.uniform(low, high, (round(5200 * density), 2))
@@ -66,7 +66,7 @@ def pines(terrain: LakeTerrain, random: Generator, palette: Palette, density: fl
 
 
 def undergrowth(terrain: LakeTerrain, random: Generator, palette: Palette, density: float) -> list[Mesh]:
-    """Return bushes and reeds in clumps beside the road; density: factor of their number."""
+    """Return bushes and reeds in clumps next to the road; density: factor of their number."""
     track = terrain.track
     meshes = []
     for texture, colour, count, near, far, tallest in (
@@ -111,16 +111,16 @@ def pylons() -> list[Mesh]:
 
 
 def beam(a: np.ndarray, b: np.ndarray, half_width: float, colour: Colour, texture: np.ndarray) -> Mesh:
-    """Return two crossed strips from point a to point b."""
+    """Return a beam from point a to point b as two crossed strips."""
     corners: list[np.ndarray] = []
     for sideways in np.array([(half_width, 0, 0), (0, half_width, 0)]):
         corners += [a - sideways, a + sideways, b + sideways, b - sideways]
-    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
-    return Mesh(np.array(corners), np.tile(np.array(colour), (8, 1)), np.zeros((8, 2)), faces, texture)
+    uv, faces = quads(2)
+    return Mesh(np.array(corners), np.tile(np.array(colour), (8, 1)), uv, faces, texture)
 
 
 def boulders(terrain: LakeTerrain, random: Generator, light: Light, palette: Palette) -> Mesh:
-    """Return the boulders, without those that a shifted land would put on the road."""
+    """Return the boulders, except those that would lie on the road because the land is shifted."""
     texture = textures.rock(random)
     meshes = []
     for side, s, distance, width, height in BOULDERS:
@@ -135,7 +135,7 @@ def boulders(terrain: LakeTerrain, random: Generator, light: Light, palette: Pal
 
 
 def mountains(random: Generator, light: Light, palette: Palette, soil: np.ndarray) -> Mesh:
-    """Return a ring of distant hills, which the haze turns blue."""
+    """Return a ring of distant hills."""
     turn = np.linspace(0, 2 * np.pi, 121)
     crest = 14 + 16 * np.abs(textures.clouds(random, 256, 24, 4)[0, :120] + 0.5)
     crest = np.r_[crest, crest[:1]]

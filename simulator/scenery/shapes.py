@@ -1,4 +1,4 @@
-"""Meshes as arrays: ribbons along the road, boulders, boxes, and plants as crossed images."""
+"""Meshes as arrays: ground, ribbons along the road, boulders, boxes, and plants as crossed images."""
 
 from dataclasses import dataclass, replace
 
@@ -15,7 +15,7 @@ class Mesh:
     """Triangles with colours at their corners and one texture.
 
     points   float (n, 3): m
-    colours  float (n, 3): 0..1, multiplied with the texture
+    colours  float (n, 3): 0..1, by which the texture is multiplied
     uv       float (n, 2): texture coordinates
     faces    int (m, 3): indices into the points
     texture  uint8 (rows, columns, 3 RGB or 4 RGBA); with 4 channels, pixels with alpha below half are transparent
@@ -32,7 +32,12 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Light:
-    """The light of a scene: sun is the unit vector towards it; fill is the light that reaches shaded sides."""
+    """The light of a scene.
+
+    sun       unit vector towards the sun
+    sunlight  colour of its light
+    fill      colour of the light that reaches shaded sides, too
+    """
 
     sun: tuple[float, float, float]
     sunlight: Colour
@@ -50,8 +55,8 @@ class Material:
 
     colour   (3,) or (distances, offsets, 3)
     texture  as in Mesh
-    metres   of road that one repetition of the texture covers
-    across   texture coordinates at the ribbon's offsets; None: one repetition in `metres` across the road, too
+    metres   length of road that one repetition of the texture covers
+    across   texture coordinates at the ribbon's offsets; None: the texture repeats every `metres` across the road, too
     """
 
     colour: ArrayLike
@@ -61,13 +66,30 @@ class Material:
 
 
 def grid(rows: int, columns: int) -> np.ndarray:
-    """Return the faces of a sheet of rows x columns points.
+    """Return the faces of a sheet of rows x columns points, int (m, 3).
 
-    They are counter-clockwise seen with the rows towards north and the columns towards east.
+    They are counter-clockwise, seen with the rows towards the north and the columns towards the east.
     """
     a = np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)
     b = a + columns
     return np.stack([a, a + 1, b + 1, a, b + 1, b], axis=-1).reshape(-1, 3)
+
+
+def ground_grid(track: Track, margin: float, spacing: float) -> np.ndarray:
+    """Return the points of a square grid over the track and `margin` m around it: float64 (rows, columns, 2), m."""
+    low, high = track.points[:, :2].min(axis=0) - margin, track.points[:, :2].max(axis=0) + margin
+    xs, ys = (np.arange(start, end, spacing) for start, end in zip(low, high, strict=True))
+    return np.stack(np.meshgrid(xs, ys), axis=-1)
+
+
+def quads(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return texture coordinates and faces of `count` separate quadrangles of four points each.
+
+    uv: float (4 * count, 2), from the bottom left corner counter-clockwise; faces: int (2 * count, 3).
+    """
+    uv = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), (count, 1))
+    faces = np.arange(count)[:, None, None] * 4 + np.array([[0, 1, 2], [0, 2, 3]])
+    return uv, faces.reshape(-1, 3)
 
 
 def normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -80,8 +102,13 @@ def normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
 
 
+def flatness(mesh: Mesh) -> np.ndarray:
+    """Return the flatness at each point of a mesh, (n, 1): 1 where it is level, 0 where it is vertical."""
+    return np.clip(np.abs(normals(mesh.points, mesh.faces)[:, 2:]), 0, 1)
+
+
 def illuminate(mesh: Mesh, light: Light, face_up: bool = False) -> Mesh:
-    """Return the mesh with its colours under the light; face_up turns its normals upwards."""
+    """Return the mesh with its colours in this light; face_up turns the normals upwards."""
     facing = normals(mesh.points, mesh.faces)
     if face_up:
         facing *= np.where(facing[:, 2:] < 0, -1.0, 1.0)
@@ -89,10 +116,10 @@ def illuminate(mesh: Mesh, light: Light, face_up: bool = False) -> Mesh:
 
 
 def ribbon(track: Track, s: ArrayLike, offsets: ArrayLike, heights: ArrayLike, material: Material) -> Mesh:
-    """Return a strip along the road, through the distances s in metres.
+    """Return a strip along the road, through the points at the distances s in metres.
 
-    offsets, heights: (k,), its cross-section from left to right: metres to the right of the centre line and above the
-    road.
+    offsets, heights: (k,), its cross-section from left to right, in metres to the right of the centre line and above
+    the road.
     """
     s, offsets = np.asarray(s, float), np.asarray(offsets, float)
     n, k = len(s), len(offsets)
@@ -116,12 +143,12 @@ def roadside(track: Track, s: ArrayLike, side: int, offsets: ArrayLike, heights:
 
 
 def whole_lap(track: Track, spacing: float = 1.0) -> np.ndarray:
-    """Return distances about `spacing` metres apart round the track, from the first point to the first point again."""
+    """Return distances about `spacing` metres apart round the track, which begin and end at its first point."""
     return np.linspace(0, track.length, round(track.length / spacing) + 1)
 
 
 def distances(start: float, end: float, spacing: float = 1.0) -> np.ndarray:
-    """Return distances along the track from start to end, in metres, about `spacing` apart."""
+    """Return distances about `spacing` metres apart along the track, from start to end."""
     return np.linspace(start, end, max(2, round((end - start) / spacing) + 1))
 
 
@@ -135,7 +162,7 @@ def plants(
 ) -> Mesh:
     """Return two crossed upright images of a plant at each place.
 
-    places: (n, 3), the foot of each; heights, widths: (n,), metres; colours: (n, 3).
+    places: (n, 3), m, the point on the ground; heights, widths: (n,), m; colours: (n, 3).
     """
     turn = random.uniform(0, np.pi, len(places))[:, None] + np.array([0, np.pi / 2])
     sideways = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)  # (n, 2, 3)
@@ -143,10 +170,8 @@ def plants(
     foot, up = places[:, None], np.zeros((len(places), 1, 3))
     up[:, 0, 2] = heights
     corners = np.stack([foot - sideways, foot + sideways, foot + sideways + up, foot - sideways + up], axis=2)
-    quads = 2 * len(places)
-    faces = np.arange(quads)[:, None, None] * 4 + np.array([[0, 1, 2], [0, 2, 3]])
-    uv = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), (quads, 1))
-    return Mesh(corners.reshape(-1, 3), np.repeat(colours, 8, axis=0), uv, faces.reshape(-1, 3), texture)
+    uv, faces = quads(2 * len(places))
+    return Mesh(corners.reshape(-1, 3), np.repeat(colours, 8, axis=0), uv, faces, texture)
 
 
 def boulder(
@@ -156,7 +181,7 @@ def boulder(
     colour: Colour,
     texture: np.ndarray,
 ) -> Mesh:
-    """Return an uneven ellipsoid; lengths in metres."""
+    """Return an uneven ellipsoid; centre and half axes in metres."""
     rows = 9
     polar, turn = np.meshgrid(np.linspace(0, np.pi, rows), np.linspace(0, 2 * np.pi, 2 * rows), indexing="ij")
     waves = sum(
@@ -180,26 +205,25 @@ def box(
 ) -> Mesh:
     """Return an upright box without a bottom.
 
-    foot: centre of its base; size: length along `heading` (radians), width and height, metres.
+    foot: centre of its base, m; size: length along `heading` (radians), width and height, m.
     """
     corner = np.array([[x, y, z] for z in (0, 1) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))])
     sides = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7))
     points = corner[np.array(sides).ravel()] * size
     cos, sin = np.cos(heading), np.sin(heading)
     points[:, :2] = points[:, :2] @ np.array([[cos, sin], [-sin, cos]])
-    faces = np.arange(5)[:, None, None] * 4 + np.array([[0, 1, 2], [0, 2, 3]])
-    uv = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), (5, 1))
+    uv, faces = quads(5)
     return Mesh(
         points + np.array(foot),
         np.tile(np.array(colour, float), (20, 1)),
         uv,
-        faces.reshape(-1, 3),
+        faces,
         texture,
     )
 
 
 def merge(meshes: list[Mesh]) -> Mesh:
-    """Return one mesh of meshes that share a texture."""
+    """Return a single mesh of meshes that share a texture."""
     first = np.cumsum([0] + [len(mesh.points) for mesh in meshes[:-1]])
     return replace(
         meshes[0],

@@ -1,7 +1,10 @@
 """Procedural textures: uint8 (rows, columns, 3 RGB or 4 RGBA).
 
-They are bright and nearly grey, because the engine multiplies them with the meshes' colours.
+They are bright and nearly grey, because the engine multiplies them by the meshes' colours.
 """
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,13 +23,13 @@ def noise(random: Generator, shape: tuple[int, int], blur: float) -> np.ndarray:
 
 
 def clouds(random: Generator, size: int, coarsest: float, octaves: int = 5) -> np.ndarray:
-    """Return noise of zero mean and unit variance in octaves, each half as coarse and half as strong as the last."""
+    """Return noise of mean 0 and variance 1 in octaves, each half as coarse and half as strong as the one before."""
     total = np.sum([noise(random, (size, size), coarsest / 2**k) / 2**k for k in range(octaves)], axis=0)
     return (total - total.mean()) / total.std()
 
 
 def grey(mean: float, *layers: np.ndarray) -> np.ndarray:
-    """Return a grey texture from a mean, 0..1, and layers of deviations from it."""
+    """Return a grey texture: a mean brightness, 0..1, plus layers of deviations from it."""
     level = np.clip((mean + sum(layers)) * 255, 0, 255).astype(np.uint8)
     return np.repeat(level[..., None], 3, axis=2)
 
@@ -43,15 +46,44 @@ def asphalt(random: Generator, size: int = 512, grain: float = 0.15, spots: floa
     )
 
 
+class Line(NamedTuple):
+    """A painted line along the road.
+
+    offset      m from the road's centre line, on both sides
+    half_width  m
+    colour      RGB, 0..1
+    share       of the texture's length that is painted, from its first row on
+    """
+
+    offset: float
+    half_width: float
+    colour: Colour
+    share: float = 1.0
+
+
+def paint_lines(texture: np.ndarray, colour: Colour, half_width: float, lines: Sequence[Line]) -> np.ndarray:
+    """Return a road's texture with lines, which compensate for the road's colour, by which the mesh multiplies them.
+
+    texture: uint8 (rows, columns, 3), from the left edge to the right; half_width: of the road, m.
+    """
+    painted = texture.astype(float)
+    rows, columns = texture.shape[:2]
+    offset = np.abs((np.arange(columns) + 0.5) / columns * 2 * half_width - half_width)
+    for line in lines:
+        level = np.array(line.colour) / colour * 255
+        painted[: round(rows * line.share), np.abs(offset - line.offset) < line.half_width] = level
+    return np.clip(painted, 0, 255).astype(np.uint8)
+
+
 def concrete(random: Generator, size: int = 128) -> np.ndarray:
-    """Return one concrete slab with the joint to the next."""
+    """Return a concrete slab with the joint to the next."""
     texture = grey(0.90, 0.02 * noise(random, (size, size), 1.5), 0.03 * noise(random, (size, size), 20))
     texture[:2] = 160  # the joint
     return texture
 
 
 def kerb(size: int = 64) -> np.ndarray:
-    """Return one red and one white stripe of a kerb."""
+    """Return a red and a white stripe of a kerb."""
     texture = np.full((size, size, 3), (250, 248, 240), np.uint8)
     texture[: size // 2] = (232, 100, 98)
     return texture
@@ -63,12 +95,12 @@ def plain() -> np.ndarray:
 
 
 def soil(random: Generator, size: int = 256) -> np.ndarray:
-    """Return soil or grass."""
+    """Return a texture for soil and grass."""
     return grey(0.80, 0.07 * clouds(random, size, 24), 0.05 * noise(random, (size, size), 0.8))
 
 
 def rock(random: Generator, size: int = 256, streak: float = 6.0) -> np.ndarray:
-    """Return rock with vertical streaks, as on the real cliffs; streak: their length relative to their width."""
+    """Return rock with vertical streaks, as on the real cliffs; streak: length of a streak relative to its width."""
     pad = 40
     grain = np.pad(random.standard_normal((size, size)).astype(np.float32), pad, mode="wrap")
     streaks = cv2.GaussianBlur(grain, (0, 0), 2, sigmaY=2 * streak)[pad:-pad, pad:-pad]
@@ -76,7 +108,7 @@ def rock(random: Generator, size: int = 256, streak: float = 6.0) -> np.ndarray:
 
 
 def cobbles(random: Generator, size: int = 512, stones: int = 12) -> np.ndarray:
-    """Return irregular cobbles, longer along the road (rows) than across it, with pale joints."""
+    """Return irregular cobbles with pale joints, longer along the road (rows) than across it."""
     rows, columns = np.mgrid[0:size, 0:size].astype(np.float32)
     rows += 7 * noise(random, (size, size), 18)
     columns += 5 * noise(random, (size, size), 18)
@@ -91,7 +123,7 @@ def cobbles(random: Generator, size: int = 512, stones: int = 12) -> np.ndarray:
 
 
 def pine(random: Generator, size: int = 128, low: float = 0.62) -> np.ndarray:
-    """Return a pine; low: how far down its branches reach, from 0 at the top to 1 at the ground."""
+    """Return a pine; low: height to which its branches reach down, from 0 at the top to 1 at the ground."""
     texture = np.zeros((size, size, 4), np.uint8)
     texture[:, :, :3] = 150
     middle = size // 2
@@ -133,13 +165,13 @@ def reeds(random: Generator, size: int = 64) -> np.ndarray:
     texture = np.zeros((size, size, 4), np.uint8)
     texture[:, :, :3] = 140
     for _ in range(60):
-        part = random.uniform(0.04, 0.96)
-        tall = np.sin(np.pi * part) ** 0.5 * random.uniform(0.5, 0.95)
+        across = random.uniform(0.04, 0.96)
+        tall = np.sin(np.pi * across) ** 0.5 * random.uniform(0.5, 0.95)
         level = int(random.uniform(110, 240))
         cv2.line(
             texture,
-            (int(part * size), size),
-            (int(part * size + random.normal() * 4), int((1 - tall) * size)),
+            (int(across * size), size),
+            (int(across * size + random.normal() * 4), int((1 - tall) * size)),
             (level, level, int(0.8 * level), 255),
             1,
         )
@@ -178,6 +210,6 @@ def palm(random: Generator, size: int = 128) -> np.ndarray:
 
 def sky(zenith: Colour, horizon: Colour, rows: int = 128) -> np.ndarray:
     """Return a vertical gradient from the zenith's colour in the top row to the horizon's in the bottom row."""
-    part = np.linspace(0, 1, rows)[:, None, None]
-    level = (1 - part) * np.array(zenith) + part * np.array(horizon)
+    down = np.linspace(0, 1, rows)[:, None, None]
+    level = (1 - down) * np.array(zenith) + down * np.array(horizon)
     return np.repeat(level * 255, 8, axis=1).astype(np.uint8)
