@@ -9,7 +9,7 @@ BIN = .venv/bin
 APT = ./.ci/apt
 
 test: lint
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: .venv/installed
 	$(BIN)/ruff check .

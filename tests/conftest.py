@@ -36,7 +36,7 @@ def cache(tmp_path_factory, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
 
 
-def draw_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarray:
+def render_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarray:
     """A grey road to the horizon, bent by -1..1 and seen from `offset` metres right of its centre: uint8 RGB."""
     frame = np.zeros((160, 320, 3), np.uint8)
     frame[:60] = (90, 140, 210)
@@ -53,7 +53,7 @@ def draw_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarr
     return np.clip(frame + rng.normal(0, 6, frame.shape), 0, 255).astype(np.uint8)
 
 
-def draw_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/Users/driver/data/IMG/") -> Path:
+def render_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/Users/driver/data/IMG/") -> Path:
     """A folder as the simulator records it: no header, absolute paths, 15 rows a second, throttle 0 in every tenth."""
     rng = np.random.default_rng(seed)
     (folder / "IMG").mkdir(parents=True)
@@ -65,7 +65,7 @@ def draw_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/
         names = []
         for camera, offset in (("center", 0), ("left", -0.8), ("right", 0.8)):
             names.append(f"{camera}_{stamp}.jpg")
-            frame = draw_frame(bend, offset, rng)
+            frame = render_frame(bend, offset, rng)
             cv2.imwrite(str(folder / "IMG" / names[-1]), frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 75])
         throttle = 0 if row % 10 == 9 else 1
         lines.append(",".join([prefix + name for name in names] + [f"{0.4 * bend:.6g}", str(throttle), "0", "30.19"]))
@@ -74,15 +74,15 @@ def draw_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/
 
 
 @pytest.fixture(scope="session")
-def drawn(tmp_path_factory) -> Path:
+def sample_recording(tmp_path_factory) -> Path:
     """A recording of 60 rows; not to be changed."""
-    return draw_recording(tmp_path_factory.mktemp("data") / "lake drawn")
+    return render_recording(tmp_path_factory.mktemp("data") / "lake sample")
 
 
 @pytest.fixture
 def copied(tmp_path) -> Path:
     """A recording of 60 rows that a test may change."""
-    return draw_recording(tmp_path / "data" / "lake")
+    return render_recording(tmp_path / "data" / "lake")
 
 
 @pytest.fixture(scope="session")
@@ -100,7 +100,7 @@ def model_file(tmp_path_factory) -> Path:
 def jpegs() -> list[bytes]:
     """Eight frames as the simulator sends them."""
     rng = np.random.default_rng(0)
-    return [cv2.imencode(".jpg", draw_frame(np.sin(n), 0, rng))[1].tobytes() for n in range(8)]
+    return [cv2.imencode(".jpg", render_frame(np.sin(n), 0, rng))[1].tobytes() for n in range(8)]
 
 
 @pytest.fixture(scope="session")
@@ -162,6 +162,6 @@ def log(folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="session")
-def finished(drawn, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
+def finished(sample_recording, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
     """A run of two epochs as in the report: what it printed, and its folder; not to be changed."""
-    return finished_run(drawn, tmp_path_factory.mktemp("run"), *SHORT)
+    return finished_run(sample_recording, tmp_path_factory.mktemp("run"), *SHORT)

@@ -29,7 +29,7 @@ class Process:
         self.lines, self.listening = [], threading.Event()
         self.reader = threading.Thread(target=self._read)
         self.reader.start()
-        assert self.listening.wait(60)
+        assert self.listening.wait(120)
         self.port = int(re.search(r"Listening on [\d.]+:(\d+)", "".join(self.lines))[1])
 
     def _read(self):
@@ -42,7 +42,7 @@ class Process:
     def stop(self, number=STOP) -> int:
         if self.process.poll() is None:
             self.process.send_signal(number)
-        code = self.process.wait(30)
+        code = self.process.wait(60)
         self.reader.join()
         self.process.stdout.close()
         self.process.stderr.close()

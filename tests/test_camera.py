@@ -31,7 +31,7 @@ def test_a_warped_frame_is_what_is_seen_from_there(pose):
     assert difference.mean() < 0.62 and np.percentile(difference, 99) < 8  # measured: 0.481, 6
 
 
-def test_unseen_is_told_and_the_bonnet_is_no_road():
+def test_unseen_pixels_are_marked_and_the_bonnet_is_not_road():
     _, seen = warp.warp(np.zeros((160, 320, 3), np.uint8), 0, 0, 0)
     assert seen[2:134, 2:-2].all() and not seen[136:].any()
     _, seen = warp.warp(np.zeros((160, 320, 3), np.uint8), 1.5, 0, 0)  # to the right: its right is unknown
@@ -76,8 +76,8 @@ def test_steering_and_curvature_are_inverse():
     assert motion.curvature(1.0) == pytest.approx(np.tan(np.radians(25)) / 2.87)
 
 
-def test_a_constant_steering_drives_a_circle(drawn):
-    recording = read_recording(drawn)
+def test_a_constant_steering_drives_a_circle(sample_recording):
+    recording = read_recording(sample_recording)
     recording.steering[:], recording.speed[:] = 0.5, 20
     path = motion.Stretch.of(recording, slice(0, len(recording)))
     radius = 1 / motion.curvature(0.5)
@@ -86,8 +86,8 @@ def test_a_constant_steering_drives_a_circle(drawn):
     assert path.driven[-1] == pytest.approx(20 * motion.MPH * (recording.time[-1] - recording.time[0]))
 
 
-def test_the_car_follows_its_wheels_with_a_lag(drawn):
-    recording = read_recording(drawn)
+def test_the_car_follows_its_wheels_with_a_lag(sample_recording):
+    recording = read_recording(sample_recording)
     recording.steering[:], recording.speed[:] = 0.0, 20
     recording.steering[20:] = 0.5
     path = motion.Stretch.of(recording, slice(0, len(recording)))
@@ -97,8 +97,8 @@ def test_the_car_follows_its_wheels_with_a_lag(drawn):
     assert turning[20:] == pytest.approx(motion.curvature(0.5) * (1 - np.exp(-seconds / motion.YAW_LAG)), rel=1e-6)
 
 
-def test_breaks_are_not_driven_over(drawn):
-    recording = read_recording(drawn)
+def test_breaks_are_not_driven_over(sample_recording):
+    recording = read_recording(sample_recording)
     recording.keep(np.tile(np.arange(60), 4))
     recording.time[:] = np.arange(240) / 15
 

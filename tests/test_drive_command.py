@@ -21,20 +21,20 @@ from tools.simulator_client import Simulator, telemetry
 
 def failing(*arguments, first="") -> str:
     process = subprocess.run(
-        [*script("drive.py", first), *map(str, arguments)], timeout=60, capture_output=True, text=True
+        [*script("drive.py", first), *map(str, arguments)], timeout=120, capture_output=True, text=True
     )
     assert process.returncode == 1 and "Traceback" not in process.stderr
     assert process.stderr.splitlines()[-1].startswith("drive.py: ")
     return process.stderr
 
 
-def test_mistakes_are_told(model_file, tmp_path):
+def test_mistakes_are_reported(model_file, tmp_path):
     assert "no such file" in failing(tmp_path / "none.pt")
     torch.save({"weights": [1]}, tmp_path / "foreign.pt")
     assert "not a model of this project" in failing(tmp_path / "foreign.pt")
     mine = tmp_path / "mine"
     mine.mkdir()
-    (mine / "thesis.txt").write_text("words")
+    (mine / "thesis.txt").write_text("words", encoding="utf-8")
     assert "thesis.txt" in failing(model_file, mine)
     (tmp_path / "run1").mkdir()
     frame = tmp_path / "run1" / "2018_07_16_17_11_43_382.jpg"
@@ -42,17 +42,20 @@ def test_mistakes_are_told(model_file, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         assert f"can't listen on 127.0.0.1:{port}" in failing(model_file, tmp_path / "run1", "--port", port)
+    with serving(model_file) as other:  # two servers must not share a port, which SO_REUSEPORT would let them do
+        message = failing(model_file, tmp_path / "run1", "--port", other.port)
+        assert f"can't listen on 127.0.0.1:{other.port}" in message
     assert frame.exists(), "a server that cannot start deletes nothing"
 
 
 def test_other_versions_of_the_socket_libraries_are_refused():
-    said = failing(first="import importlib.metadata; importlib.metadata.version = lambda name: '5.18.1'")
-    assert "python-socketio is 5.18.1 and must be 4.6.1" in said and "pip install -r requirements.txt" in said
+    message = failing(first="import importlib.metadata; importlib.metadata.version = lambda name: '5.18.1'")
+    assert "python-socketio is 5.18.1 and must be 4.6.1" in message and "pip install -r requirements.txt" in message
 
 
 def test_the_versions_come_from_requirements_txt(tmp_path):
     check_versions(tmp_path / "none.txt")  # an installed package, whose versions pip has seen to
-    (tmp_path / "requirements.txt").write_text("eventlet==0.0.1  # older\npython-socketio==4.6.1\n")
+    (tmp_path / "requirements.txt").write_text("eventlet==0.0.1  # older\npython-socketio==4.6.1\n", encoding="utf-8")
     with pytest.raises(UserError, match=r"^eventlet is [\d.]+ and must be 0\.0\.1: .*pip install -r requirements.txt"):
         check_versions(tmp_path / "requirements.txt")
 
@@ -90,7 +93,7 @@ def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, stee
         [*script("video.py", ELSEWHERE), str(folder), "--overlay", str(model_file)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=120,
     )
     assert film.returncode == 0 and "run1.mp4: 8 frames" in film.stdout, film.stderr
 

@@ -40,7 +40,7 @@ def drive_server(*arguments: object, cwd: Path) -> Iterator[int]:
         raise AssertionError("".join(output))
     finally:
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=60)
 
 
 # The mean offsets were measured in lock-step on a CPU, where a drive is the same on every run.

@@ -188,7 +188,8 @@ def test_words_are_no_numbers_even_if_a_whole_column_has_them(tmp_path, word, co
     numbers = ["0.5", "1", "0", "9"]
     plain_line = "a.jpg,b.jpg,c.jpg," + ",".join(numbers)
     numbers[column] = word
-    (tmp_path / "driving_log.csv").write_text(plain_line + f"\na.jpg,b.jpg,c.jpg,{','.join(numbers)}" * 3)
+    text = plain_line + f"\na.jpg,b.jpg,c.jpg,{','.join(numbers)}" * 3
+    (tmp_path / "driving_log.csv").write_text(text, encoding="utf-8")
     recording = read_recording(tmp_path)
     accepted = word == "1_0" and column == 3  # float() takes underscores
     np.testing.assert_array_equal(recording.lines, [1, 2, 3, 4] if accepted else [1])

@@ -5,13 +5,15 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import av
 import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, draw_recording
+from conftest import ROOT, render_recording
+from drive_process import serving
 
 from cloning.errors import SimulatorError, UserError
 from cloning.lane.reader import LanePosition
@@ -32,7 +34,7 @@ except ImportError:  # Windows
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A recording of 20 seconds through bends."""
-    return draw_recording(tmp_path_factory.mktemp("replay") / "lake", rows=300, seed=4)
+    return render_recording(tmp_path_factory.mktemp("replay") / "lake", rows=300, seed=4)
 
 
 @pytest.fixture
@@ -74,7 +76,7 @@ def test_bad_drivers_score_badly(recording, driver):
 
 
 def test_the_car_goes_where_geometry_says(recording):
-    """On a straight, a constant steering drives a circle off the human's way, once the car has begun to turn."""
+    """On a straight, a constant steering drives a circle away from the human's path, once the car has begun to turn."""
     recording.steering[:], recording.speed[:] = 0.0, 15
     done = replay.drive(recording, human(recording), 3.0, lambda frame: 0.02)
     at = next(iter(done.interventions))
@@ -86,8 +88,8 @@ def test_the_car_goes_where_geometry_says(recording):
     assert done.interventions[at] > 3 and done.offset[at] == 0
 
 
-def test_in_a_bend_the_inner_way_is_shorter(recording):
-    """Whoever steers a little more than the human in a bend runs a circle of his own, whatever the human's speed."""
+def test_in_a_bend_the_inner_path_is_shorter(recording):
+    """A driver that steers a little more than the human in a bend drives its own circle."""
     recording.steering[:], recording.speed[:] = 0.3, 20
     done = replay.drive(recording, human(recording)[:1], 30.0, lambda frame: 0.32)
     r, own = 1 / curvature(np.float32(0.3)), 1 / curvature(np.float32(0.32))
@@ -114,18 +116,39 @@ def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
     assert not line.is_lane_centre and not line.offset.any()
 
 
-def test_the_model_sees_the_recorded_file_itself_while_it_is_on_the_humans_way(recording):
+def test_a_car_is_set_back_onto_the_line_and_along_it(recording):
+    [line] = human(recording)
+    line = replace(line, offset=np.full(300, 0.8), yaw=np.full(300, 0.1), is_lane_centre=True)
+    car = replay.ReplayedCar(recording, line)
+    for row in range(5):
+        car.move(row, 1.0)
+    assert car.offset(5) > 0.8 and car.yaw > 0 and car.curvature > car.human_curvature
+    car.set_back(5)
+    assert car.offset(5) == pytest.approx(0, abs=1e-9)
+    assert car.yaw == pytest.approx(-0.1), "the human's heading is 0.1 to the right of the line's"
+    assert car.curvature == car.human_curvature
+
+
+def road_column(frame: np.ndarray) -> float:
+    """The mean column of the grey road in the rows near the car."""
+    red, _, blue = np.moveaxis(frame[90:130].astype(int), -1, 0)
+    return np.nonzero(np.abs(red - blue) < 35)[1].mean()
+
+
+def test_the_model_sees_the_recorded_file_itself_on_the_humans_path(recording):
     seen = []
 
     def driver(frame):
         seen.append((frame.jpeg(), frame.recorded, frame.view))
         return frame.human_steering + (0.3 if len(seen) == 100 else 0)
 
-    replay.drive(recording, human(recording), 2.5, driver)
+    done = replay.drive(recording, human(recording), 2.5, driver)
     names = [recording.folder / "IMG" / os.fsdecode(recording.names[image]) for image in recording.images[:, 0]]
     assert all(jpeg == path.read_bytes() for (jpeg, *_), path in zip(seen[:100], names, strict=False))
     jpeg, recorded, view = seen[150]
     assert np.abs(view.astype(int) - recorded)[70:130].mean() > 5, "moved"
+    assert done.offset_from_human[150] > 0.1
+    assert road_column(view) < road_column(recorded) - 3, "from further right, the road is further left"
     assert np.abs(decode(jpeg).astype(int) - view)[60:135].mean() < 4, "sent as seen"
 
 
@@ -155,20 +178,12 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     outputs = "--picture", tmp_path / "way.png", "--film", tmp_path / "seen.mp4"
     alone = run(*folder, "--model", model, "--report", tmp_path / "a.json", *outputs)
     assert alone.returncode == 0, alone.stderr
-    server = subprocess.Popen(
-        [sys.executable, "drive.py", model, "--port", "0"], cwd=ROOT, text=True, stderr=subprocess.PIPE
-    )
-    try:
-        said = server.stderr.readline() + server.stderr.readline()  # the model, then the address
-        port = re.search(r"Listening on [\d.]+:(\d+)", said)[1]
-        served = run(*folder, "--port", port, "--report", tmp_path / "b.json")
-    finally:
-        server.terminate()
-        server.wait(20)
+    with serving(model) as server:
+        served = run(*folder, "--port", server.port, "--report", tmp_path / "b.json")
     assert served.returncode == 0, served.stderr
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
     assert alone.stdout == served.stdout
-    [report] = json.loads((tmp_path / "a.json").read_text())
+    [report] = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert set(report["limits"]) == {"1", "2.5"} and report["rows_driven"] == 300
     assert report["reference"] == {"lane centre": 0, "human's way": 300} and "cannot be estimated" not in alone.stdout
     one = report["limits"]["1"]
@@ -185,15 +200,15 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     assert av.open(str(tmp_path / "seen.mp4")).streams.video[0].width == 1280
 
 
-def test_on_an_unknown_road_the_humans_way_is_the_reference(tmp_path, model):
-    folder, random = draw_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
+def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):
+    folder, random = render_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
     for path in (folder / "IMG").iterdir():
         cv2.imwrite(str(path), random.integers(0, 255, (160, 320, 3), np.uint8))
     done = run(folder, "--model", model, "--limit", "2", "--report", tmp_path / "r.json")
     assert done.returncode == 0, done.stderr
     assert "from the human driver's path in 60 rows" in done.stdout
     assert "the lane centre cannot be estimated reliably" in done.stdout
-    assert list(json.loads((tmp_path / "r.json").read_text())[0]["limits"]) == ["2"]
+    assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == ["2"]
 
 
 def test_the_same_answer_in_process_as_by_the_network(recording, model):
@@ -209,7 +224,7 @@ def test_the_same_answer_in_process_as_by_the_network(recording, model):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["nowhere"], "no such folder"),
         (["FOLDER", "--model", "nothing.pt"], "no such file"),
@@ -217,10 +232,10 @@ def test_the_same_answer_in_process_as_by_the_network(recording, model):
         (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
     ],
 )
-def test_unusable_arguments_are_said(folder, model, arguments, said):
+def test_unusable_arguments_are_reported(folder, model, arguments, message):
     known = {"FOLDER": folder, "MODEL": model}
     done = run(*[known.get(argument, argument) for argument in arguments])
-    assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
 
 
 def film_frames(path) -> int:
@@ -229,11 +244,11 @@ def film_frames(path) -> int:
 
 @pytest.mark.parametrize(("limits", "driven"), [(["1", "1"], ["1"]), (["2", "1", "2"], ["2", "1"])])
 def test_a_limit_given_twice_is_driven_once_and_one_drive_writes_the_film(model, tmp_path, limits, driven):
-    folder = draw_recording(tmp_path / "lake", rows=60)
+    folder = render_recording(tmp_path / "lake", rows=60)
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json"
     done = run("--reference", "human", folder, "--model", model, "--limit", *limits, *outputs)
     assert done.returncode == 0, done.stderr
-    assert list(json.loads((tmp_path / "r.json").read_text())[0]["limits"]) == driven
+    assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == driven
     assert film_frames(tmp_path / "x.mp4") == 60
 
 
@@ -249,7 +264,8 @@ def test_a_full_disk_costs_the_film_alone(folder, model, tmp_path):
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert re.fullmatch(r"simulator: \S+x\.mp4: .*no film was written.*\n", done.stderr)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.png", "r.json"]
-    assert "autonomy" in done.stdout and json.loads((tmp_path / "r.json").read_text())[0]["limits"]["2"]
+    assert "autonomy" in done.stdout
+    assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]["2"]
 
 
 def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording):
@@ -266,7 +282,7 @@ def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording):
     assert len(rows) < 110
 
 
-def test_all_outputs_are_tried_and_every_failure_is_said():
+def test_all_outputs_are_tried_and_every_failure_is_reported():
     from cloning.outputs import run_all
 
     done = []
@@ -282,7 +298,7 @@ def test_all_outputs_are_tried_and_every_failure_is_said():
 
 
 def test_a_recording_without_two_seconds_of_driving_is_refused(tmp_path, model):
-    done = run(draw_recording(tmp_path / "short", rows=20), "--model", model)
+    done = run(render_recording(tmp_path / "short", rows=20), "--model", model)
     assert done.returncode == 2 and "two seconds" in done.stderr
 
 
@@ -293,8 +309,8 @@ def test_stretches_are_joined_in_one_report(folder, tmp_path):
     assert len(human(recording)) == 2 and sum(done.seconds) == pytest.approx(298 * 0.067, abs=0.01)
 
 
-def test_the_score_board_keeps_what_it_has(tmp_path, model):
-    folder = draw_recording(tmp_path / "lake", rows=40)
+def test_the_scoreboard_keeps_its_columns(tmp_path, model):
+    folder = render_recording(tmp_path / "lake", rows=40)
     for name, extra in (("one", ["--what", "untrained"]), ("two", [])):
         done = subprocess.run(
             [
@@ -317,7 +333,7 @@ def test_the_score_board_keeps_what_it_has(tmp_path, model):
             timeout=200,
         )
         assert done.returncode == 0, done.stderr
-    lines = (tmp_path / "table.md").read_text().splitlines()
+    lines = (tmp_path / "table.md").read_text(encoding="utf-8").splitlines()
     assert "| course | one | two |" in lines
     rows = [line.split("|")[1:-1] for line in lines if line.startswith("| real lake, 1 m from")]
     assert len(rows) == 1 and rows[0][1] == rows[0][2] and "%" in rows[0][1]

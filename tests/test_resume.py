@@ -11,7 +11,7 @@ import time
 
 import pytest
 import torch
-from conftest import HERE, ROOT, SHORT, draw_recording, finished_run, log, run_here, run_model, same, weights
+from conftest import HERE, ROOT, SHORT, finished_run, log, render_recording, run_here, run_model, same, weights
 
 import model
 from cloning.training import checkpoint
@@ -29,9 +29,9 @@ def seed_of(path):
 
 
 @pytest.fixture(scope="module")
-def one_epoch(drawn, tmp_path_factory):
+def one_epoch(sample_recording, tmp_path_factory):
     """The folder of a run of one epoch, with seed 0; not to be changed."""
-    return finished_run(drawn, tmp_path_factory.mktemp("one epoch"), *SHORT, "--epochs", 1)[1]
+    return finished_run(sample_recording, tmp_path_factory.mktemp("one epoch"), *SHORT, "--epochs", 1)[1]
 
 
 @pytest.fixture
@@ -40,12 +40,12 @@ def begun(one_epoch, tmp_path):
     return shutil.copytree(one_epoch, tmp_path / "begun")
 
 
-def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, drawn, tmp_path):
+def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, sample_recording, tmp_path):
     output, chance = tmp_path / "model.pt", random.Random(5)
     kills = 0
     while True:
         run = subprocess.Popen(
-            [*SAVING, str(drawn), *map(str, SHORT), "--output", str(output), "--resume"],
+            [*SAVING, str(sample_recording), *map(str, SHORT), "--output", str(output), "--resume"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             env={**os.environ, **HERE},
@@ -73,20 +73,15 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, drawn,
     assert not list(tmp_path.glob("*previous*"))  # a run never takes its own files for an earlier run's
 
 
-def test_killed_when_an_epoch_was_just_saved_loses_nothing_of_its_log(finished, drawn, tmp_path, monkeypatch):
-    arguments = (drawn, *SHORT, "--output", tmp_path / "model.pt", "--resume")
-    with monkeypatch.context() as patch:
-        save = model.TrainingRun.save
-
-        def save_and_die(run, *models):
-            save(run, *models)
-            if models:
-                raise Killed
-
-        patch.setattr(model.TrainingRun, "save", save_and_die)
-        for _ in range(2):
-            with pytest.raises(Killed):
-                run_here(*arguments)
+def test_killed_when_an_epoch_was_just_saved_loses_nothing_of_its_log(finished, sample_recording, tmp_path):
+    killed = [
+        sys.executable,
+        "-c",
+        "import os, model; save = model.TrainingRun.save; "
+        "model.TrainingRun.save = lambda run, *models: (save(run, *models), models and os._exit(9)); model.main()",
+    ]
+    arguments = (sample_recording, *SHORT, "--output", tmp_path / "model.pt", "--resume")
+    assert [run_model(*arguments, command=killed, env=HERE).returncode for _ in range(2)] == [9, 9]
     done = run_here(*arguments)
     assert done.returncode == 0, done.stderr
     assert [row["val_loss"] for row in log(tmp_path)] == [row["val_loss"] for row in log(finished[1])]
@@ -94,21 +89,21 @@ def test_killed_when_an_epoch_was_just_saved_loses_nothing_of_its_log(finished, 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_cleanly_with_everything_saved(finished, drawn, tmp_path, number):
+def test_a_signal_ends_cleanly_with_everything_saved(finished, sample_recording, tmp_path, number):
     output = tmp_path / "model.pt"
-    command = [sys.executable, str(ROOT / "model.py"), str(drawn), *map(str, SHORT), "--output", str(output)]
+    command = [sys.executable, str(ROOT / "model.py"), str(sample_recording), *map(str, SHORT), "--output", str(output)]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     for line in run.stdout:
         if line.startswith("Epoch"):
             break
     run.send_signal(number)
-    _, errors = run.communicate(timeout=60)
+    _, errors = run.communicate(timeout=120)
     assert run.returncode == 128 + number
     assert errors.startswith("model.py: ") and "--resume" in errors
     assert "Traceback" not in errors
     place = torch.load(tmp_path / "model-resume.pt", weights_only=True)["training"]
     assert 0 < place["images"] < 150  # in the middle of an epoch
-    assert run_here(drawn, "--output", output, "--resume").returncode == 0
+    assert run_here(sample_recording, "--output", output, "--resume").returncode == 0
     assert same(weights(output), weights(finished[1] / "model.pt"))
 
 
@@ -143,7 +138,7 @@ def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
     other = run_here("--output", output, "--resume", "--learning-rate", 0.1)
     assert other.returncode == 2
     assert "--learning-rate 0.0001, not 0.1" in other.stderr
-    changed = run_here(draw_recording(tmp_path / "other", rows=20, seed=1), "--output", output, "--resume")
+    changed = run_here(render_recording(tmp_path / "other", rows=20, seed=1), "--output", output, "--resume")
     assert changed.returncode == 2
     assert "the run began with other recordings" in changed.stderr
 
@@ -157,9 +152,9 @@ def test_resume_refuses_a_state_that_does_not_fit(begun):
     assert str(begun / "model-resume.pt") in done.stderr
 
 
-def test_a_moved_run_goes_on_where_it_is(finished, drawn, tmp_path):
+def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path):
     """Where and how a run was started never comes out of its checkpoint: output, device, strict."""
-    begun = run_here(drawn, *SHORT, "--epochs", 1, "--strict", "--output", "runs/a/model.pt", cwd=tmp_path)
+    begun = run_here(sample_recording, *SHORT, "--epochs", 1, "--strict", "--output", "runs/a/model.pt", cwd=tmp_path)
     assert begun.returncode == 0, begun.stderr
     folder = tmp_path / "runs" / "a"
     saved = torch.load(folder / "model-resume.pt", weights_only=True)
@@ -185,9 +180,9 @@ def test_a_checkpoint_of_an_earlier_version_is_resumed(finished, begun):
     assert not list(begun.glob("*previous*"))
 
 
-def test_a_new_run_keeps_the_models_of_the_ones_before(begun, drawn):
+def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording):
     for seed in (1, 2):
-        done = run_here(drawn, *SHORT, "--epochs", 1, "--seed", seed, "--output", begun / "model.pt")
+        done = run_here(sample_recording, *SHORT, "--epochs", 1, "--seed", seed, "--output", begun / "model.pt")
         assert done.returncode == 0, done.stderr
         assert f"{begun / 'model.pt'} of an earlier run is now" in done.stdout
     for kind in ("model", "model-best", "model-resume"):
@@ -196,7 +191,9 @@ def test_a_new_run_keeps_the_models_of_the_ones_before(begun, drawn):
 
 
 @pytest.mark.parametrize("before_the_end", ["in the first epoch", "while it is saved"])
-def test_a_new_run_leaves_the_model_in_place_until_its_first_epoch_has_ended(begun, drawn, monkeypatch, before_the_end):
+def test_a_new_run_leaves_the_model_in_place_until_its_first_epoch_has_ended(
+    begun, sample_recording, monkeypatch, before_the_end
+):
     old = (begun / "model.pt").read_bytes(), (begun / "model-best.pt").read_bytes()
 
     def interrupted(*_, **__):
@@ -207,19 +204,19 @@ def test_a_new_run_leaves_the_model_in_place_until_its_first_epoch_has_ended(beg
             patch.setattr(model.TrainingRun, "validate", interrupted)
         else:
             patch.setattr(model, "loss_picture", interrupted)
-        stopped = run_here(drawn, *SHORT, "--seed", 1, "--output", begun / "model.pt")
+        stopped = run_here(sample_recording, *SHORT, "--seed", 1, "--output", begun / "model.pt")
     assert stopped.returncode == 128 + signal.SIGINT
     assert ((begun / "model.pt").read_bytes(), (begun / "model-best.pt").read_bytes()) == old
     assert seed_of(begun / "model-resume-previous.pt") == 0
     assert seed_of(begun / "model-resume.pt") == 1
-    again = run_here(drawn, *SHORT, "--seed", 2, "--epochs", 1, "--output", begun / "model.pt")
+    again = run_here(sample_recording, *SHORT, "--seed", 2, "--epochs", 1, "--output", begun / "model.pt")
     assert again.returncode == 0, again.stderr
     assert ((begun / "model-previous.pt").read_bytes(), (begun / "model-best-previous.pt").read_bytes()) == old
     assert not (begun / "model-resume-previous-2.pt").exists()  # the stopped run had no finished epoch
 
 
 @pytest.mark.parametrize("kill_after", range(1, 5))
-def test_killed_while_the_earlier_models_make_room(begun, drawn, tmp_path, monkeypatch, kill_after):
+def test_killed_while_earlier_models_are_renamed(begun, sample_recording, tmp_path, monkeypatch, kill_after):
     """After each of two renamed and two written models: --resume goes on, and every model is kept once."""
     steps = 0
 
@@ -234,7 +231,7 @@ def test_killed_while_the_earlier_models_make_room(begun, drawn, tmp_path, monke
         return step
 
     rename, save = checkpoint.set_aside, checkpoint.save_model
-    arguments = (drawn, *SHORT, "--epochs", 1, "--seed", 1, "--output", begun / "model.pt")
+    arguments = (sample_recording, *SHORT, "--epochs", 1, "--seed", 1, "--output", begun / "model.pt")
     with monkeypatch.context() as patch:
         patch.setattr(
             checkpoint, "set_aside", lambda path: (rename if "resume" in path.stem else then_die(rename))(path)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, SHORT, draw_recording, finished_run, run_here, run_model, weights
+from conftest import ROOT, SHORT, finished_run, render_recording, run_here, run_model, weights
 
 import model
 from cloning.lane.reader import LanePosition
@@ -20,7 +20,7 @@ from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FA
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
 from cloning.road.warp import SOURCE_ROWS, ground_mask
 from cloning.training import robust
-from cloning.training.robust import Lanes, Poses
+from cloning.training.robust import Lanes, Poses, RobustObservations
 
 N, SPEED = 300, 20.0  # rows; mph
 
@@ -82,9 +82,9 @@ def test_a_shifted_car_comes_back_and_stays(monkeypatch, steering, right, yaw):
 def test_the_label_grows_with_offset_and_yaw(monkeypatch):
     one = lanes(monkeypatch).take(np.array([50]))
     limit = robust.MAX_LABEL_OFFSET
-    by_place = [float(one.steering(right, 0.0)[0]) for right in np.linspace(-limit, limit, 9)]
+    by_offset = [float(one.steering(right, 0.0)[0]) for right in np.linspace(-limit, limit, 9)]
     by_yaw = [float(one.steering(0.0, yaw)[0]) for yaw in np.linspace(-0.2, 0.2, 9)]
-    for found in (by_place, by_yaw):
+    for found in (by_offset, by_yaw):
         assert (np.diff(found) < 0).all()
         assert found[4] == pytest.approx(0, abs=1e-6)
 
@@ -176,6 +176,23 @@ def test_sampled_poses_are_on_both_sides_and_of_every_camera(monkeypatch):
         assert 0.2 < (poses.steering[poses.camera == camera] > 0).mean() < 0.8
 
 
+@pytest.mark.parametrize("human", [0.0, 1.5, -1.5])
+def test_sampled_poses_are_near_the_lane_and_near_the_recorded_car(monkeypatch, human):
+    """Far from the recorded car, little of the warped frame would be seen."""
+    found, sampled, of = lanes(monkeypatch, offset=human).take(np.full(2000, 100)), [], Poses.of
+
+    def note(lanes, offset, yaw, *more):
+        sampled[:] = offset, yaw
+        return of(lanes, offset, yaw, *more)
+
+    monkeypatch.setattr(Poses, "of", note)
+    found.sample_poses(np.random.default_rng(0), np.zeros(2000, bool))
+    offset, yaw = sampled
+    least, most = max(-2.0, human - 2.4), min(2.0, human + 2.4)  # m from the lane's centre and from the recorded car
+    assert (offset.min(), offset.max()) == (pytest.approx(least, abs=0.01), pytest.approx(most, abs=0.01))
+    assert np.degrees(np.abs(yaw).max()) <= 25 and np.degrees(yaw.std()) == pytest.approx(8, abs=0.5)
+
+
 # --------------------------------------------------------------------------------------------------
 # The command
 
@@ -183,11 +200,11 @@ ROBUST = ("--robust", *SHORT)
 
 
 @pytest.fixture(scope="module")
-def finished(drawn, tmp_path_factory):
-    return finished_run(drawn, tmp_path_factory.mktemp("robust"), *ROBUST)
+def finished(sample_recording, tmp_path_factory):
+    return finished_run(sample_recording, tmp_path_factory.mktemp("robust"), *ROBUST)
 
 
-def test_robust_trains_and_says_what_was_left_out(finished, drawn):
+def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording):
     done, folder = finished
     assert "lane ahead unknown" in done.stdout
     row = next(line for line in done.stdout.splitlines() if line.startswith("total"))
@@ -202,8 +219,15 @@ def test_robust_trains_and_says_what_was_left_out(finished, drawn):
     assert (arguments["batch_size"], arguments["learning_rate"]) == (8, 3e-4)  # as given, and as --robust sets it
 
 
-def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, drawn, tmp_path):
-    command = [sys.executable, str(ROOT / "model.py"), str(drawn), *map(str, ROBUST), "--output", tmp_path / "model.pt"]
+def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_recording, tmp_path):
+    command = [
+        sys.executable,
+        str(ROOT / "model.py"),
+        str(sample_recording),
+        *map(str, ROBUST),
+        "--output",
+        tmp_path / "model.pt",
+    ]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert any(line.startswith("Epoch 2") for line in run.stdout)
     run.kill()
@@ -215,7 +239,9 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, drawn, t
 
 
 @pytest.mark.parametrize("options, begins", [([], 1e-4), (["--robust"], 3e-4)])
-def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(drawn, tmp_path, monkeypatch, options, begins):
+def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
+    sample_recording, tmp_path, monkeypatch, options, begins
+):
     steps = []  # (finished epochs, images of this epoch after the step, rate of the step)
 
     def note(run, *models):
@@ -225,7 +251,7 @@ def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(drawn, t
     monkeypatch.setattr(model, "SAVE_SECONDS", -1)
     monkeypatch.setattr(model.TrainingRun, "save", note)
     monkeypatch.setattr(model.TrainingRun, "summary", lambda run: "")  # of model files that are not written
-    done = run_here(drawn, *SHORT, *options, "--output", tmp_path / "model.pt")
+    done = run_here(sample_recording, *SHORT, *options, "--output", tmp_path / "model.pt")
     assert done.returncode == 0, done.stderr
     assert len(steps) > 8
     shares = [  # of the run that was done before each step
@@ -237,8 +263,8 @@ def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(drawn, t
     assert shares[0] == 0 and shares[-1] > 0.8
 
 
-def test_validation_counts_centre_images_and_other_poses_alike(drawn, tmp_path):
-    arguments = model.parse([str(drawn), *map(str, ROBUST), "--output", str(tmp_path / "model.pt")])
+def test_validation_counts_centre_images_and_other_poses_alike(sample_recording, tmp_path):
+    arguments = model.parse([str(sample_recording), *map(str, ROBUST), "--output", str(tmp_path / "model.pt")])
     run = model.TrainingRun(*model.prepare(*arguments)[:3])
     with run.pool:
         both = run.validate()
@@ -251,26 +277,26 @@ def test_validation_counts_centre_images_and_other_poses_alike(drawn, tmp_path):
     assert not np.array_equal(center(np.arange(3)), warped(np.arange(3)))
 
 
-def test_a_missing_lane_network_is_named(drawn, tmp_path):
+def test_a_missing_lane_network_is_named(sample_recording, tmp_path):
     for name in ("cloning", "model.py"):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, tmp_path / name)
     (tmp_path / "cloning" / "lane" / "lane.pt").unlink()
-    done = run_model(drawn, *ROBUST, command=[sys.executable, "model.py"], cwd=tmp_path)
+    done = run_model(sample_recording, *ROBUST, command=[sys.executable, "model.py"], cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("model.py: ") and "lane.pt: no such file" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_the_reports_options_do_not_go_with_robust(drawn, tmp_path):
+def test_the_reports_options_do_not_go_with_robust(sample_recording, tmp_path):
     for option in ("--throttle-threshold", "--side-correction"):
-        done = run_here(drawn, "--robust", option, 0.1, "--output", tmp_path / "model.pt")
+        done = run_here(sample_recording, "--robust", option, 0.1, "--output", tmp_path / "model.pt")
         assert done.returncode == 2
         assert f"{option} has no effect with --robust" in done.stderr
 
 
 def test_drives_too_short_are_named(tmp_path):
-    done = run_here(draw_recording(tmp_path / "short", rows=20), *ROBUST, "--output", tmp_path / "model.pt")
+    done = run_here(render_recording(tmp_path / "short", rows=20), *ROBUST, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
     assert "too short" in done.stderr
 
@@ -300,3 +326,31 @@ def test_rows_in_bends_are_sampled_more_often(monkeypatch):
     assert steering > 0.2
     assert weights.sum() == pytest.approx(1)
     assert weights[3] / weights[0] == pytest.approx((robust.STRAIGHT_WEIGHT + steering) / robust.STRAIGHT_WEIGHT)
+
+
+def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monkeypatch):
+    many = lanes(monkeypatch, 0.4)
+    both = Lanes.joined([Lanes.unknown(2000), many.take(np.full(2000, 100))])
+    n, drive = len(both), recording(0.4)
+    rows = np.full(n, 100, np.int32)
+    labels = both.steering(both.offset, both.yaw)
+    everything = RobustObservations([drive], np.zeros(n, int), rows, labels, np.arange(n, dtype=np.uint64), rows, both)
+    turn = everything.shuffle(np.random.default_rng(0))
+    assert len(turn) == n
+    expected = both.weights()[2000:].sum()  # of the rows in a bend
+    assert expected > 0.6
+    assert (turn >= 2000).mean() == pytest.approx(expected, abs=0.03)
+    views = everything.sample_views(turn, np.zeros(n, int), 0.2, np.random.default_rng(1))
+    for poses in views.poses:
+        assert poses.mirrored.mean() == pytest.approx(0.5, abs=0.03)
+
+
+def test_the_label_is_the_recovery_steering_and_not_the_drivers(monkeypatch):
+    """Rows whose lane is 1 m to the left of a car that a human drives straight on."""
+    reading = LanePosition(np.full(N, 1.0), np.zeros(N), np.ones(N, bool))
+    monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
+    monkeypatch.setattr(robust, "center_digests", lambda _, rows: np.zeros(len(rows), np.uint64))
+    selected = RobustObservations.select(recording(0.0), model.Arguments(robust=True))
+    assert (selected.steering < -0.1).all()
+    assert selected.steering == pytest.approx(selected.lanes.steering(1.0, 0.0), abs=1e-4)
+    assert 0.5 * N < len(selected) < N

@@ -215,7 +215,7 @@ def test_numbers_are_written_as_the_simulators(value, text):
 
 def digest(folder):
     """Hash of the images and of the rows without the folder's own path."""
-    log = (folder / "driving_log.csv").read_text().replace(str(folder), "")
+    log = (folder / "driving_log.csv").read_text(encoding="utf-8").replace(str(folder), "")
     images = b"".join(hashlib.sha256(path.read_bytes()).digest() for path in sorted((folder / "IMG").iterdir()))
     return hashlib.sha256(log.encode() + images).hexdigest()
 
@@ -225,7 +225,7 @@ def test_recordings_are_as_the_simulators_and_the_same_in_two_processes(tmp_path
     assert done.returncode == 0, done.stderr
     record.record(tmp_path / "b", Track("lake"), laps=0.1, seed=5)
     assert digest(tmp_path / "a") == digest(tmp_path / "b")
-    rows = list(csv.reader((tmp_path / "a" / "driving_log.csv").read_text().splitlines()))
+    rows = list(csv.reader((tmp_path / "a" / "driving_log.csv").read_text(encoding="utf-8").splitlines()))
     times = []
     for row in rows:
         assert len(row) == 7
@@ -289,14 +289,14 @@ def test_a_kill_leaves_a_readable_folder(tmp_path):
         time.sleep(0.01)
     process.kill()
     process.wait()
-    text = log.read_text()
+    text = log.read_text(encoding="utf-8")
     assert text.endswith("\n")
     for row in csv.reader(text.splitlines()):
         assert len(row) == 7
         assert all(cv2.imread(path) is not None for path in row[:3])
     if not Path("/proc/self/cmdline").exists():
         pytest.skip("rows are whole; without /proc the rendering processes cannot be listed")
-    ends = time.monotonic() + 20
+    ends = time.monotonic() + 60
     while any(str(folder).encode() in line for line in command_lines()):
         assert time.monotonic() < ends  # the rendering processes end with it
         time.sleep(0.1)
@@ -325,10 +325,10 @@ for i in range(1000):
 def test_a_frame_depends_on_the_pose_alone():
     few, many = (
         subprocess.Popen([sys.executable, "-c", RENDER, step], stdout=subprocess.PIPE, text=True, cwd=ROOT)
-        for step in ("16", "8")
+        for step in ("8", "4")
     )
     few, many = (process.communicate()[0].splitlines() for process in (few, many))
-    assert len(few) == 63
+    assert len(few) == 125
     assert few == many[::2]
 
 
@@ -343,7 +343,7 @@ def test_a_full_disk_is_reported_and_leaves_whole_rows(tmp_path, monkeypatch):
         monkeypatch.setattr("pathlib.Path.write_bytes", full)
         with pytest.raises(RecordingError, match="No space left"):
             recording.add(1, images, 0, 1, 0, 10)
-    assert len((tmp_path / "full" / "driving_log.csv").read_text().splitlines()) == 1
+    assert len((tmp_path / "full" / "driving_log.csv").read_text(encoding="utf-8").splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -365,8 +365,8 @@ def test_bad_arguments_are_reported(arguments, message):
 
 
 def test_an_existing_recording_is_kept(tmp_path):
-    (tmp_path / "driving_log.csv").write_text("precious\n")
+    (tmp_path / "driving_log.csv").write_text("precious\n", encoding="utf-8")
     done = command("record", tmp_path)
     assert done.returncode == 2
     assert "exists already" in done.stderr
-    assert (tmp_path / "driving_log.csv").read_text() == "precious\n"
+    assert (tmp_path / "driving_log.csv").read_text(encoding="utf-8") == "precious\n"

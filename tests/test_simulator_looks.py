@@ -97,7 +97,7 @@ def test_recovery_folder_has_gaps_in_time(tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    names = [row[0] for row in csv.reader((folder / "driving_log.csv").read_text().splitlines())]
+    names = [row[0] for row in csv.reader((folder / "driving_log.csv").read_text(encoding="utf-8").splitlines())]
     seconds = [int(name[-13:-11]) * 60 + int(name[-10:-8]) + int(name[-7:-4]) / 1000 for name in names]
     assert sum(np.diff(seconds) > 0.5) >= 1
     assert len(list((folder / "IMG").iterdir())) == 3 * len(names)

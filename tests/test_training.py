@@ -6,19 +6,20 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from conftest import HERE, ROOT, SHORT, draw_recording, log, run_here, run_model, same, weights
+from conftest import HERE, ROOT, SHORT, log, render_recording, run_here, run_model, same, weights
 from PIL import Image
 
 import model
 
 
-def test_what_a_run_prints(finished, drawn):
+def test_what_a_run_prints(finished, sample_recording):
     lines = finished[0].stdout.splitlines()
-    counts = [line.split()[-4:] for line in lines if line.startswith((str(drawn), "total"))]
+    counts = [line.split()[-4:] for line in lines if line.startswith((str(sample_recording), "total"))]
     assert counts == [["60", "0", "6", "54"]] * 2
     assert "Total params: 559,419" in lines
     assert sum(line.startswith("Epoch ") for line in lines) == 2
@@ -52,25 +53,42 @@ def test_what_a_run_leaves(finished):
         assert Image.open(folder / "diagnostic_images" / name).size[0] > 1000
 
 
-def test_training_learns(drawn, tmp_path):
+def test_training_learns(sample_recording, tmp_path):
     """After three seconds it predicts frames that it was not trained on ten times better than the mean steering."""
     faster = ("--learning-rate", 1e-3, "--samples-per-epoch", 700, "--epochs", 3)
-    done = run_here(drawn, *SHORT, *faster, "--output", tmp_path / "model.pt")
-    steering = np.loadtxt(drawn / "driving_log.csv", delimiter=",", usecols=3)
+    done = run_here(sample_recording, *SHORT, *faster, "--output", tmp_path / "model.pt")
+    steering = np.loadtxt(sample_recording / "driving_log.csv", delimiter=",", usecols=3)
     assert float(log(tmp_path)[-1]["val_loss"]) < 0.1 * steering.var()  # the error of steering the mean
     correlations = next(line.split()[-4:] for line in done.stdout.splitlines() if line.startswith("correlation"))
     assert float(correlations[2]) > 0.95
     assert "hardly follows" not in done.stdout
 
 
-def test_same_seed_same_weights_other_seed_others(finished, drawn, tmp_path):
+def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_recording, tmp_path):
+    arguments, training, validation, _ = model.prepare(
+        *model.parse([str(sample_recording), "--output", str(tmp_path / "m.pt")])
+    )
+    rows = np.loadtxt(sample_recording / "driving_log.csv", delimiter=",", usecols=(3, 4))
+    assert not set(training.frame) & set(validation.frame)
+    used, driven = {*training.row, *validation.row}, set(np.flatnonzero(rows[:, 1]))  # throttle is 0 in the others
+    assert used <= driven and all(abs(rows[row, 0]) < 0.02 for row in driven - used)
+    assert len(validation) == len(set(validation.row)) < 0.35 * len(set(training.row))
+    times = np.bincount(training.row, minlength=len(rows))[training.row]
+    size = np.abs(rows[training.row, 0])
+    assert set(times[(size > 0.2) & (size <= 0.5)]) == {2} and set(times[size < 0.2]) == {1}
+    run = model.TrainingRun(arguments, training, validation)
+    run.pool.shutdown()
+    assert run.generator.observations is training and run.validation is validation
+
+
+def test_same_seed_same_weights_other_seed_others(finished, sample_recording, tmp_path):
     for seed in (0, 1):
-        assert run_here(drawn, *SHORT, "--seed", seed, "--output", tmp_path / f"{seed}.pt").returncode == 0
+        assert run_here(sample_recording, *SHORT, "--seed", seed, "--output", tmp_path / f"{seed}.pt").returncode == 0
     assert same(weights(tmp_path / "0.pt"), weights(finished[1] / "model.pt"))
     assert not same(weights(tmp_path / "1.pt"), weights(finished[1] / "model.pt"))
 
 
-def test_no_run_changes_a_tracked_file(drawn, tmp_path):
+def test_no_run_changes_a_tracked_file(sample_recording, tmp_path):
     git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "core.autocrlf=false"]
     if not shutil.which("git"):
         pytest.skip("git is not installed")
@@ -81,7 +99,7 @@ def test_no_run_changes_a_tracked_file(drawn, tmp_path):
         shutil.copytree(ROOT / name, tmp_path / name)
     for command in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "all"]):
         subprocess.run([*git, *command], cwd=tmp_path, check=True)
-    shutil.copytree(drawn, tmp_path / "data" / "lake")
+    shutil.copytree(sample_recording, tmp_path / "data" / "lake")
     damaged = next((tmp_path / "data" / "lake" / "IMG").glob("left*"))
     damaged.write_bytes(b"")  # so that rejected_rows.csv is written, too
     for _ in range(2):
@@ -91,7 +109,7 @@ def test_no_run_changes_a_tracked_file(drawn, tmp_path):
     assert status.stdout == ""
 
 
-def test_it_trains_without_what_only_some_systems_have(drawn, tmp_path):
+def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_path):
     """No SIGTERM, processor affinity, fork or mallopt, as on Windows or macOS."""
     code = (
         "import ctypes, os, signal, sys, torch\n"
@@ -101,14 +119,14 @@ def test_it_trains_without_what_only_some_systems_have(drawn, tmp_path):
         "import model\n"
         "sys.exit(model.main())"
     )
-    arguments = (drawn, *SHORT, "--epochs", 1, "--output", tmp_path / "model.pt")
+    arguments = (sample_recording, *SHORT, "--epochs", 1, "--output", tmp_path / "model.pt")
     done = run_model(*arguments, command=[sys.executable, "-c", code], env=HERE)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "model.pt").exists()
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Arguments and recordings that cannot be
+# Invalid arguments and recordings
 
 
 def test_no_recordings(tmp_path):
@@ -128,8 +146,8 @@ def test_no_recordings(tmp_path):
         (["--batch-size", "x"], "int"),
     ],
 )
-def test_arguments_that_cannot_be(drawn, tmp_path, arguments, words):
-    done = run_here(drawn, *arguments, "--output", tmp_path / "model.pt")
+def test_invalid_arguments(sample_recording, tmp_path, arguments, words):
+    done = run_here(sample_recording, *arguments, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
     assert words in done.stderr
     assert "model.py: " in done.stderr
@@ -137,10 +155,10 @@ def test_arguments_that_cannot_be(drawn, tmp_path, arguments, words):
 
 
 @pytest.mark.parametrize("device", ["cuda", "mps"])
-def test_a_device_that_is_not_there(drawn, tmp_path, monkeypatch, device):
+def test_a_device_that_is_not_there(sample_recording, tmp_path, monkeypatch, device):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    done = run_here(drawn, "--device", device, "--output", tmp_path / "model.pt")
+    done = run_here(sample_recording, "--device", device, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
     assert f"model.py: error: --device {device}: " in done.stderr
     assert not list(tmp_path.iterdir())
@@ -161,7 +179,7 @@ def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path
 
 def test_default_is_every_recording_under_data(tmp_path):
     for i, name in enumerate(("lake", "turn-repetitive")):
-        draw_recording(tmp_path / "data" / name, rows=20, seed=i)
+        render_recording(tmp_path / "data" / name, rows=20, seed=i)
     done = run_here(*SHORT, "--epochs", 1, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     totals = [line.split()[-4:] for line in done.stdout.splitlines() if line.startswith("total")]
@@ -200,25 +218,45 @@ TORCHRUN = [
     "--standalone",
     str(ROOT / "model.py"),
 ]
+without_libuv = pytest.mark.skipif(sys.platform == "win32", reason="PyTorch for Windows has no libuv for torchrun")
 
 
 @pytest.fixture(scope="module")
-def two_processes(drawn, tmp_path_factory):
-    """An epoch by two processes, and a second one that they resume with the run's own arguments: output, folder."""
+def two_processes(sample_recording, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
+    """Two epochs by two processes: what they printed, and their folder; not to be changed."""
     folder = tmp_path_factory.mktemp("two processes")
-    begun = run_model(drawn, *SHORT, "--epochs", 1, "--output", folder / "model.pt", command=TORCHRUN)
-    resumed = run_model("--output", folder / "model.pt", "--resume", "--epochs", 2, command=TORCHRUN)
-    assert (begun.returncode, resumed.returncode) == (0, 0), begun.stderr + resumed.stderr
-    return begun.stdout + resumed.stdout, folder
+    done = run_model(sample_recording, *SHORT, "--output", folder / "model.pt", command=TORCHRUN)
+    assert done.returncode == 0, done.stderr
+    return done, folder
 
 
-def test_two_processes_train_as_one_also_when_they_resume(finished, two_processes):
-    """Two ranks with half of every batch each end where one process ends, up to rounding."""
-    a, b = weights(finished[1] / "model.pt"), weights(two_processes[1] / "model.pt")
-    for name in a:  # Adam moves a weight by up to 1e-4 a step, of which there were 12
+def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
+    """Adam moves a weight by up to 1e-4 a step, of which there were 12 or more."""
+    a, b = weights(one), weights(other)
+    for name in a:
         assert (a[name] - b[name]).abs().mean() < 2e-6
 
 
+@without_libuv
+def test_two_processes_train_as_one(finished, two_processes):
+    """Two ranks with half of every batch each end where one process ends."""
+    assert_equal_up_to_rounding(finished[1] / "model.pt", two_processes[1] / "model.pt")
+
+
+@without_libuv
+def test_two_processes_continue_with_the_runs_own_arguments(finished, two_processes, tmp_path):
+    one, two = (
+        shutil.copytree(folder, tmp_path / name) for (_, folder), name in ((finished, "one"), (two_processes, "two"))
+    )
+    more = ("--resume", "--epochs", 3)
+    assert run_here("--output", one / "model.pt", *more).returncode == 0
+    done = run_model("--output", two / "model.pt", *more, command=TORCHRUN)
+    assert done.returncode == 0, done.stderr
+    assert [row["epoch"] for row in log(two)] == ["1", "2", "3"]
+    assert_equal_up_to_rounding(one / "model.pt", two / "model.pt")
+
+
+@without_libuv
 def test_two_processes_print_once_and_the_losses_of_both(finished, two_processes):
     logs = [
         [
@@ -227,6 +265,6 @@ def test_two_processes_print_once_and_the_losses_of_both(finished, two_processes
             if "val_loss" in line
             for number in re.findall(r"loss: ([\d.]+)", line)
         ]
-        for output in (finished[0].stdout, two_processes[0])
+        for output in (finished[0].stdout, two_processes[0].stdout)
     ]
     assert len(logs[0]) == 4 and logs[1] == pytest.approx(logs[0], abs=2e-4)  # the global losses; bfloat16 rounds

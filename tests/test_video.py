@@ -56,7 +56,7 @@ def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
 def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
     save(tmp_path / "run1")
     result = subprocess.run(
-        [sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True, text=True, timeout=60
+        [sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
     assert result.returncode == 0 and "run1.mp4: 30 frames at 20 frames/s" in result.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run1", "run1.mp4"]
@@ -69,20 +69,20 @@ def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
         assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
 
 
-def test_what_a_person_would_wish(run, tmp_path):
+def test_odd_files_other_sizes_and_a_given_rate(run, tmp_path):
     """Other files and unreadable frames are left out and reported, other sizes scaled; --fps is used."""
     folder = tmp_path / "run.1"
     save(folder, 10)
     save(folder, 2, rows=80, columns=160, begin=datetime(2018, 7, 16, 17, 11, 44), first=10)
-    (folder / "notes.txt").write_text("mine")
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
     (folder / "2018_07_16_17_11_44_900.jpg").write_bytes(b"")
     whole = (folder / "2018_07_16_17_11_43_000.jpg").read_bytes()
     (folder / "2018_07_16_17_11_44_901.jpg").write_bytes(whole[: len(whole) // 2])
-    status, said = run("run.1", "--fps", "60")
+    status, printed = run("run.1", "--fps", "60")
     assert status == 0
-    assert "video.py: left out, not frames: notes.txt" in said
-    assert "video.py: left out, unreadable: 2018_07_16_17_11_44_900.jpg, 2018_07_16_17_11_44_901.jpg" in said
-    assert "2 frames of another size were scaled to 320x160" in said
+    assert "video.py: left out, not frames: notes.txt" in printed
+    assert "video.py: left out, unreadable: 2018_07_16_17_11_44_900.jpg, 2018_07_16_17_11_44_901.jpg" in printed
+    assert "2 frames of another size were scaled to 320x160" in printed
     fps, seen = frames_of(tmp_path / "run.1.mp4")
     assert fps == pytest.approx(60) and len(seen) == 12
     assert {frame.shape for frame in seen} == {(160, 320, 3)}
@@ -96,23 +96,23 @@ def test_odd_sizes_lose_a_row_and_a_column(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name, content, said",
+    "name, content, printed",
     [(None, None, "no such folder"), ("notes.txt", b"", "no frames"), ("2018_07_16_17_11_43_382.jpg", b"", "readable")],
 )
-def test_no_film_is_a_clear_error(run, tmp_path, name, content, said):
+def test_no_film_is_a_clear_error(run, tmp_path, name, content, printed):
     if name:
         (tmp_path / "run1").mkdir()
         (tmp_path / "run1" / name).write_bytes(content)
     status, error = run("run1")
-    assert status == 1 and said in error
+    assert status == 1 and printed in error
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize("fps", ["0", "-5", "fast", "nan"])
 def test_an_impossible_rate_is_refused(run, tmp_path, fps):
     save(tmp_path / "run1", 2)
-    status, said = run("run1", "--fps", fps)
-    assert status == 2 and "--fps" in said
+    status, printed = run("run1", "--fps", fps)
+    assert status == 2 and "--fps" in printed
 
 
 def test_a_pause_and_bunches_leave_the_rate_alone():
@@ -139,6 +139,6 @@ def test_the_overlay_draws_steering_and_attention(run, tmp_path):
     assert "video.py: none.pt: no such file" in run("run1", "--overlay", "none.pt")[1]
     torch.nn.init.constant_(network.dense[-1].bias, float("nan"))
     save_model(tmp_path / "broken.pt", network)
-    said = run("run1", "--overlay", "broken.pt")[1]
-    assert "video.py: broken.pt: the network's steering is not finite; train the model again" in said
+    printed = run("run1", "--overlay", "broken.pt")[1]
+    assert "video.py: broken.pt: the network's steering is not finite; train the model again" in printed
     assert not list(tmp_path.glob(".*"))

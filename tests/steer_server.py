@@ -1,0 +1,131 @@
+"""A server for the simulator's end of the wire, on a raw socket, that follows the real client's transcript."""
+
+import base64
+import contextlib
+import hashlib
+import re
+import socket
+import struct
+import threading
+
+import numpy as np
+
+from cloning.road.track import Track
+from simulator.client import Client
+from simulator.run import Run
+
+STEER = '42["steer",{"steering_angle":"%s","throttle":"%s"}]'
+
+
+class Server:
+    """Speaks the server's part of the transcript; `reply(packet, n)` returns the answers to telemetry number n."""
+
+    def __init__(self, reply, greet=True, sessions=1):
+        self.reply, self.greet, self.sessions = reply, greet, sessions
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self.listener.getsockname()[1]
+        self.requests, self.messages, self.frames, self.error = [], [], [], None
+        self.closed = False
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.listener.close()
+        self.thread.join(20)
+        assert not self.thread.is_alive()
+        if self.error:
+            raise self.error
+
+    def run(self):
+        try:
+            for _ in range(self.sessions):
+                client, _ = self.listener.accept()
+                client.settimeout(20)
+                with client, contextlib.suppress(ConnectionError):
+                    self.session(client)
+        except Exception as error:
+            self.error = error
+
+    def send(self, client, text):
+        data = text.encode()
+        size = bytes([len(data)]) if len(data) < 126 else b"\x7e" + struct.pack(">H", len(data))
+        client.sendall(b"\x81" + size + data)
+
+    def exactly(self, client, n):
+        data = b""
+        while len(data) < n:
+            data += client.recv(n - len(data)) or self.lost()
+        return data
+
+    def lost(self):
+        raise ConnectionError
+
+    def session(self, client):
+        request = b""
+        while not request.endswith(b"\r\n\r\n"):
+            request += client.recv(1) or self.lost()
+        self.requests.append(request.decode())
+        key = re.search(rb"(?i)sec-websocket-key: (.*)\r", request)[1]
+        accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
+        client.sendall(
+            b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Accept: " + accept + b"\r\n\r\n"
+        )
+        self.send(client, '0{"sid":"x","upgrades":[],"pingTimeout":60000,"pingInterval":25000}')
+        if self.greet:
+            self.send(client, STEER % ("0", "0"))
+        self.send(client, "40")
+        message, answered, pieces = b"", 0, []
+        while True:
+            first, second = self.exactly(client, 2)
+            assert second & 0x80, "a client masks its frames"
+            size = second & 0x7F
+            if size == 126:
+                size = struct.unpack(">H", self.exactly(client, 2))[0]
+            mask = self.exactly(client, 4)
+            data = bytes(a ^ mask[i % 4] for i, a in enumerate(self.exactly(client, size)))
+            if first & 0x0F == 8:
+                self.closed = True
+                return
+            message += data
+            pieces.append((first, size))
+            if first & 0x80:
+                text, message = message.decode(), b""
+                self.messages.append(text)
+                self.frames.append(pieces)
+                pieces = []
+                if text == "2":
+                    self.send(client, "3")
+                elif text.startswith("42"):
+                    replies = self.reply(text, answered)
+                    answered += 1
+                    if replies is None:
+                        return
+                    if replies == "close":
+                        client.sendall(b"\x88\x02\x03\xe8")
+                        return
+                    for packet in replies:
+                        self.send(client, packet)
+
+
+class Blank:
+    """Cameras that see grey noise, so that frames are as large as real ones."""
+
+    noise = np.random.default_rng(0).integers(60, 190, (160, 320, 3), np.uint8)
+
+    def frames(self, transform):
+        return self.noise[None]
+
+
+def drive(server, laps=0.02, wait=5.0, realtime=False):
+    run = Run(Track("lake"), "autonomous")
+    client = Client(run, Blank(), "127.0.0.1", server.port, wait, realtime)
+    client.drive(laps)
+    return client
+
+
+def ahead(packet, n):
+    return [STEER % ("0.0", "1.0")]

@@ -1,0 +1,113 @@
+"""What `simulator drive` reports: repeatable laps, the report's figures, latencies, exit statuses, a full disk."""
+
+import json
+import re
+import socket
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+from steer_server import STEER, Server, ahead, drive
+
+from cloning.errors import OutputError
+from cloning.outputs import write_json
+from simulator import report
+from simulator.__main__ import main
+
+
+def test_a_report_that_cannot_be_written_is_reported_before_the_drive(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "simulator", "drive", "--report", str(tmp_path / "no" / "report.json")],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert "no such folder" in done.stderr
+
+
+def test_lockstep_repeats_to_the_last_digit():
+    runs = []
+    for _ in range(2):
+        with Server(lambda packet, n: [STEER % (f"{0.02 * ((n * 7919) % 5 - 2):.3f}", "0.7")]) as server:
+            runs.append(drive(server, laps=0.05).run)
+    assert runs[0].trajectory == runs[1].trajectory
+    assert report.lap_report(runs[0]) == report.lap_report(runs[1])
+
+
+def test_report_says_what_happened(tmp_path):
+    with Server(lambda packet, n: [STEER % ("0.3" if n > 30 else "0", "1")]) as server:
+        client = drive(server, laps=0.05)
+    figures = report.lap_report(client.run, client)
+    assert figures["departures"]
+    assert figures["autonomy"] == pytest.approx(
+        1 - 6 * len(figures["departures"]) / figures["simulated_seconds"], abs=1e-3
+    )
+    assert figures["frames_per_simulated_second"] == pytest.approx(15, abs=0.5)
+    printed = report.report_text(figures)
+    assert f"departures: {len(figures['departures'])}" in printed
+    write_json(tmp_path / "report.json", figures)
+    assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8")) == figures
+    report.write_picture(tmp_path / "way.png", client.run)
+    assert cv2.imread(tmp_path / "way.png").std() > 10
+    with pytest.raises(OutputError, match="nowhere"):
+        write_json(tmp_path / "nowhere" / "report.json", figures)
+
+
+def test_a_round_trip_in_real_time_is_that_of_the_telemetry_that_is_answered():
+    """The greeting answers no telemetry, though it comes while the first two are in flight."""
+    pause, answered = 0.05, []
+
+    def slowly(packet, n):
+        time.sleep(pause)
+        answered.append(time.perf_counter())
+        return ahead(packet, n)
+
+    with Server(slowly) as server:
+        client = drive(server, realtime=True)
+    # Three telemetries circulate, and the server answers one at a time.
+    assert min(client.round_trips) >= 0.9 * pause
+    between = np.median(np.diff(answered))  # 0.05 s and what else a busy machine takes
+    assert np.median(client.round_trips) == pytest.approx(3 * between, rel=0.2)
+
+
+@pytest.mark.parametrize(("steering", "status"), [("0", 0), ("1", 1)])
+def test_the_exit_status_tells_whether_the_car_left_the_road(steering, status, capsys):
+    with Server(lambda packet, n: [STEER % (steering if n > 15 else "0", "1")]) as server:
+        assert main(["drive", "--laps", "0.03", "--port", str(server.port)]) == status
+    departures = int(re.search(r"departures: (\d+)", capsys.readouterr().out)[1])
+    assert bool(departures) == bool(status)
+
+
+def test_the_exit_status_of_a_drive_without_a_server_is_2(capsys):
+    closed = socket.create_server(("127.0.0.1", 0))
+    port = closed.getsockname()[1]
+    closed.close()
+    assert main(["drive", "--wait", "0.1", "--port", str(port)]) == 2
+    assert "simulator: no server" in capsys.readouterr().err
+
+
+def test_a_full_disk_costs_the_film_alone(tmp_path, capsys):
+    resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fills_up(packet, n):
+        # The first frames of the film fit, then nothing does, until the drive is over.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10 if 20 < n < 90 else before[0], before[1]))
+        return [STEER % ("0", "0.3")]
+
+    names = [tmp_path / name for name in ("x.mp4", "report.json", "above.png")]
+    outputs = [str(word) for pair in zip(("--film", "--report", "--picture"), names, strict=True) for word in pair]
+    try:
+        with Server(fills_up) as server:
+            assert main(["drive", "--laps", "0.03", "--port", str(server.port), *outputs]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    printed = capsys.readouterr()
+    assert re.search(r"simulator: \S+x\.mp4: .*no film was written", printed.err)
+    assert "departures: 0" in printed.out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["above.png", "report.json"]
+    assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["distance_m"] > 30
+    assert cv2.imread(tmp_path / "above.png").std() > 10
