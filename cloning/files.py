@@ -16,9 +16,12 @@ def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]
     if it writes nothing, an existing `path` stays as it is.
 
     per_process: several processes may write this file at the same time; the last one wins.
-    Raises OSError with the name `path`, not the temporary one, for example when the disk is full.
+    Raises OSError with the name `path`, not the temporary one, for example when the disk is full, and at once when
+    `path` is a folder.
     """
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part" if per_process else f".{path.name}.part")
     try:
         with suppress(OSError):

@@ -10,10 +10,12 @@ from cloning.files import write
 
 
 def check_folders(*paths: str | None) -> None:
-    """Raise OutputError if the folder of a file that will be written is missing: before the work, not after it."""
+    """Raise OutputError if a file cannot be written because of missing or existing folders: before the work."""
     for path in paths:
         if path and not Path(path).absolute().parent.is_dir():
             raise OutputError(f"{path}: there is no such folder; make it first")
+        if path and Path(path).is_dir():
+            raise OutputError(f"{path}: is a folder; name a file in it")
 
 
 def write_output(path: str | Path, data: bytes) -> None:

@@ -9,6 +9,7 @@ way if it holds a finished epoch, and replaced if it does not, since then there 
 import hashlib
 import itertools
 import json
+import math
 import os
 import uuid
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -62,7 +63,8 @@ class Progress:
 
     def finish_epoch(self, val_loss: float) -> bool:
         """Add the epoch to the history and begin the next one; whether it is the best so far."""
-        is_best = val_loss < min((row["val_loss"] for row in self.history), default=float("inf"))
+        earlier = [row["val_loss"] for row in self.history if not math.isnan(row["val_loss"])]
+        is_best = not self.history or val_loss < min(earlier, default=math.inf)  # there is always a best one
         self.history.append(
             {
                 "epoch": len(self.history) + 1,

@@ -1,13 +1,16 @@
 """The command line of model.py: its options as a typed record, parsed once."""
 
 import argparse
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import TypeVar
 
 from cloning.compute import DEVICES, is_available
 
 Number = TypeVar("Number", int, float)
+MAX_SEED = 2**63 - 1  # torch takes no larger one
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
     Exits with status 2 and a message for an argument that is not possible.
     """
     parser = build_parser()
-    values = vars(parser.parse_args(argv))
+    values = vars(parser.parse_intermixed_args(argv))  # recordings may follow options
     given = frozenset(values)
     if values.get("robust"):
         for name in REPORT_ONLY:
@@ -56,6 +59,8 @@ def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
                 parser.error(f"{option(name)} belongs to the report's training; leave it out with --robust")
         values = {**ROBUST_DEFAULTS, **values}
     arguments = Arguments(**values)
+    if Path(arguments.output).is_dir():
+        parser.error(f"--output {arguments.output}: is a folder; name the model file in it, such as model.pt")
     if not is_available(arguments.device):
         parser.error(f"--device {arguments.device}: torch finds no such GPU on this machine; leave the option out")
     return arguments, given
@@ -81,23 +86,23 @@ def build_parser() -> argparse.ArgumentParser:
     )
     group = parser.add_argument_group("training")
     group.add_argument(
-        "--epochs", type=at_least(1, int), help=text("epochs", "epochs in total; with --resume it may be raised")
+        "--epochs", type=number(int, 1), help=text("epochs", "epochs in total; with --resume it may be raised")
     )
     group.add_argument(
         "--batch-size",
-        type=at_least(1, int),
+        type=number(int, 1),
         help=text("batch_size", "observations in a batch; each gives 3.7 images on average"),
     )
-    group.add_argument(
-        "--learning-rate", type=at_least(1e-9, float), help=text("learning_rate", "learning rate of Adam")
-    )
+    group.add_argument("--learning-rate", type=number(float, 1e-9), help=text("learning_rate", "learning rate of Adam"))
     group.add_argument(
         "--samples-per-epoch",
-        type=at_least(1, int),
+        type=number(int, 1),
         help=text("samples_per_epoch", "images in an epoch, at least; a fifth as many observations validate it"),
     )
     group.add_argument(
-        "--seed", type=at_least(0, int), help=text("seed", "the same seed repeats the same run on the same machine")
+        "--seed",
+        type=number(int, 0, MAX_SEED),
+        help=text("seed", "the same seed repeats the same run on the same machine"),
     )
     group.add_argument(
         "--device",
@@ -107,12 +112,12 @@ def build_parser() -> argparse.ArgumentParser:
     group = parser.add_argument_group("observations")
     group.add_argument(
         "--throttle-threshold",
-        type=float,
+        type=number(float),
         help=text("throttle_threshold", "rows with less throttle are dropped"),
     )
     group.add_argument(
         "--side-correction",
-        type=float,
+        type=number(float),
         help=text("side_correction", "added to the steering of left images, subtracted from that of right ones"),
     )
     group.add_argument("--strict", action="store_true", help="stop at the first unusable row instead of leaving it out")
@@ -136,14 +141,16 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def at_least(least: Number, kind: type[Number]) -> Callable[[str], Number]:
-    """A type for argparse: a finite number of this kind, not below `least`."""
+def number(
+    kind: type[Number], least: float = -sys.float_info.max, most: float = sys.float_info.max
+) -> Callable[[str], Number]:
+    """A type for argparse: a finite number of this kind, from `least` to `most`."""
 
-    def number(text: str) -> Number:
+    def parse_number(text: str) -> Number:
         value = kind(text)
-        if not least <= value < float("inf"):
-            raise argparse.ArgumentTypeError(f"{text} is not a number from {least} up")
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{text} is not a number from {least:.10g} to {most:.10g}")
         return value
 
-    number.__name__ = kind.__name__  # argparse names it: "invalid int value"
-    return number
+    parse_number.__name__ = kind.__name__  # argparse names it: "invalid int value"
+    return parse_number
