@@ -19,10 +19,15 @@ from collections import deque
 from pathlib import Path
 from wsgiref.types import WSGIEnvironment
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("drive.py")  # also while the libraries below are loaded
+
 import numpy as np
 import torch
 
-from cloning.errors import UserError
+from cloning.errors import UserError, message_of
 from cloning.pilot.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.recordings.format import FRAME
@@ -344,7 +349,7 @@ def main() -> None:
         if args.folder:
             server.saver = saver = saved_frames.FrameSaver(args.folder)  # last, because it empties the folder
     except (UserError, OSError) as error:
-        sys.exit(f"drive.py: {error}")
+        sys.exit(f"drive.py: {message_of(error)}")
     port = listener.getsockname()[1]
     print(
         f"Driving with {model}{' (the model that comes with the project)' if model == SHIPPED_MODEL else ''}.\n"
@@ -362,4 +367,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program.run(main)

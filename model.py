@@ -6,11 +6,9 @@
     python model.py --resume                            # continue a run that was stopped or killed
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes that share every batch
 
-"The report" is the writeup of Udacity's Behavioral Cloning project that is reproduced here. This file follows it from
-top to bottom: data preprocessing, data subdivision, augmentation in a generator, training and validation.
-
-A run writes model.pt (the last epoch's model, as in the report), model-best.pt (the one with the lowest validation
-loss), model-resume.pt, training_loss.png, training_log.csv, training_arguments.json and pictures in diagnostic_images/.
+"The report" is the writeup of the Behavioral Cloning project that is reproduced here; this file follows it from top to
+bottom. A run writes model.pt (the last epoch's model, as in the report), model-best.pt (lowest validation loss),
+model-resume.pt, training_loss.png, training_log.csv, training_arguments.json and pictures in diagnostic_images/.
 """
 
 import functools
@@ -24,6 +22,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Self, TypeVar
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("model.py")  # also while the libraries below are loaded
+
 import cv2
 import numpy as np
 import torch
@@ -31,7 +34,7 @@ from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from cloning.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable, threads
-from cloning.errors import RecordingError, UserError
+from cloning.errors import RecordingError, UserError, message_of
 from cloning.files import write
 from cloning.pilot.network import CROP, UNITS, Network, load_model
 from cloning.recordings.check import check_images
@@ -352,8 +355,7 @@ class TrainingRun:
         self.checkpoint = Checkpoint(self.files, arguments, self.network, self.optimizer, data)
         self.validation_sets = validation.validation_sets(arguments.seed)
         self.progress = self.checkpoint.restore(resumed) if resumed else Progress()
-        self.stop = StopSignals()
-        self.saved_at = time.monotonic()
+        self.stop, self.saved_at = StopSignals(), time.monotonic()
 
     def train(self) -> None:
         """Train the remaining epochs. Raises Interrupted, after saving the state, if a signal stops the run."""
@@ -484,7 +486,7 @@ def main(argv: list[str] | None = None) -> int:
     except UserError as error:
         status, message = 2, str(error)
     except OSError as error:
-        status, message = 1, f"{error.filename}: {error.strerror}; all earlier files are intact. Continue with --resume"
+        status, message = 1, f"{message_of(error)}; all earlier files are intact. Remove the cause and use --resume"
     except Interrupted as error:
         status, message = 128 + error.args[0], "stopped and saved; continue with --resume"
     except KeyboardInterrupt:
@@ -495,4 +497,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program.run(main)

@@ -14,11 +14,16 @@ from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("video.py", "stopped; no film was written")  # also while the libraries below are loaded
+
 import cv2
 import numpy as np
 from tqdm import tqdm
 
-from cloning.errors import UserError
+from cloning.errors import UserError, message_of
 from cloning.film import FilmWriter
 from cloning.recordings import saved_frames
 from cloning.recordings.format import FRAME, SAMPLE_RATE
@@ -145,10 +150,13 @@ def load_overlay(model_file: Path) -> Overlay:
 
 
 def parse_rate(text: str) -> Fraction:
-    """Parse a rate in frames per second. Raises ValueError unless it is above 0 and at most 1000."""
-    rate = Fraction(text)
+    """Parse a rate in frames per second. Raises ArgumentTypeError unless it is above 0 and at most 1000."""
+    try:
+        rate = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        rate = Fraction(0)
     if not 0 < rate <= 1000:
-        raise ValueError
+        raise argparse.ArgumentTypeError(f"{text} is not a number above 0 and up to 1000")
     return rate
 
 
@@ -165,10 +173,8 @@ def main() -> None:
     try:
         make_film(folder, args.fps, load_overlay(args.overlay) if args.overlay else None)
     except (UserError, OSError) as error:
-        sys.exit(f"video.py: {error}")
-    except KeyboardInterrupt:
-        sys.exit("video.py: stopped; no film was written")
+        sys.exit(f"video.py: {message_of(error)}")
 
 
 if __name__ == "__main__":
-    main()
+    program.run(main)

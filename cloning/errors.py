@@ -26,3 +26,10 @@ class SimulatorError(UserError):
 
 class OutputError(UserError):
     """A file that the user asked for cannot be written."""
+
+
+def message_of(error: UserError | OSError) -> str:
+    """The message for the user; that of an OSError begins with the file's name, as those of a UserError do."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)

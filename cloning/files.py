@@ -17,9 +17,12 @@ def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]
 
     per_process: give each process its own temporary file, so that several may write `path` at the same time; the last
     one to finish wins.
-    Raises OSError with the name `path`, not the temporary one, for example when the disk is full.
+    Raises OSError with the name `path`, not the temporary one, for example when the disk is full, and at once when
+    `path` is a folder.
     """
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part" if per_process else f".{path.name}.part")
     try:
         with suppress(OSError):

@@ -10,10 +10,12 @@ from cloning.files import write
 
 
 def check_folders(*paths: str | None) -> None:
-    """Raise OutputError if the folder of an output file is missing; call it before the work that makes the output."""
+    """Raise OutputError, before the work, if an output file is a folder or its folder is missing."""
     for path in paths:
         if path and not Path(path).absolute().parent.is_dir():
             raise OutputError(f"{path}: no such folder to write it in; make the folder first")
+        if path and Path(path).is_dir():
+            raise OutputError(f"{path}: is a folder; name a file in it")
 
 
 def write_output(path: str | Path, data: bytes) -> None:

@@ -7,6 +7,12 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from cloning import program
+
+if __name__ == "__main__":
+    # Also while the libraries below are loaded.
+    program.end_on_interrupt("simulator", "stopped; the files that it has written are complete")
+
 from cloning.errors import UserError
 from cloning.outputs import check_folders, run_all, write_json
 from cloning.replay.autonomy import LIMITS
@@ -267,10 +273,7 @@ def main(argv: list[str] | None = None) -> int:
     except UserError as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("\nsimulator: stopped; the files that it has written are complete", file=sys.stderr)
-        return 130
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program.run(main)

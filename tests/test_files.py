@@ -5,7 +5,20 @@ import os
 
 import pytest
 
+from cloning.errors import OutputError
 from cloning.files import write, written_whole
+from cloning.outputs import check_folders
+
+
+@pytest.mark.parametrize("name", ["runs", "."])
+def test_a_folder_is_refused_at_once(tmp_path, monkeypatch, name):
+    (tmp_path / "runs").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(IsADirectoryError) as caught, written_whole(name):
+        pytest.fail("the work began")
+    assert caught.value.filename == name
+    with pytest.raises(OutputError, match="is a folder"):
+        check_folders(name)
 
 
 @pytest.mark.parametrize("per_process", [False, True])

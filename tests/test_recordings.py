@@ -1,6 +1,7 @@
 """driving_log.csv in the nineteen shapes met in the wild, and IMG/ with everything that goes wrong in it."""
 
 import os
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -195,6 +196,17 @@ def test_unchanged_images_are_not_looked_at_again(copied, monkeypatch):
     assert looked_at == [changed.read_bytes()]
     assert len(again) == len(first) - 1
     np.testing.assert_array_equal(np.delete(again.digests, 7), np.delete(first.digests, 7))
+
+
+def test_a_damaged_cache_is_told_and_replaced(copied, capsys):
+    check_images(read_recording(copied))
+    (cache,) = Path(os.environ["XDG_CACHE_HOME"]).rglob("*.npz")
+    whole = cache.read_bytes()
+    cache.write_bytes(whole[:-200])
+    recording = read_recording(copied)
+    check_images(recording)
+    assert len(recording) == 60 and "unreadable" in capsys.readouterr().out
+    assert cache.read_bytes() == whole
 
 
 def test_size_from_the_header_and_cut_at_every_byte(sample_recording):

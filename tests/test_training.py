@@ -1,6 +1,7 @@
 """The command line on a rendered recording: what a run prints and leaves, that it learns, and what it refuses."""
 
 import json
+import math
 import os
 import re
 import shutil
@@ -15,6 +16,8 @@ from conftest import HERE, ROOT, SHORT, log, render_recording, run_here, run_mod
 from PIL import Image
 
 import model
+from cloning.training import options
+from cloning.training.checkpoint import Progress
 
 
 def test_what_a_run_prints(finished, sample_recording):
@@ -142,6 +145,9 @@ def test_no_recordings(tmp_path):
     [
         (["--epochs", "0"], "--epochs"),
         (["--learning-rate", "nan"], "--learning-rate"),
+        (["--throttle-threshold", "nan"], "--throttle-threshold"),
+        (["--side-correction", "inf"], "--side-correction"),
+        (["--seed", str(2**64)], "--seed"),
         (["--throttle-threshold", "2"], "--throttle-threshold drops"),
         (["--batch-size", "x"], "int"),
     ],
@@ -152,6 +158,27 @@ def test_invalid_arguments(sample_recording, tmp_path, arguments, words):
     assert words in done.stderr
     assert "model.py: " in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("output", [".", "runs"])
+def test_a_folder_is_not_taken_for_the_model_file(drawn, tmp_path, output):
+    (tmp_path / "runs").mkdir()
+    done = run_here(drawn, *SHORT, "--output", output, cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"model.py: error: --output {output}: is a folder" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+def test_recordings_may_follow_options():
+    assert options.parse(["a", "--epochs", "3", "b"])[0].recordings == ["a", "b"]
+
+
+def test_the_first_epoch_is_the_best_so_far_even_if_it_diverged():
+    progress, is_best = Progress(), []
+    for val_loss in (math.nan, 0.5, math.nan, 0.6, 0.4):
+        progress.images = 1
+        is_best.append(progress.finish_epoch(val_loss))
+    assert is_best == [True, True, False, False, True]
 
 
 @pytest.mark.parametrize("device", ["cuda", "mps"])

@@ -108,7 +108,7 @@ def test_no_film_is_a_clear_error(run, tmp_path, name, content, printed):
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
 
 
-@pytest.mark.parametrize("fps", ["0", "-5", "fast", "nan"])
+@pytest.mark.parametrize("fps", ["0", "-5", "fast", "nan", "1/0"])
 def test_an_impossible_rate_is_refused(run, tmp_path, fps):
     save(tmp_path / "run1", 2)
     status, printed = run("run1", "--fps", fps)

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
@@ -106,7 +107,7 @@ def _read_cache(cache: Path, names: np.ndarray, states: np.ndarray) -> tuple[np.
             reasons, digests = np.where(changed, b"", old["reasons"][at]).astype("S80"), old["digests"][at]
     except FileNotFoundError:
         pass  # the first run on this folder
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         print(f"{cache}: unreadable ({error}); all images will be checked again")
     return reasons, digests, changed
 

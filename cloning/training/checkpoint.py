@@ -9,6 +9,7 @@ way if it contains a finished epoch, and replaced if it does not.
 import hashlib
 import itertools
 import json
+import math
 import os
 import uuid
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -61,8 +62,12 @@ class Progress:
     run: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def finish_epoch(self, val_loss: float) -> bool:
-        """Add the epoch to the history and begin the next one; return whether val_loss is the lowest so far."""
-        is_best = val_loss < min((row["val_loss"] for row in self.history), default=float("inf"))
+        """Add the epoch to the history and begin the next one; return whether val_loss is the lowest so far.
+
+        The first epoch always is, so that there is a best model even if the losses are not numbers.
+        """
+        earlier = [row["val_loss"] for row in self.history if not math.isnan(row["val_loss"])]
+        is_best = not self.history or val_loss < min(earlier, default=math.inf)
         self.history.append(
             {
                 "epoch": len(self.history) + 1,

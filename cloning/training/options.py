@@ -1,14 +1,17 @@
 """The command line of model.py."""
 
 import argparse
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import TypeVar
 
 from cloning.compute import DEVICES, is_available
 from cloning.recordings.format import DRIVING_LOG
 
 Number = TypeVar("Number", int, float)
+MAX_SEED = 2**63 - 1  # torch takes no larger one
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
     argv: of this process if None. Exits with status 2 and a message for an unusable argument.
     """
     parser = build_parser()
-    values = vars(parser.parse_args(argv))
+    values = vars(parser.parse_intermixed_args(argv))  # recordings may follow options
     given = frozenset(values)
     if values.get("robust"):
         for name in REPORT_ONLY:
@@ -57,6 +60,8 @@ def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
                 parser.error(f"{option(name)} has no effect with --robust; leave it out")
         values = {**ROBUST_DEFAULTS, **values}
     arguments = Arguments(**values)
+    if Path(arguments.output).is_dir():
+        parser.error(f"--output {arguments.output}: is a folder; name the model file in it, such as model.pt")
     if not is_available(arguments.device):
         parser.error(f"--device {arguments.device}: torch finds no such GPU on this machine; leave the option out")
     return arguments, given
@@ -84,25 +89,25 @@ def build_parser() -> argparse.ArgumentParser:
     )
     group = parser.add_argument_group("training")
     group.add_argument(
-        "--epochs", type=at_least(1, int), help=text("epochs", "epochs in total; may be raised with --resume")
+        "--epochs", type=number(int, 1), help=text("epochs", "epochs in total; may be raised with --resume")
     )
     group.add_argument(
         "--batch-size",
-        type=at_least(1, int),
+        type=number(int, 1),
         help=text("batch_size", "observations in a batch; each gives 3.7 images on average"),
     )
-    group.add_argument(
-        "--learning-rate", type=at_least(1e-9, float), help=text("learning_rate", "learning rate of Adam")
-    )
+    group.add_argument("--learning-rate", type=number(float, 1e-9), help=text("learning_rate", "learning rate of Adam"))
     group.add_argument(
         "--samples-per-epoch",
-        type=at_least(1, int),
+        type=number(int, 1),
         help=text(
             "samples_per_epoch", "smallest number of images in an epoch; a fifth as many observations validate it"
         ),
     )
     group.add_argument(
-        "--seed", type=at_least(0, int), help=text("seed", "on the same machine, the same seed repeats the same run")
+        "--seed",
+        type=number(int, 0, MAX_SEED),
+        help=text("seed", "on the same machine, the same seed repeats the same run"),
     )
     group.add_argument(
         "--device",
@@ -112,12 +117,12 @@ def build_parser() -> argparse.ArgumentParser:
     group = parser.add_argument_group("observations")
     group.add_argument(
         "--throttle-threshold",
-        type=float,
+        type=number(float),
         help=text("throttle_threshold", "drop rows with less throttle, 0 to 1"),
     )
     group.add_argument(
         "--side-correction",
-        type=float,
+        type=number(float),
         help=text("side_correction", "steering added to the label of left images, subtracted from that of right ones"),
     )
     group.add_argument("--strict", action="store_true", help="fail if a row is unusable, instead of leaving it out")
@@ -139,14 +144,17 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def at_least(least: Number, kind: type[Number]) -> Callable[[str], Number]:
-    """Return a type for argparse: a finite number of this kind that is at least `least`."""
+def number(kind: type[Number], least: float = -math.inf, most: float = math.inf) -> Callable[[str], Number]:
+    """Return a type for argparse: a finite number of this kind, from `least` to `most`."""
+    limits = (f" of at least {least:g}" if least > -math.inf else "") + (
+        f", at most {most:g}" if most < math.inf else ""
+    )
 
-    def number(text: str) -> Number:
+    def parse_number(text: str) -> Number:
         value = kind(text)
-        if not least <= value < float("inf"):
-            raise argparse.ArgumentTypeError(f"{text} is not a finite number of at least {least}")
+        if not least <= value <= most or value in (-math.inf, math.inf):
+            raise argparse.ArgumentTypeError(f"{text} is not a finite number{limits}")
         return value
 
-    number.__name__ = kind.__name__  # for argparse's message "invalid int value"
-    return number
+    parse_number.__name__ = kind.__name__  # for argparse's message "invalid int value"
+    return parse_number

@@ -46,7 +46,7 @@ class ClientSession:
                 if time.monotonic() > until:
                     raise SimulatorError(f"{error}; start `python drive.py model.pt` first") from None
                 if not announced:
-                    _print(f"{error}; trying again for {self.wait:.0f} s")
+                    _print(f"{error}; trying again for {self.wait:g} s")
                     announced = True
                 time.sleep(RETRY_INTERVAL)
 
@@ -106,7 +106,7 @@ class ClientSession:
     def no_answer(self) -> SimulatorError:
         """Return the error for a server that sends nothing usable."""
         return SimulatorError(
-            f"no usable answer in {self.wait:.0f} s ({self.unusable} unusable answers so far); "
+            f"no usable answer in {self.wait:g} s ({self.unusable} unusable answers so far); "
             "`steer` must contain strings, as drive.py sends them"
         )
 

@@ -1,0 +1,54 @@
+"""Ctrl-C ends every command with a message and without a traceback, also while its libraries are loaded."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from conftest import ROOT
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there SIGINT goes to a whole console")
+
+# Some libraries turn an exception that is raised while they load into an error of their own.
+INTERRUPTED_LIBRARY = """
+import os, signal
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+except BaseException:
+    raise ImportError("initialization failed")
+"""
+
+INTERRUPTED_MAIN = """
+import os, signal
+from cloning import program
+program.end_on_interrupt("test", "stopped")
+def main():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+    except KeyboardInterrupt:
+        print("cleaned up")
+        raise
+program.run(main)
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "command"),
+    [
+        ("model.py", ["model.py"]),
+        ("drive.py", ["drive.py"]),
+        ("video.py", ["video.py", "run1"]),
+        ("simulator", ["-m", "simulator", "record", "data"]),
+    ],
+)
+def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
+    (tmp_path / "numpy.py").write_text(INTERRUPTED_LIBRARY, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr.startswith(f"{program}: stopped") and done.stderr.count("\n") == 1
+
+
+def test_ctrl_c_in_a_command_lets_it_clean_up():
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED_MAIN], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "cleaned up\n", "test: stopped\n")
