@@ -234,7 +234,7 @@ def test_real_recordings_are_trusted(folder):
 
 
 def test_training_leaves_weights_that_load(tmp_path, sample_recording):
-    shipped = reader.SHIPPED.read_bytes()
+    shipped = reader.SHIPPED_WEIGHTS.read_bytes()
     done = subprocess.run(
         [sys.executable, "-m", "tools.train_lane", sample_recording, *SHORT_TRAINING],
         cwd=tmp_path,
@@ -245,7 +245,7 @@ def test_training_leaves_weights_that_load(tmp_path, sample_recording):
     )
     assert done.returncode == 0, done.stderr
     assert "step 2/2" in done.stdout
-    assert reader.SHIPPED.read_bytes() == shipped  # no run changes a tracked file
+    assert reader.SHIPPED_WEIGHTS.read_bytes() == shipped  # no run changes a tracked file
     network = load_network(tmp_path / "lane.pt")
     assert isinstance(network, LaneNetwork) and not network.training
     shape = network(torch.zeros(2, *STRIP_SHAPE)).shape

@@ -161,9 +161,9 @@ def test_invalid_arguments(sample_recording, tmp_path, arguments, words):
 
 
 @pytest.mark.parametrize("output", [".", "runs"])
-def test_a_folder_is_not_taken_for_the_model_file(drawn, tmp_path, output):
+def test_a_folder_is_not_taken_for_the_model_file(sample_recording, tmp_path, output):
     (tmp_path / "runs").mkdir()
-    done = run_here(drawn, *SHORT, "--output", output, cwd=tmp_path)
+    done = run_here(sample_recording, *SHORT, "--output", output, cwd=tmp_path)
     assert done.returncode == 2
     assert f"model.py: error: --output {output}: is a folder" in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]

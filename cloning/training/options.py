@@ -146,9 +146,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 def number(kind: type[Number], least: float = -math.inf, most: float = math.inf) -> Callable[[str], Number]:
     """Return a type for argparse: a finite number of this kind, from `least` to `most`."""
-    limits = (f" of at least {least:g}" if least > -math.inf else "") + (
-        f", at most {most:g}" if most < math.inf else ""
-    )
+    limits = f" of at least {least:g}" if least > -math.inf else ""
+    limits += f" and at most {most:g}" if most < math.inf else ""
 
     def parse_number(text: str) -> Number:
         value = kind(text)
