@@ -13,7 +13,6 @@ import argparse
 import contextlib
 import os
 import re
-import resource
 import statistics
 import subprocess
 import sys
@@ -96,6 +95,8 @@ def lockstep(track: str, frames: int) -> tuple[float, float]:
 
 def measure(laps: float, repeat: int) -> None:
     """Measure both tracks and print the table."""
+    import resource  # missing on Windows, where main refuses to run
+
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start")
     print("track   recording, times real time     memory   lock-step, ms per frame")
     print("        wall (worst)  cpu (worst)      MB       wall   cpu")
