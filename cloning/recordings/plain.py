@@ -17,8 +17,9 @@ import pandas as pd
 from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
 
 BLOCK = 2 << 20  # bytes read at a time, about 10,000 lines: so much that the 1 ms of each call of pandas hardly counts
-COMMA, QUOTE, CARRIAGE_RETURN, NEW_LINE, DELETE = b',"\r\n\x7f'
+COMMA, QUOTE, CARRIAGE_RETURN, NEW_LINE, SPACE, SLASH, BACKSLASH, DELETE = b',"\r\n /\\\x7f'
 NEGATIVE_ZERO = re.compile(rb"-0+(?![0-9.])")  # would lose its sign in a column that pandas reads as integers
+MAX_NAME = 255  # bytes of a file's name
 SUFFIXES = (b".jpg", b".JPG", b".jpeg", b".JPEG")
 LEAST, GREATEST = np.array([RANGES[name] for name in NUMBERS], float).T
 
@@ -27,9 +28,6 @@ ODD = np.zeros(256, bool)
 ODD[:32] = True
 ODD[[CARRIAGE_RETURN, NEW_LINE]] = False
 ODD[[QUOTE, DELETE]] = True
-
-# For pandas, \ becomes / and all that is not ASCII becomes DELETE, which may be in a folder's name but not an image's.
-TO_ASCII = bytes.maketrans(b"\\" + bytes(range(128, 256)), b"/" + bytes([DELETE]) * 128)
 
 
 @dataclass
@@ -75,42 +73,66 @@ def read_plain(block: bytes, starts: np.ndarray, first_line: int) -> tuple[np.nd
     A line is plain if the tolerant reader would certainly read the same row from it. If any number of the block is
     not a number, or is -0, none of its lines counts as plain.
     """
-    is_plain = _has_seven_fields(block, starts)
+    is_plain, commas = _seven_fields(block, starts)
     if not is_plain.all():
         block = np.frombuffer(block, np.uint8)[np.repeat(is_plain, np.diff(starts))].tobytes()
-    table = None if not block or NEGATIVE_ZERO.search(block) else _read_table(block)
-    if table is None or any(table[name].dtype.kind not in "if" for name in NUMBERS):  # words such as True
+        starts = line_starts(block)
+        _, commas = _seven_fields(block, starts)
+    table = None if not block or NEGATIVE_ZERO.search(block) else _read_numbers(block)
+    if table is None or any(dtype.kind not in "if" for dtype in table.dtypes):  # words such as True
         return np.zeros_like(is_plain), PlainRows(np.empty((0, 3), "S1"), np.empty((0, 4)), np.empty(0, np.int32))
-    paths = np.column_stack([table[camera].to_numpy().astype(bytes) for camera in CAMERAS])
-    names = np.strings.slice(paths, np.strings.rfind(paths, b"/") + 1, paths.itemsize)
     numbers = np.column_stack([table[name].to_numpy(float) for name in NUMBERS])
-    is_image = np.logical_or.reduce([np.strings.endswith(names, suffix) for suffix in SUFFIXES])
-    is_image &= np.strings.find(names, bytes([DELETE])) < 0
+    commas = commas.reshape(-1, len(COLUMNS) - 1)
+    fields = np.column_stack([starts[:-1], commas[:, : len(CAMERAS) - 1] + 1])
+    names, is_image = _image_names(block, fields.ravel(), commas[:, : len(CAMERAS)].ravel())
+    names, is_image = names.reshape(-1, len(CAMERAS)), is_image.reshape(-1, len(CAMERAS))
     in_range = (numbers >= LEAST) & (numbers <= GREATEST)  # nan is in no range
     usable = is_image.all(1) & in_range.all(1)
     is_plain[is_plain] = usable
     lines = first_line + np.flatnonzero(is_plain)
-    return is_plain, PlainRows(as_narrow_as_possible(names[usable]), numbers[usable], lines.astype(np.int32))
+    return is_plain, PlainRows(names[usable], numbers[usable], lines.astype(np.int32))
 
 
-def _has_seven_fields(block: bytes, starts: np.ndarray) -> np.ndarray:
-    """Return which lines have seven fields and no odd character: bool (lines,)."""
+def _seven_fields(block: bytes, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which lines have seven fields and no odd character, bool (lines,), and the indices of all commas."""
     text = np.frombuffer(block, np.uint8)
-    commas = np.diff(np.searchsorted(np.flatnonzero(text == COMMA), starts))
+    commas = np.flatnonzero(text == COMMA)
+    is_plain = np.diff(np.searchsorted(commas, starts)) == len(COLUMNS) - 1
     odd = np.flatnonzero(ODD[text])
-    is_plain = commas == len(COLUMNS) - 1
     is_plain[np.searchsorted(starts, odd, side="right") - 1] = False
-    return is_plain
+    return is_plain, commas
 
 
-def _read_table(text: bytes) -> pd.DataFrame:
-    """Return plain lines as a table of COLUMNS: paths with /, and the others as int64 or float64 if all are numbers."""
+def _image_names(block: bytes, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the file names at the end of paths, bytes (n,), and which are ASCII names of a JPEG, bool (n,).
+
+    starts, ends: int (n,), of the paths in the block. A name that is too long for a file is cut.
+    """
+    text = np.frombuffer(block, np.uint8)
+    slashes = np.append(-1, np.flatnonzero((text == SLASH) | (text == BACKSLASH)))
+    starts = starts.copy()
+    while (blank := text[starts] == SPACE).any():
+        starts += blank
+    starts = np.maximum(starts, slashes[np.searchsorted(slashes, ends) - 1] + 1)
+    lengths = ends - starts
+    width = int(np.clip(lengths.max(), 1, MAX_NAME))
+    padded = np.append(text, np.zeros(width, np.uint8))
+    characters = np.lib.stride_tricks.sliding_window_view(padded, width)[starts]
+    characters[np.arange(width) >= lengths[:, None]] = 0
+    names = characters.view(f"S{width}").ravel()
+    is_image = np.logical_or.reduce([np.strings.endswith(names, suffix) for suffix in SUFFIXES])
+    return names, is_image & (lengths <= MAX_NAME) & (characters < DELETE).all(1)
+
+
+def _read_numbers(text: bytes) -> pd.DataFrame:
+    """Return the table of NUMBERS of plain lines: int64 or float64 where all of a column are numbers."""
     return pd.read_csv(
-        io.BytesIO(text.translate(TO_ASCII)),
+        io.BytesIO(text),
         engine="c",
         header=None,
         names=list(COLUMNS),
-        dtype=dict.fromkeys(CAMERAS, object),  # no dtype for the numbers: as float, True would become 1
+        usecols=list(NUMBERS),  # no dtype: as float, True would become 1
+        encoding="latin-1",  # of the paths, which are not read
         skipinitialspace=True,
         quoting=csv.QUOTE_NONE,
         na_filter=False,
