@@ -1,5 +1,6 @@
 """drive.py as a process, for the tests."""
 
+import os
 import re
 import signal
 import subprocess
@@ -8,7 +9,7 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from conftest import ROOT
+from conftest import HERE, ROOT
 
 # What Ctrl-C sends; Windows sends it to a whole console, and Ctrl-Break to one process group.
 STOP = signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGINT
@@ -21,6 +22,7 @@ class Process:
         self.process = subprocess.Popen(
             [*script("drive.py", first), *map(str, arguments), "--port", str(port)],
             cwd=cwd,
+            env={**os.environ, **HERE},
             stderr=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -60,8 +62,8 @@ def script(name: str, first: str = "") -> list[str]:
     """The command of a script at the top; first: Python code to run before it."""
     if not first:
         return [sys.executable, str(ROOT / name)]
-    run = f"import runpy, sys; sys.path.insert(0, {str(ROOT)!r}); sys.argv = sys.argv[1:]"
-    return [sys.executable, "-c", f"{first}\n{run}\nrunpy.run_path(sys.argv[0], run_name='__main__')", str(ROOT / name)]
+    run = f"import runpy, sys; sys.argv = sys.argv[1:]\nrunpy.run_path({str(ROOT / name)!r}, run_name='__main__')"
+    return [sys.executable, "-c", f"{first}\n{run}", name]
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """drive.py's command line: which model drives, where frames are saved, how it ends, and what it tells of mistakes."""
 
+import os
 import re
 import shutil
 import signal
@@ -10,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from conftest import HERE
 from drive_process import STOP, script, serving
 
 from cloning.errors import UserError
@@ -21,7 +23,11 @@ from tools.simulator_client import Simulator, telemetry
 
 def failing(*arguments, first="") -> str:
     process = subprocess.run(
-        [*script("drive.py", first), *map(str, arguments)], timeout=120, capture_output=True, text=True
+        [*script("drive.py", first), *map(str, arguments)],
+        env={**os.environ, **HERE},
+        timeout=120,
+        capture_output=True,
+        text=True,
     )
     assert process.returncode == 1 and "Traceback" not in process.stderr
     assert process.stderr.splitlines()[-1].startswith("drive.py: ")
@@ -91,6 +97,7 @@ def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, stee
     assert len(list(folder.iterdir())) == 8
     film = subprocess.run(
         [*script("video.py", ELSEWHERE), str(folder), "--overlay", str(model_file)],
+        env={**os.environ, **HERE},
         capture_output=True,
         text=True,
         timeout=120,

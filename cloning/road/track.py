@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from cloning.road.motion import right_of, wrap_angle
 
@@ -102,6 +101,8 @@ class Track:
 
     def __init__(self, name: str, direction: str | None = None):
         """Load a track; name: a key of ROADS; direction: "cw", "ccw" or None for that of the real simulator."""
+        from scipy.interpolate import CubicSpline  # large, and not needed to train as the report does
+
         self.name, road = name, ROADS[name]
         self.direction = direction or road.forward
         listed = np.loadtxt(Path(__file__).with_name(f"{name}.csv"), delimiter=",", skiprows=1)

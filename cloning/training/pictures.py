@@ -4,8 +4,6 @@ import io
 from collections.abc import Callable
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from PIL import Image, ImageDraw, ImageFont
 
 from cloning.recordings.format import CAMERAS
@@ -70,6 +68,10 @@ def batch_pictures(choices: Choices, augment: Augment) -> dict[str, bytes]:
 
 def loss_picture(history: list[EpochMetrics]) -> bytes:
     """Return a PNG of both losses by epoch, with the lowest validation loss marked."""
+    # matplotlib is large, and not needed before the first epoch is finished.
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
     epochs, best = [row["epoch"] for row in history], min(history, key=lambda row: row["val_loss"])
