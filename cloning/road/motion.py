@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.log import Recording
+
+if TYPE_CHECKING:
+    from cloning.recordings.log import Recording  # which loads pandas, and driving needs none
 
 MPH = 0.44704  # m/s
 TOP_SPEED_MPH = 30  # the simulator clamps the car's speed to it
@@ -92,7 +94,7 @@ class Stretch:
         return len(self.driven)
 
     @staticmethod
-    def of(recording: Recording, rows: slice) -> "Stretch":
+    def of(recording: "Recording", rows: slice) -> "Stretch":
         """Integrate the trajectory from the rows' steering, speed and time stamps."""
         speed = recording.speed[rows].astype(float) * MPH
         pause = np.diff(recording.time[rows])
@@ -107,7 +109,7 @@ class Stretch:
         return Stretch(rows, right, forward, heading, np.r_[0.0, np.cumsum(step)])
 
 
-def stretches(recording: Recording) -> list[Stretch]:
+def stretches(recording: "Recording") -> list[Stretch]:
     """Split a recording at gaps in time, jumps in speed and standstills; each stretch is at least 2 s long."""
     speed = np.abs(recording.speed.astype(float)) * MPH
     pause = np.diff(recording.time)
