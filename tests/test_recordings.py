@@ -115,12 +115,12 @@ def test_the_facts_own_decimal_commas(tmp_path):
         ("<<<<<<< HEAD", "merge"),  # 16
         ("IMG/center_x.jpg, 0.0", "1 image name"),  # 18
         (row(STAMPS[1], "1.2,0,0,9"), "steering 1.2"),
-        (row(STAMPS[1], "nan,0,0,9"), "steering nan"),  # 19
+        (row(STAMPS[1], "nan,0,0,9"), "nan,0,0,9"),  # 19
         (row(STAMPS[1], "0.1,left,0,9"), "0.1,left"),
         (row(STAMPS[1], "0.1,0.2"), "2 numbers"),
         ("\0\0\0\0", "cut off"),
         (row(STAMPS[1], ",1,0,9"), ",1,0,9"),
-        (row(STAMPS[1], "0,inf,0,9"), "throttle inf"),
+        (row(STAMPS[1], "0,inf,0,9"), "0,inf,0,9"),
     ],
 )
 def test_rows_that_are_left_out_and_reported(tmp_path, bad, words):

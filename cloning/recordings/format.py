@@ -7,7 +7,8 @@ IMAGE_FOLDER = "IMG"  # next to the csv
 CAMERAS = ("center", "left", "right")  # in the order of a row's images
 NUMBERS = ("steering", "throttle", "brake", "speed")
 COLUMNS = (*CAMERAS, *NUMBERS)
-RANGES = {"steering": (-1, 1), "throttle": (-1, 1), "brake": (-1, 1), "speed": (-100, 100)}  # the car reaches 30 mph
+# Of the numbers that the simulator writes: only steering has a sign. The car reaches 30 mph, on a slope a little more.
+RANGES = {"steering": (-1, 1), "throttle": (0, 1), "brake": (0, 1), "speed": (0, 100)}
 SAMPLE_RATE = 15  # rows a second
 FRAME = (160, 320, 3)  # rows, columns, RGB of a camera's image
 TIME_STAMP = "%Y_%m_%d_%H_%M_%S_%f"  # in the names of images, with milliseconds in place of microseconds

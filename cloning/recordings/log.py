@@ -12,7 +12,7 @@ import numpy as np
 
 from cloning.errors import RecordingError
 from cloning.recordings.format import COLUMNS, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE
-from cloning.recordings.plain import PlainRows, as_narrow_as_possible, line_starts, read_blocks, read_plain
+from cloning.recordings.plain import as_narrow_as_possible, line_starts, read_blocks, read_plain
 from cloning.recordings.tolerant import TolerantReader
 
 WHERE_TO_GET_RECORDINGS = (
@@ -126,49 +126,58 @@ def read_recording(folder: str | Path) -> Recording:
     """
     folder = Path(folder)
     path = folder / DRIVING_LOG
-    reader, plain = _read_rows(path)
+    reader = _read_rows(path)
+    plain = reader.plain
     lines = np.concatenate([np.array(reader.lines, np.int32), *(rows.lines for rows in plain)])
     if not len(lines):
-        first = "; ".join(f"line {line}: {detail}" for line, _, detail in reader.rejected[:3]) or "the file has no rows"
+        first_lines = {detail: line for line, _, detail in reversed(reader.rejected)}
+        reasons = [f"line {line}: {detail}" for detail, line in first_lines.items()][-3:]
+        first = "; ".join(reversed(reasons)) or "the file has no rows"
         raise RecordingError(f"{path}: no usable row ({first}). A row is {','.join(COLUMNS)}")
     numbers = np.concatenate([np.reshape(reader.numbers, (-1, 4)), *(rows.numbers for rows in plain)])
     columns = np.ascontiguousarray(numbers.astype(np.float32).T)
     names = np.concatenate([np.array(reader.names, bytes).reshape(-1, 3), *(rows.names for rows in plain)])
-    rows_read = reader.rows + sum(len(rows.lines) for rows in plain)
-    del numbers, plain
+    rows_read, repairs, rejected = reader.rows, reader.repairs, reader.rejected
+    del numbers, plain, reader
     names, images = _unique(names)
     time = _time_stamps(names[images[:, 0]])
     if np.isnan(time).any():
         time = lines / float(SAMPLE_RATE)
     steering, throttle, brake, speed = columns
     recording = Recording(
-        folder, names, images, steering, throttle, brake, speed, time, lines, rows_read, reader.repairs, reader.rejected
+        folder, names, images, steering, throttle, brake, speed, time, lines, rows_read, repairs, rejected
     )
-    recording.keep(np.lexsort((lines, time)))  # sessions may have been merged in any order
+    order = np.lexsort((lines, time))  # sessions may have been merged in any order
+    contradicting = _contradicting(images[:, 0], steering)
+    for row in np.flatnonzero(contradicting):
+        detail = f"{recording.name(int(row))} also has a row with another steering angle; delete the wrong one"
+        rejected.append((int(lines[row]), "one image, two angles", detail))
+    rejected.sort()
+    recording.keep(order[~contradicting[order]])
     return recording
 
 
-def _read_rows(path: Path) -> tuple[TolerantReader, list[PlainRows]]:
+def _read_rows(path: Path) -> TolerantReader:
     """Read a csv: plain lines with pandas, all others with the tolerant reader in the order of the file."""
-    reader = TolerantReader(path)
-    plain: list[PlainRows] = []
+    reader, number, is_whole = TolerantReader(path), 0, True
     encoding = _encoding(path)
     if encoding == "utf-8":
-        first_line = 1
         for block in read_blocks(path):
             starts = line_starts(block)
-            plain.append(_read_block(reader, block, starts, first_line))
-            first_line += len(starts) - 1
+            _read_block(reader, block, starts, number + 1)
+            number += len(starts) - 1
+            is_whole = block.endswith((b"\n", b"\r"))
     else:
-        with open(path, encoding=encoding, errors="surrogateescape", newline="") as text:
+        with open(path, encoding=encoding, errors="replace", newline="") as text:
             for number, line in enumerate(text, 1):
                 reader.read_line(number, line)
-    reader.finish()
-    return reader, plain
+                is_whole = line.endswith(("\n", "\r"))
+    reader.finish(0 if is_whole else number)
+    return reader
 
 
-def _read_block(reader: TolerantReader, block: bytes, starts: np.ndarray, first_line: int) -> PlainRows:
-    """Return the plain rows of a block; the tolerant reader takes all other lines, and all lines until it is settled.
+def _read_block(reader: TolerantReader, block: bytes, starts: np.ndarray, first_line: int) -> None:
+    """Read a block: its plain rows with pandas; all other lines, and all lines until it is settled, tolerantly.
 
     starts: of the lines, as `line_starts` returns them; first_line: the number of the first line in the csv.
     """
@@ -177,14 +186,21 @@ def _read_block(reader: TolerantReader, block: bytes, starts: np.ndarray, first_
         text = block[starts[at] : starts[at + 1]].decode("utf-8", "surrogateescape")
         reader.read_line(first_line + at, text)
 
-    first = 0
-    while first < len(starts) - 1 and not reader.settled:
+    first, end = 0, len(starts) - 1
+    while first < end and not reader.settled:
         read_tolerantly(first)
         first += 1
+    shape, header = reader.shape(), reader.header
     is_plain, rows = read_plain(block[starts[first] :], starts[first:] - starts[first], first_line + first)
-    for at in np.flatnonzero(~is_plain):
-        read_tolerantly(first + int(at))
-    return rows
+    for at in first + np.flatnonzero(~is_plain):
+        read_tolerantly(int(at))
+        if reader.header != header:  # the columns below it may be others
+            rows = rows.above(reader.header)
+            for below in range(int(at) + 1, end):
+                read_tolerantly(below)
+            break
+    reader.rows += len(rows.lines)
+    shape.plain.append(rows)
 
 
 def _encoding(path: Path) -> str:
@@ -216,6 +232,18 @@ def _unique(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     images[order] = np.cumsum(is_first) - 1
     unique = flat[is_first]
     return as_narrow_as_possible(unique), np.ascontiguousarray(images.reshape(3, -1).T)
+
+
+def _contradicting(images: np.ndarray, steering: np.ndarray) -> np.ndarray:
+    """Return which rows have the image of a row with other steering: bool (n,); images: int (n,), an index each."""
+    if np.bincount(images).max() == 1:
+        return np.zeros(len(images), bool)
+    order = images.argsort(kind="stable")
+    starts = np.flatnonzero(np.diff(images[order], prepend=-1))
+    differ = np.minimum.reduceat(steering[order], starts) != np.maximum.reduceat(steering[order], starts)
+    contradicting = np.empty(len(images), bool)
+    contradicting[order] = np.repeat(differ, np.diff(starts, append=len(images)))
+    return contradicting
 
 
 def _time_stamps(names: np.ndarray) -> np.ndarray:

@@ -14,13 +14,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from cloning.errors import RecordingError
 from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
 
 BLOCK = 2 << 20  # bytes read at a time, about 10,000 lines: so much that the 1 ms of each call of pandas hardly counts
 COMMA, QUOTE, CARRIAGE_RETURN, NEW_LINE, SPACE, SLASH, BACKSLASH, DELETE = b',"\r\n /\\\x7f'
 NEGATIVE_ZERO = re.compile(rb"-0+(?![0-9.])")  # would lose its sign in a column that pandas reads as integers
+LONGEST_LINE = 1 << 20  # bytes; at the end of a file that a crash has filled with zeros, there may be far more
 MAX_NAME = 255  # bytes of a file's name
 SUFFIXES = (b".jpg", b".JPG", b".jpeg", b".JPEG")
+PREFIXES = np.array([f"{camera}_".encode() for camera in CAMERAS])
 LEAST, GREATEST = np.array([RANGES[name] for name in NUMBERS], float).T
 
 # Characters that no plain line contains: quotes, and control characters, some of which are blanks for Python alone.
@@ -43,13 +46,23 @@ class PlainRows:
     numbers: np.ndarray
     lines: np.ndarray
 
+    def above(self, line: int) -> "PlainRows":
+        """Return the rows above a line."""
+        count = int(np.searchsorted(self.lines, line))
+        return PlainRows(self.names[:count], self.numbers[:count], self.lines[:count])
+
 
 def read_blocks(path: Path) -> Iterator[bytes]:
-    """Yield the csv in blocks of whole lines, without the byte order mark that some programs write at its beginning."""
+    """Yield the csv in blocks of whole lines, without the byte order mark that some programs write at its beginning.
+
+    Raises RecordingError if a line is too long for any csv.
+    """
     with open(path, "rb") as file:
         if file.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:
             file.seek(0)
-        while block := file.read(BLOCK) + file.readline():
+        while block := file.read(BLOCK) + (rest := file.readline(LONGEST_LINE)):
+            if len(rest) == LONGEST_LINE:
+                raise RecordingError(f"{path}: a line of more than {LONGEST_LINE} bytes: not a csv; copy it again")
             yield block
 
 
@@ -87,6 +100,7 @@ def read_plain(block: bytes, starts: np.ndarray, first_line: int) -> tuple[np.nd
     names, is_image = _image_names(block, fields.ravel(), commas[:, : len(CAMERAS)].ravel())
     names, is_image = names.reshape(-1, len(CAMERAS)), is_image.reshape(-1, len(CAMERAS))
     in_range = (numbers >= LEAST) & (numbers <= GREATEST)  # nan is in no range
+    is_image &= np.strings.startswith(names, PREFIXES)
     usable = is_image.all(1) & in_range.all(1)
     is_plain[is_plain] = usable
     lines = first_line + np.flatnonzero(is_plain)

@@ -1,26 +1,34 @@
 """Read lines of `driving_log.csv` that are not plain: headers, quotes, tabs, extra columns, decimal commas, damage.
 
-Most lines are interpreted one by one. A line with more than four numbers has to wait for the end of the file: only then
-is it known whether the file has decimal points or decimal commas.
+Rows are collected by their shape until the end of the file: only all of them together show what their columns mean, and
+whether the file has decimal points or decimal commas.
 """
 
 import csv
-import re
+from collections.abc import Sequence
 from pathlib import Path
 
-from cloning.errors import RecordingError
-from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
+import numpy as np
 
-SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE)  # as the simulator writes it
+from cloning.errors import RecordingError
+from cloning.recordings.columns import (
+    Shape,
+    UnclearColumns,
+    base_name,
+    by_camera,
+    check_numbers,
+    check_places,
+    decimal_comma_readings,
+    header_columns,
+    is_header,
+    is_image,
+    number,
+)
+from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
+from cloning.recordings.plain import PlainRows
+
 MERGE_MARKERS = ("<<<<<<<", "=======", ">>>>>>>")  # what git leaves in a file with a conflict
-HEADER_WORDS = {  # beginnings of other names that headers have for the columns
-    "ct": "center",
-    "lt": "left",
-    "rt": "right",
-    "angle": "steering",
-    "steer": "steering",
-    "reverse": "brake",
-}
+LONGEST_LINE = 20_000  # characters: more than three paths and some columns can have
 
 
 class TolerantReader:
@@ -30,194 +38,221 @@ class TolerantReader:
     names     file names of the images, three for each usable row, in one flat list
     numbers   steering, throttle, brake, speed of each usable row, in one flat list
     lines     line in the csv of each usable row
+    plain     usable rows that pandas has read
     repairs   rows that were interpreted, by kind of repair: kind -> [rows, first line]
     rejected  rows that were left out: (line, kind, detail)
+    header    line of the last header, 0 before the first
     """
 
     def __init__(self, path: Path):
         """path: the csv, which error messages name."""
-        self.path, self.rows = path, 0
+        self.path, self.rows, self.header = path, 0, 0
         self.names: list[bytes] = []
         self.numbers: list[float] = []
         self.lines: list[int] = []
+        self.plain: list[PlainRows] = []
         self.repairs: dict[str, list[int]] = {}
         self.rejected: list[tuple[int, str, str]] = []
-        self._columns: tuple[str, ...] | None = None  # of the header, if there is one
+        self._columns: tuple[str, ...] | None = None  # of the last header, if there was one
+        self._shapes: dict[tuple[int, int, tuple[int, ...]], Shape] = {}  # by header, fields and images
         self._points = False  # a number with a decimal point has been seen
         self._commas = False  # a fraction after a decimal comma has been seen
-        self._undecided: list[tuple[int, list[str], list[str]]] = []  # line, names, numbers
+        self._pointless: list[tuple[Shape, Shape, int, Sequence[str], list[str]]] = []  # see _read_decimal_commas
 
     @property
     def settled(self) -> bool:
-        """Whether plain lines can no longer change how other lines are read, so that pandas may read them.
+        """Whether pandas may read plain lines, because it is known how the lines up to the next header are read.
 
-        There is no header after the first row, and there are no decimal commas once there is a decimal point.
+        There are no decimal commas once there is a decimal point.
         """
         return self.rows > 0 and self._points and self._columns in (None, COLUMNS)
+
+    def shape(self, fields: int = len(COLUMNS), images: tuple[int, ...] = (0, 1, 2)) -> Shape:
+        """Return the shape of rows below the last header; by default, of the simulator's own rows."""
+        key = (self.header, fields, images)
+        if key not in self._shapes:
+            self._shapes[key] = Shape(self._columns, fields, images)
+        return self._shapes[key]
 
     def read_line(self, line: int, text: str) -> None:
         """Read a line; line: its number in the csv, from 1.
 
-        Raises RecordingError if the first line is neither a row nor a usable header.
+        Raises RecordingError if it is an unusable header, or the first line and neither a row nor a header.
         """
         fields = text.split(",")
         if len(fields) == len(COLUMNS) and '"' not in text and self._columns in (None, COLUMNS):
-            names = [_base_name(value) for value in fields[:3]]
-            if _is_image(names[0]) and _is_image(names[1]) and _is_image(names[2]):
+            names = [base_name(value) for value in fields[:3]]
+            if is_image(names[0]) and is_image(names[1]) and is_image(names[2]):
                 self.rows += 1
                 self._points = self._points or "." in fields[3] or "." in fields[6]
-                return self._add_row(line, names, fields[3:])
+                return self._collect(self.shape(), line, names, [token.strip() for token in fields[3:]])
         self._read_odd_line(line, text)
 
-    def finish(self) -> None:
-        """Interpret the rows with more than four numbers, because it is known now how the file writes fractions."""
-        for line, names, tokens in self._undecided:
-            if self._points:
-                self._repair("extra columns ignored", line)
-                self._add_row(line, names, tokens[:4])
-                continue
-            readings = _decimal_comma_readings(tokens) if self._commas else []
-            readings = [
-                numbers for numbers in readings if not (float(numbers[1]) and float(numbers[2]))
-            ]  # never both pedals
-            if len(readings) == 1:
-                self._repair("decimal commas", line)
-                self._add_row(line, names, readings[0])
-            else:
-                self._reject(
-                    line,
-                    "ambiguous columns",
-                    f"{','.join(tokens)!r} can be read in {len(readings)} ways; "
-                    "write decimal points, or delete the extra columns",
+    def finish(self, open_line: int) -> None:
+        """Interpret the rows, because all are known now; open_line: the last one if it has no line end, else 0."""
+        self._read_decimal_commas()
+        for shape in self._shapes.values():
+            try:
+                check_places(shape)
+                rows = [[number(token) for token in tokens[: len(NUMBERS)]] for tokens in shape.tokens]
+                check_numbers(
+                    np.concatenate([np.array(shape.lines, np.int32), *(rows.lines for rows in shape.plain)]),
+                    np.concatenate([np.reshape(rows, (-1, len(NUMBERS))), *(rows.numbers for rows in shape.plain)]),
+                    shape.columns is not None,
                 )
+            except UnclearColumns as error:
+                for line in (*shape.lines, *(int(line) for rows in shape.plain for line in rows.lines)):
+                    self._reject(line, error)
+                continue
+            self.plain += shape.plain
+            for line, names, tokens in zip(shape.lines, shape.names, shape.tokens, strict=True):
+                if shape.has_extra_columns:
+                    self._repair("extra columns ignored", line)
+                self._add_row(line, names, tokens[: len(NUMBERS)])
+        if open_line in self.lines or any(open_line in rows.lines[-1:] for rows in self.plain):
+            self._repair("the file ends within this line: its last number may be cut short", open_line)
+        self.repairs = dict(sorted(self.repairs.items(), key=lambda item: item[1][1]))
 
     def _read_odd_line(self, line: int, text: str) -> None:
         """Read a line that is not seven plain columns: blank, a header, quoted, tabs, extra columns, decimal commas."""
         text = text.strip("\r\n")
         if not text.strip("\0 \t,;"):
             if "\0" in text:
-                self._reject(line, "binary zeros", "the file was cut off while it was written; delete the line")
+                self._reject(
+                    line, UnclearColumns("binary zeros", "the file was cut off while it was written; delete the line")
+                )
             return
         if text.startswith(MERGE_MARKERS):
-            return self._reject(line, "merge conflict", f"{text[:20]!r}: resolve the merge, delete the line")
+            error = UnclearColumns("merge conflict", f"{text[:20]!r}: resolve the merge, delete the line")
+            return self._reject(line, error)
+        if len(text) > LONGEST_LINE:
+            self.rows += 1
+            error = UnclearColumns("not a row", f"a line of {len(text)} characters: {text[:40]!r}…; delete it")
+            return self._reject(line, error)
         delimiter = max(",;\t", key=text.count) if text.count(",") < 6 else ","
         fields = [value.strip() for value in next(csv.reader([text], delimiter=delimiter))]
-        names = [_base_name(value) for value in fields]
-        images = [at for at, name in enumerate(names) if _is_image(name)]
-        if not images and not self.rows and self._columns is None:
-            self._columns = self._header(line, fields)
-            return None
+        names = [base_name(value) for value in fields]
+        images = tuple(at for at, name in enumerate(names) if is_image(name))
+        if not images and (is_header(fields) or not (self.rows or self.header)):
+            return self._read_header(line, fields)
         self.rows += 1
         if delimiter != ",":
             self._repair("tab-separated" if delimiter == "\t" else "separated by semicolons", line)
             if any("," in value for value in fields[images[-1] + 1 :] if images):
                 self._repair("decimal commas", line)
                 fields = [value.replace(",", ".") for value in fields]
-        if self._columns and len(fields) == len(self._columns):
-            by_name = dict(zip(self._columns, fields, strict=True))
-            names = [_base_name(by_name[name]) for name in CAMERAS]
-            return self._add_row(line, names, [by_name[name] for name in NUMBERS])
-        if len(images) != 3:
+        try:
+            self._read_row(line, fields, images, delimiter == ",")
+        except UnclearColumns as error:
+            self._reject(line, error)
+
+    def _read_header(self, line: int, fields: list[str]) -> None:
+        try:
+            columns, usual_places_taken = header_columns(fields)
+        except UnclearColumns as error:
+            raise RecordingError(f"{self.path}: line {line}: {error}") from None
+        self.header, self._columns = line, columns
+        if usual_places_taken:
+            self._repair("header lacks names; usual places taken", line)
+
+    def _read_row(self, line: int, fields: list[str], images: tuple[int, ...], by_commas: bool) -> None:
+        """Collect a row; images: their places; by_commas: the fields are separated by them.
+
+        Raises UnclearColumns if it lacks images or numbers.
+        """
+        shape = self.shape(len(fields), images)
+        if shape.is_named:
+            by_name = dict(zip(self._columns or (), fields, strict=True))
+            names = [base_name(by_name[name]) for name in CAMERAS]
+            if not all(map(is_image, names)):
+                raise UnclearColumns("not a row", f"{', '.join(names)}: not the three images that the header names")
+            tokens = [by_name[name] for name in NUMBERS]
+            self._points = self._points or any("." in token for token in tokens)
+            return self._collect(shape, line, names, tokens)
+        if len(images) != len(CAMERAS):
             count = "1 image name" if len(images) == 1 else f"{len(images)} image names"
-            return self._reject(
-                line,
+            raise UnclearColumns(
                 "not a row",
                 f"{count} where center, left and right are expected; record again, or add the columns",
             )
-        names, tokens = [names[at] for at in images], fields[images[-1] + 1 :]
-        self._points = self._points or any("." in token for token in tokens)
-        self._commas = self._commas or any(
-            token.isdigit() and (len(token) > 3 or token[0] == "0" < token[1:]) for token in tokens[1:]
-        )
-        if len(tokens) == 4:
-            return self._add_row(line, names, tokens)
-        if len(tokens) < 4:
-            return self._reject(
-                line,
+        names, tokens = [base_name(fields[at]) for at in images], fields[images[-1] + 1 :]
+        if len(tokens) < len(NUMBERS):
+            raise UnclearColumns(
                 "columns missing",
-                f"{len(tokens)} numbers where steering, throttle, brake, "
-                "speed are expected; record again, or add the columns",
+                f"{len(tokens)} numbers where steering, throttle, brake, speed are expected; "
+                "record again, or add the columns",
             )
-        self._undecided.append((line, names, tokens))
+        has_point = any("." in token for token in tokens)
+        self._points = self._points or has_point
+        if len(tokens) > len(NUMBERS) and by_commas and not has_point:
+            # Only the fractions of decimal commas have so many digits, or begin with zeros.
+            self._commas = self._commas or any(
+                token.isdigit() and (len(token) > 3 or token[0] == "0" < token[1:]) for token in tokens[1:]
+            )
+            self._pointless.append((shape, self.shape(), line, names, tokens))
+        else:
+            self._collect(shape, line, names, tokens)
+
+    def _read_decimal_commas(self) -> None:
+        """Collect the rows that may have decimal commas: those with more than four numbers and no decimal point.
+
+        For each, the shape that it has as it stands, and the shape that it has if commas are decimal marks.
+        """
+        for shape, joined, line, names, tokens in self._pointless:
+            readings = decimal_comma_readings(tokens)
+            if self._commas and not self._points and len(readings) == 1 and joined.is_usual:
+                self._repair("decimal commas", line)
+                self._collect(joined, line, names, readings[0])
+            elif self._commas or readings:
+                mixed = "; the file also has decimal points" if self._points else ""
+                error = UnclearColumns(
+                    "ambiguous columns",
+                    f"{','.join(tokens)!r} can be read in {len(readings)} ways with decimal commas{mixed}; "
+                    "write decimal points, or delete the extra columns",
+                )
+                self._reject(line, error)
+            else:
+                self._collect(shape, line, names, tokens)
+
+    def _collect(self, shape: Shape, line: int, names: Sequence[str], tokens: list[str]) -> None:
+        """Add a row to its shape, with the images in the order of CAMERAS, unless the cameras are unclear."""
+        try:
+            ordered = by_camera(names)
+            if ordered != names:
+                if shape.columns is not None:
+                    raise UnclearColumns(
+                        "cameras unclear",
+                        f"{', '.join(names)}: not in the header's order of cameras; correct the header or the row",
+                    )
+                self._repair("images in another order; ordered by the cameras in their names", line)
+        except UnclearColumns as error:
+            return self._reject(line, error)
+        shape.lines.append(line)
+        shape.names.append(ordered)
+        shape.tokens.append(tokens)
         return None
 
-    def _header(self, line: int, fields: list[str]) -> tuple[str, ...]:
-        """Return the names of the header's columns: those of COLUMNS where it means them, its own for others.
-
-        Raises RecordingError if the header lacks columns, unless their positions are certain.
-        """
-        columns = tuple(_column(value) or f"{value} ({at})" for at, value in enumerate(fields))
-        known = [name for name in columns if name in COLUMNS]
-        if known != list(dict.fromkeys(known)) or "center" not in known or "steering" not in known:
-            raise RecordingError(
-                f"{self.path}: line {line}: neither a row nor a header with center and steering: "
-                f"{','.join(fields)[:80]!r}; a header is {','.join(COLUMNS)}"
-            )
-        if len(known) < len(COLUMNS):  # unnamed columns must be at the usual positions
-            start = columns.index("center")
-            usual = (*columns[:start], *COLUMNS, *columns[start + len(COLUMNS) :])
-            if len(columns) != len(usual) or any(
-                name != place for name, place in zip(columns, usual, strict=True) if name in COLUMNS
-            ):
-                missing = [name for name in COLUMNS if name not in known]
-                raise RecordingError(f"{self.path}: line {line}: the header lacks {', '.join(missing)}; add them")
-            columns = usual
-            self._repair("header lacks names; usual places taken", line)
-        return columns
-
-    def _add_row(self, line: int, names: list[str], tokens: list[str]) -> None:
+    def _add_row(self, line: int, names: Sequence[str], tokens: list[str]) -> None:
         """Add a row if its four tokens are numbers in their ranges, else reject it."""
-        try:
-            numbers = [float(token) for token in tokens]
-        except ValueError:
-            return self._reject(line, "not a number", f"{','.join(tokens).strip()!r}; correct or delete the row")
+        numbers = [number(token) for token in tokens]
+        if any(value != value for value in numbers):
+            error = UnclearColumns("not a number", f"{','.join(tokens)!r}; correct or delete the row")
+            return self._reject(line, error)
         for (name, (least, greatest)), value in zip(RANGES.items(), numbers, strict=True):
-            if not least <= value <= greatest:  # nan is in no range
+            if not least <= value <= greatest:
                 lost = " (has its decimal point been lost?)" if name == "speed" else ""
-                return self._reject(
-                    line,
+                error = UnclearColumns(
                     f"{name} out of range",
                     f"{name} {value:g} is not in {least}..{greatest}{lost}; correct or delete the row",
                 )
+                return self._reject(line, error)
         self.names += [name.encode(errors="surrogateescape") for name in names]
         self.numbers += numbers
         self.lines.append(line)
         return None
 
-    def _reject(self, line: int, kind: str, detail: str) -> None:
-        self.rejected.append((line, kind, detail))
+    def _reject(self, line: int, error: UnclearColumns) -> None:
+        self.rejected.append((line, error.kind, str(error)))
 
     def _repair(self, kind: str, line: int) -> None:
         self.repairs.setdefault(kind, [0, line])[0] += 1
-
-
-def _base_name(path: str) -> str:
-    return path.strip().replace("\\", "/").rsplit("/", 1)[-1]
-
-
-def _is_image(name: str) -> bool:
-    return name[-4:].lower() == ".jpg" or name[-5:].lower() == ".jpeg"
-
-
-def _column(name: str) -> str | None:
-    """Return the column that a word such as `camera_center`, `ct_path` or `SteeringAngle` means; None if unknown."""
-    name = name.lower().replace("centre", "center")
-    for column in COLUMNS:
-        if column in name:
-            return column
-    return next((column for word, column in HEADER_WORDS.items() if name.startswith(word)), None)
-
-
-def _decimal_comma_readings(tokens: list[str], names: tuple[str, ...] = NUMBERS) -> list[list[str]]:
-    """Return all ways to join tokens, which were split at commas, into numbers of these columns in their ranges.
-
-    The simulator writes no trailing zeros: a fraction never ends with 0.
-    """
-    if not tokens or not names:
-        return [] if tokens or names else [[]]
-    readings, (least, greatest) = [], RANGES[names[0]]
-    for size in range(1, min(len(tokens), 2) + 1):
-        number = ".".join(tokens[:size])
-        if SIMULATOR_NUMBER.fullmatch(number) and least <= float(number) <= greatest:
-            readings += [[number, *rest] for rest in _decimal_comma_readings(tokens[size:], names[1:])]
-    return readings
