@@ -85,7 +85,7 @@ def test_formats_that_are_read_correctly(tmp_path, text):
     [
         (lines(numbers=["-0,0597,0,98,0,30,18", "0,1,0,6,9E-05", "0,25,0,3,0,22,14829"]), "decimal commas"),  # 12
         (
-            lines(numbers=["-0.0597,0.98,0,30.18,1", "0,1,0,6.9E-05", "0.25,0.3,0,22.14829,Lake: turning left"]),
+            lines(numbers=["-0.0597,0.98,0,30.18,-", "0,1,0,6.9E-05", "0.25,0.3,0,22.14829,Lake: turning left"]),
             "extra columns ignored",
         ),  # 13
         ([x.replace(",", "\t") for x in lines()], "tab-separated"),  # 15

@@ -9,7 +9,6 @@ together with decimal commas; throttle and brake in another order in one of seve
 was not meant for them: images in another order without the cameras' names.
 """
 
-import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -35,8 +34,6 @@ HEADER_WORDS = {  # beginnings of other names that headers have for the columns
     "reverse": "brake",
 }
 DOUBTED_SHARE = 0.01  # of a column's values that are out of range, from which on the column is taken for another one
-MOVING = 1.0  # mph: a column that never exceeds it is no speed
-MOST_FIELDS = 16  # after the images, without a header; so that all choices of four can be looked at
 
 
 class UnclearColumns(ValueError):
@@ -169,7 +166,7 @@ def check_places(shape: Shape) -> None:
     """Raise UnclearColumns if the places of the four numbers in a shape's rows are not certain.
 
     They are certain by a header that names each field; else they are the first four after the images, as the simulator
-    writes them, unless other four of the fields could be meant.
+    writes them, unless another field could be one of them as well: only words and numbers out of all ranges could not.
     """
     if shape.is_named or not shape.tokens:
         return
@@ -179,29 +176,14 @@ def check_places(shape: Shape) -> None:
             f"{shape.fields} fields below a header that names {len(shape.columns or ())} in another order than the "
             "simulator's; correct the header, or write one above these rows",
         )
-    count = len(shape.tokens[0])
-    if count > len(NUMBERS) and _has_other_places(shape.tokens, count):
-        raise UnclearColumns(
-            "columns unclear", f"it is not certain which {len(NUMBERS)} of {count} columns are meant; {SETTLE}"
-        )
-
-
-def _has_other_places(tokens: list[list[str]], count: int) -> bool:
-    """Return whether the first four fields have no speed, or four others could be meant as well, in their order."""
-    if count > MOST_FIELDS:
-        return True
-    values = np.array([[number(token) for token in row] for row in tokens])
-    least, greatest = np.array([RANGES[name] for name in NUMBERS], float).T
-    inside = (values[:, :, None] >= least) & (values[:, :, None] <= greatest)
-    fits = np.asarray(inside.mean(0) > 1 - DOUBTED_SHARE)  # columns x numbers
-    moves = np.asarray((values > MOVING).any(0))
-    possible = (
-        places
-        for places in itertools.combinations(range(count), len(NUMBERS))
-        if moves[places[-1]] and fits[places, range(len(NUMBERS))].all()
-    )
-    first = tuple(range(len(NUMBERS)))
-    return not moves[first[-1]] or any(places != first for places in possible)
+    for line, tokens in zip(shape.lines, shape.tokens, strict=True):
+        for token in tokens[len(NUMBERS) :]:
+            if any(least <= number(token) <= greatest for least, greatest in RANGES.values()):
+                raise UnclearColumns(
+                    "columns unclear",
+                    f"{len(tokens)} numbers where {len(NUMBERS)} are expected, and {token} in line {line} could be meant "
+                    f"as well as the others; {SETTLE}",
+                )
 
 
 def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> None:
