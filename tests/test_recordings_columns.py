@@ -211,3 +211,11 @@ def test_checks_of_shapes():
     rows[:9, 0] = 1.5
     with pytest.raises(UnclearColumns, match="9 of 300"):
         check_numbers(np.arange(300), rows, is_named=True)
+
+
+def test_decimal_commas_beside_an_unnamed_column_are_left_out(log):
+    rows = ["0,3333333,0,0,0,0", "1,0,0,0,1", "1,333333,0,0,0,0"]  # a lap before steering, throttle, brake and speed
+    with pytest.raises(
+        RecordingError, match="line 2: '1,0,0,0,1' can be read in 1 ways with decimal commas; line 1 in none"
+    ):
+        log(*usual(rows))

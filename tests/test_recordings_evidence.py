@@ -175,10 +175,9 @@ def leaves_no_evidence(part, later):
     """Whether nothing in two merged logs shows which columns one of them has; the values and names are both's."""
     cameras = tuple(name for name in part.order if name in CAMERAS)
     wordless = not any("center" in image for image in later.images[0].values())
-    pedals_swapped = ("steering", "brake", "throttle", "speed")
-    return (part.header is not None and later.header is None and cameras != CAMERAS and wordless) or any(
-        one.header is None and tuple(name for name in one.order if name in NUMBERS) == pedals_swapped
-        for one in (part, later)
+    pedals = [[name for name in one.order if name in ("throttle", "brake")] for one in (part, later)]
+    return (part.header is not None and later.header is None and cameras != CAMERAS and wordless) or (
+        (part.header is None or later.header is None) and ["brake", "throttle"] in pedals
     )
 
 

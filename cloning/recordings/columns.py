@@ -181,8 +181,8 @@ def check_places(shape: Shape) -> None:
             if any(least <= number(token) <= greatest for least, greatest in RANGES.values()):
                 raise UnclearColumns(
                     "columns unclear",
-                    f"{len(tokens)} numbers where {len(NUMBERS)} are expected, and {token} in line {line} could be meant "
-                    f"as well as the others; {SETTLE}",
+                    f"{len(tokens)} numbers where {len(NUMBERS)} are expected, and {token} in line {line} could be "
+                    f"meant as well as the others; {SETTLE}",
                 )
 
 

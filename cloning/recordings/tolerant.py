@@ -196,18 +196,27 @@ class TolerantReader:
     def _read_decimal_commas(self) -> None:
         """Collect the rows that may have decimal commas: those with more than four numbers and no decimal point.
 
-        For each, the shape that it has as it stands, and the shape that it has if commas are decimal marks.
+        For each, the shape that it has as it stands, and the shape that it has if commas are decimal marks. A row whose
+        numbers cannot be four with decimal commas shows that the rows have other columns.
         """
-        for shape, joined, line, names, tokens in self._pointless:
-            readings = decimal_comma_readings(tokens)
-            if self._commas and not self._points and len(readings) == 1 and joined.is_usual:
+        readings = [decimal_comma_readings(tokens) for *_, tokens in self._pointless]
+        other_columns = [
+            line
+            for (_, _, line, _, tokens), found in zip(self._pointless, readings, strict=True)
+            if not found and not any(number(token) != number(token) for token in tokens)
+        ]
+        if self._points:
+            hint = "; the file also has decimal points"
+        else:
+            hint = f"; line {other_columns[0]} in none" if other_columns else ""
+        for (shape, joined, line, names, tokens), found in zip(self._pointless, readings, strict=True):
+            if self._commas and not hint and len(found) == 1 and joined.is_usual:
                 self._repair("decimal commas", line)
-                self._collect(joined, line, names, readings[0])
-            elif self._commas or readings:
-                mixed = "; the file also has decimal points" if self._points else ""
+                self._collect(joined, line, names, found[0])
+            elif self._commas or found:
                 error = UnclearColumns(
                     "ambiguous columns",
-                    f"{','.join(tokens)!r} can be read in {len(readings)} ways with decimal commas{mixed}; "
+                    f"{','.join(tokens)!r} can be read in {len(found)} ways with decimal commas{hint}; "
                     "write decimal points, or delete the extra columns",
                 )
                 self._reject(line, error)
