@@ -297,9 +297,8 @@ def test_so_does_a_drive_in_real_time(behave, message):
 def test_what_a_server_sends_without_end_is_not_kept(behave):
     tracemalloc.start()
     try:
-        with Hostile(behave) as server:
-            with pytest.raises(SimulatorError):
-                drive(server, realtime=False)
+        with Hostile(behave) as server, pytest.raises(SimulatorError):
+            drive(server, realtime=False)
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
         tracemalloc.stop()
