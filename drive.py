@@ -8,7 +8,6 @@ python drive.py model.pt run1         # also save each frame in run1/, for `pyth
 import argparse
 import itertools
 import logging
-import math
 import re
 import signal
 import socket
@@ -27,7 +26,8 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from cloning.errors import UserError, message_of
+from cloning.arguments import MAX_PORT, address, number
+from cloning.errors import UserError
 from cloning.pilot.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.recordings.format import FRAME
@@ -39,7 +39,7 @@ try:
     from cloning.pilot.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
     from cloning.wire import server as wire
 except UserError as error:  # wrong versions of the socket libraries
-    sys.exit(f"drive.py: {error}")
+    sys.exit(program.failed("drive.py", error))
 
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
 SET_SPEED = 9.0  # mph, as in Udacity's drive.py
@@ -292,17 +292,21 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--speed",
-        type=float,
+        type=number(float, 0.1, 1000),
         default=SET_SPEED,
         help=f"set speed in mph; the car does at most {TOP_SPEED_MPH} (default %(default)g)",
     )
     parser.add_argument(
         "--host",
+        type=address,
         default="127.0.0.1",
         help="address to listen on (default %(default)s: this machine only; 0.0.0.0: any machine may connect)",
     )
     parser.add_argument(
-        "--port", type=int, default=PORT, help="port to listen on (default %(default)s, which the simulator uses)"
+        "--port",
+        type=number(int, 0, MAX_PORT),
+        default=PORT,
+        help="port to listen on (default %(default)s, which the simulator uses; 0: any free one)",
     )
     parser.add_argument(
         "--device",
@@ -313,8 +317,6 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     args = parser.parse_intermixed_args(arguments)  # the folder may follow options
     if args.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch finds no GPU here; leave it out")
-    if not 0 < args.speed < math.inf:
-        parser.error("--speed must be a number above 0, in mph")
     return args
 
 
@@ -327,8 +329,8 @@ def log_to_stderr() -> None:
     log.setLevel(logging.INFO)
 
 
-def main() -> None:
-    """Load the model, listen, and drive until Ctrl-C."""
+def main() -> int:
+    """Load the model, listen, and drive until Ctrl-C; return the exit status."""
     args = parse_arguments()
     log_to_stderr()
     torch.set_num_threads(1)  # a second thread would make single frames slower and their latency less regular
@@ -341,15 +343,15 @@ def main() -> None:
         server = DriveServer(network, args.speed)
         try:
             listener = wire.listen(args.host, args.port)
-        except (OSError, OverflowError) as error:
+        except OSError as error:
             raise UserError(
-                f"can't listen on {args.host}:{args.port} ({getattr(error, 'strerror', None) or error}); "
+                f"can't listen on {args.host}:{args.port} ({error.strerror or error}); "
                 "is another server running? Stop it, or choose another --port"
             ) from None
         if args.folder:
             server.saver = saver = saved_frames.FrameSaver(args.folder)  # last, because it empties the folder
     except (UserError, OSError) as error:
-        sys.exit(f"drive.py: {message_of(error)}")
+        return program.failed("drive.py", error)
     port = listener.getsockname()[1]
     print(
         f"Driving with {model}{' (the model that comes with the project)' if model == SHIPPED_MODEL else ''}.\n"
@@ -364,6 +366,7 @@ def main() -> None:
         if saver:
             saver.close()
         server.close()
+    return program.DONE
 
 
 if __name__ == "__main__":

@@ -476,7 +476,7 @@ def run(arguments: Arguments, given: frozenset[str]) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return 0, 1 for a file error, 2 for unusable input, 128 + signal if stopped."""
+    """Run the command; return 0, 2 after an error, 128 + signal if stopped."""
     arguments, given = parse(argv)
     keep_freed_memory()
     join_processes(arguments.device)
@@ -486,7 +486,7 @@ def main(argv: list[str] | None = None) -> int:
     except UserError as error:
         status, message = 2, str(error)
     except OSError as error:
-        status, message = 1, f"{message_of(error)}; all earlier files are intact. Remove the cause and use --resume"
+        status, message = 2, f"{message_of(error)}; all earlier files are intact. Remove the cause and use --resume"
     except Interrupted as error:
         status, message = 128 + error.args[0], "stopped and saved; continue with --resume"
     except KeyboardInterrupt:

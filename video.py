@@ -3,11 +3,12 @@
 python video.py run1                        # run1.mp4, at the rate at which the frames were taken
 python video.py run1 --fps 60
 python video.py run1 --overlay model.pt     # with the model's steering and what it looks at
+
+Exit status: 0 if the film shows every frame, 1 if unreadable ones were left out, 2 if no film was written.
 """
 
 import argparse
 import sys
-from collections import Counter
 from collections.abc import Callable
 from datetime import datetime
 from fractions import Fraction
@@ -19,18 +20,19 @@ from cloning import program
 if __name__ == "__main__":
     program.end_on_interrupt("video.py", "stopped; no film was written")  # also while the libraries below are loaded
 
-import cv2
 import numpy as np
 from tqdm import tqdm
 
-from cloning.errors import UserError, message_of
+from cloning.arguments import number, ratio
+from cloning.errors import UserError
 from cloning.film import FilmWriter
 from cloning.recordings import saved_frames
-from cloning.recordings.format import FRAME, SAMPLE_RATE
-from cloning.recordings.images import jpeg_size
+from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.images import decode
 
 MAX_FRAME_GAP = 1.0  # s: a longer gap between two frames is a pause, which does not count for the rate
 MAX_RATE = 240.0  # frames/s that a film is given without --fps
+FPS_RANGE = 0.01, 1000.0  # frames/s that can be given
 
 Overlay = Callable[[np.ndarray], np.ndarray]  # from a frame to the film's picture, both uint8 (rows, columns, 3), RGB
 
@@ -47,7 +49,8 @@ def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
     others: list[str] = []
     for path in folder.iterdir():
         time = saved_frames.taken_at(path.name)
-        if time and path.is_file():
+        # A link that leads nowhere is a frame that is lost; a folder or a pipe is none.
+        if time and (path.is_file() or (path.is_symlink() and not path.exists())):
             frames.append((time, path))
         else:
             others.append(path.name)
@@ -82,50 +85,39 @@ def frame_rate(times: list[datetime]) -> Fraction:
     return Fraction(rate).limit_denominator(1000)
 
 
-def read_saved_frame(path: Path) -> np.ndarray | None:
-    """Return a frame of any size, uint8 (rows, columns, 3), RGB; None if it is unreadable or cut short."""
-    try:
-        jpeg = path.read_bytes()
-        jpeg_size(jpeg)
-    except (OSError, ValueError):
-        return None
-    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
-
-
-def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = None) -> Path:
-    """Write `folder`.mp4 next to the folder, and return its path.
+def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = None) -> int:
+    """Write `folder`.mp4 next to the folder, and return how many unreadable frames were left out.
 
     fps: frames/s; None: from the frames' times. overlay: makes each frame's picture; all pictures must have one size.
-    Frames of another size than the first are scaled to it. Raises FilmError, OSError.
+    A frame is readable if training could read it: a whole JPEG of 320x160 pixels. Raises FilmError, OSError.
     """
     frames = find_frames(folder)
     fps = fps or frame_rate([time for time, _ in frames])
     path = folder.with_name(folder.name + ".mp4")
     unreadable: list[str] = []
-    sizes: Counter[tuple[int, ...]] = Counter()
+    reason: ValueError | OSError | None = None  # of the first unreadable frame
     writer = FilmWriter(path, fps)
     try:
         for _, frame_path in tqdm(frames, unit="frame", disable=None):
-            frame = read_saved_frame(frame_path)
-            if frame is None:
+            try:
+                frame = decode(frame_path.read_bytes())
+            except (OSError, ValueError) as error:
                 unreadable.append(frame_path.name)
+                reason = reason or error
                 continue
-            sizes[frame.shape] += 1
-            first = next(iter(sizes))
-            if frame.shape != first:
-                frame = cv2.resize(frame, (first[1], first[0]), interpolation=cv2.INTER_AREA)
             writer.add(overlay(frame) if overlay else frame)
         writer.close()
     finally:
         writer.discard()
-    if not sizes:
-        raise FilmError(f"{folder}: none of its {len(frames)} frames is readable; save new ones with drive.py")
+    why = reason.strerror if isinstance(reason, OSError) else reason
+    if len(unreadable) == len(frames):
+        raise FilmError(
+            f"{folder}: none of its {len(frames)} frames is readable (the first: {why}); save new ones with drive.py"
+        )
     if unreadable:
-        print_note(f"left out, unreadable: {abbreviated(unreadable)}")
-    if len(sizes) > 1:
-        print_note(f"{sizes.total() - sizes[first]} frames of another size were scaled to {first[1]}x{first[0]}")
-    print(f"{path}: {sizes.total()} frames at {float(fps):.4g} frames/s")
-    return path
+        print_note(f"left out, unreadable (the first: {why}): {abbreviated(unreadable)}")
+    print(f"{path}: {len(frames) - len(unreadable)} frames at {float(fps):.4g} frames/s")
+    return len(unreadable)
 
 
 def load_overlay(model_file: Path) -> Overlay:
@@ -136,11 +128,6 @@ def load_overlay(model_file: Path) -> Overlay:
     network = load_model(model_file)
 
     def overlay(frame: np.ndarray) -> np.ndarray:
-        if frame.shape != FRAME:
-            raise FilmError(
-                f"the frames have {frame.shape[1]}x{frame.shape[0]} pixels, but a model reads "
-                f"{FRAME[1]}x{FRAME[0]}; leave out --overlay"
-            )
         try:
             return attention.overlay(frame, *attention.visual_backprop(network, frame))
         except ArithmeticError as error:
@@ -149,31 +136,24 @@ def load_overlay(model_file: Path) -> Overlay:
     return overlay
 
 
-def parse_rate(text: str) -> Fraction:
-    """Parse a rate in frames per second. Raises ArgumentTypeError unless it is above 0 and at most 1000."""
-    try:
-        rate = Fraction(text)
-    except (ValueError, ZeroDivisionError):
-        rate = Fraction(0)
-    if not 0 < rate <= 1000:
-        raise argparse.ArgumentTypeError(f"{text} is not a number above 0 and up to 1000")
-    return rate
-
-
-def main() -> None:
-    """Parse the command line and make the film."""
+def main() -> int:
+    """Parse the command line and make the film; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the folder with the frames; the film is FOLDER.mp4")
     parser.add_argument(
-        "--fps", type=parse_rate, help="frames per second, up to 1000 (default: from the frames' times)"
+        "--fps",
+        type=number(ratio, *FPS_RANGE),
+        help="frames per second, such as 60 or 30000/1001 (default: from the frames' times)",
     )
     parser.add_argument("--overlay", metavar="MODEL", type=Path, help="draw this model's steering and attention")
     args = parser.parse_args()
     folder = args.folder if args.folder.name not in ("", "..") else args.folder.resolve()  # a name for "."
+    fps = Fraction(args.fps).limit_denominator(1001) if args.fps else None
     try:
-        make_film(folder, args.fps, load_overlay(args.overlay) if args.overlay else None)
+        left_out = make_film(folder, fps, load_overlay(args.overlay) if args.overlay else None)
     except (UserError, OSError) as error:
-        sys.exit(f"video.py: {message_of(error)}")
+        return program.failed("video.py", error)
+    return program.INCOMPLETE if left_out else program.DONE
 
 
 if __name__ == "__main__":

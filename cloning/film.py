@@ -63,7 +63,7 @@ class FilmWriter:
 
     def discard(self) -> None:
         """Delete the unfinished film; a finished one stays."""
-        with contextlib.suppress(OSError):  # the disk may be too full for the end of the file
+        with contextlib.suppress(OSError, self.av.FFmpegError):  # the disk may be too full for the end of the file
             self.container.close()
         self.temporary.unlink(missing_ok=True)
         self._place.close()
@@ -72,7 +72,7 @@ class FilmWriter:
     def _discarded_on_error(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:
+        except (OSError, self.av.FFmpegError) as error:
             self.discard()
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 

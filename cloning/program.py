@@ -1,6 +1,7 @@
-"""How a command ends after Ctrl-C: with a message and without a traceback, at any moment.
+"""How a command ends: its exit status, its last message, and Ctrl-C without a traceback at any moment.
 
-A command calls `end_on_interrupt` before it imports large libraries, and `run` at the end of its file.
+A command calls `end_on_interrupt` before it imports large libraries, and `run` at the end of its file. Its exit status
+is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C).
 """
 
 import os
@@ -9,6 +10,18 @@ import sys
 from collections.abc import Callable
 from types import FrameType
 from typing import NoReturn
+
+from cloning.errors import UserError, message_of
+
+DONE = 0
+INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film, a car that left the road
+FAILED = 2  # not done: argparse's status for wrong arguments, and that of every other error the user can correct
+
+
+def failed(program: str, error: UserError | OSError) -> int:
+    """Print an error as `PROGRAM: MESSAGE` to stderr and return the exit status."""
+    print(f"{program}: {message_of(error)}", file=sys.stderr)
+    return FAILED
 
 
 def end_on_interrupt(program: str, message: str = "stopped") -> None:

@@ -2,7 +2,6 @@
 
 import argparse
 import functools
-import sys
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ if __name__ == "__main__":
     # Also while the libraries below are loaded.
     program.end_on_interrupt("simulator", "stopped; the files that it has written are complete")
 
+from cloning.arguments import MAX_PORT, address, number
 from cloning.errors import UserError
 from cloning.outputs import check_folders, run_all, write_json
 from cloning.replay.autonomy import LIMITS
@@ -24,30 +24,6 @@ if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
 
-def positive(text: str) -> float:
-    """Parse a number above 0 and below a million."""
-    value = float(text)
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError("must be above 0 and below a million")
-    return value
-
-
-def mph(text: str) -> float:
-    """Parse a set speed in mph."""
-    value = float(text)
-    if not 1 <= value <= TOP_SPEED_MPH:
-        raise argparse.ArgumentTypeError(f"must be 1 to {TOP_SPEED_MPH:g} mph, the car's top speed")
-    return value
-
-
-def natural(text: str) -> int:
-    """Parse a whole number from 0 up."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError("must be 0 or more")
-    return value
-
-
 def add_record(commands: "Subparsers") -> None:
     """Add the options of `record`."""
     parser = commands.add_parser("record", help="record an expert driver, faster than real time")
@@ -55,14 +31,17 @@ def add_record(commands: "Subparsers") -> None:
     parser.add_argument("folder", help="folder for the new recording: IMG/ and driving_log.csv")
     add_laps(parser)
     parser.add_argument(
-        "--speed", type=mph, default=TOP_SPEED_MPH, help="set speed in mph, 1 to %(default)s (default %(default)s)"
+        "--speed",
+        type=number(float, 1, TOP_SPEED_MPH),
+        default=TOP_SPEED_MPH,
+        help="set speed in mph, 1 to %(default)s (default %(default)s)",
     )
     parser.add_argument(
         "--recovery", action="store_true", help="record only returns from the sides of the road to the lane centre"
     )
     parser.add_argument(
         "--seed",
-        type=natural,
+        type=number(int, 0),
         default=0,
         help="seed of the expert's random lateral offsets, and of the dates in the image names (default 0)",
     )
@@ -104,7 +83,7 @@ def add_replay(commands: "Subparsers") -> None:
     parser.add_argument("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
     parser.add_argument(
         "--limit",
-        type=positive,
+        type=number(float, 0.01, 1000),
         nargs="+",
         default=LIMITS,
         help="distance in m from the lane centre at which a human would take over; each limit is a drive of its own "
@@ -136,19 +115,26 @@ def add_window(commands: "Subparsers") -> None:
 
 def add_laps(parser: argparse.ArgumentParser) -> None:
     """Add --laps."""
-    parser.add_argument("--laps", type=positive, default=1, help="laps to drive, such as 0.5 (default 1)")
+    parser.add_argument(
+        "--laps", type=number(float, 0.001, 1e5), default=1, help="laps to drive, such as 0.5 (default 1)"
+    )
 
 
 def add_server(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where drive.py is."""
-    parser.add_argument("--host", default="127.0.0.1", help="address of drive.py (default %(default)s)")
-    parser.add_argument("--port", type=int, default=PORT, help="port of drive.py (default %(default)s)")
+    parser.add_argument("--host", type=address, default="127.0.0.1", help="address of drive.py (default %(default)s)")
+    parser.add_argument(
+        "--port", type=number(int, 1, MAX_PORT), default=PORT, help="port of drive.py (default %(default)s)"
+    )
 
 
 def add_wait(parser: argparse.ArgumentParser) -> None:
     """Add --wait."""
     parser.add_argument(
-        "--wait", type=positive, default=60.0, help="seconds to wait for drive.py or its answer (default 60)"
+        "--wait",
+        type=number(float, 0.01, 1e6),
+        default=60.0,
+        help="seconds to wait for drive.py, or for an answer that the car can use (default 60)",
     )
 
 
@@ -162,7 +148,7 @@ def add_road(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--look",
-        type=natural,
+        type=number(int, 0),
         default=0,
         help="look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
         "textures and plants",
@@ -225,7 +211,7 @@ def run_drive(args: argparse.Namespace) -> int:
     if args.picture:
         steps.append(lambda: report.write_picture(args.picture, run))
     run_all(*steps)
-    return 1 if run.departures else 0
+    return program.INCOMPLETE if run.departures else program.DONE
 
 
 def run_replay(args: argparse.Namespace) -> int:
@@ -271,8 +257,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return args.run(args)
     except UserError as error:
-        print(f"simulator: {error}", file=sys.stderr)
-        return 2
+        return program.failed("simulator", error)
 
 
 if __name__ == "__main__":

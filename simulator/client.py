@@ -1,5 +1,7 @@
 """The autonomous mode: the car sends its centre camera's frames and drives as the server answers."""
 
+import queue
+import threading
 import time
 from collections.abc import Callable
 
@@ -25,6 +27,7 @@ from simulator.run import Run
 STANDSTILL_TIME = 60.0  # simulated seconds within which the car must move by a metre
 MAX_CATCH_UP = 25  # physics steps to catch up with real time, before the next look for an answer
 RECONNECT_INTERVAL = 1.0  # s between two attempts of the window to connect
+WINDOW_SEND_TIMEOUT = 0.1  # s that the window waits for a server that does not read
 
 
 class Standstill(SimulatorError):
@@ -116,39 +119,47 @@ class Client(ClientSession):
         one frame less in flight.
         """
         sent: list[float] = []  # when each telemetry that has no answer yet was sent
-        greeted = False  # commands that arrive before CONNECT answer no telemetry
+        greeted = answered = False  # commands that arrive before CONNECT answer no telemetry
         for _ in range(OPENS):
             self.connection.send(self.next_frame())
             sent.append(time.perf_counter())
-        begin, origin, last_usable = time.perf_counter(), self.run.time, time.monotonic()
+        begin, origin, until = time.perf_counter(), self.run.time, self.first_answer_due()
         while self.run.travelled < goal:
             due = int((time.perf_counter() - begin) / STEP) * STEP + origin
             for _ in range(min(MAX_CATCH_UP, round((due - self.run.time) / STEP))):
                 self.step()
+                if answered:
+                    self.progressed()
             packet = self.connection.receive(max(0.0, begin + self.run.time - origin + STEP - time.perf_counter()))
             self._show(bar)
             answer = self.parse(packet) if packet else None
             greeted = greeted or packet == CONNECT
             if answer is None:
-                if time.monotonic() - last_usable > self.wait:
+                if time.monotonic() > until:
                     raise self.no_answer()
                 continue
-            last_usable = time.monotonic()
+            until = time.monotonic() + self.wait
             if sent and greeted:
                 self.round_trips.append(time.perf_counter() - sent.pop(0))
+                answered = True
             self.apply(answer)
             self.connection.send(self.next_frame())
             sent.append(time.perf_counter())
 
 
 class RemoteDriver:
-    """drive.py as the window's driver; while it cannot be reached, it is tried again every second."""
+    """drive.py as the window's driver; while it cannot be reached, it is tried again every second.
+
+    It never holds the window up: connecting, which can take long, is done in a thread.
+    """
 
     def __init__(self, host: str, port: int, cameras: Cameras):
         self.address, self.cameras = (host, port), cameras
         self.steering = self.throttle = 0.0  # as last commanded
         self.connection: Connection | None = None
         self.state, self.next_try = "not connected", 0.0
+        self._connecting: threading.Thread | None = None
+        self._connected: queue.SimpleQueue[Connection | ConnectionLost] = queue.SimpleQueue()  # by the thread
 
     def poll(self, by_hand: bool, run: Run) -> None:
         """Use the answers that have arrived, without waiting, and send a telemetry for each.
@@ -172,16 +183,31 @@ class RemoteDriver:
         except ConnectionLost as error:
             self.connection, self.state = None, str(error)
             self.steering = self.throttle = 0.0
+            self.next_try = time.monotonic() + RECONNECT_INTERVAL
 
     def _connect(self, run: Run) -> Connection | None:
-        if time.monotonic() < self.next_try:
+        """Return a connection that the thread has made, or None; start the thread if it is time."""
+        if self._connecting is None:
+            if time.monotonic() >= self.next_try:
+                # A daemon, so that it does not keep a closed window's process.
+                self._connecting = threading.Thread(target=self._open_connection, daemon=True)
+                self._connecting.start()
             return None
-        self.next_try = time.monotonic() + RECONNECT_INTERVAL
-        self.connection = Connection(*self.address, real_timing=True)
-        self.state = "drives"
+        if self._connected.empty():
+            return None
+        self._connecting, made = None, self._connected.get()
+        if isinstance(made, ConnectionLost):
+            raise made
+        self.connection, self.state = made, "drives"
         for _ in range(OPENS):
-            self.connection.send(current_telemetry(run, self.cameras, 0.0, 0.0))
-        return self.connection
+            made.send(current_telemetry(run, self.cameras, 0.0, 0.0))
+        return made
+
+    def _open_connection(self) -> None:
+        try:
+            self._connected.put(Connection(*self.address, real_timing=True, send_timeout=WINDOW_SEND_TIMEOUT))
+        except ConnectionLost as error:
+            self._connected.put(error)
 
     def close(self) -> None:
         """Close the connection, if one is open."""

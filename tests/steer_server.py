@@ -17,6 +17,27 @@ from simulator.run import Run
 STEER = '42["steer",{"steering_angle":"%s","throttle":"%s"}]'
 
 
+def lost():
+    raise ConnectionError
+
+
+def accept_websocket(client, headers=b""):
+    """Read a client's request, accept it, and return it; headers: additional ones, each with its line end."""
+    request = b""
+    while not request.endswith(b"\r\n\r\n"):
+        request += client.recv(1) or lost()
+    key = re.search(rb"(?i)sec-websocket-key: (.*)\r", request)[1]
+    accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
+    client.sendall(
+        b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        + headers
+        + b"Sec-WebSocket-Accept: "
+        + accept
+        + b"\r\n\r\n"
+    )
+    return request.decode()
+
+
 class Server:
     """Speaks the server's part of the transcript; `reply(packet, n)` returns the answers to telemetry number n."""
 
@@ -57,23 +78,11 @@ class Server:
     def exactly(self, client, n):
         data = b""
         while len(data) < n:
-            data += client.recv(n - len(data)) or self.lost()
+            data += client.recv(n - len(data)) or lost()
         return data
 
-    def lost(self):
-        raise ConnectionError
-
     def session(self, client):
-        request = b""
-        while not request.endswith(b"\r\n\r\n"):
-            request += client.recv(1) or self.lost()
-        self.requests.append(request.decode())
-        key = re.search(rb"(?i)sec-websocket-key: (.*)\r", request)[1]
-        accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
-        client.sendall(
-            b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            b"Sec-WebSocket-Accept: " + accept + b"\r\n\r\n"
-        )
+        self.requests.append(accept_websocket(client))
         self.send(client, '0{"sid":"x","upgrades":[],"pingTimeout":60000,"pingInterval":25000}')
         if self.greet:
             self.send(client, STEER % ("0", "0"))

@@ -29,7 +29,7 @@ def failing(*arguments, first="") -> str:
         capture_output=True,
         text=True,
     )
-    assert process.returncode == 1 and "Traceback" not in process.stderr
+    assert process.returncode == 2 and "Traceback" not in process.stderr
     assert process.stderr.splitlines()[-1].startswith("drive.py: ")
     return process.stderr
 

@@ -7,6 +7,8 @@ import sys
 import pytest
 from conftest import ROOT
 
+from cloning.program import FAILED
+
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there SIGINT goes to a whole console")
 
 # Some libraries turn an exception that is raised while they load into an error of their own.
@@ -17,6 +19,13 @@ try:
 except BaseException:
     raise ImportError("initialization failed")
 """
+
+# Those that a user calls; the other modules in tools/ are parts of them.
+TOOLS = [
+    path.stem
+    for path in sorted((ROOT / "tools").glob("*.py"))
+    if "argparse.ArgumentParser" in path.read_text(encoding="utf-8")
+]
 
 INTERRUPTED_MAIN = """
 import os, signal
@@ -39,6 +48,7 @@ program.run(main)
         ("drive.py", ["drive.py"]),
         ("video.py", ["video.py", "run1"]),
         ("simulator", ["-m", "simulator", "record", "data"]),
+        *((tool, ["-m", f"tools.{tool}"]) for tool in TOOLS),
     ],
 )
 def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
@@ -47,6 +57,25 @@ def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
     done = subprocess.run([sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 130
     assert done.stderr.startswith(f"{program}: stopped") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["model.py", "nowhere"],
+        ["drive.py", "nowhere.pt"],
+        ["video.py", "nowhere"],
+        ["-m", "simulator", "replay", "nowhere"],
+        ["-m", "tools.follow_driver", "nowhere.pt", "nowhere"],
+        ["-m", "tools.scoreboard", "nowhere.pt", "--name", "x", "--recordings", "nowhere"],
+    ],
+)
+def test_an_error_of_the_user_is_a_line_and_status_2(tmp_path, command):
+    command = [ROOT / word if word.endswith(".py") else word for word in command]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, *command], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == FAILED == 2
+    assert "nowhere" in done.stderr.splitlines()[-1] and "Traceback" not in done.stderr
 
 
 def test_ctrl_c_in_a_command_lets_it_clean_up():

@@ -120,7 +120,7 @@ def test_disk_full_is_clear_and_the_last_checkpoint_stays(finished, begun):
         2,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
     )
-    assert full.returncode == 1
+    assert full.returncode == 2
     assert "model-resume.pt: File too large" in full.stderr
     assert "Traceback" not in full.stderr
     assert (begun / "model-resume.pt").read_bytes() == before

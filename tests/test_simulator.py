@@ -350,11 +350,11 @@ def test_a_full_disk_is_reported_and_leaves_whole_rows(tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         (["record"], "folder"),
-        (["record", "x", "--speed", "40"], "1 to 30"),
-        (["record", "x", "--laps", "0"], "above 0"),
+        (["record", "x", "--speed", "40"], "at least 1 and at most 30"),
+        (["record", "x", "--laps", "0"], "at least 0.001"),
         (["record", "x", "--track", "moon"], "moon"),
         (["fly"], "fly"),
-        (["record", "x", "--seed", "-1"], "0 or more"),
+        (["record", "x", "--seed", "-1"], "at least 0"),
     ],
 )
 def test_bad_arguments_are_reported(arguments, message):

@@ -6,6 +6,7 @@ import re
 import select
 import socket
 import threading
+import time
 
 import cv2
 import numpy as np
@@ -198,7 +199,10 @@ def test_the_window_looks_for_a_server_without_waiting():
     port = closed.getsockname()[1]
     closed.close()
     remote = RemoteDriver("127.0.0.1", port, Blank())
-    remote.poll(False, Run(Track("lake"), "autonomous"))
+    run, until = Run(Track("lake"), "autonomous"), time.monotonic() + 10
+    while remote.state == "not connected":
+        remote.poll(False, run)
+        assert time.monotonic() < until
     assert "no server" in remote.state
     assert (remote.steering, remote.throttle) == (0, 0)
 

@@ -149,7 +149,8 @@ def test_no_recordings(tmp_path):
         (["--side-correction", "inf"], "--side-correction"),
         (["--seed", str(2**64)], "--seed"),
         (["--throttle-threshold", "2"], "--throttle-threshold drops"),
-        (["--batch-size", "x"], "int"),
+        (["--batch-size", "x"], "x is not a whole number of at least 1"),
+        (["--batch-size", str(10**18)], "at most"),
     ],
 )
 def test_invalid_arguments(sample_recording, tmp_path, arguments, words):

@@ -20,9 +20,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("bench_driving")  # also while the libraries below are loaded
+
 import numpy as np
 import torch
 
+from cloning.arguments import number
 from cloning.errors import UserError
 from cloning.pilot.network import Network, load_model
 from cloning.recordings.images import decode
@@ -146,27 +152,27 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
     return bounds, servers
 
 
-def main() -> None:
-    """Run the benchmark and print its table."""
+def main() -> int:
+    """Run the benchmark and print its table; return the exit status."""
     parser = argparse.ArgumentParser(
         prog="bench_driving", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("model", help="a model file of model.py")
     parser.add_argument("recording", type=Path, help="folder of a recording, whose first 500 centre images are sent")
-    parser.add_argument("--frames", type=int, default=3000, help="frames for each server (default %(default)s)")
+    parser.add_argument(
+        "--frames", type=number(int, TURN), default=3000, help="frames for each server (default %(default)s)"
+    )
     args = parser.parse_args()
     if not Path("/proc/self/stat").exists():
         parser.error("needs Linux, because CPU time and memory are read from /proc")
     jpegs = [path.read_bytes() for path in sorted(args.recording.glob("IMG/center_*.jpg"))[:500]]
     if not jpegs:
         parser.error(f"{args.recording}: no centre images in its IMG/; name a folder that holds driving_log.csv")
-    if args.frames < TURN:
-        parser.error(f"--frames: at least {TURN}")
     torch.set_num_threads(1)
     try:
         bounds, servers = measure(args.model, jpegs, args.frames)
     except UserError as error:
-        sys.exit(f"bench_driving: {error}")
+        return program.failed("bench_driving", error)
     print(
         f"{len(bounds)} frames each; times in ms\n{'':25} median      p99  /bound  frames/s  CPU/frame  MB first  last"
     )
@@ -182,7 +188,8 @@ def main() -> None:
         if server.latencies:
             ratio = np.median(server.latencies) / np.median(bounds)
             print(f"{'  in the server':24} {milliseconds(server.latencies)} {ratio:7.2f}")
+    return program.DONE
 
 
 if __name__ == "__main__":
-    main()
+    program.run(main)

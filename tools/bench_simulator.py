@@ -21,6 +21,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("bench_simulator")  # also while the libraries below are loaded
+
+from cloning.arguments import number
 from cloning.errors import SimulatorError, UserError
 from cloning.recordings.format import DRIVING_LOG, SAMPLE_RATE
 from cloning.road.track import ROADS, Track
@@ -117,18 +123,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="bench_simulator", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--laps", type=float, default=1.0, help="laps to record on each track (default 1)")
-    parser.add_argument("--repeat", type=int, default=3, help="recordings of each track (default 3)")
+    parser.add_argument(
+        "--laps", type=number(float, 0.001, 1e5), default=1.0, help="laps to record on each track (default 1)"
+    )
+    parser.add_argument("--repeat", type=number(int, 1), default=3, help="recordings of each track (default 3)")
     args = parser.parse_args()
     if not Path("/proc/self/smaps_rollup").exists():
         parser.error("needs Linux, because memory is read from /proc")
     try:
         measure(args.laps, args.repeat)
     except UserError as error:
-        print(f"bench_simulator: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return program.failed("bench_simulator", error)
+    return program.DONE
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program.run(main)

@@ -28,6 +28,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from unittest import mock
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("bench_training")  # also while the libraries below are loaded
+
+from cloning.arguments import number
 from cloning.compute import keep_freed_memory, threads
 from cloning.errors import UserError
 from cloning.road.track import Track
@@ -243,7 +249,7 @@ def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> Non
     rates: dict[str, list[float]] = {}
     memory: dict[str, float] = {}
     measured: dict = {}
-    for number in range(1, rounds + 1):
+    for round_number in range(1, rounds + 1):
         for part in parts:
             command = [sys.executable, "-m", "tools.bench_training", *recordings, "--part", part]
             command += ["--samples", str(samples), "--steps", str(steps)]
@@ -254,7 +260,7 @@ def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> Non
             for name, value in measured["rates"].items():
                 rates.setdefault(name, []).append(value)
                 memory[name] = max(memory.get(name, 0.0), measured["gb"] or 0.0)
-                print(f"round {number}: {NAMES[name]}: {value:.0f}", file=sys.stderr, flush=True)
+                print(f"round {round_number}: {NAMES[name]}: {value:.0f}", file=sys.stderr, flush=True)
     precision = measured["precision"].removeprefix("torch.")
     print(f"\n{measured['device']}, {precision}, {rounds} rounds, {measured['flops'] / 1e6:.0f} MFLOP per image\n")
     print("| training images/s | median | least | most | peak memory GB |\n|---|---|---|---|---|")
@@ -267,27 +273,34 @@ def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> Non
         print(f"| {above} / {below} | {statistics.median(ratios):.2f} | {min(ratios):.2f} | {max(ratios):.2f} |")
 
 
-def main() -> None:
-    """Run the benchmark, or with --part one part of it, in a process that the benchmark started."""
+def main() -> int:
+    """Run the benchmark, or with --part one part of it, in a process that it started; return the exit status."""
     parser = argparse.ArgumentParser(
         prog="bench_training", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
         "recordings", nargs="*", help="folders of recordings; without any, a third of a lap is rendered"
     )
-    parser.add_argument("--rounds", type=int, default=3, help="measurements of each part (default %(default)s)")
-    parser.add_argument("--samples", type=int, default=20224, help="images per epoch in (a) (default %(default)s)")
-    parser.add_argument("--steps", type=int, default=5, help="measured batches in (c) and (k) (default %(default)s)")
+    parser.add_argument(
+        "--rounds", type=number(int, 1), default=3, help="measurements of each part (default %(default)s)"
+    )
+    parser.add_argument(
+        "--samples",
+        type=number(int, 5 * BATCH_IMAGES),
+        default=20224,
+        help="images per epoch in (a), at least five batches (default %(default)s)",
+    )
+    parser.add_argument(
+        "--steps", type=number(int, 1), default=5, help="measured batches in (c) and (k) (default %(default)s)"
+    )
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.samples < 5 * BATCH_IMAGES or min(args.rounds, args.steps) < 1:
-        parser.error(f"needs at least {5 * BATCH_IMAGES} --samples (five batches), one round and one step")
     try:
         with tempfile.TemporaryDirectory() as folder:
             if args.part:
                 measured = measure(args.part, args.recordings, args.samples, args.steps, Path(folder))
                 print("\n" + json.dumps(measured))
-                return
+                return program.DONE
             if not args.recordings:
                 from simulator.record import record
 
@@ -295,8 +308,9 @@ def main() -> None:
                 record(args.recordings[0], Track("lake"), laps=0.35)
             compare(args.recordings, args.rounds, args.samples, args.steps)
     except UserError as error:
-        sys.exit(f"bench_training: {error}")
+        return program.failed("bench_training", error)
+    return program.DONE
 
 
 if __name__ == "__main__":
-    main()
+    program.run(main)

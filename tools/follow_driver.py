@@ -9,8 +9,12 @@ this shows how similar rendered and real roads are.
 """
 
 import argparse
-import sys
 from pathlib import Path
+
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("follow_driver")  # also while the libraries below are loaded
 
 import numpy as np
 import torch
@@ -60,10 +64,9 @@ def main(argv: list[str] | None = None) -> int:
             cells = [f"{values.mean():+.3f} {values.std():.3f}" for values in (predicted_smoothed, driven_smoothed)]
             print(f"{folder.name:24} {correlation:11.2f} {smoothed:9.2f}    {cells[0]:28}{cells[1]}")
     except (UserError, OSError) as error:
-        print(f"follow_driver: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return program.failed("follow_driver", error)
+    return program.DONE
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program.run(main)

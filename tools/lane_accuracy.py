@@ -8,14 +8,19 @@ that the network was not trained on. For real recordings only the position of th
 """
 
 import argparse
-import sys
 import tempfile
 import time
 from pathlib import Path
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("lane_accuracy")  # also while the libraries below are loaded
+
 import cv2
 import numpy as np
 
+from cloning.arguments import number
 from cloning.errors import UserError
 from cloning.files import write
 from cloning.lane.place import estimate_lane_position
@@ -152,7 +157,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--network", metavar="lane.pt", help="file with the weights (default: those that come with the project)"
     )
-    parser.add_argument("--laps", type=float, default=0.3, help="length of each rendered drive; 0: none (default 0.3)")
+    parser.add_argument(
+        "--laps", type=number(float, 0, 1e5), default=0.3, help="length of each rendered drive; 0: none (default 0.3)"
+    )
     parser.add_argument("--picture", type=Path, help="write real frames with the estimated lane drawn in")
     args = parser.parse_args(argv)
     try:
@@ -166,10 +173,9 @@ def main(argv: list[str] | None = None) -> int:
             pictures = np.vstack([draw_frames(folder, network) for folder in args.recordings])
             write(args.picture, cv2.imencode(args.picture.suffix, pictures)[1].tobytes())
     except (UserError, OSError) as error:
-        print(f"lane_accuracy: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return program.failed("lane_accuracy", error)
+    return program.DONE
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program.run(main)

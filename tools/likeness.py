@@ -8,12 +8,17 @@ where they would be on flat ground.
 """
 
 import argparse
-import sys
 from pathlib import Path
+
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("likeness")  # also while the libraries below are loaded
 
 import cv2
 import numpy as np
 
+from cloning.arguments import number
 from cloning.errors import RecordingError, UserError
 from cloning.lane.place import localise_all
 from cloning.lane.reader import detect_centres
@@ -157,16 +162,15 @@ def main() -> int:
         prog="likeness", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("recording", type=Path, help="folder of a real recording of the lake or the jungle")
-    parser.add_argument("--frames", type=int, default=120, help="number of places to compare (default 120)")
+    parser.add_argument("--frames", type=number(int, 1), default=120, help="number of places to compare (default 120)")
     parser.add_argument("--picture", metavar="FILE.png", help="write real frames above rendered ones")
     args = parser.parse_args()
     try:
         compare(args.recording, args.frames, args.picture)
     except UserError as error:
-        print(f"likeness: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return program.failed("likeness", error)
+    return program.DONE
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program.run(main)

@@ -25,6 +25,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TypedDict
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("scoreboard")  # also while the libraries below are loaded
+
+from cloning.arguments import number
 from cloning.cores import threads
 from cloning.errors import UserError
 from cloning.outputs import write_json, write_output
@@ -165,8 +171,8 @@ def measure(args: argparse.Namespace) -> None:
     write_output(args.table, table(columns).encode())
 
 
-def main() -> None:
-    """Parse the command line and measure."""
+def main() -> int:
+    """Parse the command line and measure; return the exit status."""
     parser = argparse.ArgumentParser(
         prog="scoreboard", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -180,12 +186,16 @@ def main() -> None:
         "--tracks", nargs="*", default=list(ROADS), choices=ROADS, help="tracks to drive (default: both)"
     )
     parser.add_argument(
-        "--speeds", nargs="*", type=int, default=[9, 15, 30], help="set speeds in mph (default 9 15 30)"
+        "--speeds", nargs="*", type=number(int, 1, 30), default=[9, 15, 30], help="set speeds in mph (default 9 15 30)"
     )
     parser.add_argument(
-        "--looks", nargs="*", type=int, default=[0, *UNSEEN_LOOKS], help="looks of the tracks (default 0 101 102)"
+        "--looks",
+        nargs="*",
+        type=number(int, 0),
+        default=[0, *UNSEEN_LOOKS],
+        help="looks of the tracks (default 0 101 102)",
     )
-    parser.add_argument("--laps", type=float, default=1, help="laps on each course (default 1)")
+    parser.add_argument("--laps", type=number(float, 0.001, 1e5), default=1, help="laps on each course (default 1)")
     parser.add_argument(
         "--table",
         type=Path,
@@ -196,8 +206,9 @@ def main() -> None:
     try:
         measure(parser.parse_args())
     except UserError as error:
-        sys.exit(f"scoreboard: {error}")
+        return program.failed("scoreboard", error)
+    return program.DONE
 
 
 if __name__ == "__main__":
-    main()
+    program.run(main)

@@ -12,15 +12,20 @@ measure them with `python -m tools.lane_accuracy --network lane.pt`, then copy t
 import argparse
 import io
 import multiprocessing
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
+
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("train_lane")  # also while the libraries below are loaded
 
 import cv2
 import numpy as np
 import torch
 
+from cloning.arguments import number
 from cloning.compute import choose_precision, in_precision, one_thread, threads
 from cloning.errors import UserError
 from cloning.files import write
@@ -360,20 +365,16 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         prog="train_lane", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
-    parser.add_argument("--looks", type=int, default=24, help="looks in which each track is rendered (default 24)")
+    parser.add_argument("--looks", type=number(int, 1), default=24, help="looks of each rendered track (default 24)")
     parser.add_argument(
         "--frames",
-        type=int,
+        type=number(int, 1),
         default=200,
-        help="frames of the lake per look; the jungle gets twice as many (default 200)",
+        help="lake frames per look; twice as many jungle ones (default 200)",
     )
-    parser.add_argument(
-        "--steps", type=int, default=2400, help="batches of 96 rendered frames and 40 real pairs (default 2400)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of all random choices (default %(default)s)")
-    parser.add_argument(
-        "--output", type=Path, default=Path("lane.pt"), help="file for the weights (default %(default)s)"
-    )
+    parser.add_argument("--steps", type=number(int, 1), default=2400, help="batches to train on (default %(default)s)")
+    parser.add_argument("--seed", type=number(int, 0), default=0, help="of all random choices (default %(default)s)")
+    parser.add_argument("--output", type=Path, default=Path("lane.pt"), help="file of weights (default %(default)s)")
     return parser.parse_args(argv)
 
 
@@ -386,15 +387,13 @@ def main(argv: list[str] | None = None) -> int:
         strips, centres = render_all(range(arguments.looks), arguments.frames, arguments.seed)
         network = train(BatchSampler(strips, centres, recordings, arguments.seed), arguments.steps)
         weights = network.state_dict().items()
-        halved = {name: value.half() if value.is_floating_point() else value for name, value in weights}
         buffer = io.BytesIO()
-        torch.save(halved, buffer)
+        torch.save({name: value.half() if value.is_floating_point() else value for name, value in weights}, buffer)
         write(arguments.output, buffer.getvalue())
     except (UserError, OSError) as error:
-        print(f"train_lane: {error}", file=sys.stderr)
-        return 2
-    return 0
+        return program.failed("train_lane", error)
+    return program.DONE
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program.run(main)

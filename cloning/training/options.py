@@ -1,17 +1,16 @@
 """The command line of model.py."""
 
 import argparse
-import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TypeVar
 
+from cloning.arguments import number
 from cloning.compute import DEVICES, is_available
 from cloning.recordings.format import DRIVING_LOG
 
-Number = TypeVar("Number", int, float)
 MAX_SEED = 2**63 - 1  # torch takes no larger one
+MAX_COUNT = 10**9  # of epochs or images: more than a lifetime of training
+MAX_BATCH = 10**5  # observations: 56 GB of images
 
 
 @dataclass(frozen=True)
@@ -89,17 +88,19 @@ def build_parser() -> argparse.ArgumentParser:
     )
     group = parser.add_argument_group("training")
     group.add_argument(
-        "--epochs", type=number(int, 1), help=text("epochs", "epochs in total; may be raised with --resume")
+        "--epochs", type=number(int, 1, MAX_COUNT), help=text("epochs", "epochs in total; may be raised with --resume")
     )
     group.add_argument(
         "--batch-size",
-        type=number(int, 1),
+        type=number(int, 1, MAX_BATCH),
         help=text("batch_size", "observations in a batch; each gives 3.7 images on average"),
     )
-    group.add_argument("--learning-rate", type=number(float, 1e-9), help=text("learning_rate", "learning rate of Adam"))
+    group.add_argument(
+        "--learning-rate", type=number(float, 1e-9, 10), help=text("learning_rate", "learning rate of Adam")
+    )
     group.add_argument(
         "--samples-per-epoch",
-        type=number(int, 1),
+        type=number(int, 1, MAX_COUNT),
         help=text(
             "samples_per_epoch", "smallest number of images in an epoch; a fifth as many observations validate it"
         ),
@@ -142,18 +143,3 @@ def build_parser() -> argparse.ArgumentParser:
         help="continue the run of this --output with its original arguments; begin a new run if there is none",
     )
     return parser
-
-
-def number(kind: type[Number], least: float = -math.inf, most: float = math.inf) -> Callable[[str], Number]:
-    """Return a type for argparse: a finite number of this kind, from `least` to `most`."""
-    limits = f" of at least {least:g}" if least > -math.inf else ""
-    limits += f" and at most {most:g}" if most < math.inf else ""
-
-    def parse_number(text: str) -> Number:
-        value = kind(text)
-        if not least <= value <= most or value in (-math.inf, math.inf):
-            raise argparse.ArgumentTypeError(f"{text} is not a finite number{limits}")
-        return value
-
-    parse_number.__name__ = kind.__name__  # for argparse's message "invalid int value"
-    return parse_number

@@ -5,14 +5,18 @@ long messages in fragments.
 """
 
 import base64
+import contextlib
 import json
 import math
 import select
 import socket
 import time
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from wsproto import ConnectionType, WSConnection
+from wsproto.connection import ConnectionState
 from wsproto.events import CloseConnection, Event, Ping, RejectConnection, Request, TextMessage
 from wsproto.utilities import ProtocolError
 
@@ -23,8 +27,11 @@ PATH = "/socket.io/?EIO=4&transport=websocket"
 # Engine.IO's packet types, with which each packet begins; a message (4) goes on with Socket.IO's type.
 OPEN, CLOSE, PING, PONG, MESSAGE = "0", "1", "2", "3", "4"
 CONNECT, DISCONNECT, EVENT = "40", "41", "42"
-CONNECT_TIMEOUT = 10.0  # s to reach a server, and again for it to open a session
+CONNECT_TIMEOUT = 10.0  # s to reach a server and for it to open a session
+SEND_TIMEOUT = 5.0  # s for a server to take a packet; one that reads takes it at once
 CLOSE_TIMEOUT = 1.0  # s for a server to notice that the session is over
+READ_BYTES = 4096  # at a time: enough for 40 answers, and few enough to decode before the next picture is due
+MAX_PACKET = 1 << 16  # characters; an answer has about 80
 
 
 class ConnectionLost(Exception):
@@ -48,7 +55,7 @@ def parse_answer(packet: str) -> Answer | None:
         return None
     try:
         contents = json.loads(packet[len(EVENT) :])
-    except ValueError:
+    except (ValueError, RecursionError):  # not JSON, or nested too deep
         return None
     if not isinstance(contents, list) or not contents:
         return None
@@ -64,7 +71,7 @@ def parse_answer(packet: str) -> Answer | None:
 
 
 def _number(text: object) -> float | None:
-    if not isinstance(text, str):
+    if not isinstance(text, str) or not text.isascii() or "_" in text:  # float() reads 1_0, and Arabic digits
         return None
     try:
         value = float(text)
@@ -91,96 +98,123 @@ MANUAL_TELEMETRY = f'{EVENT}["telemetry",null]'  # while the human driver holds 
 
 
 class Connection:
-    """A connection to the server; sends and receives Engine.IO packets, as text."""
+    """A connection to the server; sends and receives Engine.IO packets, as text.
 
-    def __init__(self, host: str, port: int, real_timing: bool):
+    Whatever the server sends, it takes no more memory than a packet of MAX_PACKET and READ_BYTES. When the connection
+    is lost, its socket is closed.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        real_timing: bool,
+        timeout: float = CONNECT_TIMEOUT,
+        send_timeout: float = SEND_TIMEOUT,
+    ):
         """Connect, and wait until the server has opened a session.
 
         real_timing: write as the real client does, each fragment on its own and with Nagle's algorithm; otherwise
-        a whole packet at once. Raises ConnectionLost.
+        a whole packet at once. timeout: s until the session is open; send_timeout: s for the server to take a packet.
+        Raises ConnectionLost.
         """
-        address = f"{host}:{port}"
+        until = time.monotonic() + timeout
+        address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         try:
-            self.socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
-        except OSError as error:
-            raise ConnectionLost(f"no server at {address} ({error.strerror or error})") from error
-        self.real_timing = real_timing
-        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0 if real_timing else 1)
+            self.socket = socket.create_connection((host, port), timeout=timeout)
+        except (OSError, UnicodeError) as error:  # UnicodeError: a name that no host can have
+            raise ConnectionLost(f"no server at {address} ({getattr(error, 'strerror', None) or error})") from error
+        self.real_timing, self.send_timeout = real_timing, send_timeout
         self.protocol = WSConnection(ConnectionType.CLIENT)
-        self.packets: list[str] = []  # received, but not yet returned by `receive`
+        self.packets: deque[str] = deque()  # received, but not yet returned by `receive`
         self.partial = ""  # message of which not all fragments have arrived
         self.last_ping = time.monotonic()
         self.pong_due_since: float | None = None
         agent = [(b"user-agent", b"websocket-sharp/1.0")]
-        request = Request(host=address, target=PATH, extra_headers=agent)
+        with self._closed_if_lost():
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0 if real_timing else 1)
+            self._write(self.protocol.send(Request(host=address, target=PATH, extra_headers=agent)))
+            self._open_session(address, until)
+
+    @contextlib.contextmanager
+    def _closed_if_lost(self) -> Iterator[None]:
+        """Close the socket after an error that the server can cause, and raise it as ConnectionLost."""
         try:
-            self.socket.sendall(self.protocol.send(request))
-            self._open_session(address)
-        except OSError as error:
-            self.socket.close()
-            raise ConnectionLost(f"the connection to {address} broke ({error.strerror or error})") from error
-        except BaseException:
+            yield
+        except ConnectionLost:
             self.socket.close()
             raise
+        except TimeoutError as error:
+            self.socket.close()
+            raise ConnectionLost(f"the server has read nothing for {self.send_timeout:g} s") from error
+        except OSError as error:
+            self.socket.close()
+            raise ConnectionLost(f"the connection broke ({error.strerror or error})") from error
+        except (ProtocolError, UnicodeError) as error:  # UnicodeError: wsproto decodes a header as ASCII
+            self.socket.close()
+            raise ConnectionLost(f"the server does not speak WebSocket ({error!s:.100})") from error
 
-    def _open_session(self, address: str) -> None:
+    def _open_session(self, address: str, until: float) -> None:
         """Wait for the server's open packet, then ping at once, as the real client does."""
-        until = time.monotonic() + CONNECT_TIMEOUT
         while not self.packets:
-            self._read_socket(max(0.0, until - time.monotonic()))
             if time.monotonic() > until:
                 raise ConnectionLost(f"{address} accepts connections but does not answer")
-        packet = self.packets.pop(0)
+            self._read_socket(max(0.0, until - time.monotonic()))
+        packet = self.packets.popleft()
         if not packet.startswith(OPEN):
-            raise ConnectionLost(f"{address} does not speak Engine.IO (it sent {packet!r:.60})")
-        self.ping()
+            raise ConnectionLost(f"{address} does not speak Engine.IO (it sent {packet[:60]!r})")
+        self._send(PING)
+        self.last_ping = self.pong_due_since = time.monotonic()
 
     def _read_socket(self, timeout: float) -> None:
         """Wait up to `timeout` seconds for bytes, and decode them."""
         if not select.select([self.socket], [], [], timeout)[0]:
             return
-        try:
-            data = self.socket.recv(65536)
-        except OSError as error:
-            raise ConnectionLost(f"the connection broke ({error.strerror or error})") from error
+        data = self.socket.recv(READ_BYTES)
         if not data:
             raise ConnectionLost("the server closed the connection")
-        try:
-            self.protocol.receive_data(data)
-            for event in self.protocol.events():
-                self._handle(event)
-        except ProtocolError as error:
-            raise ConnectionLost(f"the server does not speak WebSocket ({error})") from error
+        self.protocol.receive_data(data)
+        for event in self.protocol.events():
+            self._handle(event)
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, RejectConnection):
             raise ConnectionLost(f"the server refuses the connection (HTTP {event.status_code})")
         elif isinstance(event, CloseConnection):
+            if self.protocol.state is ConnectionState.OPEN:  # not a closing frame, but bytes that are no frame at all
+                raise ConnectionLost(f"the server does not speak WebSocket ({event.reason!s:.100})")
             raise ConnectionLost("the server closed the connection")
         elif isinstance(event, Ping):
-            self.socket.sendall(self.protocol.send(event.response()))
+            self._write(self.protocol.send(event.response()))
         elif isinstance(event, TextMessage):
             self.partial += event.data
+            if len(self.partial) > MAX_PACKET:
+                raise ConnectionLost(f"the server sent a message of more than {MAX_PACKET} characters")
             if event.message_finished:
                 self.packets.append(self.partial)
                 self.partial = ""
 
-    def send(self, packet: str) -> None:
-        """Send a packet in fragments. Raises ConnectionLost."""
+    def _write(self, *frames: bytes) -> None:
+        """Write frames to the socket, each by itself."""
+        until = time.monotonic() + self.send_timeout
+        for frame in frames:
+            self.socket.settimeout(max(1e-3, until - time.monotonic()))
+            self.socket.sendall(frame)
+
+    def _send(self, packet: str) -> None:
         data = packet.encode()
         fragments = [data[i : i + FRAGMENT].decode() for i in range(0, len(data), FRAGMENT)]
         last = len(fragments) - 1
-        try:
-            frames = [
-                self.protocol.send(TextMessage(fragment, message_finished=i == last))
-                for i, fragment in enumerate(fragments)
-            ]
-            for frame in frames if self.real_timing else [b"".join(frames)]:
-                self.socket.sendall(frame)
-        except OSError as error:
-            raise ConnectionLost(f"the connection broke ({error.strerror or error})") from error
-        except ProtocolError as error:
-            raise ConnectionLost("the server closed the connection") from error
+        frames = [
+            self.protocol.send(TextMessage(fragment, message_finished=i == last))
+            for i, fragment in enumerate(fragments)
+        ]
+        self._write(*(frames if self.real_timing else [b"".join(frames)]))
+
+    def send(self, packet: str) -> None:
+        """Send a packet in fragments. Raises ConnectionLost."""
+        with self._closed_if_lost():
+            self._send(packet)
 
     def receive(self, timeout: float) -> str | None:
         """Return the next packet, or None if none comes within `timeout` seconds; answer and send pings meanwhile.
@@ -188,49 +222,45 @@ class Connection:
         Raises ConnectionLost.
         """
         until = time.monotonic() + timeout
-        self._keep_alive()
-        while not self.packets:
-            left = until - time.monotonic()
-            self._read_socket(max(0.0, min(left, 1.0)))
-            if left <= 0:
-                break
+        with self._closed_if_lost():
             self._keep_alive()
-        if not self.packets:
-            return None
-        packet = self.packets.pop(0)
-        if packet == PONG:
-            self.pong_due_since = None
-        elif packet.startswith(PING):
-            self.send(PONG + packet[1:])
-        elif packet in (CLOSE, DISCONNECT):
-            raise ConnectionLost("the server ended the session")
-        return packet
+            while not self.packets:
+                left = until - time.monotonic()
+                self._read_socket(max(0.0, min(left, 1.0)))
+                if left <= 0:
+                    break
+                self._keep_alive()
+            if not self.packets:
+                return None
+            packet = self.packets.popleft()
+            if packet == PONG:
+                self.pong_due_since = None
+            elif packet.startswith(PING):
+                self._send(PONG + packet[1:])
+            elif packet in (CLOSE, DISCONNECT):
+                raise ConnectionLost("the server ended the session")
+            return packet
 
     def _keep_alive(self) -> None:
         now = time.monotonic()
         if self.pong_due_since is not None and now - self.pong_due_since > PONG_TIMEOUT:
             raise ConnectionLost(f"the server did not answer a ping within {PONG_TIMEOUT:.0f} s")
         if now - self.last_ping > PING_INTERVAL:
-            self.ping()
-
-    def ping(self) -> None:
-        """Send a ping. Raises ConnectionLost."""
-        self.send(PING)
-        self.last_ping = time.monotonic()
-        if self.pong_due_since is None:
-            self.pong_due_since = self.last_ping
+            self._send(PING)
+            self.last_ping = now
+            self.pong_due_since = self.pong_due_since or now
 
     def close(self) -> None:
-        """End the session as the real client does, and let the server finish sending."""
-        try:
-            self.send(DISCONNECT)
-            self.send(CLOSE)
-            self.socket.sendall(self.protocol.send(CloseConnection(code=1000)))
+        """End the session as the real client does, and let the server finish sending, for a second at most."""
+        self.send_timeout = CLOSE_TIMEOUT
+        until = time.monotonic() + CLOSE_TIMEOUT
+        with contextlib.suppress(ConnectionLost), self._closed_if_lost():  # the server may have closed already
+            self._send(DISCONNECT)
+            self._send(CLOSE)
+            self._write(self.protocol.send(CloseConnection(code=1000)))
             self.socket.shutdown(socket.SHUT_WR)
-            self.socket.settimeout(CLOSE_TIMEOUT)
-            while self.socket.recv(65536):
-                pass
-        except (ConnectionLost, OSError, ProtocolError):
-            return  # the server has already closed the connection
-        finally:
-            self.socket.close()
+            while (left := until - time.monotonic()) > 0:
+                self.socket.settimeout(left)
+                if not self.socket.recv(READ_BYTES):
+                    break
+        self.socket.close()

@@ -6,15 +6,29 @@ import time
 from tqdm import tqdm
 
 from cloning.errors import SimulatorError
-from cloning.wire.client import CONNECT, MESSAGE, Answer, Connection, ConnectionLost, parse_answer
+from cloning.wire.client import (
+    CONNECT,
+    CONNECT_TIMEOUT,
+    MESSAGE,
+    SEND_TIMEOUT,
+    Answer,
+    Connection,
+    ConnectionLost,
+    parse_answer,
+)
 
 OPENS = 2  # telemetries sent at the start: the real client's "open" event fires twice
-GREETING_TIMEOUT = 1.0  # s for a server to send its first command
+GREETING_TIMEOUT = 1.0  # s for a server to send its first command, or its first answer
 RETRY_INTERVAL = 0.1  # s between two attempts to connect; the real client makes thousands a second
+MAX_UNASKED = 100  # commands that came unasked and are read before a frame; a server could send them without end
 
 
 class ClientSession:
-    """Sends telemetry and receives the answers, and connects again when the connection is lost."""
+    """Sends telemetry and receives the answers, and connects again when the connection is lost.
+
+    Connecting is no progress, since a server may break each connection: only an answer that the car was driven by
+    (`request_answer` returned it, or `progressed` was called) lets `wait` seconds begin anew.
+    """
 
     def __init__(self, host: str, port: int, wait: float, real_timing: bool = False):
         """wait: seconds to wait for a server to appear, or for a usable answer; real_timing: see Connection."""
@@ -23,6 +37,8 @@ class ClientSession:
         self.unusable = self.reconnections = 0
         self._connection: Connection | None = None
         self._in_flight = 1  # telemetries sent before the next answer is due
+        self._waiting_until: float | None = None  # time.monotonic() at which patience ends; None: not waiting
+        self._lost: ConnectionLost | None = None  # why the last connection broke, while waiting
 
     @property
     def connected(self) -> bool:
@@ -38,17 +54,37 @@ class ClientSession:
 
     def connect(self) -> None:
         """Try to connect until the server has opened a session. Raises SimulatorError after `wait` seconds."""
-        until, announced = time.monotonic() + self.wait, False
         while self._connection is None:
+            left = max(RETRY_INTERVAL, self._patience_ends() - time.monotonic())
             try:
-                self._connection = Connection(*self.address, real_timing=self.real_timing)
+                self._connection = Connection(
+                    *self.address, self.real_timing, min(CONNECT_TIMEOUT, left), min(SEND_TIMEOUT, self.wait)
+                )
             except ConnectionLost as error:
-                if time.monotonic() > until:
-                    raise SimulatorError(f"{error}; start `python drive.py model.pt` first") from None
-                if not announced:
-                    _print(f"{error}; trying again for {self.wait:g} s")
-                    announced = True
-                time.sleep(RETRY_INTERVAL)
+                self._wait_after(error)
+
+    def _patience_ends(self) -> float:
+        """Return the time.monotonic() at which patience ends; it begins when the first thing is waited for."""
+        if self._waiting_until is None:
+            self._waiting_until = time.monotonic() + self.wait
+        return self._waiting_until
+
+    def first_answer_due(self) -> float:
+        """Return the time.monotonic() at which patience ends, or a moment later for a server that came at the end."""
+        return max(self._patience_ends(), time.monotonic() + min(GREETING_TIMEOUT, self.wait))
+
+    def _wait_after(self, error: ConnectionLost) -> None:
+        """Wait before the next attempt, and say so once. Raises SimulatorError after `wait` seconds of attempts."""
+        first, self._lost = self._lost is None, error
+        if time.monotonic() > self._patience_ends():
+            raise self.no_answer() from None
+        if first:
+            _print(f"{error}; trying again for {self.wait:g} s")
+        time.sleep(RETRY_INTERVAL)
+
+    def progressed(self) -> None:
+        """Begin `wait` anew, because an answer has driven the car."""
+        self._waiting_until = self._lost = None
 
     def parse(self, packet: str) -> Answer | None:
         """Return the answer in a packet, or None; count messages that hold none."""
@@ -64,10 +100,11 @@ class ClientSession:
         first command, if the server sends one.
         """
         self._in_flight = OPENS
-        while (packet := self.connection.receive(GREETING_TIMEOUT)) is not None:
+        until = time.monotonic() + min(GREETING_TIMEOUT, self.wait)
+        while (packet := self.connection.receive(max(0.0, until - time.monotonic()))) is not None:
             if self.parse(packet):
-                self._in_flight += 1
-            if packet.startswith(CONNECT):
+                self._in_flight = OPENS + 1
+            if packet.startswith(CONNECT) or time.monotonic() > until:
                 break
 
     def receive_unasked(self) -> Answer:
@@ -76,7 +113,9 @@ class ClientSession:
         If it were not taken now, it would pass for the answer to the next telemetry.
         """
         latest = Answer()
-        while (packet := self.connection.receive(0)) is not None:
+        for _ in range(MAX_UNASKED):
+            if (packet := self.connection.receive(0)) is None:
+                break
             latest = self.parse(packet) or latest
         return latest
 
@@ -85,35 +124,37 @@ class ClientSession:
 
         Raises SimulatorError after `wait` seconds without one, ConnectionLost.
         """
-        sent = time.perf_counter()
+        sent, until = time.perf_counter(), self.first_answer_due()
         for _ in range(self._in_flight):
             self.connection.send(packet)
         for _ in range(self._in_flight):
-            answer = self._receive_answer()
+            answer = self._receive_answer(until)
             self.round_trips.append(time.perf_counter() - sent)
+            until = time.monotonic() + self.wait
         self._in_flight = 1
+        self.progressed()
         return answer
 
-    def _receive_answer(self) -> Answer:
-        until = time.monotonic() + self.wait
-        while True:
-            packet = self.connection.receive(max(0.0, until - time.monotonic()))
-            if packet is None:
-                raise self.no_answer()
+    def _receive_answer(self, until: float) -> Answer:
+        while (packet := self.connection.receive(max(0.0, until - time.monotonic()))) is not None:
             if answer := self.parse(packet):
                 return answer
+            if time.monotonic() > until:
+                break
+        raise self.no_answer()
 
     def no_answer(self) -> SimulatorError:
-        """Return the error for a server that sends nothing usable."""
-        return SimulatorError(
-            f"no usable answer in {self.wait:g} s ({self.unusable} unusable answers so far); "
-            "`steer` must contain strings, as drive.py sends them"
-        )
+        """Return the error for a server that is missing, breaks each connection, or sends nothing usable."""
+        reason = f"{self._lost}; " if self._lost else ""
+        remedy = "start `python drive.py model.pt` first"
+        if self.unusable:
+            remedy = f"{self.unusable} unusable answers so far: `steer` must contain strings, as drive.py sends them"
+        return SimulatorError(f"{reason}no usable answer in {self.wait:g} s; {remedy}")
 
     def count_reconnection(self, error: ConnectionLost) -> None:
-        """Count a lost connection and say that a new one will be made."""
+        """Count a lost connection and wait before a new one is made. Raises SimulatorError after `wait` seconds."""
         self.reconnections += 1
-        _print(f"{error}; connecting again")
+        self._wait_after(error)
 
     def close(self) -> None:
         """Close the connection, if one is open."""

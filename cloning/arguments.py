@@ -1,0 +1,43 @@
+"""Types for argparse, so that every command refuses an impossible number or address in the same words."""
+
+import argparse
+import math
+from collections.abc import Callable
+from typing import TypeVar
+
+Number = TypeVar("Number", int, float)
+MAX_PORT = 65535
+
+
+def number(kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf) -> Callable[[str], Number]:
+    """Return a type for argparse: a finite number from `least` to `most`.
+
+    kind: makes the number from the text, and raises ValueError or ArithmeticError if it is none.
+    """
+    limits = f" of at least {least:g}" if least > -math.inf else ""
+    limits += f" and at most {most:g}" if most < math.inf else ""
+    wanted = ("a whole number" if kind is int else "a finite number") + limits
+
+    def parse(text: str) -> Number:
+        try:
+            value = kind(text)
+        except (ValueError, ArithmeticError):
+            value = None
+        if value is None or not least <= value <= most or value in (-math.inf, math.inf):
+            raise argparse.ArgumentTypeError(f"{text[:40]} is not {wanted}")
+        return value
+
+    return parse
+
+
+def ratio(text: str) -> float:
+    """Return the value of a number or a fraction such as 30000/1001. Raises ValueError, ZeroDivisionError."""
+    numerator, slash, denominator = text.partition("/")
+    return float(numerator) / (float(denominator) if slash else 1)
+
+
+def address(text: str) -> str:
+    """Return a host name or address; an empty one would stand for every network that this machine is in."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("is empty; name an address, such as 127.0.0.1")
+    return text
