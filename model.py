@@ -448,7 +448,6 @@ def prepare(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, Obs
     arguments, checkpoint = resumed_arguments(arguments, given)
     kind: type[Observations] = RobustObservations if arguments.robust else ReportObservations
     files = RunFiles(arguments.output)
-    files.pictures.mkdir(parents=True, exist_ok=True)
     folders = find_folders(arguments.recordings)
     arguments = replace(arguments, recordings=[str(folder.resolve()) for folder in folders])
     observations = read_observations(kind, folders, arguments, files.rejected)
@@ -482,7 +481,8 @@ def main(argv: list[str] | None = None) -> int:
     join_processes(arguments.device)
     status, message = 0, ""
     try:
-        run(arguments, given)
+        with RunFiles(arguments.output).claimed():
+            run(arguments, given)
     except UserError as error:
         status, message = 2, str(error)
     except OSError as error:
