@@ -320,6 +320,23 @@ def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkey
     assert {path.name: path.read_bytes() for path in begun.iterdir() if path.is_file()} == before
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device", "disk")])
+@pytest.mark.parametrize("place, advice", [("fingerprint", "start the run again"), ("loss_picture", "--resume")])
+def test_resume_is_recommended_only_once_the_new_run_has_a_state(
+    begun, sample_recording, monkeypatch, error, place, advice
+):
+    """Before, --resume would continue the earlier run."""
+
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(model, place, fail)
+    done = run_here(sample_recording, *SHORT, "--seed", 1, "--output", begun / "model.pt")
+    assert done.returncode in (1, 130)
+    assert ("--resume" in done.stderr) == (advice == "--resume") and advice in done.stderr
+    assert seed_of(begun / "model-resume.pt") == (advice == "--resume")
+
+
 def set_average(name, value):
     return lambda saved: saved["training"]["optimizer"]["state"][3].__setitem__(name, value)
 

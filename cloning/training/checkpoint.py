@@ -26,6 +26,7 @@ import torch
 
 from cloning.errors import ModelError, OutputError
 from cloning.files import write
+from cloning.outputs import check_folders
 from cloning.pilot.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
 from cloning.tensors import matching, shown
 from cloning.training.distributed import from_first_rank
@@ -57,6 +58,7 @@ class RunFiles:
         self.arguments = self.last.with_name("training_arguments.json")
         self.rejected = self.last.with_name("rejected_rows.csv")
         self.pictures = self.last.with_name("diagnostic_images")
+        self._state_at_start = self._state()
 
     @contextlib.contextmanager
     def claimed(self) -> Iterator[None]:
@@ -68,6 +70,7 @@ class RunFiles:
 
             def claim() -> None:
                 self.pictures.mkdir(parents=True, exist_ok=True)
+                check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
                 if os.name == "nt":
                     return
                 folder = os.open(self.last.parent, os.O_RDONLY)
@@ -84,6 +87,21 @@ class RunFiles:
 
             from_first_rank(claim)
             yield
+
+    def next_step(self, resumed: bool) -> str:
+        """Return what the user can do after an error; resumed: whether --resume was given.
+
+        Until a new run has saved a state, --resume would continue an earlier run.
+        """
+        begun = resumed or self._state() != self._state_at_start
+        return "continue with --resume" if begun else "start the run again"
+
+    def _state(self) -> tuple[int, int] | None:
+        """Return what tells whether model-resume.pt was replaced."""
+        if not os.path.exists(self.resume):
+            return None
+        now = self.resume.stat()
+        return now.st_ino, now.st_mtime_ns
 
 
 @dataclass
