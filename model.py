@@ -447,11 +447,9 @@ def prepare(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, Obs
     """Return the arguments, the training and validation observations, and the checkpoint to resume or None."""
     arguments, checkpoint = resumed_arguments(arguments, given)
     kind: type[Observations] = RobustObservations if arguments.robust else ReportObservations
-    files = RunFiles(arguments.output)
-    files.pictures.mkdir(parents=True, exist_ok=True)
     folders = find_folders(arguments.recordings)
     arguments = replace(arguments, recordings=[str(folder.resolve()) for folder in folders])
-    observations = read_observations(kind, folders, arguments, files.rejected)
+    observations = read_observations(kind, folders, arguments, RunFiles(arguments.output).rejected)
     train, validation = split(observations, arguments.seed)
     training = observations.take(train).resample(arguments.seed)
     sizes = f"training: {len(train):,} rows, {len(training):,} observations after resampling"
@@ -480,17 +478,19 @@ def main(argv: list[str] | None = None) -> int:
     arguments, given = parse(argv)
     keep_freed_memory()
     join_processes(arguments.device)
-    status, message = 0, ""
+    status, message, files = 0, "", RunFiles(arguments.output)
     try:
-        run(arguments, given)
+        with files.claimed():
+            run(arguments, given)
     except UserError as error:
         status, message = 2, str(error)
     except OSError as error:
-        status, message = 2, f"{message_of(error)}; all earlier files are intact. Remove the cause and use --resume"
+        remedy = f"all earlier files are intact. Remove the cause and {files.next_step(arguments.resume)}"
+        status, message = 2, f"{message_of(error)}; {remedy}"
     except Interrupted as error:
         status, message = 128 + error.args[0], "stopped and saved; continue with --resume"
     except KeyboardInterrupt:
-        status, message = 128 + SIGNALS[0], "stopped at once; --resume continues from the last saved state"
+        status, message = 128 + SIGNALS[0], f"stopped at once; {files.next_step(arguments.resume)}"
     if message and rank() == 0:
         print(f"model.py: {message}", file=sys.stderr)
     return leave_processes(status)

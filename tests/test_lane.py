@@ -256,8 +256,29 @@ def test_unusable_weights_are_named_with_the_remedy(tmp_path):
     with pytest.raises(ModelError, match=r"none\.pt: no such file.*python -m tools.train_lane"):
         load_network(tmp_path / "none.pt")
     Path(tmp_path / "bad.pt").write_bytes(b"nothing")
-    with pytest.raises(ModelError, match=r"bad\.pt: holds no weights.*python -m tools.train_lane"):
+    with pytest.raises(ModelError, match=r"bad\.pt: .*damaged.*python -m tools.train_lane"):
         load_network(tmp_path / "bad.pt")
+
+
+def test_changed_weights_are_refused_and_those_of_earlier_versions_are_not(tmp_path):
+    flipped, earlier, changed, other = (tmp_path / f"{name}.pt" for name in ("flipped", "earlier", "changed", "other"))
+    data = bytearray(reader.SHIPPED_WEIGHTS.read_bytes())
+    data[len(data) // 2] ^= 1
+    flipped.write_bytes(data)
+    with pytest.raises(ModelError, match=r"flipped\.pt: .*checksum"):
+        load_network(flipped)
+    weights = torch.load(reader.SHIPPED_WEIGHTS, weights_only=True)
+    weights["dense.2.bias"] += 0.01
+    torch.save(weights, changed)
+    with pytest.raises(ModelError, match=r"changed\.pt: .*digest"):
+        load_network(changed)
+    del weights["digest"]
+    torch.save(weights, earlier)
+    assert torch.equal(load_network(earlier).dense[2].bias, weights["dense.2.bias"].float())
+    weights["dense.2.bias"][0] = torch.nan
+    torch.save(weights, other)
+    with pytest.raises(ModelError, match=r"other\.pt: holds no weights .*dense\.2\.bias.*not finite.*train_lane"):
+        load_network(other)
 
 
 @pytest.fixture

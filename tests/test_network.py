@@ -1,7 +1,10 @@
 """The network against the report's table and plain arithmetic, its gradient in pieces, and the model file."""
 
+import copy
+import random
 import subprocess
 import sys
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -140,6 +143,133 @@ def test_other_files_are_refused_clearly(tmp_path, content, words):
     with pytest.raises(ModelError, match=words) as error:
         load_model(path)
     assert str(path) in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def saved() -> dict:
+    """The contents of the model file that comes with the project, as of an earlier version: without a digest."""
+    contents = torch.load(SHIPPED_MODEL, weights_only=True)
+    del contents["digest"]
+    return contents
+
+
+def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(saved, tmp_path):
+    path, data, chance = tmp_path / "model.pt", SHIPPED_MODEL.read_bytes(), random.Random(1)
+    anywhere = [chance.randrange(len(data)) for _ in range(40)]
+    in_the_names = [chance.randrange(9000) for _ in range(20)] + [chance.randrange(-4000, 0) for _ in range(20)]
+    refused = 0
+    for place in anywhere + in_the_names:
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << chance.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            network = load_model(path)
+        except ModelError as error:
+            assert str(error).startswith(f"{path}: ")
+            refused += 1
+        else:  # in the padding between the entries, or in a field that nothing reads
+            assert all(torch.equal(value, saved["network"][name]) for name, value in network.state_dict().items())
+    assert refused >= 50  # most of a file is weights
+
+
+def test_a_file_without_a_digest_is_loaded_and_its_checksums_are_compared(saved, tmp_path):
+    path = tmp_path / "model.pt"
+    torch.save(saved, path)
+    assert torch.equal(load_model(path).dense[0].weight, saved["network"]["dense.0.weight"])
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(ModelError, match="checksum of model/data/10 is wrong"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("part", ["network", "recipe"])
+def test_what_was_changed_after_saving_is_noticed(part, tmp_path):
+    """The archive's checksums fit, since torch wrote them anew."""
+    contents = torch.load(SHIPPED_MODEL, weights_only=True)
+    if part == "network":
+        contents["network"]["dense.3.bias"] += 1e-6
+    else:
+        contents["recipe"]["crop"] = (61, 24)
+    torch.save(contents, tmp_path / "model.pt")
+    with pytest.raises(ModelError, match="do not match its digest"):
+        load_model(tmp_path / "model.pt")
+
+
+NAME = "dense.3.weight"  # (1, 10)
+
+
+@pytest.mark.parametrize(
+    "part, value, words",
+    [
+        ("recipe", None, "no recipe"),
+        ("recipe", [1], "no recipe"),
+        ("frame", (120, 320, 3), "frame"),
+        ("frame", torch.zeros(3), "frame"),
+        ("colour", "BGR", "colour 'BGR'"),
+        ("crop", (60, 26), "crop"),
+        ("crop", (-1, 86), "crop"),
+        ("crop", [60, 25], "crop"),
+        ("crop", (60,), "crop"),
+        ("crop", ("60", "25"), "crop"),
+        ("crop", 60, "crop"),
+        ("scale", 0, "scale"),
+        ("scale", -127.5, "scale"),
+        ("scale", float("nan"), "scale"),
+        ("scale", "127.5", "scale"),
+        ("scale", None, "scale"),
+        ("scale", True, "scale"),
+        ("scale", torch.tensor(127.5), "scale"),
+        ("scale", 10**400, "scale"),
+        ("offset", float("inf"), "offset"),
+        ("network", None, "missing or unknown"),
+        ("network", [torch.zeros(3)], "missing or unknown"),
+        ("network", {0: torch.zeros(3)}, "missing or unknown"),
+        ("more", torch.zeros(3), "missing or unknown: 'more'"),
+        (NAME, "weights", f"{NAME} is 'weights'"),
+        (NAME, torch.zeros(10, 1), f"{NAME} is a tensor \\(10, 1\\)"),
+        (NAME, torch.zeros(1, 10, dtype=torch.int32), "int32"),
+        (NAME, torch.full((1, 10), float("nan")), f"{NAME} contains numbers that are not finite"),
+        (NAME, torch.full((1, 10), -float("inf")), f"{NAME} contains numbers that are not finite"),
+        (NAME, torch.full((1, 10), 1e200, dtype=torch.float64), f"{NAME} contains numbers that are not finite"),
+        (NAME, torch.zeros(1).expand(10**5, 10**5), "view"),
+        (NAME, torch.zeros(1, 10, device="meta"), "damaged"),
+        (NAME, torch.zeros(1, 10).to_sparse(), "damaged"),
+        ("versions", [[1]] * 2, "contained twice"),
+        ("versions", {1, 2}, "damaged"),
+    ],
+)
+def test_unusable_contents_are_named(saved, tmp_path, part, value, words):
+    contents = copy.deepcopy(saved)
+    inside = {"recipe": contents["recipe"], "network": contents["network"]}
+    place = contents if part in contents else inside["recipe" if part in contents["recipe"] else "network"]
+    place[part] = value
+    path = tmp_path / "model.pt"
+    torch.save(contents, path)
+    with pytest.raises(ModelError, match=words) as error:
+        load_model(path)
+    assert str(error.value).startswith(f"{path}: ") and "python model.py" in str(error.value)
+    assert len(str(error.value)) < 400
+
+
+def test_a_small_file_never_unpacks_to_a_large_one(saved, tmp_path):
+    plain, packed = tmp_path / "plain.pt", tmp_path / "packed.pt"
+    torch.save(saved, plain)
+    with zipfile.ZipFile(plain) as archive, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as smaller:
+        for name in archive.namelist():
+            smaller.writestr(name, archive.read(name))
+    with pytest.raises(ModelError, match="compressed"):
+        load_model(packed)
+    doubled = [0]
+    for _ in range(40):  # 2 ** 40 values for whoever visits all of them
+        doubled = [doubled, doubled]
+    torch.save({**saved, "history": doubled}, packed)
+    with pytest.raises(ModelError, match="contained twice"):
+        load_model(packed)
+    with open(packed, "wb") as file:
+        file.truncate(2**33)  # takes no space on the disk
+    with pytest.raises(ModelError, match="8,589,934,592 bytes"):
+        load_model(packed)
 
 
 def test_code_in_a_model_file_is_not_run(tmp_path):

@@ -1,5 +1,6 @@
 """Kills, signals, full disks and --resume: nothing is lost, and no run takes the models of an earlier one away."""
 
+import contextlib
 import json
 import os
 import random
@@ -14,7 +15,6 @@ import torch
 from conftest import HERE, ROOT, SHORT, finished_run, log, render_recording, run_here, run_model, same, weights
 
 import model
-from cloning.training import checkpoint
 
 # The same command, but it saves after every batch: kills then strike at every place of an epoch, and while writing.
 SAVING = [sys.executable, "-c", "import sys, model; model.SAVE_SECONDS = 0; sys.exit(model.main())"]
@@ -22,6 +22,15 @@ SAVING = [sys.executable, "-c", "import sys, model; model.SAVE_SECONDS = 0; sys.
 
 class Killed(BaseException):
     """As if the process were killed here: nothing in the program catches it."""
+
+
+@contextlib.contextmanager
+def edited(path):
+    """The contents of a file, which are written back without their digest, as earlier versions did."""
+    contents = torch.load(path, weights_only=True)
+    yield contents
+    contents.pop("digest", None)
+    torch.save(contents, path)
 
 
 def seed_of(path):
@@ -144,9 +153,8 @@ def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
 
 
 def test_resume_refuses_a_state_that_does_not_fit(begun):
-    saved = torch.load(begun / "model-resume.pt", weights_only=True)
-    del saved["training"]["optimizer"]
-    torch.save(saved, begun / "model-resume.pt")
+    with edited(begun / "model-resume.pt") as saved:
+        del saved["training"]["optimizer"]
     done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
     assert done.returncode == 2
     assert str(begun / "model-resume.pt") in done.stderr
@@ -157,9 +165,8 @@ def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path)
     begun = run_here(sample_recording, *SHORT, "--epochs", 1, "--strict", "--output", "runs/a/model.pt", cwd=tmp_path)
     assert begun.returncode == 0, begun.stderr
     folder = tmp_path / "runs" / "a"
-    saved = torch.load(folder / "model-resume.pt", weights_only=True)
-    saved["arguments"]["device"] = "cuda"  # as if begun on another machine
-    torch.save(saved, folder / "model-resume.pt")
+    with edited(folder / "model-resume.pt") as saved:
+        saved["arguments"]["device"] = "cuda"  # as if begun on another machine
     resumed = run_here("--resume", "--epochs", 2, "--device", "cpu", cwd=folder)
     assert resumed.returncode == 0, resumed.stderr
     assert not (folder / "runs").exists()
@@ -171,10 +178,10 @@ def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path)
 
 def test_a_checkpoint_of_an_earlier_version_is_resumed(finished, begun):
     """It has no identifier of its run, and may have an option that is gone."""
-    saved = torch.load(begun / "model-resume.pt", weights_only=True)
-    del saved["run"]
-    saved["arguments"]["gone"] = 1
-    torch.save(saved, begun / "model-resume.pt")
+    for name in ("model", "model-best", "model-resume"):
+        with edited(begun / f"{name}.pt") as saved:
+            del saved["run"]
+            saved["arguments"]["gone"] = 1
     assert run_here("--output", begun / "model.pt", "--resume", "--epochs", 2).returncode == 0
     assert same(weights(begun / "model.pt"), weights(finished[1] / "model.pt"))
     assert not list(begun.glob("*previous*"))
@@ -215,36 +222,176 @@ def test_a_new_run_leaves_the_model_in_place_until_its_first_epoch_has_ended(
     assert not (begun / "model-resume-previous-2.pt").exists()  # the stopped run had no finished epoch
 
 
-@pytest.mark.parametrize("kill_after", range(1, 5))
-def test_killed_while_earlier_models_are_renamed(begun, sample_recording, tmp_path, monkeypatch, kill_after):
-    """After each of two renamed and two written models: --resume goes on, and every model is kept once."""
-    steps = 0
+def tables(folder):
+    """The seed in each model file of a folder: of the run that wrote it."""
+    return {path.name: seed_of(path) for path in folder.glob("*.pt")}
 
-    def then_die(function):
-        def step(*arguments, **more):
-            nonlocal steps
-            function(*arguments, **more)
-            steps += 1
-            if steps == kill_after:
-                raise Killed
 
-        return step
+KINDS = ("model", "model-best", "model-resume")
+CHANGES = 10  # of files by a new run of one epoch until it is saved
 
-    rename, save = checkpoint.set_aside, checkpoint.save_model
-    arguments = (sample_recording, *SHORT, "--epochs", 1, "--seed", 1, "--output", begun / "model.pt")
+
+@pytest.mark.parametrize("kill_at", range(1, CHANGES + 1))
+@pytest.mark.parametrize("then", ["resume", "new run"])
+def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, kill_at, then):
+    """At each point --resume continues the run that model-resume.pt is of, and each earlier run's model is kept once.
+
+    Changes: 1 copy of model-resume.pt, 2 model-resume.pt, 3 arguments, 4 log, 5 picture, 6 and 7 copies of the models,
+    8 model.pt, 9 model-best.pt, 10 model-resume.pt. Diagnostic pictures and the cache are not counted.
+    """
+    changes, replace = 0, os.replace
+
+    def dying(source, target):
+        nonlocal changes
+        is_counted = target.parent == begun
+        changes += is_counted
+        if is_counted and changes == kill_at:
+            raise Killed
+        replace(source, target)
+
+    command = (sample_recording, *SHORT, "--epochs", 1, "--output", begun / "model.pt")
     with monkeypatch.context() as patch:
-        patch.setattr(
-            checkpoint, "set_aside", lambda path: (rename if "resume" in path.stem else then_die(rename))(path)
-        )
-        patch.setattr(
-            checkpoint,
-            "save_model",
-            lambda path, *more, **state: (save if "resume" in path.stem else then_die(save))(path, *more, **state),
-        )
+        patch.setattr(os, "replace", dying)
+        patch.setattr(os, "rename", dying)
         with pytest.raises(Killed):
-            run_here(*arguments)
-    resumed = run_here("--output", begun / "model.pt", "--resume")
-    assert resumed.returncode == 0, resumed.stderr
-    found = {path.name: seed_of(path) for path in begun.glob("*.pt")}
-    kinds = ("model", "model-best", "model-resume")
-    assert found == {f"{kind}.pt": 1 for kind in kinds} | {f"{kind}-previous.pt": 0 for kind in kinds}
+            run_here(*command, "--seed", 1)
+    assert all((begun / f"{kind}.pt").exists() for kind in KINDS)  # complete, and never missing for a moment
+    new_run_begun = kill_at > 2
+    assert seed_of(begun / "model-resume.pt") == new_run_begun
+    if then == "resume":
+        done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 1)
+        last, earlier = int(new_run_begun), [0] * new_run_begun
+    else:
+        done = run_here(*command, "--seed", 2)
+        last, earlier = 2, [0]
+    assert done.returncode == 0, done.stderr
+    found = tables(begun)
+    for kind in KINDS:
+        assert found.pop(f"{kind}.pt") == last
+        for seed in earlier:
+            assert found.pop(f"{kind}-previous.pt") == seed
+    # What else is kept: the models of seed 1 that a kill after they were written left; a copy of the resumed run's
+    # state that was made for the new run.
+    kept = {f"{kind}-previous-2.pt": 1 for kind, point in (("model", 8), ("model-best", 9)) if kill_at > point}
+    copied = {"model-resume-previous.pt": 0} if kill_at == 2 else {}
+    assert found == (copied if then == "resume" else kept)
+
+
+def test_files_of_a_run_get_the_same_ending(begun, sample_recording):
+    """Also if some of them were missing."""
+    command = (sample_recording, *SHORT, "--epochs", 1, "--output", begun / "model.pt")
+    (begun / "model-best.pt").unlink()
+    for seed in (1, 2):
+        assert run_here(*command, "--seed", seed).returncode == 0
+    assert tables(begun) == {f"{kind}.pt": 2 for kind in KINDS} | {f"{kind}-previous-2.pt": 1 for kind in KINDS} | {
+        "model-previous.pt": 0,
+        "model-resume-previous.pt": 0,
+    }
+
+
+def test_resume_does_not_replace_the_models_of_another_run(begun, sample_recording):
+    command = (sample_recording, *SHORT, "--epochs", 1, "--output", begun / "model.pt")
+    assert run_here(*command, "--seed", 1).returncode == 0
+    shutil.copy(begun / "model-resume-previous.pt", begun / "model-resume.pt")
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    assert done.returncode == 2
+    assert f"{begun / 'model.pt'}: damaged, or of another run than model-resume.pt" in done.stderr
+    for kind in ("model", "model-best"):
+        os.replace(begun / f"{kind}-previous.pt", begun / f"{kind}.pt")
+    assert run_here("--output", begun / "model.pt", "--resume", "--epochs", 2).returncode == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no locks on folders")
+def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkeypatch):
+    before = {path.name: path.read_bytes() for path in begun.iterdir() if path.is_file()}
+    others = []
+
+    def meanwhile(*arguments):
+        others.append(run_model(sample_recording, *SHORT, "--output", begun / "model.pt", *arguments))
+        others.append(run_model(sample_recording, *SHORT, "--output", begun / "other.pt"))
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(model, "read_observations", meanwhile)
+        with pytest.raises(Killed):
+            run_here(sample_recording, *SHORT, "--output", begun / "model.pt")
+    assert [run.returncode for run in others] == [2, 2]
+    assert all("another run is writing to this folder" in run.stderr for run in others)
+    assert {path.name: path.read_bytes() for path in begun.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device", "disk")])
+@pytest.mark.parametrize("place, advice", [("fingerprint", "start the run again"), ("loss_picture", "--resume")])
+def test_resume_is_recommended_only_once_the_new_run_has_a_state(
+    begun, sample_recording, monkeypatch, error, place, advice
+):
+    """Before, --resume would continue the earlier run."""
+
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(model, place, fail)
+    done = run_here(sample_recording, *SHORT, "--seed", 1, "--output", begun / "model.pt")
+    assert done.returncode in (1, 130)
+    assert ("--resume" in done.stderr) == (advice == "--resume") and advice in done.stderr
+    assert seed_of(begun / "model-resume.pt") == (advice == "--resume")
+
+
+def set_average(name, value):
+    return lambda saved: saved["training"]["optimizer"]["state"][3].__setitem__(name, value)
+
+
+def set_place(name, value):
+    return lambda saved: saved["training"].__setitem__(name, value)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (set_average("exp_avg", torch.full((36,), torch.nan)), "exp_avg contains numbers that are not finite"),
+        (set_average("exp_avg_sq", torch.zeros(35)), "exp_avg_sq is a tensor (35,)"),
+        (set_average("step", 3.0), "step is 3.0"),
+        (set_average("more", 3.0), "unknown: 'more'"),
+        (set_place("optimizer", [1]), "optimizer's state"),
+        (set_place("optimizer", {"state": {}}), "optimizer's state"),
+        (set_place("number", 1.5), "number is 1.5"),
+        (set_place("number", -1), "number is -1"),
+        (set_place("images", "4"), "images is '4'"),
+        (set_place("loss", None), "loss is None"),
+        (set_place("seconds", torch.zeros(2)), "seconds is a tensor"),
+        (set_place("fingerprint", torch.zeros(2)), "other recordings"),
+        (lambda saved: saved.update(training=3), "no state"),
+        (lambda saved: saved.update(history={"epoch": 1}), "history"),
+        (lambda saved: saved.update(history=[1]), "history"),
+        (lambda saved: saved["history"][0].update(val_loss="low"), "val_loss is 'low'"),
+        (lambda saved: saved["history"][0].pop("images"), "history"),
+        (lambda saved: saved.update(run=[1]), "identifier"),
+        (lambda saved: saved.update(arguments=None), "no arguments"),
+        (lambda saved: saved["arguments"].update(batch_size="8"), "--batch-size is of type str"),
+        (lambda saved: saved["arguments"].update(recordings=[1]), "--recordings is of type list"),
+        (lambda saved: saved["recipe"].update(crop=(61, 24)), "recipe"),
+        (lambda saved: saved["recipe"].update(scale=0), "scale 0"),
+        (lambda saved: saved["network"].update({"dense.3.bias": torch.full((1,), torch.inf)}), "not finite"),
+    ],
+)
+def test_an_unusable_state_is_named(begun, change, words):
+    path = begun / "model-resume.pt"
+    with edited(path) as saved:
+        change(saved)
+    before = {path.name: path.read_bytes() for path in begun.iterdir() if path.is_file()}
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"model.py: {path}: ") and words in done.stderr, done.stderr
+    assert "new run without --resume" in done.stderr
+    assert {path.name: path.read_bytes() for path in begun.iterdir() if path.is_file()} == before
+
+
+def test_a_flipped_bit_in_the_optimizers_state_is_noticed(begun):
+    path = begun / "model-resume.pt"
+    data = bytearray(path.read_bytes())
+    average = torch.load(path, weights_only=True)["training"]["optimizer"]["state"][10]["exp_avg"]
+    data[data.find(average.numpy().tobytes()) + 1000] ^= 4
+    path.write_bytes(data)
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    assert done.returncode == 2
+    assert f"{path}: " in done.stderr and "checksum" in done.stderr and "new run without --resume" in done.stderr

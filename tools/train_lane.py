@@ -10,7 +10,6 @@ measure them with `python -m tools.lane_accuracy --network lane.pt`, then copy t
 """
 
 import argparse
-import io
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -28,7 +27,6 @@ import torch
 from cloning.arguments import number
 from cloning.compute import choose_precision, in_precision, one_thread, threads
 from cloning.errors import UserError
-from cloning.files import write
 from cloning.lane.place import centre_ahead
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
@@ -39,6 +37,7 @@ from cloning.lane.reader import (
     extract_strip,
     normalize,
     read_strips,
+    save_network,
 )
 from cloning.recordings.images import decode
 from cloning.recordings.log import find_folders, read_recording
@@ -386,10 +385,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"rendering {arguments.looks} looks of {' and '.join(FRAME_SHARES)}", flush=True)
         strips, centres = render_all(range(arguments.looks), arguments.frames, arguments.seed)
         network = train(BatchSampler(strips, centres, recordings, arguments.seed), arguments.steps)
-        weights = network.state_dict().items()
-        buffer = io.BytesIO()
-        torch.save({name: value.half() if value.is_floating_point() else value for name, value in weights}, buffer)
-        write(arguments.output, buffer.getvalue())
+        save_network(arguments.output, network)
     except (UserError, OSError) as error:
         return program.failed("train_lane", error)
     return program.DONE

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from cloning import tensors
 from cloning.compute import choose_precision, in_precision, one_thread, threads
 from cloning.errors import ModelError
 from cloning.recordings.images import read_frame
@@ -100,21 +101,23 @@ class LaneNetwork(nn.Module):
         return (both[: len(strips)] - both[len(strips) :]) / 2
 
 
+def save_network(path: str | Path, network: LaneNetwork) -> None:
+    """Write the network's weights to a file, in half precision, which is enough. Raises OSError."""
+    weights = network.state_dict().items()
+    tensors.save(path, {name: value.half() if value.is_floating_point() else value for name, value in weights})
+
+
 @functools.cache
 def load_network(path: str | Path | None = None) -> LaneNetwork:
     """Return the network with the weights of a file, or with the shipped ones. Raises ModelError."""
     path = SHIPPED_WEIGHTS if path is None else path
+    remedy = f"train the lane network with `python -m tools.train_lane --output {path}`"
+    weights = tensors.load(path, remedy)
+    network = LaneNetwork()
     try:
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-        network = LaneNetwork()
-        network.load_state_dict(weights)
-    except FileNotFoundError:
-        raise ModelError(
-            f"{path}: no such file; train the lane network with `python -m tools.train_lane --output {path}`"
-        ) from None
-    except Exception as error:
-        reason = f"holds no weights of the lane network ({type(error).__name__})"
-        raise ModelError(f"{path}: {reason}; train them with `python -m tools.train_lane --output {path}`") from error
+        network.load_state_dict(tensors.matching(weights, network.state_dict()))
+    except ValueError as error:
+        raise ModelError(f"{path}: holds no weights of the lane network: {error}; {remedy}") from None
     return network.eval()
 
 

@@ -1,6 +1,5 @@
 """NVIDIA's network, the model file that stores it, and the steering computed with it."""
 
-import io
 import platform
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,13 @@ import numpy as np
 import torch
 from torch import nn
 
+from cloning import tensors
 from cloning.errors import ModelError
-from cloning.files import write
 from cloning.recordings.format import FRAME
 
 FORMAT, VERSION = "behavioral-cloning", 1  # of the model file
 SHIPPED_MODEL = Path(__file__).with_name("shipped.pt")  # comes with the project
+COLOUR = "RGB"  # order of a frame's colours
 CROP = (60, 25)  # rows cut off the top and the bottom of a frame
 UNITS = 4224  # of the flattened layer; dropout keeps half of them
 
@@ -98,25 +98,15 @@ def layer_table(network: Network) -> str:
 
 def save_model(path: Path, network: Network, **more: object) -> None:
     """Write a model file: the weights, what driving needs to use them, and `more` (plain values and tensors)."""
-    buffer = io.BytesIO()
-    torch.save(
-        {
-            "format": FORMAT,
-            "version": VERSION,
-            "network": network.state_dict(),
-            "recipe": {
-                "frame": FRAME,
-                "colour": "RGB",
-                "crop": network.crop,
-                "scale": network.scale,
-                "offset": network.offset,
-            },
-            "versions": versions(),
-            **more,
-        },
-        buffer,
-    )
-    write(path, buffer.getvalue())
+    recipe = {
+        "frame": FRAME,
+        "colour": COLOUR,
+        "crop": network.crop,
+        "scale": network.scale,
+        "offset": network.offset,
+    }
+    about = {"format": FORMAT, "version": VERSION, "recipe": recipe, "versions": versions()}
+    tensors.save(path, {**about, "network": network.state_dict(), **more})
 
 
 def versions() -> dict[str, str]:
@@ -129,21 +119,15 @@ def versions() -> dict[str, str]:
     }
 
 
-def load_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Return the contents of a model file, read with weights_only=True. Raises ModelError."""
-    try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-    except FileNotFoundError:
-        raise ModelError(f"{path}: no such file; `python model.py` trains a model") from None
-    except Exception as error:  # torch.load and pickle raise many kinds for a foreign or damaged file
+def load_checkpoint(path: str | Path, remedy: str = "`python model.py` trains a model") -> dict[str, Any]:
+    """Return the contents of a model file, read without running code from it. Raises ModelError, with the remedy."""
+    saved = tensors.load(path, remedy)
+    if saved.get("format") != FORMAT:
+        raise ModelError(f"{path}: not a model of this project; {remedy}")
+    version = saved.get("version")
+    if type(version) is not int or version != VERSION:
         raise ModelError(
-            f"{path}: not a model of this project, or damaged ({type(error).__name__}); `python model.py` trains one"
-        ) from error
-    if not isinstance(saved, dict) or saved.get("format") != FORMAT:
-        raise ModelError(f"{path}: not a model of this project; `python model.py` trains one")
-    if saved.get("version") != VERSION:
-        raise ModelError(
-            f"{path}: the model file has version {saved.get('version')}, but this program reads version {VERSION}; "
+            f"{path}: the model file has version {tensors.shown(version)}, but this program reads version {VERSION}; "
             "train the model again with `python model.py`"
         )
     return saved
@@ -153,15 +137,44 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> Network:
     """Return the network of a model file, in evaluation mode on the device. Raises ModelError."""
     saved = load_checkpoint(path)
     try:
-        recipe = saved["recipe"]
-        network = Network(recipe["crop"], recipe["scale"], recipe["offset"])
-        network.load_state_dict(saved["network"])
-    except (KeyError, RuntimeError) as error:
+        network = Network(*read_recipe(saved))
+        restore_weights(network, saved)
+    except ValueError as error:
         raise ModelError(
-            f"{path}: its contents do not fit this project's network ({error}); train it again with `python model.py`"
+            f"{path}: its contents do not fit this project's network: {error}; train it again with `python model.py`"
         ) from None
     network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
     return network.eval()
+
+
+def read_recipe(saved: dict[str, Any]) -> tuple[tuple[int, int], float, float]:
+    """Return crop, scale and offset, as `Network` takes them, from a model file's contents.
+
+    Raises ValueError for frames of another shape or order of colours, which no caller has, and for unusable values.
+    """
+    recipe = saved.get("recipe")
+    if not isinstance(recipe, dict):
+        raise ValueError("it has no recipe")
+    for name, value in (("frame", FRAME), ("colour", COLOUR)):
+        if repr(recipe.get(name)) != repr(value):
+            raise ValueError(f"its recipe has the {name} {tensors.shown(recipe.get(name))}, not {value!r}")
+    crop, scale, offset = (recipe.get(name) for name in ("crop", "scale", "offset"))
+    if (
+        not isinstance(crop, tuple)
+        or not [type(rows) for rows in crop] == [int, int]
+        or min(crop) < 0
+        or sum(crop) != sum(CROP)
+    ):
+        raise ValueError(f"its recipe has the crop {tensors.shown(crop)}, not two counts of rows, {sum(CROP)} in all")
+    if not tensors.is_number(scale, 1e-6, 1e6) or not tensors.is_number(offset, -1e6, 1e6):
+        values = f"{tensors.shown(scale)} and the offset {tensors.shown(offset)}"
+        raise ValueError(f"its recipe has the scale {values}, not a number above 0 and a number")
+    return crop, scale, offset
+
+
+def restore_weights(network: Network, saved: dict[str, Any]) -> None:
+    """Give a network the weights of a model file's contents. Raises ValueError if they do not fit."""
+    network.load_state_dict(tensors.matching(saved.get("network"), network.state_dict()))
 
 
 def steer(network: Network, frame: np.ndarray) -> np.float32:

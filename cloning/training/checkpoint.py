@@ -1,30 +1,46 @@
 """The files of a run: its models, and the state from which --resume continues; no model is lost if it is killed.
 
-A new run leaves an earlier run's models in place until its own first epoch has ended. Then it renames them to
-model-previous.pt and model-best-previous.pt, or to -previous-2, -previous-3 … if that name is taken. The earlier run's
-model-resume.pt has to go at the start, because --resume continues the new run from then on: it is renamed in the same
-way if it contains a finished epoch, and replaced if it does not.
+A new run leaves an earlier run's models in place until its own first epoch has ended. Before it replaces a file of an
+earlier run, it copies it to model-previous.pt, model-best-previous.pt or model-resume-previous.pt; if an even earlier
+run's files are there, to -previous-2, -previous-3 … A model-resume.pt without a finished epoch is not copied.
+
+So at any time model-resume.pt is complete, and it alone says which run --resume continues: the earlier one until the
+new one's first state has replaced it, which happens before the first batch, then the new one. A run recognises files
+by the run's identifier in them: a killed run that is resumed never takes its own models for an earlier run's, and a
+copy that was made before the kill is not made again.
 """
 
+import contextlib
 import hashlib
 import itertools
 import json
 import math
 import os
 import uuid
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from cloning.errors import ModelError
+from cloning.errors import ModelError, OutputError
 from cloning.files import write
-from cloning.pilot.network import Network, load_checkpoint, save_model, versions
+from cloning.outputs import check_folders
+from cloning.pilot.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
+from cloning.tensors import matching, shown
+from cloning.training.distributed import from_first_rank
 from cloning.training.observations import Observations
 from cloning.training.options import Arguments, option
 
+if os.name != "nt":
+    import fcntl
+
 EpochMetrics = dict[str, float]  # a row of training_log.csv: epoch, images, seconds, loss, val_loss
+NEW_RUN = "start a new run without --resume"
+PLACE = ("number", "images", "loss", "seconds")  # of Progress
+METRICS = ("epoch", "images", "seconds", "loss", "val_loss")  # of EpochMetrics
+COUNTS = {"number", "images", "epoch"}
 NEVER_RESUMED = {"output", "device", "strict", "resume"}  # they belong to one process, not to the run
 MAY_CHANGE = NEVER_RESUMED | {"recordings", "epochs"}  # with --resume; a fingerprint checks the recordings' contents
 
@@ -42,6 +58,50 @@ class RunFiles:
         self.arguments = self.last.with_name("training_arguments.json")
         self.rejected = self.last.with_name("rejected_rows.csv")
         self.pictures = self.last.with_name("diagnostic_images")
+        self._state_at_start = self._state()
+
+    @contextlib.contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Make the folders and keep other runs out of them until the block ends, or this process.
+
+        On Windows, and on a file system without locks, other runs are not kept out. Raises OutputError, OSError.
+        """
+        with contextlib.ExitStack() as stack:
+
+            def claim() -> None:
+                self.pictures.mkdir(parents=True, exist_ok=True)
+                check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
+                if os.name == "nt":
+                    return
+                folder = os.open(self.last.parent, os.O_RDONLY)
+                stack.callback(os.close, folder)
+                try:
+                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise OutputError(
+                        f"{self.last}: another run is writing to this folder; wait for its end, or give an --output in "
+                        "another folder"
+                    ) from None
+                except OSError as error:  # a network's file system, for example
+                    print(f"{self.last.parent}: cannot be locked ({error.strerror}); start no other run in it")
+
+            from_first_rank(claim)
+            yield
+
+    def next_step(self, resumed: bool) -> str:
+        """Return what the user can do after an error; resumed: whether --resume was given.
+
+        Until a new run has saved a state, --resume would continue an earlier run.
+        """
+        begun = resumed or self._state() != self._state_at_start
+        return "continue with --resume" if begun else "start the run again"
+
+    def _state(self) -> tuple[int, int] | None:
+        """Return what tells whether model-resume.pt was replaced."""
+        if not os.path.exists(self.resume):
+            return None
+        now = self.resume.stat()
+        return now.st_ino, now.st_mtime_ns
 
 
 @dataclass
@@ -51,7 +111,7 @@ class Progress:
     number                 of the next batch, from 0, counted over all epochs
     images, loss, seconds  so far in this epoch; loss is the sum of squared errors
     history                the metrics of each finished epoch
-    run                    a random identifier, by which a run recognises its own files
+    run                    a random identifier, by which a run recognises its own files; None from an earlier version
     """
 
     number: int = 0
@@ -59,7 +119,7 @@ class Progress:
     loss: float = 0.0
     seconds: float = 0.0
     history: list[EpochMetrics] = field(default_factory=list)
-    run: str = field(default_factory=lambda: uuid.uuid4().hex)
+    run: str | None = field(default_factory=lambda: uuid.uuid4().hex)
 
     def finish_epoch(self, val_loss: float) -> bool:
         """Add the epoch to the history and begin the next one; return whether val_loss is the lowest so far.
@@ -86,24 +146,66 @@ def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Argu
 
     given: the names of the arguments on the command line. The checkpoint is None for a new run. Raises ModelError.
     """
-    path = RunFiles(arguments.output).resume
+    files = RunFiles(arguments.output)
+    path = files.resume
     if not arguments.resume:
         return arguments, None
     if not path.exists():
         print(f"{path}: nothing to resume yet; starting a new run")
         return arguments, None
-    saved = load_checkpoint(path)
+    saved = load_checkpoint(path, NEW_RUN)
     if "training" not in saved:
         raise ModelError(f"{path}: contains no state to resume; give the --output of the run")
-    initial: dict[str, Any] = saved["arguments"]
+    try:
+        initial, history = _initial_arguments(saved), _progress(saved).history
+    except ValueError as error:
+        raise _unusable(path, error) from None
     for name in sorted(given - MAY_CHANGE):
         if name in initial and initial[name] != getattr(arguments, name):
             raise ModelError(
                 f"{path}: the run began with {option(name)} {initial[name]}, not {getattr(arguments, name)}; "
-                "leave the option out, or start a new run without --resume"
+                f"leave the option out, or {NEW_RUN}"
             )
-    names = {item.name for item in fields(Arguments)} - NEVER_RESUMED - given
-    return replace(arguments, **{name: value for name, value in initial.items() if name in names}), saved
+    for model in (files.last, files.best):
+        if history and model.exists() and _run_of(model) != saved.get("run"):
+            raise ModelError(
+                f"{model}: damaged, or of another run than {path.name}, which would replace it; move it away first"
+            )
+    return replace(arguments, **{name: value for name, value in initial.items() if name not in given}), saved
+
+
+def _initial_arguments(saved: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments that a checkpoint supplies. Raises ValueError."""
+    initial, known = saved.get("arguments"), {}
+    if not isinstance(initial, dict):
+        raise ValueError("it has no arguments")
+    for name, default in asdict(Arguments()).items():
+        if name in initial and name not in NEVER_RESUMED:
+            value = known[name] = initial[name]
+            if type(value) is not type(default) or (name == "recordings" and not all(type(it) is str for it in value)):
+                raise ValueError(f"its {option(name)} is of type {type(value).__name__}")
+    return known
+
+
+def _progress(saved: dict[str, Any]) -> Progress:
+    """Return the progress that a checkpoint contains. Raises ValueError."""
+    state, history, run = saved["training"], saved.get("history"), saved.get("run")
+    if not isinstance(state, dict) or not isinstance(history, list) or type(run) not in (str, type(None)):
+        raise ValueError("it has no state, history or identifier of its run")
+    values = [(name, state.get(name)) for name in PLACE]
+    for row in history:
+        if not isinstance(row, dict) or tuple(row) != METRICS:
+            raise ValueError(f"its history has {shown(row)}, not {', '.join(METRICS)}")
+        values += row.items()
+    for name, value in values:
+        if not (type(value) is int and 0 <= value <= 10**12 if name in COUNTS else type(value) is float):
+            raise ValueError(f"its {name} is {shown(value)}")
+    place: dict[str, Any] = {name: state[name] for name in PLACE}
+    return Progress(**place, history=history, run=run)
+
+
+def _unusable(path: Path, error: ValueError) -> ModelError:
+    return ModelError(f"{path}: its contents do not fit this program: {error}; {NEW_RUN}")
 
 
 def fingerprint(*observations: Observations) -> str:
@@ -130,15 +232,15 @@ class Checkpoint:
         self.fingerprint = data_fingerprint
 
     def begin(self, progress: Progress, precision: torch.dtype, resumed: bool) -> None:
-        """Write training_arguments.json and, unless the run is resumed, its first state."""
+        """Write training_arguments.json and, first, unless the run is resumed, its first state."""
+        if not resumed:
+            if _has_finished_epoch(self.files.resume):
+                self.set_aside(self.files.resume)
+            self.save(progress)
         settings = {**asdict(self.arguments), "precision": str(precision), "versions": versions()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if resumed:
             print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
-        else:
-            if _has_finished_epoch(self.files.resume):
-                set_aside(self.files.resume)
-            self.save(progress)
 
     def save(self, progress: Progress, *models: Path) -> None:
         """Write the network to these files, then model-resume.pt with all that --resume needs. Raises OSError."""
@@ -146,7 +248,7 @@ class Checkpoint:
         if models and len(progress.history) == 1:
             for path in (self.files.last, self.files.best):
                 if path.exists() and _run_of(path) != progress.run:  # its own if it was killed in `save`
-                    set_aside(path)
+                    self.set_aside(path)
         for path in models:
             save_model(path, self.network, **more)
         save_model(
@@ -170,40 +272,66 @@ class Checkpoint:
         """
         path = self.files.resume
         try:
-            state = saved["training"]
-            if state["fingerprint"] != self.fingerprint:
-                raise ModelError(
-                    f"{path}: the run began with other recordings; restore them, or start a new run without --resume"
-                )
-            self.network.load_state_dict(saved["network"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            progress = Progress(**{name: state[name] for name in ("number", "images", "loss", "seconds")})
-            progress.history = saved["history"]
-        except (KeyError, ValueError, RuntimeError) as error:
-            raise ModelError(f"{path}: its contents do not fit this program ({error}); start a new run") from None
-        progress.run = saved.get("run", progress.run)
+            progress, state = _progress(saved), saved["training"]
+            if state.get("fingerprint") != self.fingerprint:
+                raise ModelError(f"{path}: the run began with other recordings; restore them, or {NEW_RUN}")
+            if read_recipe(saved) != (self.network.crop, self.network.scale, self.network.offset):
+                raise ValueError("its recipe is not that of this program's training")
+            restore_weights(self.network, saved)
+            self._restore_optimizer(state.get("optimizer"), has_begun=progress.number > 0)
+        except ValueError as error:
+            raise _unusable(path, error) from None
         return progress
 
+    def _restore_optimizer(self, saved: object, has_begun: bool) -> None:
+        """Load the averages of a checkpoint into the optimizer; its settings follow from the arguments."""
+        averages = saved.get("state") if isinstance(saved, dict) else None
+        parameters = dict(enumerate(self.network.parameters())) if has_begun else {}
+        if not isinstance(averages, dict) or averages.keys() != parameters.keys():
+            raise ValueError("the optimizer's state is not that of this network")
+        state = {}
+        for number, parameter in parameters.items():
+            expected = {"step": torch.zeros(()), "exp_avg": parameter.detach(), "exp_avg_sq": parameter.detach()}
+            try:
+                state[number] = matching(averages[number], expected)
+            except ValueError as error:
+                raise ValueError(f"in the optimizer's state {number}: {error}") from None
+        groups = self.optimizer.state_dict()["param_groups"]
+        self.optimizer.load_state_dict({"state": state, "param_groups": groups})
 
-def set_aside(path: Path) -> None:
-    """Rename an earlier run's file: append -previous, or -previous-2 … if that name is taken."""
-    endings = itertools.chain(["previous"], (f"previous-{number}" for number in itertools.count(2)))
-    previous = next(free for ending in endings if not (free := path.with_stem(f"{path.stem}-{ending}")).exists())
-    os.rename(path, previous)
-    print(f"{path} of an earlier run is now {previous}")
+    def set_aside(self, path: Path) -> None:
+        """Copy an earlier run's file to its name with -previous, or -previous-2 …; nothing if there is a copy already.
+
+        All files of a run get the same ending. A copy, not a new name: at any time, `path` is there.
+        """
+        data, run = path.read_bytes(), _run_of(path)
+        for ending in itertools.chain(["previous"], (f"previous-{number}" for number in itertools.count(2))):
+            last, best, resume = (
+                file.with_stem(f"{file.stem}-{ending}")
+                for file in (self.files.last, self.files.best, self.files.resume)
+            )
+            copy = path.with_stem(f"{path.stem}-{ending}")
+            if copy.exists():
+                if copy.read_bytes() == data:  # made before this program was killed
+                    return
+            elif all(_run_of(file) == run for file in (last, best, resume) if file.exists()):
+                write(copy, data)
+                print(f"{path} of an earlier run is now {copy}")
+                return
 
 
 def _has_finished_epoch(path: Path) -> bool:
     """Return whether a file may contain a finished epoch."""
     try:
-        return path.exists() and bool(load_checkpoint(path).get("history", True))
+        return path.exists() and load_checkpoint(path).get("history") != []
     except ModelError:
         return True  # unknown, so keep it
 
 
 def _run_of(path: Path) -> str | None:
-    """Return the identifier of the run that wrote a model; None if the file has none."""
+    """Return the identifier of the run that wrote a model; None from an earlier version, "?" in no usable file."""
     try:
-        return load_checkpoint(path).get("run")
+        run = load_checkpoint(path).get("run")
     except ModelError:
-        return None
+        return "?"
+    return run if type(run) is str else None

@@ -1,0 +1,142 @@
+"""Files of tensors and plain values that carry a digest of their contents; a damaged file is refused.
+
+They are torch's files: zip archives without compression, with a checksum of each entry, which torch does not compare
+when it loads them. Files of earlier versions have no digest and rely on these checksums alone.
+"""
+
+import hashlib
+import io
+import math
+import reprlib
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any, TypeGuard
+
+import torch
+
+from cloning.errors import ModelError
+from cloning.files import write
+
+MAX_SIZE = 100_000_000  # bytes; the largest file of this project has 7 million
+PLAIN = (str, int, float, bool, type(None))
+
+
+def save(path: str | Path, contents: Mapping[str, object]) -> None:
+    """Write a file of dicts, lists, tuples, tensors and plain values, with their digest. Raises OSError.
+
+    Each non-empty dict, list, tuple and tensor may be contained only once.
+    """
+    buffer = io.BytesIO()
+    torch.save({**contents, "digest": compute_digest(contents)}, buffer)
+    write(path, buffer.getvalue())
+
+
+def load(path: str | Path, remedy: str) -> dict[str, Any]:
+    """Return the contents of a file, without running code from it, in memory of about the file's size.
+
+    remedy: how to get a good file, as the end of an error's message. Raises ModelError for a file that is missing, not
+    of `save`, or changed since it was saved.
+    """
+    try:
+        with open(path, "rb") as file:
+            _check_archive(file)
+            contents = torch.load(file, map_location="cpu", weights_only=True)
+        if not isinstance(contents, dict):
+            raise ValueError("its contents have no names")
+        digest = contents.pop("digest", None)
+        if compute_digest(contents) != digest and digest is not None:
+            raise ValueError("its contents do not match its digest")
+    except FileNotFoundError:
+        raise ModelError(f"{path}: no such file; {remedy}") from None
+    except OSError as error:
+        raise ModelError(f"{path}: {error.strerror or error}; {remedy}") from error
+    except Exception as error:  # torch.load and pickle raise many kinds for a foreign or damaged file
+        is_plain = type(error) in (ValueError, zipfile.BadZipFile)
+        reason = error if is_plain else type(error).__name__
+        raise ModelError(f"{path}: not a model of this project, or damaged ({reason}); {remedy}") from error
+    return contents
+
+
+def matching(found: object, expected: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return tensors of a file that have the names, shapes and kinds of number of `expected`, and are finite.
+
+    Raises ValueError, saying what differs.
+    """
+    if not isinstance(found, dict) or set(found) != set(expected):
+        differing = set(found) ^ set(expected) if isinstance(found, dict) else expected
+        raise ValueError(f"missing or unknown: {', '.join(sorted(map(shown, differing))[:3])}")
+    for name, like in expected.items():
+        value = found[name]
+        if (
+            not isinstance(value, torch.Tensor)
+            or value.shape != like.shape
+            or value.is_floating_point() != like.is_floating_point()
+        ):
+            raise ValueError(f"{name} is {shown(value)}, not a tensor {tuple(like.shape)}, {like.dtype}")
+        if not value.to(like.dtype).isfinite().all():
+            raise ValueError(f"{name} contains numbers that are not finite")
+    return {name: found[name] for name in expected}
+
+
+def shown(value: object) -> str:
+    """Return a short description of any value of a file, for a message."""
+    if isinstance(value, torch.Tensor):
+        return f"a tensor {tuple(value.shape)}, {value.dtype}"
+    return reprlib.repr(value)
+
+
+def is_number(value: object, least: float = -math.inf, most: float = math.inf) -> TypeGuard[float]:
+    """Return whether a value of a file is an int or a float, from `least` to `most`; never for nan."""
+    return isinstance(value, (int, float)) and type(value) is not bool and least <= value <= most
+
+
+def compute_digest(contents: object) -> str:
+    """Return a digest of dicts, lists, tuples, tensors and plain values, whichever file they are in.
+
+    Raises ValueError for any other value, for a tensor that is only a view, and for what is contained twice: a small
+    file could otherwise stand for any amount of data.
+    """
+    digest, seen = hashlib.blake2b(digest_size=16), set()
+
+    def add(value: object) -> None:
+        if isinstance(value, torch.Tensor):
+            if value.untyped_storage().nbytes() != value.nbytes:
+                raise ValueError("a tensor is a view of another one")
+            first_time(value.untyped_storage().data_ptr() if value.nbytes else None)
+            digest.update(f"{value.dtype} {tuple(value.shape)}:".encode())
+            digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+        elif isinstance(value, (dict, list, tuple)):
+            first_time(id(value) if value else None)
+            digest.update(f"{'dict' if isinstance(value, dict) else type(value).__name__} {len(value)}:".encode())
+            for item in value.items() if isinstance(value, dict) else [value]:
+                for part in item:
+                    add(part)
+        elif type(value) in PLAIN:
+            digest.update(f"{value!r}:".encode())
+        else:
+            raise ValueError(f"a value is of type {type(value).__name__}")
+
+    def first_time(identity: int | None) -> None:
+        if identity in seen:
+            raise ValueError("a value is contained twice")
+        if identity is not None:
+            seen.add(identity)
+
+    add(contents)
+    return digest.hexdigest()
+
+
+def _check_archive(file: IO[bytes]) -> None:
+    """Raise ValueError or BadZipFile if a file is not an intact archive without compression; rewind it."""
+    size = file.seek(0, io.SEEK_END)
+    if size > MAX_SIZE:
+        raise ValueError(f"it has {size:,} bytes")
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        unpacked = sum(entry.file_size for entry in entries)
+        if unpacked > size or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise ValueError("it is compressed")
+        if damaged := archive.testzip():
+            raise ValueError(f"the checksum of {damaged} is wrong")
+    file.seek(0)
