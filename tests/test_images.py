@@ -43,6 +43,18 @@ def inserted(data: bytes, at: int) -> bytes:
     return PLAIN[:at] + data + PLAIN[at:]
 
 
+# To who takes FF01 for a segment, these three are one, and the frame is small. To who knows that FF01 stands alone, the
+# frame is huge, and its small header, which follows, is a comment.
+COMMENT = b"\xff\xfe\0\x15"
+HIDDEN = [marker + (len(HUGE) + 6).to_bytes(2) + HUGE + COMMENT for marker in (b"\xff\x01", b"\xff\xd0", b"\xff\xd8")]
+
+
+@pytest.mark.parametrize("piece", HIDDEN)
+def test_a_size_cannot_be_hidden_from_the_check_by_a_marker_without_length(piece):
+    with pytest.raises(ValueError, match="not a plain JPEG"):
+        decode(inserted(piece, HEADER))
+
+
 @pytest.mark.parametrize("marker", [b"", *MARKERS])
 @pytest.mark.parametrize("at", [2, HEADER, SCAN])
 def test_a_size_cannot_be_hidden_from_the_check(marker, at):
@@ -106,7 +118,14 @@ def test_the_orientation_in_exif_data_is_ignored(orientation):
 def mutations(count: int):
     """JPEGs with bytes of the header changed, and markers, huge frame headers and other segments put in between."""
     rng = random.Random(0)
-    pieces = [*MARKERS, HUGE, HUGE.replace(b"\xff\xc0", b"\xff\xc2"), PLAIN[HEADER:SCAN], PLAIN[SCAN : SCAN + 14]]
+    pieces = [
+        *MARKERS,
+        *HIDDEN,
+        HUGE,
+        HUGE.replace(b"\xff\xc0", b"\xff\xc2"),
+        PLAIN[HEADER:SCAN],
+        PLAIN[SCAN : SCAN + 14],
+    ]
     originals = [PLAIN, jpeg_of(progressive=True)]
     for _ in range(count):
         jpeg = bytearray(rng.choice(originals))
