@@ -73,6 +73,7 @@ def with_scans(count: int) -> bytes:
     ("jpeg", "reason"),
     [
         (with_scans(25), "not a plain JPEG"),  # each scan costs as much as a frame
+        (inserted(b"\xff\xfe\0\2" * 200_000, 2), "more than 100 segments"),
         (jpeg_of("L"), "1 channels of 8 bits where 3 of 8 are expected"),
         (jpeg_of("CMYK"), "4 channels of 8 bits where 3 of 8 are expected"),
         (PLAIN.replace(b"\xff\xc0\0\x11\x08", b"\xff\xc1\0\x11\x0c"), "3 channels of 12 bits"),

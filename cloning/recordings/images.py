@@ -14,6 +14,7 @@ from cloning.recordings.format import FRAME
 
 RULES = 2  # of what a usable image is: counted up when they change, because `check_images` keeps its results
 MAX_BYTES = 1 << 20  # of a frame's JPEG; noise at quality 100 takes a fifth of it
+MAX_SEGMENTS = 100  # a camera's JPEG has 10
 MAX_SCANS = 20  # a progressive JPEG usually has 10; each one may take as long as the whole frame
 
 NONBLOCKING = getattr(os, "O_NONBLOCK", 0)  # opening a named pipe without a writer would block; Windows has none
@@ -36,13 +37,16 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
         raise ValueError("not a JPEG")
     if len(jpeg) > MAX_BYTES:
         raise ValueError(f"larger than {MAX_BYTES} bytes")
-    size, scans, at = None, 0, 2
+    size, segments, scans, at = None, 0, 0, 2
     while jpeg[at : at + 2] != b"\xff\xd9":
         if at + 4 > len(jpeg):
             raise ValueError("cut short")
         start, marker, length = struct.unpack_from(">BBH", jpeg, at)
         is_frame_header = marker in FRAME_HEADERS and size is None and length >= 8
         is_scan_header = marker == SCAN_HEADER and scans < MAX_SCANS
+        segments += 1
+        if segments > MAX_SEGMENTS:
+            raise ValueError(f"not a plain JPEG: more than {MAX_SEGMENTS} segments")
         if start != 0xFF or length < 2 or not (is_frame_header or is_scan_header or marker in OTHER_SEGMENTS):
             raise ValueError(f"not a plain JPEG: bytes {start:02X} {marker:02X} at {at}")
         end = at + 2 + length
