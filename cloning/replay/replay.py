@@ -85,7 +85,10 @@ class Drive:
 
 
 def load_recording(folder: str | Path) -> Recording:
-    """Read a recording without unusable rows and without repetitions of the row before. Raises RecordingError."""
+    """Read a recording without unusable rows, which are printed, and without repetitions of the row before.
+
+    Raises RecordingError if the recording cannot be read, or no row is left.
+    """
     recording = read_recording(folder)
     check_images(recording)
     print_findings(recording)
