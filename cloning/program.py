@@ -1,9 +1,10 @@
-"""How a command ends: its exit status, its last message, and Ctrl-C without a traceback at any moment.
+"""How a command prints and ends: its exit status, its last message, and Ctrl-C without a traceback at any moment.
 
 A command calls `end_on_interrupt` before it imports large libraries, and `run` at the end of its file. Its exit status
 is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C).
 """
 
+import io
 import os
 import signal
 import sys
@@ -40,7 +41,12 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
 
 
 def run(main: Callable[[], int | None]) -> NoReturn:
-    """Run a command's main function and end with its exit status; Ctrl-C raises KeyboardInterrupt only in `main`."""
+    """Run a command's main function and end with its exit status; Ctrl-C raises KeyboardInterrupt only in `main`.
+
+    Characters that stdout cannot show, such as undecodable bytes of a file's name, are printed as escapes there.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
     stop = signal.getsignal(signal.SIGINT)
     if callable(stop):
         signal.signal(signal.SIGINT, signal.default_int_handler)

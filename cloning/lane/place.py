@@ -210,7 +210,7 @@ def estimate_lane_position(
 
     Where a stretch is on a known road, from its localisation; elsewhere as `reader.fuse_detections` does.
     stretches: of the recording, `motion.stretches`; network: the shipped one if None.
-    Raises OSError, RecordingError for images that can't be read, ModelError without a usable network.
+    Raises RecordingError for images that can't be read, ModelError without a usable network.
     """
     centres = detect_centres(recording, network)
     position = fuse_detections(recording, centres, stretches)

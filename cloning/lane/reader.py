@@ -157,7 +157,7 @@ class LanePosition:
 
 
 def read_strips(recording: Recording) -> np.ndarray:
-    """Return the strips of a recording's three cameras: uint8 (n, 3, 32, 160, 3). Raises OSError, RecordingError."""
+    """Return the strips of a recording's three cameras: uint8 (n, 3, 32, 160, 3). Raises RecordingError."""
     strips = np.empty((len(recording), 3, *STRIP_SHAPE), np.uint8)
 
     def read(row: int) -> None:
@@ -173,7 +173,7 @@ def read_strips(recording: Recording) -> np.ndarray:
 def detect_centres(recording: Recording, network: LaneNetwork | None = None) -> np.ndarray:
     """Detect the lane's centre in each row by each camera (centre, left, right): float32 (n, 3, 5).
 
-    m to the right of the camera, at DISTANCES_AHEAD. Raises OSError, RecordingError for images that can't be read,
+    m to the right of the camera, at DISTANCES_AHEAD. Raises RecordingError for images that can't be read,
     ModelError without a usable network.
     """
     strips = read_strips(recording).reshape(-1, *STRIP_SHAPE)

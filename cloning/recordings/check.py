@@ -2,42 +2,48 @@
 
 import hashlib
 import os
-import zipfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from cloning.errors import RecordingError
 from cloning.files import written_whole
-from cloning.recordings.format import IMAGE_FOLDER
-from cloning.recordings.images import decode
+from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
+from cloning.recordings.images import RULES, decode, read_jpeg
 from cloning.recordings.log import Recording
+
+MISSING = "missing"
+COPY_OR_DELETE = "copy it again, or delete the row"
 
 
 def check_images(recording: Recording, threads: int = 2, show_progress: bool = True) -> None:
     """Decode every image of a recording; remove the rows that have an unusable image.
 
-    The results are kept in the user's cache folder: an image file that has not changed since (same size and time of
+    Usable images are remembered in the user's cache folder: one whose file has not changed since (same size and time of
     change) is not decoded again. Sets `recording.digests`; adds line, kind and detail of each removed row to
-    `recording.rejected`. threads: that decode at the same time.
+    `recording.rejected`. threads: that decode at the same time. Raises RecordingError if `IMG/` cannot be listed.
     """
     names, folder = recording.names, recording.folder / IMAGE_FOLDER
     states = _file_states(folder, names)
     cache = _cache_file(folder)
-    reasons, digests, changed = _read_cache(cache, names, states)
-    reasons[states[:, 0] < 0] = b"missing"
-    todo = np.flatnonzero(changed & (states[:, 0] >= 0))
+    digests, is_known = _read_cache(cache, names, states)
+    is_missing = states[:, 0] < 0
+    reasons: dict[int, str] = dict.fromkeys(np.flatnonzero(is_missing).tolist(), MISSING)
+    todo = np.flatnonzero(~is_known & ~is_missing)
     if len(todo):
 
-        def examine(at: int) -> tuple[bytes, int]:
+        def examine(at: int) -> tuple[str, int]:
             try:
-                jpeg = (folder / os.fsdecode(names[at])).read_bytes()
+                jpeg = read_jpeg(folder / os.fsdecode(names[at]))
                 decode(jpeg)
-            except (OSError, ValueError) as error:
-                return str(error).encode()[:80], 0
-            return b"", int.from_bytes(hashlib.blake2b(jpeg, digest_size=8).digest(), "big")
+            except ValueError as error:
+                return str(error), 0
+            return "", int.from_bytes(hashlib.blake2b(jpeg, digest_size=8).digest(), "big")
 
         with (
             ThreadPoolExecutor(threads) as pool,
@@ -49,28 +55,54 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
                 disable=None if show_progress else True,
             ) as bar,
         ):
-            remaining = iter(todo)
+            remaining = iter(todo.tolist())
             while part := list(
                 islice(remaining, 4096)
             ):  # in parts, because a future takes memory and there may be millions of images
                 for at, (reason, digest) in zip(part, pool.map(examine, part), strict=True):
-                    reasons[at], digests[at] = reason, digest
+                    digests[at] = digest
+                    if reason:
+                        reasons[at] = reason
                     bar.update()
-        _write_cache(cache, names, states, reasons, digests)
+    is_usable = np.ones(len(names), bool)
+    is_usable[list(reasons)] = False
+    if is_usable[todo].any():
+        _write_cache(cache, names[is_usable], states[is_usable], digests[is_usable])
     recording.digests = digests
-    bad = reasons != b""
-    unusable = bad[recording.images]
+    remedy = _remedies(folder) if is_missing.any() else None
+    unusable = ~is_usable[recording.images]
     for row in np.flatnonzero(unusable.any(1)):
-        image = recording.images[row][unusable[row]][0]
-        reason = reasons[image].decode()
-        recording.rejected.append(
-            (
-                int(recording.lines[row]),
-                f"image {reason}",
-                f"{IMAGE_FOLDER}/{os.fsdecode(names[image])}: {reason}; copy it again, or delete the row",
-            )
-        )
+        image = int(recording.images[row][unusable[row]][0])
+        name, reason = os.fsdecode(names[image]), reasons[image]
+        what_to_do = remedy(name) if remedy and reason == MISSING else COPY_OR_DELETE
+        detail = f"{IMAGE_FOLDER}/{name}: {reason}; {what_to_do}"
+        recording.rejected.append((int(recording.lines[row]), f"image {reason}", detail))
     recording.keep(~unusable.any(1))
+
+
+def _remedies(folder: Path) -> Callable[[str], str]:
+    """Return what to do about a missing image, as a function of its name; folder: where it should be."""
+    if not folder.is_dir():
+        similar = _by_lower_case(folder.parent).get(folder.name.lower(), folder.name)
+        renaming = f"rename the folder {similar} to {folder.name}"
+        copying = f"there is no folder {folder.name}: copy it beside {DRIVING_LOG}"
+        return lambda name: copying if similar == folder.name else renaming
+    present = _by_lower_case(folder)
+
+    def remedy(name: str) -> str:
+        similar = present.get(name.lower(), name)
+        if similar != name:
+            return f"rename {similar}, which differs in upper and lower case, or correct the csv"
+        if (folder / name).is_symlink():
+            return "its link leads nowhere: copy the image in its place, or delete the row"
+        return COPY_OR_DELETE
+
+    return remedy
+
+
+def _by_lower_case(folder: Path) -> dict[str, str]:
+    """Return the names of a folder's entries by their form in lower case."""
+    return {entry.name.lower(): entry.name for entry in folder.iterdir()}
 
 
 def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
@@ -78,44 +110,58 @@ def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
     states = np.full((len(names), 2), -1, np.int64)
     if not folder.is_dir():
         return states
-    with os.scandir(folder) as entries:
-        while part := list(islice(entries, 8192)):
-            entry_names = np.array([os.fsencode(entry.name) for entry in part])
-            at = np.searchsorted(names, entry_names).clip(max=len(names) - 1)
-            is_wanted = names[at] == entry_names
-            for entry, index in zip(np.array(part)[is_wanted], at[is_wanted], strict=True):
-                status = entry.stat()
-                states[index] = status.st_size, status.st_mtime_ns
+    try:
+        with os.scandir(folder) as entries:
+            while part := list(islice(entries, 8192)):
+                entry_names = np.array([os.fsencode(entry.name) for entry in part])
+                at = np.searchsorted(names, entry_names).clip(max=len(names) - 1)
+                is_wanted = names[at] == entry_names
+                for entry, index in zip(np.array(part)[is_wanted], at[is_wanted], strict=True):
+                    with suppress(OSError):  # a link that leads nowhere
+                        status = entry.stat()
+                        states[index] = status.st_size, status.st_mtime_ns
+    except OSError as error:
+        raise RecordingError(f"{folder}: {error.strerror}; make it readable") from None
     return states
 
 
 def _cache_file(folder: Path) -> Path:
-    """Return the cache file for the images in a folder."""
+    """Return the file in which the usable images of a folder are remembered."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
     return home / "behavioral-cloning" / f"{name}.npz"
 
 
-def _read_cache(cache: Path, names: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return for each file why it is unusable (b"" if it is usable), its digest, and whether it is new or changed."""
-    n = len(names)
-    reasons, digests, changed = np.zeros(n, "S80"), np.zeros(n, np.uint64), np.ones(n, bool)
+def _cache_columns(names: np.dtype) -> np.dtype:
+    """Return the columns of the cache: name, size and time of change, digest; names: dtype of the file names."""
+    return np.dtype([("name", names), ("state", np.int64, 2), ("digest", np.uint64)])
+
+
+def _read_cache(cache: Path, names: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the digest of each file, uint64 (m,), and whether it is known to be usable and unchanged, bool (m,)."""
     try:
-        with np.load(cache) as old:
-            at = np.searchsorted(old["names"], names).clip(max=len(old["names"]) - 1)
-            changed = (old["names"][at] != names) | (old["states"][at] != states).any(1)
-            reasons, digests = np.where(changed, b"", old["reasons"][at]).astype("S80"), old["digests"][at]
+        with np.load(cache) as file:
+            if "rules" not in file or file["rules"] != RULES:
+                raise ValueError("checked by the rules of another version")
+            known = file["images"]
+        if known.ndim != 1 or known.dtype != _cache_columns(known.dtype["name"]):
+            raise ValueError("other columns")
+        at = np.searchsorted(known["name"], names).clip(max=len(known) - 1)
+        return known["digest"][at], (known["name"][at] == names) & (known["state"][at] == states).all(1)
     except FileNotFoundError:
         pass  # the first run on this folder
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # whatever a damaged file makes NumPy raise
         print(f"{cache}: unreadable ({error}); all images will be checked again")
-    return reasons, digests, changed
+    return np.zeros(len(names), np.uint64), np.zeros(len(names), bool)
 
 
-def _write_cache(cache: Path, names: np.ndarray, states: np.ndarray, reasons: np.ndarray, digests: np.ndarray) -> None:
+def _write_cache(cache: Path, names: np.ndarray, states: np.ndarray, digests: np.ndarray) -> None:
+    """Remember usable images; names: bytes (m,), sorted; states: of `_file_states`; digests: uint64 (m,)."""
+    images = np.empty(len(names), _cache_columns(names.dtype))
+    images["name"], images["state"], images["digest"] = names, states, digests
     try:
         cache.parent.mkdir(parents=True, exist_ok=True)
         with written_whole(cache, per_process=True) as temporary, open(temporary, "wb") as file:
-            np.savez(file, names=names, states=states, reasons=reasons, digests=digests)
+            np.savez(file, rules=RULES, images=images)
     except OSError as error:
         print(f"{cache}: {error.strerror}; the next run will check all images again")

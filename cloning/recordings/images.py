@@ -1,5 +1,8 @@
-"""Encode and decode the JPEGs of frames, in the same way for training, driving and replaying."""
+"""Encode, read and decode the JPEGs of frames, in the same way for training, driving, filming and replaying."""
 
+import os
+import re
+import stat
 import struct
 from pathlib import Path
 
@@ -9,39 +12,77 @@ import numpy as np
 from cloning.errors import RecordingError
 from cloning.recordings.format import FRAME
 
+RULES = 2  # of what a usable image is: counted up when they change, because `check_images` keeps its results
+MAX_BYTES = 1 << 20  # of a frame's JPEG; noise at quality 100 takes a fifth of it
+MAX_SEGMENTS = 100  # a camera's JPEG has 10
+MAX_SCANS = 20  # a progressive JPEG usually has 10; each one may take as long as the whole frame
+
+NONBLOCKING = getattr(os, "O_NONBLOCK", 0)  # opening a named pipe without a writer would block; Windows has none
+FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; all with Huffman codes
+SCAN_HEADER = 0xDA
+OTHER_SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, restart interval, comment, application data
+MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7]")  # the first one ends the scan; restart markers do not
+
 
 def jpeg_size(jpeg: bytes) -> tuple[int, int]:
-    """Return rows and columns of a JPEG from its header, without decoding it.
+    """Return rows and columns of a whole colour JPEG from its markers, without decoding it.
 
-    Raises ValueError if it is not a JPEG, or was cut short (no end marker after the start of the scan).
+    Where the markers leave room for interpretation, decoders disagree, and a huge frame can be hidden from all but one
+    of them. So JPEGs are accepted only as encoders write them: segment follows segment without a gap to the end marker,
+    with one frame header, 8 bits, three channels and few scans. Raises ValueError with the reason.
     """
     if not jpeg:
         raise ValueError("empty")
-    if jpeg[:2] != b"\xff\xd8":
+    if jpeg[:3] != b"\xff\xd8\xff":
         raise ValueError("not a JPEG")
-    size, at = None, 2
-    while at + 9 < len(jpeg) and jpeg[at] == 0xFF:
-        marker, length = jpeg[at + 1], struct.unpack_from(">H", jpeg, at + 2)[0]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
-            size = struct.unpack_from(">HH", jpeg, at + 5)
-        if marker == 0xDA:  # start of scan: entropy-coded to the end marker, which cannot occur inside it
-            if size and jpeg.rfind(b"\xff\xd9", at) > 0:
-                return size
-            break
-        at += 2 + length
-    raise ValueError("cut short")
+    if len(jpeg) > MAX_BYTES:
+        raise ValueError(f"larger than {MAX_BYTES} bytes")
+    size, segments, scans, at = None, 0, 0, 2
+    while jpeg[at : at + 2] != b"\xff\xd9":
+        if at + 4 > len(jpeg):
+            raise ValueError("cut short")
+        start, marker, length = struct.unpack_from(">BBH", jpeg, at)
+        is_frame_header = marker in FRAME_HEADERS and size is None and length >= 8
+        is_scan_header = marker == SCAN_HEADER and scans < MAX_SCANS
+        segments += 1
+        if segments > MAX_SEGMENTS:
+            raise ValueError(f"not a plain JPEG: more than {MAX_SEGMENTS} segments")
+        if start != 0xFF or length < 2 or not (is_frame_header or is_scan_header or marker in OTHER_SEGMENTS):
+            raise ValueError(f"not a plain JPEG: bytes {start:02X} {marker:02X} at {at}")
+        end = at + 2 + length
+        if end > len(jpeg):
+            raise ValueError("cut short")
+        if is_frame_header:
+            bits, rows, columns, channels = struct.unpack_from(">BHHB", jpeg, at + 4)
+            if (bits, channels) != (8, FRAME[2]):
+                raise ValueError(f"{channels} channels of {bits} bits where {FRAME[2]} of 8 are expected")
+            size = rows, columns
+        if is_scan_header:
+            scans += 1
+            following = MARKER_IN_SCAN.search(jpeg, end)
+            if not following:
+                raise ValueError("cut short")
+            end = following.start()
+        at = end
+    if size is None or not scans:
+        raise ValueError("no picture in it")
+    return size
 
 
 def decode(jpeg: bytes) -> np.ndarray:
     """Decode the JPEG of a recorded or received frame: uint8 (160, 320, 3), RGB.
 
-    Raises ValueError if it is not a whole JPEG of 160 rows and 320 columns; this is checked before decoding.
+    The pixels are as the camera wrote them: an orientation in Exif data is ignored, and greyscale and CMYK are refused.
+    Raises ValueError if it is not a whole colour JPEG of 160 rows and 320 columns; this is checked before decoding.
     """
     rows, columns = jpeg_size(jpeg)
     if (rows, columns) != FRAME[:2]:
         raise ValueError(f"{columns}x{rows} pixels where {FRAME[1]}x{FRAME[0]} are expected")
-    frame = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
-    if frame is None:
+    try:
+        frame = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise ValueError("damaged") from error
+    if frame is None or frame.shape != FRAME or frame.dtype != np.uint8:
         raise ValueError("damaged")
     return frame
 
@@ -52,12 +93,33 @@ def encode(frame: np.ndarray, quality: int) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-def read_frame(path: Path) -> np.ndarray:
-    """Read and decode a recorded image: uint8 (160, 320, 3), RGB.
+def read_jpeg(path: Path) -> bytes:
+    """Return the bytes of an image file, or its first ones if it is larger than any frame's.
 
-    Raises OSError if the file can't be read, RecordingError if it isn't a whole JPEG of a frame's size.
+    Raises ValueError with the reason if it cannot be read, or is not a regular file: a pipe would never end.
     """
     try:
-        return decode(path.read_bytes())
+        with open(path, "rb", buffering=0, opener=lambda name, flags: os.open(name, flags | NONBLOCKING)) as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise ValueError("not a regular file")
+            return file.read(min(status.st_size, MAX_BYTES) + 1)
+    except OSError as error:
+        raise ValueError(error.strerror or str(error)) from error
+
+
+def read_image(path: Path) -> tuple[bytes, np.ndarray]:
+    """Return the bytes of a recorded image, and its frame: uint8 (160, 320, 3), RGB.
+
+    Raises RecordingError if the file cannot be read, or is not a whole JPEG of a frame's size.
+    """
+    try:
+        jpeg = read_jpeg(path)
+        return jpeg, decode(jpeg)
     except ValueError as error:
         raise RecordingError(f"{path}: {error}; copy it again, or delete its row from the log") from error
+
+
+def read_frame(path: Path) -> np.ndarray:
+    """Read and decode a recorded image: uint8 (160, 320, 3), RGB. Raises RecordingError; see `read_image`."""
+    return read_image(path)[1]

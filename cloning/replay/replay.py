@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from cloning.errors import RecordingError
 from cloning.recordings.check import check_images
+from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.images import encode
-from cloning.recordings.log import Recording, read_recording
+from cloning.recordings.log import Recording, print_findings, read_recording
 from cloning.replay.autonomy import autonomy
 from cloning.replay.views import StretchViews
 from cloning.road.camera import VIEW_JPEG_QUALITY
@@ -83,9 +85,15 @@ class Drive:
 
 
 def load_recording(folder: str | Path) -> Recording:
-    """Read a recording without unusable rows and without repetitions of the row before. Raises RecordingError."""
+    """Read a recording without unusable rows, which are printed, and without repetitions of the row before.
+
+    Raises RecordingError if the recording cannot be read, or no row is left.
+    """
     recording = read_recording(folder)
     check_images(recording)
+    print_findings(recording)
+    if not len(recording):
+        raise RecordingError(f"{recording.folder / DRIVING_LOG}: no usable row is left to replay")
     recording.keep(np.r_[True, np.diff(recording.images[:, 0]) != 0])  # copies of oversampled rows follow one another
     return recording
 

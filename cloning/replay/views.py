@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 
-from cloning.recordings.images import decode
+from cloning.recordings.images import read_image
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, FIRST_BONNET_ROW, camera_position
 from cloning.road.motion import AXLE_TO_CAMERA, Stretch, components, forward_vector, right_of
@@ -22,16 +22,20 @@ class StretchViews:
         self.recording, self.stretch = recording, stretch
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - the object lives only while its stretch is driven
+    def _image(self, at: int, camera: int) -> tuple[bytes, np.ndarray]:
+        """Return what `frame` and `jpeg` do: read at once, so that a file that changes meanwhile gives one of both."""
+        return read_image(self.recording.path(self.stretch.rows.start + at, camera))
+
     def frame(self, at: int, camera: int) -> np.ndarray:
-        """Return a recorded frame, uint8 (160, 320, 3), RGB.
+        """Return a recorded frame, uint8 (160, 320, 3), RGB. Raises RecordingError if it became unusable.
 
         at: row of the stretch; camera: 0 centre, 1 left, 2 right.
         """
-        return decode(self.jpeg(at, camera))
+        return self._image(at, camera)[1]
 
-    def jpeg(self, at: int, camera: int = 0) -> bytes:
-        """Return the bytes of a recorded frame's file."""
-        return self.recording.path(self.stretch.rows.start + at, camera).read_bytes()
+    def jpeg(self, at: int) -> bytes:
+        """Return the bytes of the centre camera's file. Raises RecordingError if it became unusable."""
+        return self._image(at, 0)[0]
 
     def view_from(self, at: int, right: float, yaw: float) -> np.ndarray:
         """Return what the centre camera would see from another pose than the recorded one: uint8 (160, 320, 3), RGB.

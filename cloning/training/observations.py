@@ -14,7 +14,7 @@ import numpy as np
 from cloning.errors import RecordingError
 from cloning.pilot.network import CROP
 from cloning.recordings.format import FRAME
-from cloning.recordings.images import decode
+from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.log import Recording
 from cloning.training.image_cache import ImageCache
 from cloning.training.options import Arguments
@@ -238,8 +238,8 @@ def center_digests(recording: Recording, rows: np.ndarray) -> np.ndarray:
 def read_checked(path: Path) -> np.ndarray:
     """Return a frame, uint8 (160, 320, 3), RGB. Raises RecordingError if it became unusable after the check."""
     try:
-        return decode(path.read_bytes())
-    except (OSError, ValueError) as error:
+        return decode(read_jpeg(path))
+    except ValueError as error:
         raise RecordingError(
             f"{path}: {error}; the image was usable when the run began. Restore it and continue with --resume"
         ) from None

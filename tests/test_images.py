@@ -1,0 +1,399 @@
+"""Images that are hostile, damaged, turned or no files: refused at the cost of their pixels, with name and reason."""
+
+import io
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import HERE, ROOT, SHORT, render_frame, run_here, same, weights
+from PIL import Image
+
+import model
+import simulator.__main__ as simulator
+from cloning.errors import RecordingError
+from cloning.pilot.network import SHIPPED_MODEL
+from cloning.recordings import check
+from cloning.recordings.check import check_images
+from cloning.recordings.images import MAX_BYTES, decode, jpeg_size, read_frame, read_jpeg
+from cloning.recordings.log import read_recording
+from cloning.replay import command, replay
+
+FRAME = render_frame(0.3, 0, np.random.default_rng(0))
+HUGE = b"\xff\xc0\x00\x11\x08\x75\x30\x75\x30\x03\x01\x22\x00\x02\x11\x01\x03\x11\x01"  # a header of 30,000 x 30,000
+
+
+def jpeg_of(mode="RGB", **options) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(FRAME).convert(mode).save(file, "JPEG", **options)
+    return file.getvalue()
+
+
+PLAIN = jpeg_of()
+HEADER = PLAIN.index(b"\xff\xc0")  # where the frame header is
+SCAN = PLAIN.index(b"\xff\xda")
+MARKERS = [b"\xff\x01", b"\xff\xff", b"\xff", b"\xff\xd0", b"\xff\xd8", b"\xff\xdc\0\4\xff\xff", b"\xff\xcc\0\2", b"\0"]
+
+
+def inserted(data: bytes, at: int) -> bytes:
+    return PLAIN[:at] + data + PLAIN[at:]
+
+
+# To who takes FF01 for a segment, these three are one, and the frame is small. To who knows that FF01 stands alone, the
+# frame is huge, and its small header, which follows, is a comment.
+COMMENT = b"\xff\xfe\0\x15"
+HIDDEN = [marker + (len(HUGE) + 6).to_bytes(2) + HUGE + COMMENT for marker in (b"\xff\x01", b"\xff\xd0", b"\xff\xd8")]
+
+
+@pytest.mark.parametrize("piece", HIDDEN)
+def test_a_size_cannot_be_hidden_from_the_check_by_a_marker_without_length(piece):
+    with pytest.raises(ValueError, match="not a plain JPEG"):
+        decode(inserted(piece, HEADER))
+
+
+@pytest.mark.parametrize("marker", [b"", *MARKERS])
+@pytest.mark.parametrize("at", [2, HEADER, SCAN])
+def test_a_size_cannot_be_hidden_from_the_check(marker, at):
+    with pytest.raises(ValueError, match=r"not a plain JPEG|not a JPEG|pixels where"):
+        decode(inserted(marker + HUGE, at))
+
+
+def with_scans(count: int) -> bytes:
+    """A progressive JPEG whose last scan is repeated."""
+    jpeg = jpeg_of(progressive=True)
+    last = jpeg.rindex(b"\xff\xda")
+    return jpeg[:last] + jpeg[last:-2] * count + jpeg[-2:]
+
+
+@pytest.mark.parametrize(
+    ("jpeg", "reason"),
+    [
+        (with_scans(25), "not a plain JPEG"),  # each scan costs as much as a frame
+        (inserted(b"\xff\xfe\0\2" * 200_000, 2), "more than 100 segments"),
+        (jpeg_of("L"), "1 channels of 8 bits where 3 of 8 are expected"),
+        (jpeg_of("CMYK"), "4 channels of 8 bits where 3 of 8 are expected"),
+        (PLAIN.replace(b"\xff\xc0\0\x11\x08", b"\xff\xc1\0\x11\x0c"), "3 channels of 12 bits"),
+        (PLAIN.replace(b"\xff\xc0", b"\xff\xc9"), "not a plain JPEG"),  # arithmetic coding
+        (inserted(b"\xff\xfe\xff\xff" + bytes(65533), 2) + bytes(MAX_BYTES), f"larger than {MAX_BYTES} bytes"),
+        (PLAIN[: len(PLAIN) // 2] + PLAIN, "not a plain JPEG"),  # one file begun in the middle of another
+        (b"\xff\xd8\xff\xd9", "no picture in it"),
+        (PLAIN[:HEADER] + PLAIN[SCAN:], "no picture in it"),
+        (PLAIN[:SCAN] + b"\xff\xd9", "no picture in it"),
+        (PLAIN.replace(b"\xff\xdb", b"\xff\xfe"), "damaged"),  # without quantization tables
+    ],
+)
+def test_what_no_camera_of_the_simulator_writes_is_refused(jpeg, reason):
+    with pytest.raises(ValueError, match=reason):
+        decode(jpeg)
+
+
+@pytest.mark.parametrize(
+    "jpeg",
+    [
+        jpeg_of(progressive=True),
+        jpeg_of(optimize=True),
+        jpeg_of(quality=100, subsampling=0),
+        jpeg_of(restart_marker_blocks=5),
+        inserted(b"\xff\xe1\x00\x40Exif\0\0" + PLAIN[:56], 2),  # a thumbnail
+        PLAIN + b"\xff\xd8 another picture",
+    ],
+)
+def test_what_other_encoders_write_is_read_as_they_meant(jpeg):
+    expected = np.array(Image.open(io.BytesIO(jpeg))).astype(int)
+    assert np.abs(decode(jpeg).astype(int) - expected).mean() < 1
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_orientation_in_exif_data_is_ignored(orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    turned = jpeg_of(exif=exif)
+    assert Image.open(io.BytesIO(turned)).getexif()[0x0112] == orientation
+    np.testing.assert_array_equal(decode(turned), decode(PLAIN))
+
+
+def mutations(count: int):
+    """JPEGs with bytes of the header changed, and markers, huge frame headers and other segments put in between."""
+    rng = random.Random(0)
+    pieces = [
+        *MARKERS,
+        *HIDDEN,
+        HUGE,
+        HUGE.replace(b"\xff\xc0", b"\xff\xc2"),
+        PLAIN[HEADER:SCAN],
+        PLAIN[SCAN : SCAN + 14],
+    ]
+    originals = [PLAIN, jpeg_of(progressive=True)]
+    for _ in range(count):
+        jpeg = bytearray(rng.choice(originals))
+        borders = [at for at in range(2, SCAN + 14) if jpeg[at] == 0xFF]
+        for _ in range(rng.randint(0, 3)):
+            jpeg[rng.randrange(SCAN + 40)] = rng.choice([0, 1, 0xFF, rng.randrange(256)])
+        for _ in range(rng.randint(0, 3)):
+            at = rng.choice(borders)
+            jpeg[at:at] = rng.choice(pieces)
+        yield bytes(jpeg)
+
+
+def decode_mutations() -> None:
+    """Run in a process whose OpenCV takes no more than 160 x 320 pixels: it must never be asked to take more."""
+    whole = 0
+    for jpeg in mutations(3000):
+        try:
+            if jpeg_size(jpeg) != (160, 320):
+                continue
+        except ValueError:
+            continue
+        try:
+            frame = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        except cv2.error as error:
+            assert "IMAGE_PIXELS" not in str(error), jpeg[: SCAN + 100].hex()
+        else:
+            whole += frame is not None
+        try:
+            assert decode(jpeg).shape == (160, 320, 3)
+        except ValueError as error:
+            assert str(error) == "damaged"
+    print(whole)
+
+
+def test_the_decoder_never_sees_another_size_than_the_check():
+    done = subprocess.run(
+        [sys.executable, "-c", "import test_images; test_images.decode_mutations()"],
+        cwd=Path(__file__).parent,
+        env={**os.environ, **HERE, "OPENCV_IO_MAX_IMAGE_PIXELS": str(160 * 320)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 100
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Files
+
+
+def test_what_is_no_regular_file_is_not_read(tmp_path):
+    (tmp_path / "folder.jpg").mkdir()
+    with pytest.raises(ValueError, match=r"Is a directory|Permission denied"):
+        read_jpeg(tmp_path / "folder.jpg")
+    with pytest.raises(ValueError, match="No such file"):
+        read_jpeg(tmp_path / "gone.jpg")
+    with open(tmp_path / "huge.jpg", "wb") as file:
+        file.truncate(1 << 33)
+    assert len(read_jpeg(tmp_path / "huge.jpg")) == MAX_BYTES + 1
+    with pytest.raises(RecordingError, match=r"huge\.jpg: not a JPEG; copy it again"):
+        read_frame(tmp_path / "huge.jpg")
+
+
+unix = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes or devices among files")
+
+
+@unix
+def test_rows_of_links_pipes_and_folders_are_left_out(copied):
+    images = sorted((copied / "IMG").glob("center*"))[:5]
+    for image in images:
+        image.unlink()
+    images[0].symlink_to(copied / "nowhere")
+    images[1].symlink_to(images[1].name)  # to itself
+    images[2].symlink_to("/dev/zero")
+    images[3].mkdir()
+    os.mkfifo(images[4])
+    found = read_recording(copied)
+    check_images(found)
+    assert len(found) == 55
+    assert sorted((line, kind) for line, kind, _ in found.rejected) == [
+        (1, "image missing"),
+        (2, "image missing"),
+        (3, "image not a regular file"),
+        (4, "image Is a directory"),
+        (5, "image not a regular file"),
+    ]
+    assert all(f"IMG/{images[line - 1].name}" in detail for line, _, detail in found.rejected)
+    assert all("leads nowhere" in detail for line, _, detail in found.rejected if line < 3)
+
+
+def lower_case_folder(folder: Path) -> None:
+    (folder / "IMG").rename(folder / "moved")
+    (folder / "moved").rename(folder / "img")
+
+
+def upper_case_endings(folder: Path) -> None:
+    for image in list((folder / "IMG").iterdir()):
+        image.rename(image.with_suffix(".JPG"))
+
+
+def no_folder(folder: Path) -> None:
+    (folder / "IMG").rename(folder.parent / "elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        (lower_case_folder, "rename the folder img to IMG"),
+        (upper_case_endings, "rename center_2018_07_16_17_11_43_067.JPG, which differs in upper and lower case"),
+        (no_folder, "there is no folder IMG: copy it beside driving_log.csv"),
+    ],
+)
+def test_the_cause_of_missing_images_is_named(copied, tmp_path, change, remedy, capsys):
+    if change is not no_folder and (copied / "img").exists():
+        pytest.skip("this file system ignores case")
+    change(copied)
+    done = run_here(copied, "--output", tmp_path / "model.pt")
+    assert done.returncode == 2 and "0 of 60 rows are left" in done.stderr
+    first = f"{copied / 'driving_log.csv'}: line 1: left out: IMG/center_2018_07_16_17_11_43_067.jpg: missing; {remedy}"
+    assert first in done.stdout
+    with pytest.raises(RecordingError, match=r"driving_log\.csv: no usable row is left to replay"):
+        replay.load_recording(copied)
+    assert first in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("encoding", ["ascii:strict", "utf-8:strict"])
+def test_a_name_that_the_terminal_cannot_show_is_printed_as_escapes(copied, encoding):
+    log = copied / "driving_log.csv"
+    log.write_bytes(log.read_bytes().replace(b"center_", b"cent\xffr_", 6))
+    done = subprocess.run(
+        [sys.executable, "-m", "simulator", "replay", copied, "--model", SHIPPED_MODEL, "--reference", "human"],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONIOENCODING": encoding},
+        capture_output=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert rb"line 1: left out: IMG/cent\udcffr_2018_07_16_17_11_43_067.jpg: missing" in done.stdout
+    assert rb"and 1 more of this kind" in done.stdout
+
+
+def cut(image: Path) -> None:
+    image.write_bytes(image.read_bytes()[:3000])
+
+
+def shrink(image: Path) -> None:
+    cv2.imwrite(str(image), FRAME[::2, ::2])
+
+
+CHANGES = [(Path.unlink, "No such file or directory"), (cut, "cut short"), (shrink, "160x80 pixels where 320x160")]
+
+
+@pytest.mark.parametrize(("change", "reason"), CHANGES)
+def test_an_image_that_changes_while_it_is_replayed_is_named(copied, monkeypatch, capsys, change, reason):
+    def lines_then_change(recording, by_lane):
+        lines = replay.reference_lines(recording, by_lane)
+        change(recording.path(30))
+        return lines
+
+    monkeypatch.setattr(command, "reference_lines", lines_then_change)
+    assert simulator.main(["replay", str(copied), "--model", str(SHIPPED_MODEL), "--reference", "human"]) == 2
+    name = sorted((copied / "IMG").glob("left*"))[30].name.replace("left", "center")
+    assert capsys.readouterr().err == (
+        f"simulator: {copied / 'IMG' / name}: {reason}"
+        f"{' are expected' if 'pixels' in reason else ''}; copy it again, or delete its row from the log\n"
+    )
+
+
+@pytest.mark.parametrize(("change", "reason"), CHANGES)
+def test_an_image_that_changes_during_training_is_named_and_can_be_restored(
+    copied, finished, tmp_path, monkeypatch, change, reason
+):
+    images, split = {path: path.read_bytes() for path in (copied / "IMG").iterdir()}, model.split
+
+    def change_then_split(observations, seed):
+        for image in images:
+            change(image)
+        return split(observations, seed)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(model, "split", change_then_split)
+        done = run_here(copied, *SHORT, "--output", tmp_path / "model.pt")
+    assert done.returncode == 2
+    assert f".jpg: {reason}" in done.stderr and str(copied / "IMG") in done.stderr
+    assert "Restore it and continue with --resume" in done.stderr
+    for image, jpeg in images.items():
+        image.write_bytes(jpeg)
+    done = run_here(*SHORT, "--output", tmp_path / "model.pt", "--resume")
+    assert done.returncode == 0, done.stderr
+    assert same(weights(tmp_path / "model.pt"), weights(finished[1] / "model.pt"))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The cache of checked images
+
+
+@pytest.fixture
+def checked(copied) -> tuple[Path, Path, Path]:
+    """A recording that was checked before its image 7 was replaced by a bad one of the same size and time.
+
+    Returns its folder, its cache, and the bad image.
+    """
+    recording = read_recording(copied)
+    check_images(recording)
+    image = copied / "IMG" / os.fsdecode(recording.names[7])
+    state = image.stat()
+    image.write_bytes(bytes(state.st_size))
+    os.utime(image, ns=(state.st_atime_ns, state.st_mtime_ns))
+    (cache,) = Path(os.environ["XDG_CACHE_HOME"]).rglob("*.npz")
+    return copied, cache, image
+
+
+def rewritten(cache: Path, **columns) -> None:
+    with np.load(cache) as file:
+        columns = {**file, **columns}
+    np.savez(cache, **{name: column for name, column in columns.items() if column is not None})
+
+
+def as_objects(images: np.ndarray) -> np.ndarray:
+    return np.array([tuple(image) for image in images.tolist()], dtype=object)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda cache, images: rewritten(cache, rules=None),
+        lambda cache, images: rewritten(cache, rules=check.RULES - 1),
+        lambda cache, images: rewritten(cache, rules=np.array([check.RULES] * 2)),
+        lambda cache, images: rewritten(cache, images=None),
+        lambda cache, images: rewritten(cache, images=images[:0]),
+        lambda cache, images: rewritten(cache, images=images[None]),
+        lambda cache, images: rewritten(cache, images=images[["name", "state"]]),
+        lambda cache, images: rewritten(cache, images=images["name"]),
+        lambda cache, images: rewritten(cache, images=as_objects(images)),
+        lambda cache, images: np.savez(cache, names=images["name"], states=images["state"], reasons=b""),  # earlier
+        lambda cache, images: (np.save(f"{cache}.npy", images), os.replace(f"{cache}.npy", cache)),
+        lambda cache, images: cache.write_bytes(b""),
+        lambda cache, images: cache.write_bytes(b"no cache"),
+        lambda cache, images: cache.write_bytes(cache.read_bytes()[:-100]),
+        lambda cache, images: (cache.unlink(), cache.mkdir()),
+    ],
+)
+def test_a_cache_that_this_version_has_not_written_is_not_believed(checked, damage, capsys):
+    folder, cache, image = checked
+    recording = read_recording(folder)
+    check_images(recording)
+    assert len(recording) == 60, "what this version has written is believed"
+    with np.load(cache) as file:
+        damage(cache, file["images"])
+    recording = read_recording(folder)
+    check_images(recording)
+    assert [detail for *_, detail in recording.rejected] == [
+        f"IMG/{image.name}: not a JPEG; copy it again, or delete the row"
+    ]
+    assert f"{cache}: unreadable" in capsys.readouterr().out
+
+
+def test_no_damage_to_the_cache_makes_a_changed_image_usable(checked):
+    folder, cache, image = checked
+    image.write_bytes(b"changed")
+    whole, rng = cache.read_bytes(), random.Random(0)
+    for _ in range(80):
+        damaged = bytearray(whole)
+        for _ in range(rng.randint(1, 4)):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        cache.write_bytes(damaged[: rng.choice([len(damaged), rng.randrange(len(damaged))])])
+        recording = read_recording(folder)
+        check_images(recording)
+        assert len(recording) == 59 and not any(recording.digests[7:8])
