@@ -108,6 +108,20 @@ def test_no_film_is_a_clear_error(run, tmp_path, name, content, printed):
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize("room", [0, 1000])
+def test_a_full_disk_is_a_clear_error_and_leaves_nothing(run, tmp_path, room):
+    resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
+    save(tmp_path / "run1", 30)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    try:
+        status, error = run("run1")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert status == 1 and error.startswith("video.py: run1.mp4: File too large")
+    assert [path.name for path in tmp_path.iterdir()] == ["run1"]
+
+
 @pytest.mark.parametrize("fps", ["0", "-5", "fast", "nan", "1/0"])
 def test_an_impossible_rate_is_refused(run, tmp_path, fps):
     save(tmp_path / "run1", 2)
