@@ -246,7 +246,7 @@ def test_driving_on_a_full_disk(driving, jpegs):
         assert (
             f"session ended: 6 frames driven, 0 unusable; {6 - lost} frames saved in run1, {lost} LOST" in ended.printed
         )
-        assert f"drive.py: {lost} of 6 frames were not saved" in ended.printed.splitlines()[-1]
+        assert f"drive.py: run1: {lost} of 6 frames were not saved" in ended.printed.splitlines()[-1]
         assert saved(place.folder / "run1") == jpegs[: 6 - lost]
         assert not list((place.folder / "run1").glob(".*"))
 

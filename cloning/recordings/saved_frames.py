@@ -70,6 +70,7 @@ class FrameSaver:
     def __init__(self, path: Path):
         """Empty the folder and start the thread. Raises FolderError."""
         empty_folder(path)
+        self._path = path
         resolved = path.resolve()  # "." has no name
         numbered = (resolved.with_name(f"{resolved.name}-{number}") for number in itertools.count(2))
         # os.path, because Path.exists raises an error where it may not look; saving then counts what it loses.
@@ -94,7 +95,7 @@ class FrameSaver:
             frames = lost + sum(session.saved for session in self._sessions)
             reason = next(session.error for session in self._sessions if session.lost)
             raise FolderError(
-                f"{lost} of {frames} frames were not saved ({reason}); "
+                f"{self._path}: {lost} of {frames} frames were not saved ({reason}); "
                 "free some disk space, or name a folder that can be written"
             )
 

@@ -38,9 +38,9 @@ class RecordingWriter:
         self.folder = Path(folder).absolute()
         self.images = self.folder / IMAGE_FOLDER
         log = self.folder / DRIVING_LOG
-        if log.exists() and log.stat().st_size:
-            raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
         try:
+            if log.exists() and log.stat().st_size:
+                raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
             self.images.mkdir(parents=True, exist_ok=True)
             self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
         except OSError as error:
