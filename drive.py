@@ -123,7 +123,7 @@ class Session:
 
     def summary(self) -> str:
         """Return a line about the whole session: its numbers of frames, and where they are saved."""
-        saved = f"; driven frames saved in {self.folder.path}" if self.folder else ""
+        saved = f"; {self.folder.summary()}" if self.folder else ""
         return f"session ended: {self.driven} frames driven, {self.unusable} unusable{saved}"
 
 
@@ -169,7 +169,10 @@ class DriveServer:
         """Forget a session and log its summary."""
         session = self.sessions.pop(sid, None)
         if session and session.driven + session.unusable:
-            log.info(session.summary())
+            if session.folder:
+                session.folder.when_written(lambda: log.info(session.summary()))
+            else:
+                log.info(session.summary())
 
     def close(self) -> None:
         """End the sessions that are still open."""
@@ -280,7 +283,12 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; arguments: those of this process if None."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="Exit status: 0 after Ctrl-C, 1 if the server could not start or if frames could not be saved, 2 if an "
+        "argument is wrong.",
+    )
     parser.add_argument(
         "model",
         nargs="?",
@@ -360,13 +368,18 @@ def main() -> int:
         file=sys.stderr,
         flush=True,
     )
+    status = program.DONE
     try:
         run(server, listener)
     finally:
-        if saver:
-            saver.close()
         server.close()
-    return program.DONE
+        if saver:
+            try:
+                saver.close()
+            except UserError as error:
+                print(f"drive.py: {error}", file=sys.stderr)
+                status = program.INCOMPLETE
+    return status
 
 
 if __name__ == "__main__":

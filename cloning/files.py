@@ -1,10 +1,17 @@
-"""Write files that are either complete or absent: under a temporary name first, renamed at the end."""
+"""Write files that are either complete or absent: under a temporary name first, renamed at the end.
+
+This holds for a process that is killed anywhere. After a power cut it holds for what `write` wrote, which waits for the
+disk; films, saved frames and recordings do not wait, so the ones of the last seconds may then be empty or missing.
+"""
 
 import errno
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+LEFT_BEHIND = 3600.0  # s: the temporary file of a process that still writes is not so old
 
 
 @contextmanager
@@ -16,7 +23,7 @@ def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]
     if the block does not create the temporary file, an existing `path` stays as it is.
 
     per_process: give each process its own temporary file, so that several may write `path` at the same time; the last
-    one to finish wins.
+    one to finish wins. Of those in the folder, all that are an hour old are deleted: killed processes left them.
     Raises OSError with the name `path`, not the temporary one, for example when the disk is full, and at once when
     `path` is a folder.
     """
@@ -27,6 +34,10 @@ def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]
     try:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)  # left by a process that was killed
+            if per_process:
+                for other in path.parent.glob(".*.part"):
+                    if time.time() - other.stat().st_mtime > LEFT_BEHIND:
+                        other.unlink()
         yield temporary
         if temporary.exists():
             os.replace(temporary, path)

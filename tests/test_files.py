@@ -2,6 +2,7 @@
 
 import errno
 import os
+import time
 
 import pytest
 
@@ -84,6 +85,17 @@ def test_what_a_killed_process_left_is_not_taken_for_the_file(tmp_path):
     with written_whole(tmp_path / "film.mp4"):
         pass
     assert os.listdir(tmp_path) == []
+
+
+def test_what_killed_processes_left_goes_after_an_hour(tmp_path):
+    """Each process has its own temporary file, which no later process would otherwise write or delete."""
+    old, new = tmp_path / ".other.npz.1.part", tmp_path / ".checked.npz.2.part"
+    for path, age in ((old, 3700), (new, 3500)):
+        path.write_bytes(b"half")
+        os.utime(path, (time.time() - age,) * 2)
+    with written_whole(tmp_path / "checked.npz", per_process=True) as temporary:
+        temporary.write_bytes(b"new")
+    assert sorted(os.listdir(tmp_path)) == [new.name, "checked.npz"], "another process may still write the new one"
 
 
 def test_a_block_that_writes_nothing_changes_nothing(tmp_path):

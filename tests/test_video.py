@@ -150,6 +150,20 @@ def test_no_film_is_a_clear_error(run, tmp_path, name, content, printed):
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize("room", [0, 1000])
+def test_a_full_disk_is_a_clear_error_and_leaves_nothing(run, tmp_path, room):
+    resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
+    save(tmp_path / "run1", 30)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    try:
+        status, error = run("run1")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert status == 2 and error.startswith("video.py: run1.mp4: File too large")
+    assert [path.name for path in tmp_path.iterdir()] == ["run1"]
+
+
 @pytest.mark.parametrize(
     "fps", ["0", "-5", "fast", "nan", "inf", "1/0", "0/0", "1/", "1e-9", "1e300", "1e-999999999", "1000.1", "1/1/1", ""]
 )

@@ -2,10 +2,13 @@
 
 import itertools
 import logging
+import os
 import queue
 import re
 import threading
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 from cloning.errors import FolderError
@@ -16,6 +19,7 @@ from cloning.recordings.format import parse_time_stamp, time_stamp
 FRAME_NAME = re.compile(r"(?:center_)?(\d{4}(?:_\d\d){5}_\d{3})\.jpg")
 PARTIAL_NAME = re.compile(r"\.(.+)\.part")  # a frame that was being written when the process was killed
 MAX_QUEUED = 2000  # frames, about 30 MB; with more waiting in memory, driving waits for the disk
+Jobs = queue.Queue[Callable[[], None] | None]  # what the saving thread does next; None ends it
 log = logging.getLogger("drive")  # the log of drive.py
 
 
@@ -60,47 +64,57 @@ class FrameSaver:
     """Saves the frames of all sessions in a thread, so that driving does not wait for the disk.
 
     The first session's frames are saved in `path`, which is emptied at the start; those of later sessions in path-2,
-    path-3 …, of which existing ones are skipped.
+    path-3 …, of which existing ones are skipped. A frame that cannot be saved is counted, and driving goes on.
     """
 
     def __init__(self, path: Path):
         """Empty the folder and start the thread. Raises FolderError."""
         empty_folder(path)
+        self._path = path
         resolved = path.resolve()  # "." has no name
         numbered = (resolved.with_name(f"{resolved.name}-{number}") for number in itertools.count(2))
-        self._folders = itertools.chain([path], (folder for folder in numbered if not folder.exists()))
-        self._queue: queue.Queue[tuple[Path, bytes] | None] = queue.Queue(MAX_QUEUED)
-        self._thread = threading.Thread(target=self._write)
+        # os.path, because Path.exists raises an error where it may not look; saving then counts what it loses.
+        self._folders = itertools.chain([path], (folder for folder in numbered if not os.path.exists(folder)))
+        self._sessions: list[SessionFolder] = []
+        self._queue: Jobs = queue.Queue(MAX_QUEUED)
+        self._thread = threading.Thread(target=self._work)
         self._thread.start()
 
     def start_session(self) -> "SessionFolder":
         """Return the folder for the frames of a new session."""
         path = next(self._folders)
         log.info(f"saving frames in {path}")
-        return SessionFolder(path, self._queue)
+        self._sessions.append(SessionFolder(path, self._queue))
+        return self._sessions[-1]
 
     def close(self) -> None:
-        """Wait until all frames are written, and end the thread."""
+        """Wait until all frames are written, and end the thread. Raises FolderError if frames were lost."""
         self._queue.put(None)
         self._thread.join()
+        if lost := sum(session.lost for session in self._sessions):
+            frames = lost + sum(session.saved for session in self._sessions)
+            reason = next(session.error for session in self._sessions if session.lost)
+            raise FolderError(
+                f"{self._path}: {lost} of {frames} frames were not saved ({reason}); "
+                "free some disk space, or name a folder that can be written"
+            )
 
-    def _write(self) -> None:
-        while (item := self._queue.get()) is not None:
-            path, jpeg = item
-            try:
-                path.parent.mkdir(exist_ok=True)
-                with written_whole(path) as temporary:
-                    temporary.write_bytes(jpeg)
-            except OSError as error:
-                log.warning(f"frames can't be saved: {error}")
+    def _work(self) -> None:
+        while (job := self._queue.get()) is not None:
+            job()
 
 
 class SessionFolder:
-    """The folder of one session; each frame is named by the UTC time of its arrival, and no two have the same name."""
+    """The folder of one session; each frame is named by the UTC time of its arrival, and no two have the same name.
 
-    def __init__(self, path: Path, frames: queue.Queue[tuple[Path, bytes] | None]):
-        """frames: the queue of the thread that writes the frames."""
-        self.path, self._queue = path, frames
+    saved, lost   frames that the thread has written, and could not write
+    error         why it lost the last one
+    """
+
+    def __init__(self, path: Path, jobs: Jobs):
+        """jobs: the queue of the thread that writes the frames."""
+        self.path, self._queue = path, jobs
+        self.saved, self.lost, self.error = 0, 0, ""
         self._last = datetime.min.replace(tzinfo=UTC)  # time in the last frame's name
 
     def save(self, jpeg: bytes) -> None:
@@ -108,4 +122,25 @@ class SessionFolder:
         now = datetime.now(UTC)
         now -= timedelta(microseconds=now.microsecond % 1000)
         self._last = max(now, self._last + timedelta(milliseconds=1))
-        self._queue.put((self.path / f"{time_stamp(self._last)}.jpg", jpeg))
+        self._queue.put(partial(self._write, self.path / f"{time_stamp(self._last)}.jpg", jpeg))
+
+    def when_written(self, report: Callable[[], None]) -> None:
+        """Have the thread call `report` when all frames that were queued are written or lost."""
+        self._queue.put(report)
+
+    def summary(self) -> str:
+        """Return where the frames are, and how many are lost so far."""
+        if self.lost:
+            return f"{self.saved} frames saved in {self.path}, {self.lost} LOST ({self.error})"
+        return f"driven frames saved in {self.path}"
+
+    def _write(self, path: Path, jpeg: bytes) -> None:
+        try:
+            path.parent.mkdir(exist_ok=True)
+            with written_whole(path) as temporary:
+                temporary.write_bytes(jpeg)
+            self.saved += 1
+        except Exception as error:  # whatever it is: without this thread, driving would wait for ever
+            self.lost += 1
+            self.error = (error.strerror if isinstance(error, OSError) else None) or f"{type(error).__name__}: {error}"
+            log.warning(f"frames can't be saved in {path.parent}: {self.error}; driving goes on")

@@ -4,11 +4,13 @@ import errno
 import math
 import os
 import re
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Self
 
 from cloning.errors import RecordingError
+from cloning.files import written_whole
 from cloning.recordings.format import CAMERAS, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE, time_stamp
 
 # The start of a recording with seed 0, so that the same command makes the same file names on any day.
@@ -23,20 +25,22 @@ def csharp_number(value: float) -> str:
 class RecordingWriter:
     """Writes samples into a folder: three images and a row of `driving_log.csv` each.
 
-    The row is written after its images are complete: a process killed at any time leaves a readable recording.
+    The row is written after its images are complete: a process killed at any time leaves a readable recording, and at
+    most three whole images and a temporary file, `.NAME.part`, that no row names.
     """
 
     def __init__(self, folder: str | Path, start: datetime = DEFAULT_START):
         """Begin a recording; start: the date and time of simulated second 0, for the names of the images.
 
-        Raises RecordingError if the folder already contains a recording, or cannot be made.
+        An empty driving_log.csv, of a process that was killed before its first row, is used. Raises RecordingError if
+        the folder already contains a recording, or cannot be made.
         """
         self.folder = Path(folder).absolute()
         self.images = self.folder / IMAGE_FOLDER
         log = self.folder / DRIVING_LOG
-        if log.exists():
-            raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
         try:
+            if log.exists() and log.stat().st_size:
+                raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
             self.images.mkdir(parents=True, exist_ok=True)
             self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
         except OSError as error:
@@ -58,13 +62,15 @@ class RecordingWriter:
         size = os.fstat(self.log.fileno()).st_size
         try:
             for path, image in zip(paths, images, strict=True):
-                path.write_bytes(image)
+                with written_whole(path) as temporary:
+                    temporary.write_bytes(image)
             if self.log.write(row.encode()) != len(row.encode()):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
-            for path in paths:
-                path.unlink(missing_ok=True)
-            os.ftruncate(self.log.fileno(), size)
+            with suppress(OSError):  # the first error matters more
+                os.ftruncate(self.log.fileno(), size)  # first: a row without its images would be unusable
+                for path in paths:
+                    path.unlink(missing_ok=True)
             raise RecordingError(
                 f"{self.folder}: {error.strerror}; the {self.rows} rows before it are complete"
             ) from error

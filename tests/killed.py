@@ -1,0 +1,228 @@
+"""A command that is killed, or finds the disk full, at every change to its files, and the next run of it."""
+
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+from kill_points import Ended, Warm
+from PIL import Image
+
+ALL = bool(os.environ.get("ALL_KILL_POINTS"))  # see `chosen`
+KILLED = -signal.SIGKILL
+PART = re.compile(r"\.(.+)\.part")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is on the disk
+
+
+def is_temporary(path: Path) -> bool:
+    return bool(PART.fullmatch(path.name))
+
+
+def check_whole(folder: Path) -> None:
+    """Each file that stands under its own name can be read to its end."""
+    for path in folder.rglob("*"):
+        if path.is_dir() or is_temporary(path):
+            continue
+        data = path.read_bytes()
+        if path.suffix == ".pt":
+            torch.load(path, weights_only=True)
+        elif path.suffix in (".jpg", ".png"):
+            Image.open(io.BytesIO(data)).load()  # raises an error if it is cut short
+        elif path.suffix == ".mp4":
+            with av.open(str(path)) as film:
+                assert sum(1 for _ in film.decode(video=0)) == film.streams.video[0].frames > 0
+        elif path.suffix == ".json":
+            json.loads(data)
+        elif path.suffix == ".npz":
+            with np.load(path) as arrays:
+                assert all(len(arrays[name]) for name in arrays)
+        else:
+            assert path.suffix == ".csv", path
+            assert path.name == "driving_log.csv" or data.endswith(b"\n"), "the last row is cut"
+
+
+def value(path: Path) -> object:
+    """What a file says, without what differs between two runs of one command: times, and a run's identifier."""
+    if path.suffix == ".pt":
+        saved = torch.load(path, weights_only=True)
+        for row in saved["history"]:
+            del row["seconds"]
+        for part, name in ((saved, "run"), (saved["arguments"], "resume"), (saved.get("training", {}), "seconds")):
+            part.pop(name, None)
+        return plain(saved)
+    if path.name == "training_log.csv":
+        return [line.split(",")[:2] + line.split(",")[3:] for line in path.read_text(encoding="utf-8").splitlines()]
+    if path.name == "training_arguments.json":
+        return json.loads(path.read_bytes()) | {"resume": None}
+    if path.name == "drive.json":
+        return {
+            name: value
+            for name, value in json.loads(path.read_bytes()).items()
+            if name not in ("round_trip_ms", "own_ms_a_frame")
+        }
+    if path.suffix == ".mp4":  # its bytes differ from one run to the next
+        with av.open(str(path)) as film:
+            return film.streams.video[0].average_rate, [frame.to_ndarray().shape for frame in film.decode(video=0)]
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def plain(saved: object) -> object:
+    """A model file's contents in a form that can be compared."""
+    if isinstance(saved, dict):
+        return {key: plain(part) for key, part in saved.items()}
+    if isinstance(saved, torch.Tensor):
+        return str(saved.dtype), tuple(saved.shape), saved.numpy().tobytes()
+    return [plain(part) for part in saved] if isinstance(saved, list | tuple) else saved
+
+
+def contents(folder: Path) -> dict[str, object]:
+    return {str(path.relative_to(folder)): value(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Killing
+
+
+@dataclass
+class Place:
+    """A folder in which a command runs again and again from the same beginning.
+
+    command   to kill
+    again     the next run
+    begin     a folder: what is there before the command
+    checked   called after each kill
+    failures  what was found, for one message at the end
+    """
+
+    warm: Warm
+    folder: Path
+    command: list
+    again: list
+    begin: Path | None = None
+    checked: Callable[[], None] = lambda: None
+    companion: Callable[[int], None] = lambda process: None  # does its part while the command runs
+    failures: list[str] = field(default_factory=list)
+
+    def restore(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+        if self.begin:
+            shutil.copytree(self.begin, self.folder)
+        else:
+            self.folder.mkdir()
+
+    def run(self, command: list, **more) -> Ended:
+        env = {"XDG_CACHE_HOME": str(self.folder / "cache")}
+        process = self.warm.start(command, [self.folder], self.folder, env, **more)
+        self.companion(process)
+        return self.warm.wait(process)
+
+    def age_temporaries(self) -> None:
+        """As if the next run came a day later."""
+        for path in self.folder.rglob(".*.part"):
+            os.utime(path, (time.time() - 86_400,) * 2)
+
+    def whole_run(self) -> tuple[dict[str, object], list[str]]:
+        """The command without a kill: what it leaves, and its points."""
+        self.restore()
+        ended = self.run(self.command)
+        assert ended.status == 0, ended.printed
+        check_whole(self.folder)
+        assert not [path for path in self.folder.rglob("*") if is_temporary(path)]
+        return contents(self.folder), ended.points
+
+    def killed_everywhere(self, others: int, next_run: Callable[[dict[str, object]], None] | None = None) -> None:
+        """Kill the command at the chosen points, each time from the beginning, and let the next run go on.
+
+        others: see `chosen`; next_run: instead of `goes_on`.
+        """
+        wanted, points = self.whole_run()
+        for number in chosen(points, others):
+            self.restore()
+            ended = self.run(self.command, kill=number)
+            try:
+                assert ended.status == KILLED, ended.printed
+                self.checked()
+                check_whole(self.folder)
+                self.age_temporaries()
+                (next_run or self.goes_on)(wanted)
+            except Exception as error:
+                self.failures.append(f"killed at {number} of {len(points)}, {points[number - 1]}: {str(error)[:300]}")
+        self.report(f"{len(chosen(points, others))} of {len(points)} points")
+
+    def goes_on(self, wanted: dict[str, object]) -> None:
+        """The next run ends as if the one before had not been killed, and leaves no temporary file."""
+        ended = self.run(self.again)
+        assert ended.status == 0, ended.printed
+        self.checked()
+        assert differences(contents(self.folder), wanted) == []
+
+    def disk_full_everywhere(self, others: int, status: int) -> None:
+        """Fill the disk in the chosen writes; status: the command's."""
+        wanted, points = self.whole_run()
+        writes = [number for number, point in enumerate(points, 1) if point.startswith("write")]
+        writes = writes if ALL else spread(writes, others)
+        for number in writes:
+            self.restore()
+            ended = self.run(self.command, full=number)
+            try:
+                assert "Traceback" not in ended.printed, ended.printed
+                assert ended.status == status, ended.printed
+                assert re.search("No space left on device", ended.printed), ended.printed
+                self.checked()
+                check_whole(self.folder)
+                assert not [path for path in self.folder.rglob("*") if is_temporary(path)]
+                self.goes_on(wanted)
+            except Exception as error:
+                self.failures.append(f"full at {number} of {len(points)}, {points[number - 1]}: {str(error)[:300]}")
+        self.report(f"{len(writes)} writes")
+
+    def killed_at_every_length(self, name: str, lengths: int) -> None:
+        """Have the system kill the command in the write that makes its film longer, at so many different lengths."""
+        wanted, _ = self.whole_run()
+        whole = (self.folder / name).stat().st_size
+        # Not up to the whole length, because x264's threads do not always take the same decisions.
+        for length in np.linspace(0.9 * whole, 0, lengths).astype(int).tolist():
+            self.restore()
+            assert self.run(self.command, bytes=length).status == -signal.SIGXFSZ
+            check_whole(self.folder)
+            assert not (self.folder / name).exists()
+            self.goes_on(wanted)
+
+    def report(self, points: str) -> None:
+        print(points)
+        if self.failures:
+            pytest.fail("\n".join([f"{len(self.failures)} failures", *self.failures]), pytrace=False)
+
+
+def differences(found: dict[str, object], wanted: dict[str, object]) -> list[str]:
+    return sorted(name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name))
+
+
+def spread(numbers: list[int], count: int) -> list[int]:
+    """At most this many of the numbers, evenly spread, the first and the last among them."""
+    if count >= len(numbers):
+        return numbers
+    return [numbers[i] for i in np.linspace(0, len(numbers) - 1, count).round().astype(int)] if count else []
+
+
+def chosen(points: list[str], others: int) -> list[int]:
+    """The numbers of the points at which to kill: all of them, or all renames and some others, evenly spread."""
+    numbers = list(range(1, len(points) + 1))
+    if ALL:
+        return numbers
+    renames = [number for number in numbers if points[number - 1].startswith("os.rename")]
+    return sorted({*renames, *spread([number for number in numbers if number not in renames], others)})

@@ -1,0 +1,317 @@
+"""Every command killed, and its disk full, at every change to its files: none is cut, and the next run goes on.
+
+Without ALL_KILL_POINTS=1 in the environment, some of the points are left out: see `killed.chosen`.
+"""
+
+import hashlib
+import os
+import re
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import render_recording
+from kill_points import Warm
+from killed import ALL, KILLED, Place, check_whole, chosen, is_temporary, spread
+from steer_server import STEER, Server
+
+from cloning.recordings.check import check_images
+from cloning.recordings.log import read_recording
+from tools.simulator_client import Simulator, telemetry
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks a process that has loaded its libraries")
+
+TINY = ("--samples-per-epoch", 20, "--batch-size", 8, "--device", "cpu")
+
+
+@pytest.fixture(scope="module")
+def warm(tmp_path_factory):
+    process = Warm(tmp_path_factory.mktemp("warm"))
+    yield process
+    process.close()
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory) -> Path:
+    """A recording of 40 rows, one of which has no image; not to be changed."""
+    folder = render_recording(tmp_path_factory.mktemp("data") / "lake", rows=40)
+    min((folder / "IMG").glob("left_*")).unlink()
+    return folder
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Training
+
+
+@pytest.fixture(scope="module")
+def trained(warm, lake, tmp_path_factory) -> Path:
+    """The folder of a finished run of one epoch with seed 0, and the cache of checked images; not to be changed."""
+    folder = tmp_path_factory.mktemp("earlier") / "place"
+    place = Place(warm, folder, training(lake, "--epochs", 1), [])
+    place.whole_run()
+    return folder
+
+
+def training(lake: Path, *arguments) -> list:
+    return ["model.py", lake, *TINY, *arguments, "--output", "model.pt"]
+
+
+def test_training_killed_anywhere(warm, lake, tmp_path):
+    begin = training(lake, "--epochs", 1)
+    Place(warm, tmp_path / "place", begin, [*begin, "--resume"]).killed_everywhere(3)
+
+
+def test_resumed_training_killed_anywhere(warm, lake, trained, tmp_path):
+    command = training(lake, "--epochs", 2, "--resume")
+    Place(warm, tmp_path / "place", command, command, trained).killed_everywhere(3)
+
+
+def test_training_over_an_earlier_runs_files_killed_anywhere(warm, lake, trained, tmp_path):
+    """The next run finds its way: with --resume or, if the killed one had no state yet, as it tells, without."""
+    begin = training(lake, "--epochs", 1, "--seed", 1)
+    earlier = {hashlib.sha256(path.read_bytes()).hexdigest() for path in trained.glob("*.pt")}
+    place = Place(warm, tmp_path / "place", begin, [], trained)
+
+    def checked() -> None:
+        found = {hashlib.sha256(path.read_bytes()).hexdigest() for path in place.folder.glob("*.pt")}
+        assert earlier <= found, "an earlier run's model is gone"
+
+    def next_run(wanted: dict[str, object]) -> None:
+        resumed = place.run([*begin, "--resume"])
+        place.again = [*begin, "--resume"]
+        if resumed.status == 2:
+            assert "start a new run without --resume" in resumed.printed
+            place.again = begin
+        place.goes_on(wanted)
+
+    place.checked = checked
+    place.killed_everywhere(3, next_run)
+
+
+def test_training_on_a_full_disk(warm, lake, tmp_path):
+    begin = training(lake, "--epochs", 1)
+    place = Place(warm, tmp_path / "place", begin, [*begin, "--resume"])
+    place.disk_full_everywhere(4, status=1)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Recording
+
+
+RECORD = ["simulator", "record", "recorded", "--laps", "0.00002"]
+
+
+def rows_of(folder: Path) -> list[tuple]:
+    """The usable rows of a recording: names of their images, and their numbers."""
+    recording = read_recording(folder)
+    total = len((folder / "driving_log.csv").read_bytes().splitlines())
+    check_images(recording, show_progress=False)
+    assert len(recording) + len(recording.rejected) == total
+    images = [[bytes(name) for name in row] for row in recording.names[recording.images]]
+    numbers = zip(recording.steering, recording.throttle, recording.speed, strict=True)
+    return list(zip(images, [tuple(map(float, row)) for row in numbers], strict=True))
+
+
+def test_recording_killed_anywhere(warm, tmp_path):
+    """A killed recording can be trained on; one that has no row yet is begun again by the same command."""
+    place = Place(warm, tmp_path / "place", RECORD, RECORD)
+    place.whole_run()
+    complete = rows_of(place.folder / "recorded")
+
+    def next_run(wanted: dict[str, object]) -> None:
+        log = place.folder / "recorded" / "driving_log.csv"
+        if not log.exists() or not log.stat().st_size:
+            place.goes_on(wanted)
+            return
+        assert rows_of(log.parent) in [complete[:count] for count in range(len(complete) + 1)]
+        ended = place.run(RECORD)
+        assert ended.status == 2 and "exists already; name another folder, or delete this one" in ended.printed
+
+    place.killed_everywhere(1, next_run)
+
+
+def test_recording_on_a_full_disk(warm, tmp_path):
+    """The rows before it are complete, also if the process is killed while it takes back the last one."""
+    place = Place(warm, tmp_path / "place", RECORD, RECORD)
+    _, points = place.whole_run()
+    complete = rows_of(place.folder / "recorded")
+    writes = [number for number, point in enumerate(points, 1) if point.startswith("write")]
+    for full in writes if ALL else spread(writes, 2):
+        place.restore()
+        ended = place.run(RECORD, full=full)
+        assert ended.status == 2 and "No space left on device; the" in ended.printed, ended.printed
+        assert "Traceback" not in ended.printed
+        check_whole(place.folder)
+        log = (place.folder / "recorded" / "driving_log.csv").read_bytes()
+        images = {path.name for path in (place.folder / "recorded" / "IMG").iterdir()}
+        rows = log.count(b"\n")
+        assert f"the {rows} rows before it" in ended.printed
+        assert log == b"" or log.endswith(b"\n")
+        assert len(images) == 3 * rows, "what was written of the last row is taken back"
+        for kill in range(full + 1, len(ended.points) + 1):
+            place.restore()
+            assert place.run(RECORD, full=full, kill=kill).status == KILLED
+            check_whole(place.folder)
+            if (place.folder / "recorded" / "driving_log.csv").stat().st_size:
+                assert rows_of(place.folder / "recorded") == complete[:rows]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Saving frames
+
+
+class Car:
+    """A simulator that sends six telemetries, or until the server is gone, and then has the server end."""
+
+    def __init__(self, place: Place, jpegs: list[bytes]):
+        self.place, self.jpegs, self.answers = place, jpegs, 0
+
+    def drive(self, process: int) -> None:
+        self.answers = 0
+        for _ in range(600):
+            printed = self.place.warm.output.read_text(encoding="utf-8")
+            if "Watch at" in printed:
+                break
+            if not self.place.warm.alive(process):
+                return
+            time.sleep(0.02)
+        port = int(re.search(r"Listening on [\d.]+:(\d+)", printed)[1])
+        try:
+            with Simulator(port) as simulator:
+                simulator.open()
+                for n in range(6):
+                    simulator.drive(telemetry(self.jpegs[n]))
+                    self.answers += 1
+        except (ConnectionError, TimeoutError):
+            return
+        os.kill(process, signal.SIGINT)
+
+
+@pytest.fixture
+def driving(warm, model_file, jpegs, tmp_path):
+    """drive.py, which saves frames in a folder with two old ones, one of them half-written."""
+    begin = tmp_path / "begin"
+    (begin / "run1").mkdir(parents=True)
+    (begin / "run1" / "2018_07_16_17_11_43_382.jpg").write_bytes(jpegs[7])
+    (begin / "run1" / ".2018_07_16_17_11_43_383.jpg.part").write_bytes(jpegs[7][:100])
+    command = ["drive.py", model_file, "run1", "--port", 0]
+    place = Place(warm, tmp_path / "place", command, command, begin)
+    car = Car(place, jpegs)
+    place.companion = car.drive
+    return place, car
+
+
+def saved(folder: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted(folder.iterdir()) if not is_temporary(path)]
+
+
+def test_driving_killed_anywhere(driving, jpegs):
+    """The frames that are there are whole, video.py films them, and the next drive deletes them all."""
+    place, car = driving
+    place.restore()
+    points = place.run(place.command).points
+    assert saved(place.folder / "run1") == jpegs[:6]
+    for number in chosen(points, 4):
+        place.restore()
+        assert place.run(place.command, kill=number).status == KILLED
+        check_whole(place.folder)
+        frames = [jpeg for jpeg in saved(place.folder / "run1") if jpeg != jpegs[7]]
+        assert frames == jpegs[: len(frames)]
+        if frames:
+            place.companion = lambda process: None
+            film = place.run(["video.py", "run1"])
+            place.companion = car.drive
+            assert film.status == 0 and f"run1.mp4: {len(frames)} frames" in film.printed
+            assert "unreadable" not in film.printed
+        assert place.run(place.command).status == 0
+        assert saved(place.folder / "run1") == jpegs[:6]
+        assert not list((place.folder / "run1").glob(".*"))
+    print(f"{len(chosen(points, 4))} of {len(points)} points")
+
+
+def test_driving_on_a_full_disk(driving, jpegs):
+    """All frames are answered; those that are lost are counted, in the session's summary and at the end."""
+    place, car = driving
+    place.restore()
+    points = place.run(place.command).points
+    writes = [number for number, point in enumerate(points, 1) if point.startswith("write")]
+    for number in writes if ALL else spread(writes, 2):
+        place.restore()
+        ended = place.run(place.command, full=number)
+        lost = len(writes) - writes.index(number)
+        assert car.answers == 6
+        assert ended.status == 1 and "Traceback" not in ended.printed
+        assert (
+            f"session ended: 6 frames driven, 0 unusable; {6 - lost} frames saved in run1, {lost} LOST" in ended.printed
+        )
+        assert f"drive.py: run1: {lost} of 6 frames were not saved" in ended.printed.splitlines()[-1]
+        assert saved(place.folder / "run1") == jpegs[: 6 - lost]
+        assert not list((place.folder / "run1").glob(".*"))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Films and reports
+
+
+@pytest.fixture
+def filming(warm, jpegs, tmp_path):
+    folder = tmp_path / "begin" / "run1"
+    folder.mkdir(parents=True)
+    for n, jpeg in enumerate(jpegs):
+        (folder / f"2018_07_16_17_11_43_{n:03d}.jpg").write_bytes(jpeg)
+    return Place(warm, tmp_path / "place", ["video.py", "run1"], ["video.py", "run1"], tmp_path / "begin")
+
+
+def test_filming_saved_frames_killed_anywhere(filming):
+    filming.killed_everywhere(3)
+    filming.killed_at_every_length("run1.mp4", 40 if ALL else 5)
+
+
+OUTPUTS = ("--report", "drive.json", "--picture", "above.png", "--film", "film.mp4")
+
+
+@pytest.fixture
+def simulator_drive(warm, tmp_path):
+    with ServerForAll() as server:
+        command = ["simulator", "drive", "--laps", "0.002", "--port", server.port, *OUTPUTS]
+        yield Place(warm, tmp_path / "place", command, command)
+
+
+class ServerForAll(Server):
+    """Answers every session, one after the other, until it is closed."""
+
+    def __init__(self):
+        super().__init__(lambda packet, n: [STEER % ("0", "0.3")], sessions=10_000)
+
+    def __exit__(self, *_):
+        self.sessions = 0
+        self.listener.shutdown(2)
+        self.listener.close()
+        self.thread.join(20)
+
+
+def test_a_simulated_drive_killed_anywhere(simulator_drive):
+    simulator_drive.killed_everywhere(1)
+    simulator_drive.killed_at_every_length("film.mp4", 20 if ALL else 1)
+
+
+def test_a_simulated_drive_on_a_full_disk(simulator_drive):
+    simulator_drive.disk_full_everywhere(2, status=2)
+
+
+@pytest.fixture
+def replaying(warm, lake, model_file, tmp_path):
+    files = ("--report", "replay.json", "--picture", "replay.png", "--film", "replay.mp4")
+    command = ["simulator", "replay", lake, "--model", model_file, "--limit", 1, "--reference", "human", *files]
+    return Place(warm, tmp_path / "place", command, command)
+
+
+def test_a_replay_killed_anywhere(replaying):
+    replaying.killed_everywhere(1)
+    replaying.killed_at_every_length("replay.mp4", 20 if ALL else 1)
+
+
+def test_a_replay_on_a_full_disk(replaying):
+    replaying.disk_full_everywhere(2, status=2)

@@ -1,0 +1,51 @@
+"""Frames that cannot be saved are counted and told, and driving goes on."""
+
+import errno
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+
+from cloning.recordings import saved_frames as frames
+
+
+@pytest.mark.parametrize("trouble", [OSError(errno.ENOSPC, "No space left on device"), ValueError("a bug")])
+def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_path, monkeypatch, trouble):
+    """Whatever the trouble, the thread goes on: driving would wait for it for ever once its queue is full."""
+    monkeypatch.setattr(frames, "MAX_QUEUED", 2)
+    saver, write, told = frames.FrameSaver(tmp_path / "run1"), Path.write_bytes, []
+
+    def fails_for_the_second_session(path, data):
+        if data == b"lost":
+            raise trouble
+        write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", fails_for_the_second_session)
+    first, second = saver.start_session(), saver.start_session()
+    for n in range(20):
+        first.save(b"saved")
+        second.save(b"lost" if n < 5 else b"saved")
+    for session in (first, second):
+        session.when_written(lambda session=session: told.append(session.summary()))
+    reason = "No space left on device" if isinstance(trouble, OSError) else "ValueError: a bug"
+    with pytest.raises(frames.FolderError, match=rf"run1: 5 of 40 frames were not saved \({reason}\); free"):
+        saver.close()
+    assert told == [
+        f"driven frames saved in {tmp_path / 'run1'}",
+        f"15 frames saved in {tmp_path / 'run1-2'}, 5 LOST ({reason})",
+    ]
+    assert len(list((tmp_path / "run1-2").iterdir())) == 15
+
+
+def test_a_folder_that_disappears_while_driving_is_made_again_or_its_frames_are_counted(tmp_path):
+    saver = frames.FrameSaver(tmp_path / "new" / "run1")
+    session = saver.start_session()
+    for gone, lost in ((tmp_path / "new" / "run1", 0), (tmp_path / "new", 1)):
+        shutil.rmtree(gone)
+        written = threading.Event()
+        session.save(b"frame")
+        session.when_written(written.set)
+        assert written.wait(20) and session.lost == lost
+    with pytest.raises(frames.FolderError, match="1 of 2 frames were not saved"):
+        saver.close()
