@@ -17,6 +17,7 @@ from kill_points import Warm
 from killed import ALL, KILLED, Place, check_whole, chosen, is_temporary, spread
 from steer_server import STEER, Server
 
+from cloning.errors import RecordingError
 from cloning.recordings.check import check_images
 from cloning.recordings.log import read_recording
 from tools.simulator_client import Simulator, telemetry
@@ -104,8 +105,12 @@ RECORD = ["simulator", "record", "recorded", "--laps", "0.00002"]
 
 
 def rows_of(folder: Path) -> list[tuple]:
-    """The usable rows of a recording: names of their images, and their numbers."""
-    recording = read_recording(folder)
+    """The usable rows of a recording: names of their images, and their numbers; none if its only row is cut."""
+    try:
+        recording = read_recording(folder)
+    except RecordingError as error:
+        assert "no usable row (line 1: " in str(error)
+        return []
     total = len((folder / "driving_log.csv").read_bytes().splitlines())
     check_images(recording, show_progress=False)
     assert len(recording) + len(recording.rejected) == total
