@@ -28,7 +28,7 @@ from cloning.errors import UserError
 from cloning.film import FilmWriter
 from cloning.recordings import saved_frames
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.images import decode
+from cloning.recordings.images import decode, read_jpeg
 
 MAX_FRAME_GAP = 1.0  # s: a longer gap between two frames is a pause, which does not count for the rate
 MAX_RATE = 240.0  # frames/s that a film is given without --fps
@@ -95,13 +95,13 @@ def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None
     fps = fps or frame_rate([time for time, _ in frames])
     path = folder.with_name(folder.name + ".mp4")
     unreadable: list[str] = []
-    reason: ValueError | OSError | None = None  # of the first unreadable frame
+    reason: ValueError | None = None  # of the first unreadable frame
     writer = FilmWriter(path, fps)
     try:
         for _, frame_path in tqdm(frames, unit="frame", disable=None):
             try:
-                frame = decode(frame_path.read_bytes())
-            except (OSError, ValueError) as error:
+                frame = decode(read_jpeg(frame_path))
+            except ValueError as error:
                 unreadable.append(frame_path.name)
                 reason = reason or error
                 continue
@@ -109,13 +109,12 @@ def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None
         writer.close()
     finally:
         writer.discard()
-    why = reason.strerror if isinstance(reason, OSError) else reason
     if len(unreadable) == len(frames):
         raise FilmError(
-            f"{folder}: none of its {len(frames)} frames is readable (the first: {why}); save new ones with drive.py"
+            f"{folder}: none of its {len(frames)} frames is readable (the first: {reason}); save new ones with drive.py"
         )
     if unreadable:
-        print_note(f"left out, unreadable (the first: {why}): {abbreviated(unreadable)}")
+        print_note(f"left out, unreadable (the first: {reason}): {abbreviated(unreadable)}")
     print(f"{path}: {len(frames) - len(unreadable)} frames at {float(fps):.4g} frames/s")
     return len(unreadable)
 

@@ -116,7 +116,7 @@ def add_window(commands: "Subparsers") -> None:
 def add_laps(parser: argparse.ArgumentParser) -> None:
     """Add --laps."""
     parser.add_argument(
-        "--laps", type=number(float, 0.001, 1e5), default=1, help="laps to drive, such as 0.5 (default 1)"
+        "--laps", type=number(float, 1e-6, 1e5), default=1, help="laps to drive, such as 0.5 (default 1)"
     )
 
 

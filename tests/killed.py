@@ -49,7 +49,7 @@ def check_whole(folder: Path) -> None:
             json.loads(data)
         elif path.suffix == ".npz":
             with np.load(path) as arrays:
-                assert all(len(arrays[name]) for name in arrays)
+                assert all(arrays[name].size for name in arrays)
         else:
             assert path.suffix == ".csv", path
             assert path.name == "driving_log.csv" or data.endswith(b"\n"), "the last row is cut"
