@@ -98,7 +98,10 @@ class Protocol(eventlet.wsgi.HttpProtocol):
     def finish(self) -> None:
         """Close the connection."""
         self.server.socket.idle.pop(self.connection, None)
-        super().finish()
+        try:
+            super().finish()
+        finally:
+            self.rfile.close()  # which keeps the socket open if the client did not read its last answer
 
 
 def whole_requests(app: WSGIApplication) -> WSGIApplication:
