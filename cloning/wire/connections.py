@@ -11,7 +11,7 @@ from cloning.wire.libraries import eventlet
 from cloning.wire.turns import STRANGERS, TURNS
 
 MAX_CONNECTIONS = 192  # at once: macOS lets a process open 256 files
-MAX_BODY = 1 << 18  # bytes of a request: over HTTP polling, up to 16 telemetries
+MAX_BODY = 1 << 17  # bytes of a request: over HTTP polling, about 8 telemetries
 REQUEST_TIMEOUT = 5.0  # s from one answer to the end of the next request, or from the beginning
 WRITE_TIMEOUT = 10.0  # s in which a client must read something of an answer
 NO_HANDLES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)

@@ -2,7 +2,6 @@
 
 import ipaddress
 import json
-import re
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -13,13 +12,11 @@ from cloning.wire.connections import refuse
 from cloning.wire.libraries import engineio, socketio
 from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 from cloning.wire.turns import TURNS, Account
-from cloning.wire.websocket import MAX_MESSAGE, WebSocket, WebSocketWSGI
+from cloning.wire.websocket import MAX_MESSAGE, SOCKET_IO_PACKET, WebSocket, WebSocketWSGI
 
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 MAX_UNREAD = 64  # packets that wait for a client; the simulator has 3 telemetries in flight
-# The beginnings of the Socket.IO packets that are understood: an event, one with attachments, a greeting, a farewell.
-SOCKET_IO_PACKET = re.compile(r'2\d{0,9}\["|5\d{1,9}-\d{0,9}\["|[01]$')
 UNREADABLE = object()  # what a handler is given for a telemetry that is too long or not JSON
 
 

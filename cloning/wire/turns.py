@@ -28,10 +28,13 @@ class Turns:
         self.clock = 0.0  # what the account at work had used when its turn began
         self.waiting: list[tuple[Account, Any]] = []  # in the order of arrival, each with the event that ends its wait
         self.working: Account | None = None
-        self.began = 0.0  # time.thread_time()
+        self.began, self.price = 0.0, 1.0  # time.thread_time(); see `take`
 
-    def take(self, account: Account) -> None:
-        """Wait for a turn; it ends by itself when this green thread waits or ends."""
+    def take(self, account: Account, price: float = 1.0) -> None:
+        """Wait for a turn; it ends by itself when this green thread waits or ends.
+
+        price: by which the account is charged for a second of work.
+        """
         account.used = max(account.used, self.clock)
         waiter = (account, eventlet.Event())
         self.waiting.append(waiter)
@@ -43,7 +46,7 @@ class Turns:
             if waiter in self.waiting:
                 self.waiting.remove(waiter)
             raise
-        self.began = time.thread_time()
+        self.began, self.price = time.thread_time(), price
 
     def _pass_on(self) -> None:
         """End a turn and begin the next.
@@ -52,7 +55,7 @@ class Turns:
         next one.
         """
         if self.working:
-            self.working.used += time.thread_time() - self.began
+            self.working.used += self.price * (time.thread_time() - self.began)
             self.working = None
         if self.waiting:
             next_one = min(self.waiting, key=lambda waiter: waiter[0].used)

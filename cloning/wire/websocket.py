@@ -10,11 +10,14 @@ from wsgiref.types import WSGIEnvironment
 from cloning.wire.libraries import engineio, eventlet
 from cloning.wire.turns import TURNS, Account
 
-MAX_MESSAGE = 1 << 18  # bytes; a telemetry message has about 16,000
+MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
 UNREADABLE_LENGTH = 23  # bytes that are kept of a longer one: enough to see that it is a telemetry
 SLICE = 0.0003  # s that a connection may read and unmask in one turn, or without one when it has waited for input
-# What python-engineio is given: a Socket.IO packet, or a packet of its own, such as a ping or an upgrade.
-PACKET = re.compile(r"4|[0-356].{0,125}$")
+PATIENT_PRICE = 0.25  # of a turn for a message that had to be waited for, as in lock-step: others send before they read
+# The beginnings of the Socket.IO packets that are understood: an event, one with attachments, a greeting, a farewell.
+SOCKET_IO_PACKET = re.compile(r'2\d{0,9}\["|5\d{1,9}-\d{0,9}\["|[01]$')
+# What python-engineio is given: these, or a packet of its own, such as a ping or an upgrade.
+PACKET = re.compile(rf"4({SOCKET_IO_PACKET.pattern})|[0-356].{{0,125}}$")
 QUICKACK: int | None = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 
 
@@ -33,6 +36,7 @@ class QuickSocket:
         self.shutdown, self.close = sock.shutdown, sock.close
         self.account = Account()
         self.since = time.perf_counter()  # when this connection last had a turn, or nothing to read
+        self.waited = False  # whether it had nothing to read since the last message
 
     def recv(self, size: int) -> bytes:
         """Return up to `size` bytes; none at the end of the connection."""
@@ -50,12 +54,12 @@ class QuickSocket:
             return self.sock.fd.recv(65536)
         except BlockingIOError:
             data = self.sock.recv(65536)  # waits, while others work
-            self.since = time.perf_counter()
+            self.since, self.waited = time.perf_counter(), True
             return data
 
-    def take_turn(self) -> None:
-        """Wait until this connection may work."""
-        TURNS.take(self.account)
+    def take_turn(self, price: float = 1.0) -> None:
+        """Wait until this connection may work; price: see Turns."""
+        TURNS.take(self.account, price)
         self.since = time.perf_counter()
 
 
@@ -99,7 +103,8 @@ class WebSocket(eventlet.websocket.RFC6455WebSocket):
             if message is None:
                 return None
             if isinstance(message, str) and PACKET.match(message):
-                self.socket.take_turn()
+                self.socket.take_turn(PATIENT_PRICE if self.socket.waited else 1.0)
+                self.socket.waited = False
                 return message
 
     def _recv_frame(self, message: Any = None) -> Any:
