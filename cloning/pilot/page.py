@@ -107,14 +107,15 @@ class Pages:
         """
         self.open += 1
         try:
-            shown, last, quiet = None, 0.0, 0
+            shown, last, quiet = None, 0.0, QUIET_INTERVALS - 1  # so that a page hears at once
             while True:
                 TURNS.take(STRANGERS)
                 self._begin_interval()
                 last = last if self.session is shown else 0.0
                 if self.session and self.until > last:
-                    yield self._event(self.session, last)
+                    event = self._event(self.session, last)
                     shown, last, quiet = self.session, self.until, 0
+                    yield event
                 else:
                     quiet += 1
                     if quiet % QUIET_INTERVALS == 0:

@@ -12,6 +12,7 @@ from cloning.wire.turns import TURNS, Account
 
 MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
 UNREADABLE_LENGTH = 23  # bytes that are kept of a longer one: enough to see that it is a telemetry
+SEND_BUFFER = 1 << 15  # bytes of answers that the system keeps for a client that does not read; an answer has about 70
 SLICE = 0.0003  # s that a connection may read and unmask in one turn, or without one when it has waited for input
 PATIENT_PRICE = 0.25  # of a turn for a message that had to be waited for, as in lock-step: others send before they read
 # The beginnings of the Socket.IO packets that are understood: an event, one with attachments, a greeting, a farewell.
@@ -31,6 +32,7 @@ class QuickSocket:
     def __init__(self, sock: Any):
         """Wrap a connected green socket."""
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self.sock, self.buffer, self.at = sock, b"", 0
         self.sendall, self.settimeout = sock.sendall, sock.settimeout
         self.shutdown, self.close = sock.shutdown, sock.close
