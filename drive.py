@@ -6,6 +6,7 @@ python drive.py model.pt run1         # also save each frame in run1/, for `pyth
 """
 
 import argparse
+import gc
 import itertools
 import logging
 import re
@@ -37,7 +38,9 @@ from cloning.wire.protocol import PORT
 try:
     from cloning.pilot import page
     from cloning.pilot.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
+    from cloning.wire import connections
     from cloning.wire import server as wire
+    from cloning.wire.libraries import eventlet, socketio
 except UserError as error:  # wrong versions of the socket libraries
     sys.exit(program.failed("drive.py", error))
 
@@ -132,7 +135,7 @@ class Session:
 
 
 class DriveServer:
-    """Serves steering to any number of simulators, and the page to browsers."""
+    """Serves steering to up to MAX_CLIENTS simulators, and the page to browsers."""
 
     def __init__(self, network: Network, set_speed: float = SET_SPEED, saver: saved_frames.FrameSaver | None = None):
         """set_speed: mph; saver: saves the frames, or None."""
@@ -142,7 +145,7 @@ class DriveServer:
         self.socket.on("connect", self.connect)
         self.socket.on("telemetry", self.telemetry)
         self.socket.on("disconnect", self.disconnect)
-        self.app = wire.refuse_other_sites(wire.socketio.WSGIApp(self.socket, page.create_app(self)))
+        self.app = wire.refuse_other_sites(socketio.WSGIApp(self.socket, page.create_app(self)))
         steer(network, np.zeros(FRAME, np.uint8))  # the first pass is slow: do it before the first frame
 
     def session(self, sid: str) -> Session:
@@ -224,15 +227,17 @@ class StatusLine:
 
 def run(server: DriveServer, listener: socket.socket) -> None:
     """Serve, with a status line, until Ctrl-C or a signal that asks to terminate."""
+    gc.collect()
+    gc.freeze()  # else a client can make the collector look through all the libraries' objects: 0.2 s each time
     stopped: list[int] = []
     for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # the last one exists on Windows only
         if hasattr(signal, name):
             # The handler only notes the signal: python-engineio would catch an exception raised here.
             signal.signal(getattr(signal, name), lambda number, _: stopped.append(number))
-    serving = wire.eventlet.spawn(wire.serve, listener, server.app)
+    serving = eventlet.spawn(connections.serve, listener, server.app)
     status = StatusLine(server, sys.stderr.isatty())
     while not stopped and not serving.dead:
-        wire.eventlet.sleep(0.1)
+        eventlet.sleep(0.1)
         status.update()
     if serving.dead:
         serving.wait()  # raises the exception that ended it
@@ -350,7 +355,7 @@ def main() -> int:
             saved_frames.check_folder(args.folder)
         server = DriveServer(network, args.speed)
         try:
-            listener = wire.listen(args.host, args.port)
+            listener = connections.listen(args.host, args.port)
         except OSError as error:
             raise UserError(
                 f"can't listen on {args.host}:{args.port} ({error.strerror or error}); "

@@ -14,11 +14,14 @@ import numpy as np
 from cloning.pilot import attention
 from cloning.pilot.network import Network
 from cloning.recordings.images import encode
-from cloning.wire import server as wire
+from cloning.wire.libraries import eventlet
+from cloning.wire.turns import STRANGERS, TURNS
 
 SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
 UPDATE_INTERVAL = 0.1  # s between two pictures
+QUIET_INTERVALS = 10  # without driving, after which a page gets a sign that the server is there
+MAX_PAGES = 64  # open at once
 JPEG_QUALITY = 80  # of the pictures
 
 
@@ -52,6 +55,7 @@ class Server(Protocol):
 def create_app(server: Server) -> flask.Flask:
     """Return the web application: `/` is the page, `/live` its figures and pictures as server-sent events."""
     app = flask.Flask(__name__)
+    pages = {False: Pages(server, with_attention=False), True: Pages(server, with_attention=True)}
 
     @app.after_request
     def restrict(response: flask.Response) -> flask.Response:
@@ -68,8 +72,10 @@ def create_app(server: Server) -> flask.Flask:
 
     @app.get("/live")
     def live() -> flask.Response:
+        if sum(each.open for each in pages.values()) >= MAX_PAGES:
+            return flask.Response(f"{MAX_PAGES} pages are open already.\n", 503, mimetype="text/plain")
         return flask.Response(
-            events(server, "attention" in flask.request.args),
+            pages["attention" in flask.request.args].events(),
             mimetype="text/event-stream",
             headers={"Cache-Control": "no-store"},
         )
@@ -77,24 +83,64 @@ def create_app(server: Server) -> flask.Flask:
     return app
 
 
-def events(server: Server, with_attention: bool) -> Iterator[str]:
-    """Yield the figures and the picture as server-sent events, whenever frames have been driven.
+class Pages:
+    """The events for the open pages of one kind: what is drawn and encoded for one of them serves all.
 
-    Their JSON is {"session", "rows": [[time, steering, speed, throttle, latency], …], "image"}.
-    with_attention: whether the image shows what the network looks at.
+    Time is divided into intervals of UPDATE_INTERVAL. Each event shows the driving up to the first moment of its
+    interval at which a page asked for one, so that all pages get the same picture, and most of them the same text.
     """
-    shown, last = None, 0.0
-    while True:
-        session = server.watched_session()
-        last = last if session is shown else 0.0
-        rows = frames_since(session.history, last) if session else []
-        if session and rows:
-            shown, last = session, rows[-1].time
-            event = {"session": id(session), "rows": rows, "image": image(server, session, with_attention)}
-            yield f"data: {json.dumps(event)}\n\n"
-        else:
-            yield ":\n\n"  # a comment: writing it fails once the page is closed, which ends this loop
-        wire.eventlet.sleep(UPDATE_INTERVAL)
+
+    def __init__(self, server: Server, with_attention: bool):
+        """with_attention: whether the pictures show what the network looks at."""
+        self.server, self.with_attention = server, with_attention
+        self.open = 0  # number of pages
+        self.interval = -1
+        self.session: Session | None = None  # shown in this interval
+        self.until = 0.0  # time of its last frame shown, in seconds since 1970
+        self.picture = ""  # data URL, or "" if it is not drawn yet
+        self.texts: dict[float, str] = {}  # of this interval's events, by the time of the first frame shown
+
+    def events(self) -> Iterator[str]:
+        """Yield the figures and the picture as server-sent events, whenever frames have been driven.
+
+        Their JSON is {"session", "rows": [[time, steering, speed, throttle, latency], …], "image"}.
+        """
+        self.open += 1
+        try:
+            shown, last, quiet = None, 0.0, QUIET_INTERVALS - 1  # so that a page hears at once
+            while True:
+                TURNS.take(STRANGERS)
+                self._begin_interval()
+                last = last if self.session is shown else 0.0
+                if self.session and self.until > last:
+                    event = self._event(self.session, last)
+                    shown, last, quiet = self.session, self.until, 0
+                    yield event
+                else:
+                    quiet += 1
+                    if quiet % QUIET_INTERVALS == 0:
+                        yield ":\n\n"  # a comment: writing it fails once the page is closed, which ends this loop
+                eventlet.sleep(UPDATE_INTERVAL)
+        finally:
+            self.open -= 1
+
+    def _begin_interval(self) -> None:
+        """Choose what to show, if it is not chosen yet."""
+        interval = int(time.monotonic() / UPDATE_INTERVAL)
+        if interval > self.interval:
+            self.interval, self.session = interval, self.server.watched_session()
+            self.until = self.session.history[-1].time if self.session else 0.0
+            self.picture, self.texts = "", {}
+
+    def _event(self, session: Session, last: float) -> str:
+        """Return an event with the frames later than `last`, in seconds since 1970."""
+        if not self.picture:
+            self.picture = image(self.server, session, self.with_attention)
+        if last not in self.texts:
+            rows = [frame for frame in frames_since(session.history, last) if frame.time <= self.until]
+            event = {"session": id(session), "rows": rows, "image": self.picture}
+            self.texts[last] = f"data: {json.dumps(event)}\n\n"
+        return self.texts[last]
 
 
 def frames_since(history: deque[DrivenFrame], last: float) -> list[DrivenFrame]:

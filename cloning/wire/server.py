@@ -1,121 +1,23 @@
-"""The server's end of the wire: python-socketio with a faster websocket, closed to pages of other sites."""
+"""The server's end of the wire: python-socketio with bounds for each client, closed to pages of other sites."""
 
 import ipaddress
 import json
-import re
-import socket
 import time
-import warnings
 from collections.abc import Iterable
 from typing import Any
+from urllib.parse import parse_qs
 from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
+from cloning.wire.connections import refuse
+from cloning.wire.libraries import engineio, socketio
 from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
-from cloning.wire.versions import check_versions
+from cloning.wire.turns import TURNS, Account
+from cloning.wire.websocket import MAX_MESSAGE, SOCKET_IO_PACKET, WebSocket, WebSocketWSGI
 
-check_versions()  # before the imports below, which fail with some versions
-
-with warnings.catch_warnings():
-    # eventlet advises against using it in new projects, but no server has been used longer with this simulator.
-    warnings.simplefilter("ignore")
-    import eventlet
-    import eventlet.websocket
-    import eventlet.wsgi
-    import socketio
-    from engineio.async_drivers import eventlet as async_driver
-
-MAX_MESSAGE = 1 << 20  # bytes; a telemetry message has about 16,000
-# First characters of a message: Engine.IO's packet types.
-PACKET_TYPES: dict[type, str | bytes] = {str: "0123456", bytes: b"\0\1\2\3\4\5\6"}
-# The beginnings of Socket.IO's packets: an event, an event with attachments, any other.
-SOCKET_IO_PACKET = re.compile(r'2\d{0,9}\["|5[1-9]-\d{0,9}\["|[0134].{0,200}$')
+MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
+QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
+MAX_UNREAD = 64  # packets that wait for a client; the simulator has 3 telemetries in flight
 UNREADABLE = object()  # what a handler is given for a telemetry that is too long or not JSON
-QUICKACK: int | None = getattr(socket, "TCP_QUICKACK", None)  # Linux only
-
-
-class QuickSocket:
-    """A socket for a websocket that reads much at a time and acknowledges it at once.
-
-    The simulator sends a message in fragments without TCP_NODELAY: each waits for the ACK of the one before, which
-    Linux delays by 40 ms unless TCP_QUICKACK is set again after each read.
-    """
-
-    def __init__(self, sock: socket.socket):
-        """Wrap a connected socket."""
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.sock, self.buffer, self.at = sock, b"", 0
-        self.sendall, self.settimeout = sock.sendall, sock.settimeout
-        self.shutdown, self.close = sock.shutdown, sock.close
-
-    def recv(self, size: int) -> bytes:
-        """Return up to `size` bytes; none at the end of the connection."""
-        if self.at == len(self.buffer):
-            self.buffer, self.at = self.sock.recv(65536), 0
-            if QUICKACK is not None:
-                self.sock.setsockopt(socket.IPPROTO_TCP, QUICKACK, 1)
-        start, self.at = self.at, min(self.at + size, len(self.buffer))
-        return self.buffer[start : self.at]
-
-
-class WebSocket(eventlet.websocket.RFC6455WebSocket):
-    """eventlet's websocket with faster unmasking, and a limit on whole messages rather than on fragments."""
-
-    arrived = 0.0  # time.perf_counter() when the first fragment of the last message was read
-
-    class Message(eventlet.websocket.RFC6455WebSocket.Message):
-        """A message of which not all fragments have arrived."""
-
-        length = 0
-
-        def push(self, data: bytes, final: bool = False) -> None:
-            """Append a fragment, unless the message is then too long.
-
-            Such a message is answered like any other unreadable one: without an answer the car would stand still.
-            """
-            self.finished = final
-            self.length += len(data)
-            if self.length <= MAX_MESSAGE:
-                self.data.append(data)
-
-    def __init__(self, sock: socket.socket, *args: Any, **kwargs: Any):
-        """Take over a socket after the handshake."""
-        super().__init__(QuickSocket(sock), *args, **kwargs)
-        self.max_frame_length = float("inf")  # Message limits the length
-
-    def wait(self) -> str | bytes | None:
-        """Return the next message that python-engineio understands; None at the end of the connection."""
-        while True:
-            # Let the last answer be sent and other clients be served, even if more messages are buffered here.
-            eventlet.sleep(0)
-            message = super().wait()
-            # python-engineio fails on some messages of other types.
-            if message is None or message[:1] in PACKET_TYPES[type(message)]:
-                return message
-
-    def _recv_frame(self, message: Any = None) -> Any:
-        frame = super()._recv_frame(message)
-        if message is None:
-            self.arrived = time.perf_counter()
-        return frame
-
-    @staticmethod
-    def _apply_mask(data: bytes, mask: bytes, length: int | None = None, offset: int = 0) -> bytes:
-        """XOR all bytes at once: eventlet's loop over them takes 3.5 ms a telemetry message."""
-        mask = bytes(mask[(offset + i) % 4] for i in range(4)) * (len(data) // 4 + 1)
-        both = int.from_bytes(data, "little") ^ int.from_bytes(mask[: len(data)], "little")
-        return both.to_bytes(len(data), "little")
-
-
-class WebSocketWSGI(async_driver.WebSocketWSGI):
-    """Opens a WebSocket and leaves it in the request's environment, as "drive.websocket"."""
-
-    def _handle_hybi_request(self, environ: WSGIEnvironment) -> WebSocket:
-        plain = super()._handle_hybi_request(environ)
-        environ["drive.websocket"] = WebSocket(plain.socket, environ, plain.version, protocol=plain.protocol)
-        return environ["drive.websocket"]
-
-    def _negotiate_permessage_deflate(self, extensions: Any) -> None:
-        """Decline compression: it would cost time, and a small message could unpack to a huge one."""
 
 
 class Json:
@@ -134,12 +36,149 @@ class Json:
             raise ValueError(f"not JSON: {type(error).__name__}") from None
 
 
+class Client(engineio.socket.Socket):
+    """A client's session, which ends when the client does not read what it is sent, or sends nothing for too long."""
+
+    def __init__(self, server: "Engine", sid: str):
+        """Begin a session; sid: its id."""
+        super().__init__(server, sid)
+        self.account, self.polled = Account(), False
+        self.websocket: WebSocket | None = None
+
+    def receive(self, packet: Any) -> None:
+        """Handle a packet; whatever it is, the client is alive."""
+        if self.closed:
+            raise engineio.exceptions.SocketIsClosedError
+        self.last_ping = time.time()
+        if not self.upgraded:  # the websocket has taken a turn for its packet
+            TURNS.take(self.account)
+        super().receive(packet)
+
+    def send(self, packet: Any) -> None:
+        """Send a packet, unless too many of them wait already: then end the session."""
+        if self.queue.qsize() < MAX_UNREAD:
+            super().send(packet)
+        else:
+            self.hang_up()
+
+    def poll(self) -> list[Any]:
+        """Return the packets to send, at least one; none when the session has ended."""
+        while True:
+            try:
+                return super().poll()
+            except engineio.exceptions.QueueEmpty:  # for a minute
+                if not self.upgraded:
+                    raise
+
+    def close(self, wait: bool = True, abort: bool = False) -> None:
+        """End the session, and forget it; never wait until the client has read everything."""
+        super().close(wait=False, abort=abort)
+        if not self.websocket:  # else it counts as a client until its connection ends
+            self.server.sockets.pop(self.sid, None)
+
+    def hang_up(self) -> None:
+        """End the session and its connection at once."""
+        self.close(abort=True)
+        if self.websocket:
+            self.websocket.hang_up()
+
+    def handle_get_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
+        """Answer a GET: open a websocket, or wait for packets; only one may do so at a time."""
+        if "HTTP_UPGRADE" in environ:
+            return super().handle_get_request(environ, start_response)
+        if self.polled:
+            raise engineio.exceptions.EngineIOError("two requests poll at once")
+        self.polled = True
+        try:
+            return super().handle_get_request(environ, start_response)
+        finally:
+            self.polled = False
+
+    def handle_post_request(self, environ: WSGIEnvironment) -> None:
+        """Handle the packets of a POST."""
+        body = environ["wsgi.input"].getvalue()
+        if not _is_payload(body):
+            raise engineio.exceptions.EngineIOError("not a payload")
+        super().handle_post_request(environ)
+
+    def _websocket_handler(self, ws: WebSocket) -> Any:
+        self.websocket = ws
+        try:
+            return super()._websocket_handler(ws)
+        finally:
+            self.websocket = None
+            if self.closed:
+                self.server.sockets.pop(self.sid, None)
+
+
+engineio.socket.Socket = Client  # of which python-engineio makes one for each session
+
+
+def _is_payload(body: bytes) -> bool:
+    """Return whether a POST's body has the lengths of its packets where python-engineio looks for them.
+
+    It takes quadratic time to read a long number in the binary format, and to take apart a long form.
+    """
+    if body[:1].isdigit():
+        return True
+    at = 0
+    while at < len(body):
+        digits = body[at + 1 : at + 9].partition(b"\xff")
+        if body[at] > 1 or not digits[1]:
+            return False
+        at += 2 + len(digits[0])
+        length = 0
+        for digit in digits[0]:
+            length = 10 * length + digit
+        at += length
+    return True
+
+
+class Engine(engineio.Server):
+    """python-engineio's server for a few clients, which refuses requests that it would fail on."""
+
+    def handle_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
+        """Answer a request."""
+        query = parse_qs(environ.get("QUERY_STRING", ""))
+        upgrade = "websocket" in environ.get("HTTP_UPGRADE", "").lower()
+        client = self.sockets.get(query.get("sid", [""])[0])
+        if query.get("EIO") not in (["3"], ["4"]):
+            reason = "EIO must be 3 or 4, the version of Engine.IO."
+        elif query.get("transport") != ["websocket" if upgrade else "polling"]:
+            reason = "transport must be websocket, with the header Upgrade: websocket, or polling, without it."
+        elif upgrade and (environ.get("HTTP_SEC_WEBSOCKET_VERSION"), "HTTP_SEC_WEBSOCKET_KEY" in environ) != (
+            "13",
+            True,
+        ):
+            reason = "A websocket needs the headers Sec-WebSocket-Version: 13 and Sec-WebSocket-Key."
+        elif "j" in query:
+            reason = "JSONP is not supported."
+        elif upgrade and client and client.websocket:
+            reason = "This session has a websocket already."
+        elif "sid" not in query and not self._make_room():
+            reason = f"{MAX_CLIENTS} clients are connected already."
+            return refuse(start_response, "503 Service Unavailable", reason)
+        else:
+            return super().handle_request(environ, start_response)
+        return refuse(start_response, "400 Bad Request", reason)
+
+    def _make_room(self) -> bool:
+        """Return whether there is room for another client; end the quietest one's session for that."""
+        if len(self.sockets) < MAX_CLIENTS:
+            return True
+        quietest = min(self.sockets.values(), key=lambda client: client.last_ping)
+        if time.time() < quietest.last_ping + QUIET:
+            return False
+        quietest.hang_up()
+        return True
+
+
 class Server(socketio.Server):
     """python-socketio's server with the settings and filters that the simulator needs."""
 
     def __init__(self, **options: Any):
         """options: further options of socketio.Server."""
-        async_driver._async["websocket"] = WebSocketWSGI
+        engineio.async_drivers.eventlet._async["websocket"] = WebSocketWSGI
         super().__init__(
             async_mode="eventlet",
             async_handlers=False,
@@ -153,10 +192,17 @@ class Server(socketio.Server):
             **options,
         )
 
+    def _engineio_server_class(self) -> type[Engine]:
+        return Engine
+
     def _handle_eio_message(self, sid: str, data: str | bytes) -> None:
-        # Drop other text: python-socketio takes quadratic time to read the digits of a long header.
-        if isinstance(data, bytes) or (isinstance(data, str) and SOCKET_IO_PACKET.match(data)):
-            super()._handle_eio_message(sid, data)
+        """Handle a Socket.IO packet, if it is one that the simulator may send.
+
+        python-socketio takes quadratic time to read the digits of a long header, keeps every namespace that a client
+        names, and waits for the attachments that are announced: these are not, and the event is unreadable.
+        """
+        if isinstance(data, str) and SOCKET_IO_PACKET.match(data):
+            super()._handle_eio_message(sid, data if data[0] != "5" else f"2{data[data.index('[') :]}!")
 
 
 def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:
@@ -175,8 +221,8 @@ def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:
             and (site in ("none", "same-origin") or environ["PATH_INFO"] == "/")
         ):
             return app(environ, start_response)
-        start_response("403 Forbidden", [("Content-Type", "text/plain"), ("Connection", "close")])
-        return [b"This server answers programs and its own page, but no page of another site.\n"]
+        reason = "This server answers programs and its own page, but no page of another site."
+        return refuse(start_response, "403 Forbidden", reason)
 
     return guard
 
@@ -190,14 +236,3 @@ def _is_address(host: str) -> bool:
         return bool(ipaddress.ip_address(name.strip("[]")))
     except ValueError:
         return False
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """Return a listening socket; port 0 chooses a free one. Raises OSError if the port is taken."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return eventlet.listen((host, port), family, reuse_port=False)  # eventlet's default would share a taken port
-
-
-def serve(listener: socket.socket, app: WSGIApplication) -> None:
-    """Serve the application until this green thread is killed."""
-    eventlet.wsgi.server(listener, app, log_output=False, debug=False)

@@ -1,0 +1,146 @@
+"""The connections of the server: how many there may be, and how long and how much a request may take."""
+
+import errno
+import io
+import socket
+from collections.abc import Iterable
+from typing import Any
+from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
+
+from cloning.wire.libraries import eventlet
+from cloning.wire.turns import STRANGERS, TURNS
+
+MAX_CONNECTIONS = 192  # at once: macOS lets a process open 256 files
+MAX_BODY = 1 << 17  # bytes of a request: over HTTP polling, about 8 telemetries
+REQUEST_TIMEOUT = 5.0  # s from one answer to the end of the next request, or from the beginning
+WRITE_TIMEOUT = 10.0  # s in which a client must read something of an answer
+NO_HANDLES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+BROKEN = (errno.ECONNABORTED, errno.ECONNRESET, errno.EPROTO)  # by the client, before it was accepted
+
+
+class Listener:
+    """A listening socket that survives any number of clients.
+
+    When there are MAX_CONNECTIONS, a new one takes the place of the oldest that has not sent a request.
+    """
+
+    def __init__(self, sock: Any):
+        """Wrap a listening green socket."""
+        self.sock = sock
+        self.family, self.getsockname, self.close = sock.family, sock.getsockname, sock.close
+        self.idle: dict[Any, None] = {}  # connections without a whole request, the oldest first
+        self.busy = 0  # number of the others
+
+    def accept(self) -> tuple[Any, Any]:
+        """Return the next connection and the client's address."""
+        while True:
+            TURNS.take(STRANGERS)
+            try:
+                client, address = self.sock.accept()
+            except OSError as error:
+                if error.errno in NO_HANDLES:
+                    self._hang_up_oldest()
+                    eventlet.sleep(0.05)
+                elif error.errno not in BROKEN:
+                    raise
+                continue
+            if len(self.idle) + self.busy < MAX_CONNECTIONS or self._hang_up_oldest():
+                self.idle[client] = None
+                return client, address
+            client.close()
+
+    def _hang_up_oldest(self) -> bool:
+        """Hang up on the oldest connection without a request, whose thread then closes it; return whether one is."""
+        if not self.idle:
+            return False
+        oldest = next(iter(self.idle))
+        del self.idle[oldest]
+        eventlet.greenio.shutdown_safe(oldest)
+        return True
+
+
+class Protocol(eventlet.wsgi.HttpProtocol):
+    """eventlet's HTTP, where a request must arrive in time, and takes a turn."""
+
+    is_busy = False
+
+    def handle_one_request(self) -> None:
+        """Read a request and answer it."""
+        self.deadline = eventlet.Timeout(REQUEST_TIMEOUT)
+        try:
+            super().handle_one_request()
+        except eventlet.Timeout:
+            self.close_connection = True
+        finally:
+            self.deadline.cancel()
+            listener = self.server.socket
+            if self.is_busy:
+                self.is_busy, listener.busy = False, listener.busy - 1
+                listener.idle[self.connection] = None
+
+    def parse_request(self) -> bool:
+        """Read the headers."""
+        TURNS.take(STRANGERS)
+        return super().parse_request()
+
+    def get_environ(self) -> WSGIEnvironment:
+        """Return the request's WSGI environment, with this object as "drive.protocol"."""
+        return {**super().get_environ(), "drive.protocol": self}
+
+    def received(self) -> None:
+        """Note that the request is there: the connection is no longer an idle one."""
+        self.deadline.cancel()
+        listener = self.server.socket
+        if self.connection in listener.idle:  # else it was hung up on
+            del listener.idle[self.connection]
+            self.is_busy, listener.busy = True, listener.busy + 1
+
+    def finish(self) -> None:
+        """Close the connection."""
+        self.server.socket.idle.pop(self.connection, None)
+        try:
+            super().finish()
+        finally:
+            self.rfile.close()  # which keeps the socket open if the client did not read its last answer
+
+
+def whole_requests(app: WSGIApplication) -> WSGIApplication:
+    """Return a WSGI application that gives `app` a request when all of it has been read, unless it is too long."""
+
+    def read(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
+        protocol, length = environ["drive.protocol"], int(environ.get("CONTENT_LENGTH", 0))
+        if "HTTP_TRANSFER_ENCODING" in environ or length > MAX_BODY:
+            protocol.close_connection = True  # rather than read the rest
+            text = f"A request's body has a Content-Length, of {MAX_BODY} bytes at most."
+            return refuse(start_response, "413 Content Too Large", text)
+        environ["wsgi.input"] = io.BytesIO(environ["wsgi.input"].read(length))
+        protocol.received()
+        TURNS.take(STRANGERS)
+        return app(environ, start_response)
+
+    return read
+
+
+def refuse(start_response: StartResponse, status: str, reason: str) -> list[bytes]:
+    """Answer a request with an error status and one sentence, and end the connection."""
+    start_response(status, [("Content-Type", "text/plain"), ("Connection", "close")])
+    return [f"{reason}\n".encode()]
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a listening socket; port 0 chooses a free one. Raises OSError if the port is taken."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return eventlet.listen((host, port), family, reuse_port=False)  # eventlet's default would share a taken port
+
+
+def serve(listener: socket.socket, app: WSGIApplication) -> None:
+    """Serve the application until this green thread is killed."""
+    eventlet.wsgi.server(
+        Listener(listener),
+        whole_requests(app),
+        protocol=Protocol,
+        minimum_chunk_size=1,  # so that each event of the page is sent at once
+        socket_timeout=WRITE_TIMEOUT,
+        log_output=False,
+        debug=False,
+    )

@@ -1,0 +1,143 @@
+"""The websocket of the server's end: eventlet's, made faster, and without a way to use much time or memory."""
+
+import errno
+import re
+import socket
+import time
+from typing import Any
+from wsgiref.types import WSGIEnvironment
+
+from cloning.wire.libraries import engineio, eventlet
+from cloning.wire.turns import TURNS, Account
+
+MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
+UNREADABLE_LENGTH = 23  # bytes that are kept of a longer one: enough to see that it is a telemetry
+SEND_BUFFER = 1 << 15  # bytes of answers that the system keeps for a client that does not read; an answer has about 70
+SLICE = 0.0003  # s that a connection may read and unmask in one turn, or without one when it has waited for input
+PATIENT_PRICE = 0.25  # of a turn for a message that had to be waited for, as in lock-step: others send before they read
+# The beginnings of the Socket.IO packets that are understood: an event, one with attachments, a greeting, a farewell.
+SOCKET_IO_PACKET = re.compile(r'2\d{0,9}\["|5\d{1,9}-\d{0,9}\["|[01]$')
+# What python-engineio is given: these, or a packet of its own, such as a ping or an upgrade.
+PACKET = re.compile(rf"4({SOCKET_IO_PACKET.pattern})|[0-356].{{0,125}}$")
+QUICKACK: int | None = getattr(socket, "TCP_QUICKACK", None)  # Linux only
+
+
+class QuickSocket:
+    """A socket for a websocket that reads much at a time and acknowledges it at once.
+
+    The simulator sends a message in fragments without TCP_NODELAY: each waits for the ACK of the one before, which
+    Linux delays by 40 ms unless TCP_QUICKACK is set again after each read.
+    """
+
+    def __init__(self, sock: Any):
+        """Wrap a connected green socket."""
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        self.sock, self.buffer, self.at = sock, b"", 0
+        self.sendall, self.settimeout = sock.sendall, sock.settimeout
+        self.shutdown, self.close = sock.shutdown, sock.close
+        self.account = Account()
+        self.since = time.perf_counter()  # when this connection last had a turn, or nothing to read
+        self.waited = False  # whether it had nothing to read since the last message
+
+    def recv(self, size: int) -> bytes:
+        """Return up to `size` bytes; none at the end of the connection."""
+        if time.perf_counter() > self.since + SLICE:
+            self.take_turn()
+        if self.at == len(self.buffer):
+            self.buffer, self.at = self._read(), 0
+            if QUICKACK is not None:
+                self.sock.setsockopt(socket.IPPROTO_TCP, QUICKACK, 1)
+        start, self.at = self.at, min(self.at + size, len(self.buffer))
+        return self.buffer[start : self.at]
+
+    def _read(self) -> bytes:
+        try:
+            return self.sock.fd.recv(65536)
+        except BlockingIOError:
+            data = self.sock.recv(65536)  # waits, while others work
+            self.since, self.waited = time.perf_counter(), True
+            return data
+
+    def take_turn(self, price: float = 1.0) -> None:
+        """Wait until this connection may work; price: see Turns."""
+        TURNS.take(self.account, price)
+        self.since = time.perf_counter()
+
+
+class WebSocket(eventlet.websocket.RFC6455WebSocket):
+    """eventlet's websocket with faster unmasking, and a limit on whole messages rather than on fragments."""
+
+    arrived = 0.0  # time.perf_counter() when the first fragment of the last message was read
+
+    class Message(eventlet.websocket.RFC6455WebSocket.Message):
+        """A message of which not all fragments have arrived."""
+
+        data: list[bytes]
+        length = 0
+
+        def push(self, data: bytes, final: bool = False) -> None:
+            """Append a fragment, unless it is empty or the message is too long.
+
+            Such a message is answered like any other unreadable one: without an answer the car would stand still.
+            """
+            self.finished = final
+            if data and self.length <= MAX_MESSAGE:
+                self.data.append(data)
+                self.length += len(data)
+                if self.length > MAX_MESSAGE:
+                    kept = b"".join(self.data)[:UNREADABLE_LENGTH]
+                    self.data = [kept.decode("ascii", "ignore").encode()]
+
+    def __init__(self, sock: Any, *args: Any, **kwargs: Any):
+        """Take over a green socket after the handshake."""
+        super().__init__(QuickSocket(sock), *args, **kwargs)
+        self.max_frame_length = float("inf")  # Message limits the length
+
+    def wait(self) -> str | None:
+        """Return the next text that python-engineio understands, when it is this client's turn.
+
+        None at the end of the connection. What the simulator never sends is passed over: attachments and other binary
+        messages, on which python-engineio may fail, and long pings, which it would answer as long.
+        """
+        while True:
+            message = super().wait()
+            if message is None:
+                return None
+            if isinstance(message, str) and PACKET.match(message):
+                self.socket.take_turn(PATIENT_PRICE if self.socket.waited else 1.0)
+                self.socket.waited = False
+                return message
+
+    def _recv_frame(self, message: Any = None) -> Any:
+        frame = super()._recv_frame(message)
+        if message is None:
+            self.arrived = time.perf_counter()
+        return frame
+
+    @staticmethod
+    def _apply_mask(data: bytes, mask: bytes, length: int | None = None, offset: int = 0) -> bytes:
+        """XOR all bytes at once: eventlet's loop over them takes 3.5 ms a telemetry message."""
+        mask = bytes(mask[(offset + i) % 4] for i in range(4)) * (len(data) // 4 + 1)
+        both = int.from_bytes(data, "little") ^ int.from_bytes(mask[: len(data)], "little")
+        return both.to_bytes(len(data), "little")
+
+    def hang_up(self) -> None:
+        """End the connection at once, also for a green thread that waits to read or write."""
+        try:
+            self.socket.shutdown(socket.SHUT_RDWR)
+        except OSError as error:
+            if error.errno not in (errno.ENOTCONN, errno.EBADF):  # it has ended already
+                raise
+
+
+class WebSocketWSGI(engineio.async_drivers.eventlet.WebSocketWSGI):
+    """Opens a WebSocket and leaves it in the request's environment, as "drive.websocket"."""
+
+    def _handle_hybi_request(self, environ: WSGIEnvironment) -> WebSocket:
+        plain = super()._handle_hybi_request(environ)
+        environ["drive.websocket"] = WebSocket(plain.socket, environ, plain.version, protocol=plain.protocol)
+        return environ["drive.websocket"]
+
+    def _negotiate_permessage_deflate(self, extensions: Any) -> None:
+        """Decline compression: it would cost time, and a small message could unpack to a huge one."""

@@ -1,0 +1,227 @@
+"""Attack a drive.py while a car drives, and tell what the car and the server's memory feel of it.
+
+    python -m tools.attack                                  # every attack for 5 s: about five minutes
+    python -m tools.attack --only unread_pongs idle_connections --seconds 10
+
+Each attack comes from a process of its own, against a drive.py that may open 1,024 files. Beside it a car in lock-step,
+one telemetry in flight, must get the right answer to each of its frames, and in time; afterwards a new car must be
+answered, and the attack's connections must be closed. Needs Linux, because memory is read from /proc.
+"""
+
+import argparse
+import itertools
+import json
+import multiprocessing
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from cloning.errors import UserError
+from cloning.pilot.network import SHIPPED_MODEL
+from tools.attacks import Attack, all_attacks, frames
+from tools.server_process import start_server
+from tools.simulator_client import Simulator, telemetry
+
+ROOT = Path(__file__).resolve().parent.parent
+OPEN_FILES = 1024  # that the server may have: Linux's usual limit
+MAX_MEMORY, MAX_P99, MIN_RATE = 450, 40, 15  # MB, ms, frames/s: beside an attack
+NEW_CAR, LEFT_OPEN = 5.0, 10.0  # s after an attack until a new car is answered, and until its connections are closed
+FRAME_INTERVAL = 1 / 60  # s: the simulator sends at most one telemetry in a frame of its own
+PATIENCE = 20.0  # s for an answer
+
+
+@dataclass
+class Drive:
+    """What a car met: its telemetries, the answers to them, and how long each took, in s."""
+
+    asked: int = 0
+    answered: int = 0
+    wrong: int = 0
+    seconds: float = 0.0
+    round_trips: list[float] = field(default_factory=list)
+
+    def milliseconds(self) -> list[float]:
+        """Return the median, the 99th percentile and the largest of the round trips, in ms."""
+        times = self.round_trips or [PATIENCE]
+        return [1000 * float(each) for each in (np.median(times), np.quantile(times, 0.99), max(times))]
+
+    @property
+    def rate(self) -> float:
+        """Frames per second."""
+        return self.answered / self.seconds if self.seconds else 0.0
+
+
+class Car:
+    """A car in lock-step: it sends a frame, and waits for the answer before the next one."""
+
+    def __init__(self, port: int, jpegs: list[bytes], expected: list[str] | None = None):
+        """expected: the answer to each frame; those of a first, undisturbed drive if None."""
+        until = time.monotonic() + PATIENCE
+        while (simulator := Simulator(port, timeout=PATIENCE)).status != 101:
+            simulator.socket.close()
+            if time.monotonic() > until:
+                raise ConnectionError("the server refuses a new car")
+            time.sleep(0.1)
+        self.simulator = simulator
+        self.simulator.open()
+        self.messages = ["42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")]) for jpeg in jpegs]
+        self.expected = expected or [self.ask(message) for message in self.messages]
+
+    def ask(self, message: str) -> str:
+        """Send a telemetry, and return its answer."""
+        self.simulator.send(message)
+        return self.simulator.receive()
+
+    def drive(self, goes_on: Callable[[], bool]) -> Drive:
+        """Drive as long as `goes_on()`; a lost connection ends it, and leaves its last telemetry unanswered."""
+        drive, started = Drive(), time.perf_counter()
+        try:
+            for n in itertools.count():
+                due = time.perf_counter()
+                if not goes_on():
+                    break
+                drive.asked += 1
+                answer = self.ask(self.messages[n % len(self.messages)])
+                drive.round_trips.append(time.perf_counter() - due)
+                drive.answered += 1
+                drive.wrong += answer != self.expected[n % len(self.messages)]
+                time.sleep(max(0.0, due + FRAME_INTERVAL - time.perf_counter()))
+            drive.wrong += self.ask("2") != "3"  # else an answer has come twice
+        except OSError:
+            pass  # what is not answered is counted
+        drive.seconds = time.perf_counter() - started
+        return drive
+
+
+class Target:
+    """A drive.py process under attack."""
+
+    def __init__(self, model: str | Path):
+        """Start it."""
+        self.process, self.port = start_server((ROOT / "drive.py", model, "--port", "0"))
+        resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (OPEN_FILES, OPEN_FILES))
+
+    def alive(self) -> bool:
+        """Return whether it still runs."""
+        return self.process.poll() is None
+
+    def open_files(self) -> int:
+        """Return the number of files and sockets that it has open."""
+        return len(os.listdir(f"/proc/{self.process.pid}/fd"))
+
+    def forget_peak(self) -> None:
+        """Let `peak_memory` count from now on."""
+        Path(f"/proc/{self.process.pid}/clear_refs").write_text("5", encoding="ascii")
+
+    def peak_memory(self) -> float:
+        """Return its largest resident memory, in MB."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="ascii")
+        return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+    def __enter__(self) -> "Target":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@dataclass
+class Report:
+    """What an attack did: to the car, to the server's memory in MB, and afterwards."""
+
+    drive: Drive
+    memory: float
+    new_car: float  # s until a new car was answered
+    left_open: int  # connections of the attack that the server has not closed
+
+    def faults(self, timely: bool = True) -> list[str]:
+        """Return what the server promised and did not keep; timely: whether the round trips count."""
+        found = {
+            "the server ended": self.memory == 0,
+            "lost": self.drive.answered != self.drive.asked or not self.drive.asked,
+            "wrong": self.drive.wrong > 0,
+            "memory": self.memory > MAX_MEMORY,
+            "new car": self.new_car > NEW_CAR,
+            "left open": self.left_open > 0,
+            "slow": timely and (self.drive.milliseconds()[1] > MAX_P99 or self.drive.rate < MIN_RATE),
+        }
+        return [name for name, is_so in found.items() if is_so]
+
+
+def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: list[str], seconds: float) -> Report:
+    """Attack a server beside a car for some seconds; None: only drive."""
+    car = Car(server.port, jpegs, expected)
+    server.forget_peak()
+    before, until = server.open_files(), time.monotonic() + seconds
+    attacker = multiprocessing.get_context("fork").Process(target=_attack, args=(attack, server.port, until))
+    attacker.start()
+    drive = car.drive(lambda: time.monotonic() < until)
+    attacker.kill()
+    attacker.join()
+    if not server.alive():
+        return Report(drive, 0.0, PATIENCE, 0)
+    ended = time.monotonic()
+    try:
+        new = Car(server.port, jpegs[:1], expected[:1])
+        drive.wrong += new.ask(new.messages[0]) != expected[0]
+        answered_after = time.monotonic() - ended
+        new.simulator.socket.close()
+    except OSError:
+        answered_after = PATIENCE
+    while (left := server.open_files() - before) > 0 and time.monotonic() < ended + LEFT_OPEN:
+        time.sleep(0.05)
+    car.simulator.socket.close()
+    return Report(drive, server.peak_memory(), answered_after, max(left, 0))
+
+
+def _attack(attack: Attack | None, port: int, until: float) -> None:
+    os.nice(10)  # what comes over a network does not compete with the server for a processor
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    if attack:
+        attack(port, until)
+
+
+def main() -> None:
+    """Run the attacks and print a table."""
+    attacks = all_attacks()
+    parser = argparse.ArgumentParser(
+        prog="attack", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--model", default=SHIPPED_MODEL, help="a model file (default: the project's own)")
+    parser.add_argument("--seconds", type=float, default=5, help="for each attack (default %(default)s)")
+    parser.add_argument("--only", nargs="+", choices=attacks, metavar="ATTACK", help=f"of {', '.join(attacks)}")
+    args = parser.parse_args()
+    if not Path("/proc/self/status").exists():
+        parser.error("needs Linux, because memory is read from /proc")
+    chosen: Iterable[str] = args.only or attacks
+    jpegs, broken = frames(), 0
+    print(f"{'':22} asked   got wrong  fps  p50 ms p99 ms max ms  peak MB  new car s  left open")
+    for name in ("nobody", *chosen):
+        try:
+            with Target(args.model) as server:
+                expected = Car(server.port, jpegs).expected
+                report = run(attacks.get(name), server, jpegs, expected, args.seconds)
+        except UserError as error:
+            sys.exit(f"attack: {error}")
+        faults, drive = report.faults(), report.drive
+        median, p99, largest = drive.milliseconds()
+        broken += bool(faults)
+        print(
+            f"{name:22} {drive.asked:5} {drive.answered:5} {drive.wrong:5} {drive.rate:4.0f} {median:7.1f} {p99:6.1f} "
+            f"{largest:6.0f} {report.memory:8.0f} {report.new_car:10.2f} {report.left_open:10}  "
+            f"{', '.join(faults) or 'ok'}",
+            flush=True,
+        )
+    sys.exit(1 if broken else 0)
+
+
+if __name__ == "__main__":
+    main()

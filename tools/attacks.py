@@ -1,0 +1,216 @@
+"""The attacks of `tools.attack`: what each sends to a drive.py, and how often."""
+
+import itertools
+import json
+import socket
+import struct
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+
+from cloning.recordings.format import FRAME
+from cloning.recordings.images import encode
+from tools.simulator_client import fragments, telemetry
+
+Attack = Callable[[int, float], None]  # takes the server's port and the time.monotonic() at which to stop
+T = TypeVar("T")
+WEBSOCKET = (
+    b"GET /socket.io/?EIO=4&transport=websocket%s HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n"
+    b"Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Extensions: permessage-deflate\r\n\r\n"
+)
+GET = b"GET %s HTTP/1.1\r\nHost: localhost\r\n\r\n"
+POST = b"POST %s HTTP/1.1\r\nHost: localhost\r\n%s\r\n\r\n"
+POLLING = b"/socket.io/?EIO=3&transport=polling"
+
+
+def frame(payload: bytes, first: int = 0x81, masked: int = 0x80, length: int | None = None) -> bytes:
+    """Return a websocket frame with a mask of zeros.
+
+    first: final bit, reserved bits and opcode; length: announced instead of the true one.
+    """
+    length = len(payload) if length is None else length
+    if length < 126:
+        size = struct.pack(">B", masked | length)
+    elif length < 1 << 16:
+        size = struct.pack(">BH", masked | 126, length)
+    else:
+        size = struct.pack(">BQ", masked | 127, length)
+    return bytes([first]) + size + bytes(4 if masked else 0) + payload
+
+
+def flood(
+    port: int,
+    until: float,
+    opening: bytes,
+    data: bytes = b"",
+    *,
+    connections: int = 1,
+    read: bool = False,
+    pause: float = 0.0,
+    hold: bool = True,
+) -> None:
+    """Send `opening` once and `data` again and again on each connection; connect again where the server closes.
+
+    until: time.monotonic(); read: whether to read what the server sends; pause: s between two bytes, 0 to send as much
+    as the server takes; hold: whether to keep a connection, instead of closing it when `opening` is sent.
+    """
+    opened: dict[int, socket.socket] = {}
+    rest: dict[int, bytes] = {}
+    while time.monotonic() < until:
+        moved = 0
+        for n in range(connections):
+            try:
+                if n not in opened:
+                    opened[n] = socket.create_connection(("127.0.0.1", port), 0.2)
+                    opened[n].setblocking(False)
+                    rest[n], moved = opening, 1
+                if rest[n]:
+                    sent = _unless_blocked(opened[n].send, rest[n][: 1 if pause else None]) or 0
+                    rest[n], moved = rest[n][sent:], moved + sent
+                if read or not (rest[n] or data):
+                    received = _unless_blocked(opened[n].recv, 1 << 20, 0 if read else socket.MSG_PEEK)
+                    if received == b"":
+                        raise ConnectionError
+                    moved += len(received or b"") if read else 0
+                if not rest[n]:
+                    rest[n] = data
+                    if not hold:
+                        raise ConnectionError
+            except OSError:
+                if n in opened:
+                    opened.pop(n).close()
+        if pause or not moved:
+            time.sleep(pause or 0.002)
+    for each in opened.values():
+        each.close()
+
+
+def _unless_blocked(call: Callable[..., T], *arguments: Any) -> T | None:
+    """Return the result of a call on a socket, or None if it would have to wait."""
+    try:
+        return call(*arguments)
+    except BlockingIOError:
+        return None
+
+
+def flooding(opening: bytes, data: bytes = b"", **options: Any) -> Attack:
+    """Return the attack that is a flood."""
+    return lambda port, until: flood(port, until, opening, data, **options)
+
+
+def websockets(data: bytes, **options: Any) -> Attack:
+    """Return the attack that floods an open websocket with frames."""
+    return flooding(WEBSOCKET % b"", data, **options)
+
+
+def requests(data: bytes, **options: Any) -> Attack:
+    """Return the attack that floods a connection with HTTP requests."""
+    return flooding(b"", data, **options)
+
+
+def bad_frames(port: int, until: float) -> None:
+    """Break the websocket's rules, each rule on a connection of its own."""
+    broken = [
+        frame(b"2", masked=0),
+        frame(b"2", 0xF1),  # reserved bits
+        frame(b"2", 0xC1),  # compressed
+        frame(b"2", 0x83),  # unknown opcode
+        frame(b"x" * 126, 0x89),  # a control frame too long
+        frame(b"", 0x09),  # a control frame in fragments
+        frame(b"", 0x80),  # continues nothing
+        frame(b"2", 0x01) + frame(b"2", 0x81),  # begins anew
+        frame(b"\xff\xfe"),  # not UTF-8
+        frame(b"\0\0", 0x88),
+        frame(b"2", length=(1 << 64) - 1),
+    ]
+    for each in itertools.cycle(broken):
+        if time.monotonic() > until:
+            break
+        flood(port, min(until, time.monotonic() + 0.02), WEBSOCKET % b"" + each)
+
+
+def session_id(port: int) -> bytes:
+    """Return the id of a new session over HTTP polling, or b"" if the server refuses one."""
+    with socket.create_connection(("127.0.0.1", port), 2) as client:
+        client.sendall(GET % POLLING)
+        head = client.recv(65536)
+    return head.split(b'"sid":"')[1][:32] if b'"sid":"' in head else b""
+
+
+def in_sessions(data: Callable[[bytes], bytes], connections: int) -> Attack:
+    """Return the attack that opens a session over HTTP polling every second, and sends `data(session id)` in it."""
+
+    def attack(port: int, until: float) -> None:
+        while (now := time.monotonic()) < until:
+            try:
+                sid = session_id(port)
+            except OSError:
+                sid = b""
+            flood(port, min(until, now + 1), b"", data(b"&sid=" + sid), connections=connections, read=True)
+
+    return attack
+
+
+def post(path: bytes, body: bytes) -> bytes:
+    """Return a POST request."""
+    return POST % (path, b"Content-Length: %d" % len(body)) + body
+
+
+def one_frame_of(jpeg: bytes) -> bytes:
+    """Return a telemetry's websocket frames."""
+    return b"".join(fragments("42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")])))
+
+
+def frames(count: int = 8) -> list[bytes]:
+    """Return JPEGs about as large as the simulator's, 12 kB: a sky, and a field of grains."""
+    rng = np.random.default_rng(0)
+    grains = rng.normal(0, 11, (count, *FRAME)) + np.linspace(200, 90, FRAME[0])[:, None, None]
+    return [encode(image, 75) for image in np.clip(grains, 0, 255).astype(np.uint8)]
+
+
+def all_attacks() -> dict[str, Attack]:
+    """Return the attacks by name."""
+    driving = one_frame_of(frames(1)[0])
+    names = b"".join(frame(b"40/%d," % n) for n in range(50_000))
+    return {
+        # Answers that nobody reads
+        "unread_pongs": websockets(frame(b"2" + b"x" * 1_000_000), connections=4),
+        "unread_small_pongs": websockets(frame(b"2") * 1000),
+        "unread_answers": websockets(driving),
+        "unread_pages": requests(GET % b"/live?attention", connections=20),
+        "connect_again": websockets(frame(b"40") * 1000),
+        "namespaces": websockets(names, read=True),
+        "upgrade_packets": websockets(frame(b"5") * 1000),
+        "websocket_pings": websockets(frame(b"x" * 125, 0x89) * 1000),
+        "websocket_pings_read": websockets(frame(b"", 0x89) * 1000, connections=8, read=True),
+        # Messages that cost more than they should
+        "cars": websockets(driving, connections=30, read=True),
+        "attachments": websockets(frame(b'459-["telemetry"]') + 8 * frame(b"\x04" + bytes(1 << 20), 0x82), read=True),
+        "json": websockets(frame(b'42["telemetry",' + b"[]," * 300_000 + b"0]"), connections=8, read=True),
+        "empty_fragments": flooding(WEBSOCKET % b"" + frame(b"4", 0x01), frame(b"", 0x00) * 10_000, connections=8),
+        "endless_frame": flooding(WEBSOCKET % b"" + frame(b"4", length=1 << 40), bytes(1 << 20), connections=8),
+        "bad_frames": bad_frames,
+        # HTTP
+        "polling_sessions": requests(GET % POLLING, connections=50, read=True),
+        "unfetched_answers": in_sessions(
+            lambda sid: post(POLLING + sid, b'24:42["telemetry",{"a":"b"}]' * 16), connections=8
+        ),
+        "upgrade_probes": in_sessions(lambda sid: WEBSOCKET % sid + frame(b"2probe"), connections=100),
+        "payload_lengths": in_sessions(lambda sid: post(POLLING + sid, b"\0" + b"\1" * 250_000), connections=8),
+        "endless_body": flooding(POST % (b"/", b"Content-Length: 999999999999"), bytes(1 << 20), connections=20),
+        "endless_chunks": flooding(
+            POST % (POLLING, b"Transfer-Encoding: chunked"), b"10000\r\n" + bytes(1 << 16) + b"\r\n"
+        ),
+        "long_headers": requests(b"GET / HTTP/1.1\r\n" + b"A: %s\r\n" % (b"b" * 600) * 99, connections=100, read=True),
+        "slow_headers": requests(GET % b"/" + b"A: b\r\n" * 1000, connections=500, pause=0.001),
+        "odd_versions": requests(GET % b"/socket.io/?EIO=9&transport=websocket", connections=50, read=True),
+        "page_requests": requests(GET % b"/", connections=100, read=True),
+        "reconnections": flooding(WEBSOCKET % b"", connections=50, hold=False),
+        # Many at once
+        "idle_connections": flooding(b"", connections=1500),
+        "pages": flooding(GET % b"/live", connections=50, read=True),
+        "pages_with_attention": flooding(GET % b"/live?attention", connections=50, read=True),
+    }
