@@ -59,6 +59,7 @@ def value(path: Path) -> object:
     """What a file says, without what differs between two runs of one command: times, and a run's identifier."""
     if path.suffix == ".pt":
         saved = torch.load(path, weights_only=True)
+        saved.pop("digest", None)  # of all the contents, times too
         for row in saved["history"]:
             del row["seconds"]
         for part, name in ((saved, "run"), (saved["arguments"], "resume"), (saved.get("training", {}), "seconds")):
@@ -144,13 +145,13 @@ class Place:
         assert not [path for path in self.folder.rglob("*") if is_temporary(path)]
         return contents(self.folder), ended.points
 
-    def killed_everywhere(self, others: int, next_run: Callable[[dict[str, object]], None] | None = None) -> None:
+    def killed_everywhere(self, count: int, next_run: Callable[[dict[str, object]], None] | None = None) -> None:
         """Kill the command at the chosen points, each time from the beginning, and let the next run go on.
 
-        others: see `chosen`; next_run: instead of `goes_on`.
+        count: see `chosen`; next_run: instead of `goes_on`.
         """
         wanted, points = self.whole_run()
-        for number in chosen(points, others):
+        for number in chosen(points, count):
             self.restore()
             ended = self.run(self.command, kill=number)
             try:
@@ -161,7 +162,7 @@ class Place:
                 (next_run or self.goes_on)(wanted)
             except Exception as error:
                 self.failures.append(f"killed at {number} of {len(points)}, {points[number - 1]}: {str(error)[:300]}")
-        self.report(f"{len(chosen(points, others))} of {len(points)} points")
+        self.report(f"{len(chosen(points, count))} of {len(points)} points")
 
     def goes_on(self, wanted: dict[str, object]) -> None:
         """The next run ends as if the one before had not been killed, and leaves no temporary file."""
@@ -219,10 +220,11 @@ def spread(numbers: list[int], count: int) -> list[int]:
     return [numbers[i] for i in np.linspace(0, len(numbers) - 1, count).round().astype(int)] if count else []
 
 
-def chosen(points: list[str], others: int) -> list[int]:
-    """The numbers of the points at which to kill: all of them, or all renames and some others, evenly spread."""
+def chosen(points: list[str], count: int) -> list[int]:
+    """The numbers of the points at which to kill: all of them, or so many renames and others, evenly spread."""
     numbers = list(range(1, len(points) + 1))
     if ALL:
         return numbers
     renames = [number for number in numbers if points[number - 1].startswith("os.rename")]
-    return sorted({*renames, *spread([number for number in numbers if number not in renames], others)})
+    others = [number for number in numbers if number not in renames]
+    return sorted(spread(renames, count) + spread(others, count))

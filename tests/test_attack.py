@@ -8,19 +8,19 @@ import urllib.error
 import urllib.request
 from types import SimpleNamespace
 
-import eventlet
 import pytest
 from drive_process import serving
 
 import drive
 from cloning.pilot import page
 from cloning.pilot.network import Network
+from cloning.wire.libraries import eventlet
 from cloning.wire.server import MAX_CLIENTS, QUIET
 from cloning.wire.turns import Account, Turns
+from tools import attack
 from tools.attacks import GET, all_attacks, frame
 from tools.simulator_client import Simulator, telemetry
 
-attack = pytest.importorskip("tools.attack", reason="needs the module resource")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory and open files are read from /proc")
 
 SECONDS = 0.5  # of each attack; `python -m tools.attack` takes longer, and measures the round trips too

@@ -66,7 +66,7 @@ def test_training_killed_anywhere(warm, lake, tmp_path):
 
 def test_resumed_training_killed_anywhere(warm, lake, trained, tmp_path):
     command = training(lake, "--epochs", 2, "--resume")
-    Place(warm, tmp_path / "place", command, command, trained).killed_everywhere(3)
+    Place(warm, tmp_path / "place", command, command, trained).killed_everywhere(2)
 
 
 def test_training_over_an_earlier_runs_files_killed_anywhere(warm, lake, trained, tmp_path):
@@ -94,7 +94,7 @@ def test_training_over_an_earlier_runs_files_killed_anywhere(warm, lake, trained
 def test_training_on_a_full_disk(warm, lake, tmp_path):
     begin = training(lake, "--epochs", 1)
     place = Place(warm, tmp_path / "place", begin, [*begin, "--resume"])
-    place.disk_full_everywhere(4, status=1)
+    place.disk_full_everywhere(4, status=2)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ def test_recording_killed_anywhere(warm, tmp_path):
         ended = place.run(RECORD)
         assert ended.status == 2 and "exists already; name another folder, or delete this one" in ended.printed
 
-    place.killed_everywhere(1, next_run)
+    place.killed_everywhere(2, next_run)
 
 
 def test_recording_on_a_full_disk(warm, tmp_path):

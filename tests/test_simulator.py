@@ -351,7 +351,7 @@ def test_a_full_disk_is_reported_and_leaves_whole_rows(tmp_path, monkeypatch):
     [
         (["record"], "folder"),
         (["record", "x", "--speed", "40"], "at least 1 and at most 30"),
-        (["record", "x", "--laps", "0"], "at least 0.001"),
+        (["record", "x", "--laps", "0"], "at least 1e-06"),
         (["record", "x", "--track", "moon"], "moon"),
         (["fly"], "fly"),
         (["record", "x", "--seed", "-1"], "at least 0"),

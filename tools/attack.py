@@ -13,15 +13,19 @@ import itertools
 import json
 import multiprocessing
 import os
-import resource
-import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("attack")  # also while the libraries below are loaded
+
 import numpy as np
 
+from cloning.arguments import number
 from cloning.errors import UserError
 from cloning.pilot.network import SHIPPED_MODEL
 from tools.attacks import Attack, all_attacks, frames
@@ -104,6 +108,8 @@ class Target:
 
     def __init__(self, model: str | Path):
         """Start it."""
+        import resource  # missing on Windows, where main refuses to run
+
         self.process, self.port = start_server((ROOT / "drive.py", model, "--port", "0"))
         resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (OPEN_FILES, OPEN_FILES))
 
@@ -182,6 +188,8 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
 
 
 def _attack(attack: Attack | None, port: int, until: float) -> None:
+    import resource
+
     os.nice(10)  # what comes over a network does not compete with the server for a processor
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
@@ -189,14 +197,16 @@ def _attack(attack: Attack | None, port: int, until: float) -> None:
         attack(port, until)
 
 
-def main() -> None:
-    """Run the attacks and print a table."""
+def main() -> int:
+    """Run the attacks and print a table; return the exit status."""
     attacks = all_attacks()
     parser = argparse.ArgumentParser(
         prog="attack", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--model", default=SHIPPED_MODEL, help="a model file (default: the project's own)")
-    parser.add_argument("--seconds", type=float, default=5, help="for each attack (default %(default)s)")
+    parser.add_argument(
+        "--seconds", type=number(float, 0.1, 3600), default=5, help="for each attack (default %(default)s)"
+    )
     parser.add_argument("--only", nargs="+", choices=attacks, metavar="ATTACK", help=f"of {', '.join(attacks)}")
     args = parser.parse_args()
     if not Path("/proc/self/status").exists():
@@ -210,7 +220,7 @@ def main() -> None:
                 expected = Car(server.port, jpegs).expected
                 report = run(attacks.get(name), server, jpegs, expected, args.seconds)
         except UserError as error:
-            sys.exit(f"attack: {error}")
+            return program.failed("attack", error)
         faults, drive = report.faults(), report.drive
         median, p99, largest = drive.milliseconds()
         broken += bool(faults)
@@ -220,8 +230,8 @@ def main() -> None:
             f"{', '.join(faults) or 'ok'}",
             flush=True,
         )
-    sys.exit(1 if broken else 0)
+    return program.INCOMPLETE if broken else program.DONE
 
 
 if __name__ == "__main__":
-    main()
+    program.run(main)
