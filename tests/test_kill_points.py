@@ -94,7 +94,7 @@ def test_training_over_an_earlier_runs_files_killed_anywhere(warm, lake, trained
 def test_training_on_a_full_disk(warm, lake, tmp_path):
     begin = training(lake, "--epochs", 1)
     place = Place(warm, tmp_path / "place", begin, [*begin, "--resume"])
-    place.disk_full_everywhere(4, status=2)
+    place.disk_full_everywhere(3, status=2)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -303,7 +303,7 @@ def test_a_simulated_drive_killed_anywhere(simulator_drive):
 
 
 def test_a_simulated_drive_on_a_full_disk(simulator_drive):
-    simulator_drive.disk_full_everywhere(2, status=2)
+    simulator_drive.disk_full_everywhere(1, status=2)
 
 
 @pytest.fixture
@@ -319,4 +319,4 @@ def test_a_replay_killed_anywhere(replaying):
 
 
 def test_a_replay_on_a_full_disk(replaying):
-    replaying.disk_full_everywhere(2, status=2)
+    replaying.disk_full_everywhere(1, status=2)
