@@ -295,3 +295,11 @@ def test_names_that_no_file_can_have_are_left_out(log):
     found = log(*usual(), f"{long},0.1,1,0,9")
     assert [(line, kind) for line, kind, _ in found.rejected] == [(5, "name too long")]
     assert found.names.dtype.itemsize < 50  # else one row would make the memory for all names grow
+
+
+def test_only_names_without_letters_are_taken_to_be_at_their_usual_places(log):
+    found = log("center,left,right,steering,0,,speed", *usual())
+    np.testing.assert_array_equal(numbers(found), np.float32(VALUES))
+    assert found.repairs == {"header lacks names; usual places taken": [1, 1]}
+    with pytest.raises(RecordingError, match="line 1: the header lacks throttle; add"):
+        log(HEADER.replace("throttle", "lap"), *usual())

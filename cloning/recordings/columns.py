@@ -7,9 +7,9 @@ settle it.
 
 Some things leave no evidence. Without a header, or below one that was not meant for them: images in another order
 without the cameras' names; numbers in another order while the car stands or never steers left, or together with decimal
-commas; throttle and brake in another order in one of several merged logs, or while the car is slow; a number moved
-before the images, with another column in its place. Anywhere: another unit that stays within the ranges, such as
-steering in radians, and steering positive to the left.
+commas; throttle and brake in another order in one of several merged logs, or while the car is slow; a number that is
+missing or stands before the images, with another column in its place. Anywhere: another unit that stays within the
+ranges, such as steering in radians, and steering positive to the left.
 """
 
 import math
@@ -34,6 +34,7 @@ HEADER_WORDS = {  # beginnings of other names that headers have for the columns
     "lt": "left",
     "rt": "right",
     "angle": "steering",
+    "gas": "throttle",
     "steer": "steering",
     "reverse": "brake",
 }
@@ -173,10 +174,11 @@ def header_columns(fields: Sequence[str]) -> tuple[tuple[str, ...], bool]:
             )
     if len(known) == len(COLUMNS):
         return columns, False
-    start = columns.index("center")  # unnamed columns must be at the usual places
+    start = columns.index("center")  # columns with a number or nothing for a name must be at the usual places
     usual = (*columns[:start], *COLUMNS, *columns[start + len(COLUMNS) :])
     if len(columns) != len(usual) or any(
-        name != place for name, place in zip(columns, usual, strict=True) if name in COLUMNS
+        name != place and (name in COLUMNS or re.search("[^\\W\\d]", value))
+        for name, place, value in zip(columns, usual, fields, strict=True)
     ):
         missing = [name for name in COLUMNS if name not in known]
         raise UnclearColumns("header unclear", f"the header lacks {', '.join(missing)}; add them")
