@@ -33,7 +33,7 @@ from cloning.recordings.plain import PlainRows
 MERGE_MARKERS = ("<<<<<<<", "|||||||", "=======", ">>>>>>>")  # what git leaves in a file with a conflict
 BYTE_ORDER_MARK = "\ufeff"  # which some programs write at the beginning; files are also joined
 NO_CONTENT = re.compile(r"(sep=.)?[\s\0\x1a,;]*", re.IGNORECASE)  # Excel's first line; \x1a: what copy adds at the end
-DECIMAL_COMMA = re.compile(r"([-+]?\d+),(\d+([eE][-+]?\d+)?)", re.ASCII)
+DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)$", re.ASCII)
 LONGEST_LINE = 20_000  # characters: more than three paths and some columns can have
 
 
@@ -149,10 +149,11 @@ class TolerantReader:
         self.rows += 1
         if delimiter != ",":
             self._repair("tab-separated" if delimiter == "\t" else "separated by semicolons", line)
-        with_points = [(DECIMAL_COMMA.fullmatch(value) and value.replace(",", ".")) or value for value in fields]
-        if with_points != fields:  # they are not the separators, or stand within quotes
-            self._repair("decimal commas", line)
-            fields = with_points
+        if delimiter != "," or '"' in text:  # else no field has a comma
+            with_points = [DECIMAL_COMMA.sub(r"\1.\2", value) for value in fields]
+            if with_points != fields:
+                self._repair("decimal commas", line)
+                fields = with_points
         try:
             self._read_row(line, fields, images, delimiter == ",")
         except UnclearColumns as error:
