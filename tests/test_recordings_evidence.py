@@ -25,7 +25,7 @@ HEADER_NAMES = {
     "brake": ["brake", "Brake", "reverse"],
     "speed": ["speed", "Speed"],
 }
-EXAMPLES = int(os.environ.get("LOG_EXAMPLES", 250))  # 10,000 take about 5 minutes
+EXAMPLES = int(os.environ.get("LOG_EXAMPLES", 200))  # 10,000 take about 6 minutes
 
 
 @dataclass
