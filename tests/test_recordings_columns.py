@@ -137,7 +137,10 @@ def test_swapped_columns_without_a_header_are_refused(log):
     "line, why",
     [
         ("{images},0.5,0.5,0.5,9.5", "the brake is pressed with the throttle"),
-        ("{images},0.5,0,1,9.5", "the brake is pressed more than the throttle"),
+        (
+            "{images},0.5,0,1,20.5",
+            "the brake is pressed more than the throttle, but the car does not slow down, .* line 1:",
+        ),
         ("{images},0.5,1.5,0,9.5", "throttle is 1.5"),
         ("{images},0.5,1,0,-9.5", "speed is -9.5"),
     ],
@@ -149,7 +152,7 @@ def test_pedals_and_speeds_that_the_simulator_never_writes(log, line, why):
 
 def test_steering_in_degrees_is_refused(log):
     degrees = [f"{angle},0.5,0,9.5" for angle in (-12.5, 0.5, 3.25, 25)]
-    with pytest.raises(RecordingError, match="is it another column, or in another unit"):
+    with pytest.raises(RecordingError, match="is this column steering, and in the simulator's unit"):
         log(*usual(degrees))
     with pytest.raises(RecordingError, match=r"line 1: the header's 'steering \(deg\)' has another unit"):
         log(HEADER.replace("steering", "steering (deg)"), *usual())
@@ -216,6 +219,87 @@ def test_checks_of_shapes():
 def test_decimal_commas_beside_an_unnamed_column_are_left_out(log):
     rows = ["0,3333333,0,0,0,0", "1,0,0,0,1", "1,333333,0,0,0,0"]  # a lap before steering, throttle, brake and speed
     with pytest.raises(
-        RecordingError, match="line 2: '1,0,0,0,1' can be read in 1 ways with decimal commas; line 1 in none"
+        RecordingError, match="line 2: '1,0,0,0,1' may be four numbers with decimal commas, but not those in line 1;"
     ):
         log(*usual(rows))
+
+
+def test_a_header_in_other_words_within_the_file_is_refused(log):
+    rows = [line.replace(",-0.25", ",0.25") for line in swapped(10)]  # never steers left: the numbers show nothing
+    with pytest.raises(RecordingError, match="line 5: neither a row nor a header with center and steering"):
+        log(*usual(), "mitte,links,rechts,gas,lenkung,bremse,tempo", *rows)
+    with pytest.raises(RecordingError, match="steering and steering_filtered both mean steering; rename"):
+        log(HEADER + ",steering_filtered", *[line + ",0.5" for line in usual()])
+    with pytest.raises(RecordingError, match="'throttle %' has another unit"):
+        log(HEADER.replace("throttle", "throttle %"), *usual())
+
+
+def with_commas(line):
+    return line.replace(",", ";").replace(".", ",").replace(",jpg", ".jpg")
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["sep=;", with_commas(HEADER), *map(with_commas, usual())],  # as Excel writes it
+        ["sep=,", HEADER, *usual()],
+        ['"' + line.replace(",", '", "') + '"' for line in usual()],
+        [f'{images(at)},"' + row.replace(",", '","').replace(".", ",") + '"' for at, row in enumerate(NUMBERS)],
+        [f"{with_commas(images(at))};{with_commas(row)}".replace("IMG/", "a, b/") for at, row in enumerate(NUMBERS)],
+        [
+            with_commas("steering,throttle,brake,speed,center,left,right"),
+            *[with_commas(f"{row},{images(at)}") for at, row in enumerate(NUMBERS)],
+        ],
+        [HEADER, *[line + "," for line in usual()]],
+        [*usual()[:2], "\ufeffct_path,lt_path,rt_path,throttle,steer,brake,speed", *swapped()[2:]],  # two files joined
+        [*usual()[:2], *["\ufeff" + line.replace("IMG/", "") for line in usual()[2:]]],
+        [*usual(), "\x1a", "\xa0", "\x0b"],  # the end of a text file, once
+    ],
+)
+def test_rows_that_other_programs_write(log, lines):
+    found = log(*lines)
+    np.testing.assert_array_equal(numbers(found), np.float32(VALUES))
+    assert found.rejected == []
+    assert [found.name(3, camera) for camera in range(3)] == [name[4:] for name in images(3).split(",")]
+
+
+def test_decimal_commas_beside_a_note_with_a_point_are_left_out(log):
+    with pytest.raises(RecordingError, match=r"line 2: '0,1,0,30,19023,Lake v1.2' are not four numbers"):
+        log(*usual(["-0,05,0,5,0,9,25,Lake v1.2", "0,1,0,30,19023,Lake v1.2"]))
+
+
+@pytest.mark.parametrize("speeds, numbers", [((20.5, 18, 15.5, 12), "0,0,1"), ((0, 1.5, 4, 6), "0.1,0,0.5")])
+def test_short_recordings_of_braking_and_of_driving_backwards_are_kept(log, speeds, numbers):
+    found = log(*[f"{images(at)},{numbers},{speed}" for at, speed in enumerate(speeds)])
+    assert len(found) == 4
+    kind = "the brake is pressed more than the throttle, as in braking or driving backwards"
+    assert found.repairs == {kind: [4, 1]}
+
+
+def test_exchanged_pedals_are_refused_where_the_car_keeps_its_speed(log):
+    speeds = [30.19, 30.2, 30.1, 30.1, 29, 30, 30.2]
+    with pytest.raises(RecordingError, match=r"the car does not slow down, such as in line 1: .* name the columns"):
+        log(*[f"{images(at)},0.1,0,1,{speed}" for at, speed in enumerate(speeds)])
+
+
+def test_images_of_different_times_are_left_out(log):
+    sorted_alone = [line.replace("left_2018_07_16_17_11_43_002", "left_2018_07_16_17_11_43_001") for line in usual()]
+    found = log(*sorted_alone)
+    np.testing.assert_array_equal(found.lines, [1, 2, 4])
+    ((line, kind, detail),) = found.rejected
+    assert (line, kind) == (3, "images of different times") and "has a column been sorted or moved by itself?" in detail
+
+
+def test_names_that_no_file_can_have_are_left_out(log):
+    long = images(9).replace("center_", "center_" + "a" * 300)
+    found = log(*usual(), f"{long},0.1,1,0,9")
+    assert [(line, kind) for line, kind, _ in found.rejected] == [(5, "name too long")]
+    assert found.names.dtype.itemsize < 50  # else one row would make the memory for all names grow
+
+
+def test_only_names_without_letters_are_taken_to_be_at_their_usual_places(log):
+    found = log("center,left,right,steering,0,,speed", *usual())
+    np.testing.assert_array_equal(numbers(found), np.float32(VALUES))
+    assert found.repairs == {"header lacks names; usual places taken": [1, 1]}
+    with pytest.raises(RecordingError, match="line 1: the header lacks throttle; add"):
+        log(HEADER.replace("throttle", "lap"), *usual())

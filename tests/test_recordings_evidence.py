@@ -25,7 +25,7 @@ HEADER_NAMES = {
     "brake": ["brake", "Brake", "reverse"],
     "speed": ["speed", "Speed"],
 }
-EXAMPLES = int(os.environ.get("LOG_EXAMPLES", 250))  # 10,000 take about 5 minutes
+EXAMPLES = int(os.environ.get("LOG_EXAMPLES", 200))  # 10,000 take about 6 minutes
 
 
 @dataclass
@@ -47,11 +47,13 @@ class Part:
     mark: str
     digits: str
     end: str
+    quoted: bool
+    trailing: str
 
     def lines(self):
         """The text of each line, and the row that it holds: None for the header."""
         if self.header is not None:
-            yield self.separator.join(self.header) + self.end, None
+            yield self.joined(self.header), None
         for values, images in zip(self.values, self.images, strict=True):
             fields, row = [], []
             for column in self.order:
@@ -62,7 +64,11 @@ class Part:
                 else:
                     fields.append(self.written(values[column]).replace(".", self.mark))
             row = [images[camera] for camera in CAMERAS], [float(self.written(values[name])) for name in NUMBERS]
-            yield self.separator.join(fields) + self.end, row
+            yield self.joined(fields), row
+
+    def joined(self, fields):
+        fields = [f'"{value}"' for value in fields] if self.quoted else fields
+        return self.separator.join(fields) + self.trailing + self.end
 
     def written(self, value):
         """As C# writes a float, as Python does, or with four decimals."""
@@ -95,8 +101,7 @@ def rows(draw, size, must_be_signed, must_accelerate):
         values[draw(st.integers(0, size - 1))]["steering"] = -draw(st.sampled_from([0.05, 0.3, 0.9]))
     if must_accelerate:
         for value in values:
-            value.update(throttle=0.5, brake=0.0)
-        values[0]["speed"] = 9.0
+            value.update(throttle=0.5, brake=0.0, speed=15.0 + values.index(value))
     return values
 
 
@@ -113,7 +118,9 @@ def parts(draw, start):
     for number in range(draw(st.sampled_from([0, 0, 0, 1, 1, 2]))):
         order.insert(draw(st.integers(0, len(order))), f"extra{number}")
     extras = [name for name in order if name.startswith("extra")]
-    size = draw(st.integers(1, 12))
+    if draw(st.integers(0, 9)) == 0 and (headed or len(order) == len(USUAL)):
+        order.remove(draw(st.sampled_from(order)))
+    size = draw(st.integers(2, 12))
     unnamed = not headed and numbers != NUMBERS  # which only signs, ranges and fields can show
     values = draw(rows(size, unnamed, unnamed))
     for extra in extras:
@@ -144,11 +151,15 @@ def parts(draw, start):
         header,
         values,
         images,
-        draw(st.sampled_from(["", "IMG/", "/Users/driver/data/IMG/", "C:\\Users\\left turn\\IMG\\", "a b/"])),
+        draw(
+            st.sampled_from(["", "IMG/", "/Users/driver/data/IMG/", "C:\\Users\\left turn\\IMG\\", "a b/", "Jos\xe9/"])
+        ),
         draw(st.sampled_from([",", ",", ",", ", ", ";", "\t"])),
         draw(st.sampled_from([".", ".", "," if not unnamed else "."])),
         draw(st.sampled_from(["C#", "C#", "Python", "fixed"])),
         draw(st.sampled_from(["\n", "\n", "\r\n"])),
+        draw(st.integers(0, 5)) == 0,
+        draw(st.sampled_from(["", "", "", ",", ",,"])),
     )
 
 
@@ -166,7 +177,7 @@ def logs(draw):
         elif own != numbers or numbers != NUMBERS:
             part.values[0]["steering"] = -0.25
             for value in part.values:
-                value.update(throttle=0.5, brake=0.0, speed=9.0)
+                value.update(throttle=0.5, brake=0.0, speed=15.0 + part.values.index(value))
     assume(not any(leaves_no_evidence(*pair) for pair in itertools.combinations(chosen, 2)))
     return chosen
 
@@ -185,6 +196,18 @@ def leaves_no_evidence(part, later):
 def files(draw):
     """The bytes of a driving_log.csv, and of each line's row: the names of the images and the numbers."""
     lines = [line for part in draw(logs()) for line in part.lines()]
+    for _ in range(draw(st.sampled_from([0, 0, 1, 3]))):
+        at = draw(st.integers(0, len(lines) - 1))
+        text, row = lines[at]
+        damage = draw(st.sampled_from(["cut", "twice", "between"]))
+        if damage == "cut" and row is not None:  # before the numbers end, so that it shows
+            lines[at] = text[: draw(st.integers(0, max(0, text.lower().rfind(".jp"))))] + "\n", None
+        elif damage == "twice":
+            lines.insert(at, (text, row))
+        else:
+            lines.insert(
+                at, (draw(st.sampled_from(["\n", ",,,,,,\n", "=======\n", "\0\0\n", "\x1a\n", "a, b\n"])), None)
+            )
     text = "".join(text for text, _ in lines)
     if draw(st.integers(0, 4)) == 0:
         text = text.rstrip("\r\n")

@@ -1,22 +1,26 @@
 """Decide what the columns of `driving_log.csv` mean, by evidence that must agree.
 
 The evidence is the header, the cameras' names in the names of the images, the number of fields, and the numbers of all
-rows of one shape: steering is signed, -1..1; the pedals are 0..1 and never pressed together; speed runs to 30 mph.
-Where it disagrees, or leaves a choice, the rows are left out, and the reason says what would settle it.
+rows of one shape: steering is signed, -1..1; the pedals are 0..1 and never pressed together; speed runs to 30 mph, and
+falls when the car brakes. Where it disagrees, or leaves a choice, the rows are left out, and the reason says what would
+settle it.
 
-Some things leave no evidence. Without a header: numbers in another order while the car stands or never steers left, or
-together with decimal commas; throttle and brake in another order in one of several merged logs. Below a header that
-was not meant for them: images in another order without the cameras' names.
+Some things leave no evidence. Without a header, or below one that was not meant for them: images in another order
+without the cameras' names; numbers in another order while the car stands or never steers left, or together with decimal
+commas; throttle and brake in another order in one of several merged logs, or while the car is slow; a number that is
+missing or stands before the images, with another column in its place. Anywhere: another unit that stays within the
+ranges, such as steering in radians, and steering positive to the left.
 """
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
+from cloning.recordings.format import CAMERAS, COLUMNS, MAX_NAME, NUMBERS, RANGES
 from cloning.recordings.plain import PlainRows
 
 SETTLE = f"name the columns in a header line above them, such as {','.join(COLUMNS)}"
@@ -24,16 +28,21 @@ SUFFIXES = (".jpg", ".jpeg")
 CAMERA_WORD = re.compile(r"(?<![a-z])(cent(?:er|re)|left|right)(?![a-z])")
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE | re.ASCII)
-OTHER_UNITS = re.compile(r"deg|rad|°|km|kph|m/s|mps", re.IGNORECASE)
+OTHER_UNITS = re.compile(r"deg|rad|°|km|kph|m/s|mps|%|percent", re.IGNORECASE)
 HEADER_WORDS = {  # beginnings of other names that headers have for the columns
     "ct": "center",
     "lt": "left",
     "rt": "right",
     "angle": "steering",
+    "gas": "throttle",
     "steer": "steering",
     "reverse": "brake",
 }
-DOUBTED_SHARE = 0.01  # of a column's values that are out of range, from which on the column is taken for another one
+MOST_ERRORS = 0.01  # share of a column's values out of range; if there are more, the column is not what it is taken for
+FAST = 10  # mph; a car that drives backwards, with the brake, is slower
+LEAST_BRAKING = (
+    0.75  # share of the fast rows with the brake on in which the speed falls; recordings: 27 of 27 and 3 of 3
+)
 
 
 class UnclearColumns(ValueError):
@@ -104,8 +113,10 @@ def is_image(name: str) -> bool:
 def by_camera(names: Sequence[str]) -> Sequence[str]:
     """Return three names in the order of CAMERAS, by the cameras' names in them; as they are if there are none.
 
-    Raises UnclearColumns if two are the same, or only some contain a camera's name.
+    Raises UnclearColumns if two are the same, only some contain a camera's name, or one is too long for a file.
     """
+    if (longest := max(len(os.fsencode(name)) for name in names)) > MAX_NAME:
+        raise UnclearColumns("name too long", f"an image name of {longest} bytes; correct or delete the row")
     if len(set(names)) < len(names):
         raise UnclearColumns("one image for two cameras", f"{', '.join(names)}: correct or delete the row")
     cameras = [camera_of(name) for name in names]
@@ -126,8 +137,12 @@ def camera_of(name: str) -> str | None:
 
 
 def is_header(fields: Sequence[str]) -> bool:
-    """Return whether a line without images names columns: at least two of COLUMNS, with words and not with files."""
-    return len({_column(value) for value in fields if "." not in value} - {None}) >= 2
+    """Return whether a line without images names columns: at least two of COLUMNS, or as many words in any language.
+
+    A word that contains a point is a file and not a name.
+    """
+    words = [value for value in fields if value and "." not in value and math.isnan(number(value))]
+    return len(words) >= len(COLUMNS) or len({_column(value) for value in words} - {None}) >= 2
 
 
 def header_columns(fields: Sequence[str]) -> tuple[tuple[str, ...], bool]:
@@ -137,11 +152,18 @@ def header_columns(fields: Sequence[str]) -> tuple[tuple[str, ...], bool]:
     """
     columns = tuple(_column(value) or f"{value} ({at})" for at, value in enumerate(fields))
     known = [name for name in columns if name in COLUMNS]
-    if known != list(dict.fromkeys(known)) or "center" not in known or "steering" not in known:
+    for name in COLUMNS:
+        if known.count(name) > 1:
+            same = [value for column, value in zip(columns, fields, strict=True) if column == name]
+            raise UnclearColumns(
+                "header unclear",
+                f"{' and '.join(same)} both mean {name}; rename the one that the simulator didn't write",
+            )
+    if "center" not in known or "steering" not in known:
         raise UnclearColumns(
             "header unclear",
             f"neither a row nor a header with center and steering: {','.join(fields)[:80]!r}; "
-            f"a header is {','.join(COLUMNS)}",
+            f"correct it: a header is {','.join(COLUMNS)}",
         )
     for name, value in zip(columns, fields, strict=True):
         if name in NUMBERS and OTHER_UNITS.search(value.lower().replace(name, "")):
@@ -152,10 +174,11 @@ def header_columns(fields: Sequence[str]) -> tuple[tuple[str, ...], bool]:
             )
     if len(known) == len(COLUMNS):
         return columns, False
-    start = columns.index("center")  # unnamed columns must be at the usual places
+    start = columns.index("center")  # columns with a number or nothing for a name must be at the usual places
     usual = (*columns[:start], *COLUMNS, *columns[start + len(COLUMNS) :])
     if len(columns) != len(usual) or any(
-        name != place for name, place in zip(columns, usual, strict=True) if name in COLUMNS
+        name != place and (name in COLUMNS or re.search("[^\\W\\d]", value))
+        for name, place, value in zip(columns, usual, fields, strict=True)
     ):
         missing = [name for name in COLUMNS if name not in known]
         raise UnclearColumns("header unclear", f"the header lacks {', '.join(missing)}; add them")
@@ -176,9 +199,11 @@ def check_places(shape: Shape) -> None:
             f"{shape.fields} fields below a header that names {len(shape.columns or ())} in another order than the "
             "simulator's; correct the header, or write one above these rows",
         )
+    least, greatest = np.transpose(list(RANGES.values()))
+    least, greatest = least.min(), greatest.max()
     for line, tokens in zip(shape.lines, shape.tokens, strict=True):
         for token in tokens[len(NUMBERS) :]:
-            if any(least <= number(token) <= greatest for least, greatest in RANGES.values()):
+            if least <= number(token) <= greatest:
                 raise UnclearColumns(
                     "columns unclear",
                     f"{len(tokens)} numbers where {len(NUMBERS)} are expected, and {token} in line {line} could be "
@@ -190,28 +215,50 @@ def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> Non
     """Raise UnclearColumns if the numbers of a shape's rows show that its columns are others than they are taken for.
 
     lines: int (n,), in the csv; numbers: float (n, 4), in the order of NUMBERS, nan where there is none; is_named: by
-    a header. A few steering angles or speeds out of range are taken for single errors, negative pedals are not: they
+    a header. A few steering angles or speeds out of range are taken for single errors. Negative pedals are not: they
     are what steering looks like in a pedal's column.
     """
     for name, column in zip(NUMBERS, numbers.T, strict=True):
         least, greatest = RANGES[name]
         outside = np.isfinite(column) & ((column < least) | (column > greatest))
         single = outside & (column > greatest) if name == "speed" else outside & (name == "steering")
-        if (outside & ~single).any() or single.sum() > max(1, DOUBTED_SHARE * len(column)):
+        if (outside & ~single).any() or single.sum() > max(1, MOST_ERRORS * len(column)):
             at = np.flatnonzero(outside)[np.argmin(lines[outside])]
             raise UnclearColumns(
                 "columns unclear",
-                f"{name} is {column[at]:g} in line {lines[at]} and not in {least}..{greatest} in {outside.sum()} of "
-                f"{len(column)} such rows: is it another column, or in another unit? Delete the rows if they are "
-                f"wrong; else convert them, or {SETTLE}",
+                f"{name} is {column[at]:g} in line {lines[at]} and out of {least}..{greatest} in {outside.sum()} of "
+                f"{len(column)} rows: is this column {name}, and in the simulator's unit? If only they are wrong, "
+                f"delete those rows; if the unit is another one, convert the column; if it is another column, {SETTLE}",
             )
     throttle, brake = numbers[:, NUMBERS.index("throttle")], numbers[:, NUMBERS.index("brake")]
     both = (throttle > 0) & (brake > 0)
-    if not is_named and (both.any() or np.nansum(brake) > np.nansum(throttle)):
-        where = f"with the throttle in line {lines[both].min()}" if both.any() else "more than the throttle"
-        raise UnclearColumns(
-            "columns unclear", f"the brake is pressed {where}: are they other columns, or in another order? {SETTLE}"
-        )
+    if is_named or not (both.any() or brakes_most(numbers)):
+        return
+    if both.any():
+        doubt = f"the brake is pressed with the throttle in line {lines[both].min()}"
+    elif line := _keeps_its_speed(lines, brake, numbers[:, NUMBERS.index("speed")]):
+        doubt = f"the brake is pressed more than the throttle, but the car does not slow down, such as in line {line}"
+    else:
+        return
+    raise UnclearColumns("columns unclear", f"{doubt}: are they other columns, or in another order? {SETTLE}")
+
+
+def brakes_most(numbers: np.ndarray) -> bool:
+    """Return whether the brake is pressed more than the throttle; numbers: float (n, 4), as in `check_numbers`.
+
+    So it is in a short recording of braking or of driving backwards, and where the two columns are exchanged.
+    """
+    return bool(np.nansum(numbers[:, NUMBERS.index("brake")]) > np.nansum(numbers[:, NUMBERS.index("throttle")]))
+
+
+def _keeps_its_speed(lines: np.ndarray, brake: np.ndarray, speed: np.ndarray) -> int:
+    """Return the first line in which a fast car does not slow down with the brake on; 0 if it usually does."""
+    order = np.argsort(lines)
+    lines, brake, speed = lines[order], brake[order], speed[order]
+    faster = np.diff(speed)
+    fast = (np.diff(lines) == 1) & (brake[:-1] > 0) & (brake[1:] > 0) & (speed[:-1] > FAST) & np.isfinite(faster)
+    keeps = fast & (faster >= 0)
+    return int(lines[:-1][keeps][0]) if keeps.sum() > (1 - LEAST_BRAKING) * fast.sum() else 0
 
 
 def decimal_comma_readings(tokens: list[str]) -> list[list[str]]:

@@ -12,6 +12,7 @@ RANGES = {"steering": (-1, 1), "throttle": (0, 1), "brake": (0, 1), "speed": (0,
 SAMPLE_RATE = 15  # rows a second
 FRAME = (160, 320, 3)  # rows, columns, RGB of a camera's image
 TIME_STAMP = "%Y_%m_%d_%H_%M_%S_%f"  # in the names of images, with milliseconds in place of microseconds
+MAX_NAME = 255  # bytes of a file's name
 
 
 def time_stamp(moment: datetime) -> str:

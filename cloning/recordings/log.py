@@ -108,7 +108,8 @@ def print_findings(recording: Recording) -> None:
     """Print a recording's repairs, and the first five rejected rows of each kind, with file, line and remedy."""
     path = recording.folder / DRIVING_LOG
     for kind, (rows, line) in recording.repairs.items():
-        print(f"{path}: line {line}: {kind} ({rows} rows are read this way; check that it is meant)")
+        count = "1 row is" if rows == 1 else f"{rows} rows are"
+        print(f"{path}: line {line}: {kind} ({count} read this way; check that it is meant)")
     kinds: dict[str, list[tuple[int, str]]] = {}
     for line, kind, detail in recording.rejected:
         kinds.setdefault(kind, []).append((line, detail))
@@ -140,7 +141,8 @@ def read_recording(folder: str | Path) -> Recording:
     rows_read, repairs, rejected = reader.rows, reader.repairs, reader.rejected
     del numbers, plain, reader
     names, images = _unique(names)
-    time = _time_stamps(names[images[:, 0]])
+    times = _time_stamps(names)[images]
+    time = times[:, 0]
     if np.isnan(time).any():
         time = lines / float(SAMPLE_RATE)
     steering, throttle, brake, speed = columns
@@ -152,8 +154,13 @@ def read_recording(folder: str | Path) -> Recording:
     for row in np.flatnonzero(contradicting):
         detail = f"{recording.name(int(row))} also has a row with another steering angle; delete the wrong one"
         rejected.append((int(lines[row]), "one image, two angles", detail))
+    torn = np.nanmin(times, axis=1, initial=np.inf) < np.nanmax(times, axis=1, initial=-np.inf)
+    for row in np.flatnonzero(torn):
+        detail = f"{', '.join(recording.name(int(row), camera) for camera in range(3))} are of different times: has a "
+        detail += "column been sorted or moved by itself? Copy the csv again, or delete the row"
+        rejected.append((int(lines[row]), "images of different times", detail))
     rejected.sort()
-    recording.keep(order[~contradicting[order]])
+    recording.keep(order[~(contradicting | torn)[order]])
     return recording
 
 

@@ -3,7 +3,6 @@
 The bytes of a line decide whether it is plain, before pandas reads it. The tolerant reader reads all other lines.
 """
 
-import codecs
 import csv
 import io
 import re
@@ -15,13 +14,12 @@ import numpy as np
 import pandas as pd
 
 from cloning.errors import RecordingError
-from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
+from cloning.recordings.format import CAMERAS, COLUMNS, MAX_NAME, NUMBERS, RANGES
 
 BLOCK = 2 << 20  # bytes read at a time, about 10,000 lines: so much that the 1 ms of each call of pandas hardly counts
 COMMA, QUOTE, CARRIAGE_RETURN, NEW_LINE, SPACE, SLASH, BACKSLASH, DELETE = b',"\r\n /\\\x7f'
 NEGATIVE_ZERO = re.compile(rb"-0+(?![0-9.])")  # would lose its sign in a column that pandas reads as integers
 LONGEST_LINE = 1 << 20  # bytes; at the end of a file that a crash has filled with zeros, there may be far more
-MAX_NAME = 255  # bytes of a file's name
 SUFFIXES = (b".jpg", b".JPG", b".jpeg", b".JPEG")
 PREFIXES = np.array([f"{camera}_".encode() for camera in CAMERAS])
 LEAST, GREATEST = np.array([RANGES[name] for name in NUMBERS], float).T
@@ -53,13 +51,11 @@ class PlainRows:
 
 
 def read_blocks(path: Path) -> Iterator[bytes]:
-    """Yield the csv in blocks of whole lines, without the byte order mark that some programs write at its beginning.
+    """Yield the csv in blocks of whole lines.
 
     Raises RecordingError if a line is too long for any csv.
     """
     with open(path, "rb") as file:
-        if file.read(len(codecs.BOM_UTF8)) != codecs.BOM_UTF8:
-            file.seek(0)
         while block := file.read(BLOCK) + (rest := file.readline(LONGEST_LINE)):
             if len(rest) == LONGEST_LINE:
                 raise RecordingError(f"{path}: a line of more than {LONGEST_LINE} bytes: not a csv; copy it again")

@@ -5,6 +5,7 @@ whether the file has decimal points or decimal commas.
 """
 
 import csv
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,9 +13,11 @@ import numpy as np
 
 from cloning.errors import RecordingError
 from cloning.recordings.columns import (
+    NUMBER,
     Shape,
     UnclearColumns,
     base_name,
+    brakes_most,
     by_camera,
     check_numbers,
     check_places,
@@ -27,7 +30,10 @@ from cloning.recordings.columns import (
 from cloning.recordings.format import CAMERAS, COLUMNS, NUMBERS, RANGES
 from cloning.recordings.plain import PlainRows
 
-MERGE_MARKERS = ("<<<<<<<", "=======", ">>>>>>>")  # what git leaves in a file with a conflict
+MERGE_MARKERS = ("<<<<<<<", "|||||||", "=======", ">>>>>>>")  # what git leaves in a file with a conflict
+BYTE_ORDER_MARK = "\ufeff"  # which some programs write at the beginning; files are also joined
+NO_CONTENT = re.compile(r"(sep=.)?[\s\0\x1a,;]*", re.IGNORECASE)  # Excel's first line; \x1a: what copy adds at the end
+DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)$", re.ASCII)
 LONGEST_LINE = 20_000  # characters: more than three paths and some columns can have
 
 
@@ -79,6 +85,7 @@ class TolerantReader:
 
         Raises RecordingError if it is an unusable header, or the first line and neither a row nor a header.
         """
+        text = text.removeprefix(BYTE_ORDER_MARK)
         fields = text.split(",")
         if len(fields) == len(COLUMNS) and '"' not in text and self._columns in (None, COLUMNS):
             names = [base_name(value) for value in fields[:3]]
@@ -92,18 +99,21 @@ class TolerantReader:
         """Interpret the rows, because all are known now; open_line: the last one if it has no line end, else 0."""
         self._read_decimal_commas()
         for shape in self._shapes.values():
+            rows = [[number(token) for token in tokens[: len(NUMBERS)]] for tokens in shape.tokens]
+            lines = np.concatenate([np.array(shape.lines, np.int32), *(rows.lines for rows in shape.plain)])
+            numbers = np.concatenate([np.reshape(rows, (-1, len(NUMBERS))), *(rows.numbers for rows in shape.plain)])
             try:
                 check_places(shape)
-                rows = [[number(token) for token in tokens[: len(NUMBERS)]] for tokens in shape.tokens]
-                check_numbers(
-                    np.concatenate([np.array(shape.lines, np.int32), *(rows.lines for rows in shape.plain)]),
-                    np.concatenate([np.reshape(rows, (-1, len(NUMBERS))), *(rows.numbers for rows in shape.plain)]),
-                    shape.columns is not None,
-                )
+                check_numbers(lines, numbers, shape.columns is not None)
             except UnclearColumns as error:
-                for line in (*shape.lines, *(int(line) for rows in shape.plain for line in rows.lines)):
+                for line in lines.tolist():
                     self._reject(line, error)
                 continue
+            if shape.columns is None and brakes_most(numbers):
+                for line in sorted(lines.tolist()):
+                    self._repair(
+                        "the brake is pressed more than the throttle, as in braking or driving backwards", line
+                    )
             self.plain += shape.plain
             for line, names, tokens in zip(shape.lines, shape.names, shape.tokens, strict=True):
                 if shape.has_extra_columns:
@@ -116,7 +126,7 @@ class TolerantReader:
     def _read_odd_line(self, line: int, text: str) -> None:
         """Read a line that is not seven plain columns: blank, a header, quoted, tabs, extra columns, decimal commas."""
         text = text.strip("\r\n")
-        if not text.strip("\0 \t,;"):
+        if NO_CONTENT.fullmatch(text):
             if "\0" in text:
                 self._reject(
                     line, UnclearColumns("binary zeros", "the file was cut off while it was written; delete the line")
@@ -129,8 +139,9 @@ class TolerantReader:
             self.rows += 1
             error = UnclearColumns("not a row", f"a line of {len(text)} characters: {text[:40]!r}…; delete it")
             return self._reject(line, error)
-        delimiter = max(",;\t", key=text.count) if text.count(",") < 6 else ","
-        fields = [value.strip() for value in next(csv.reader([text], delimiter=delimiter))]
+        enough = [mark for mark in "\t;," if text.count(mark) >= len(COLUMNS) - 1]  # commas may also be decimal marks
+        delimiter = enough[0] if enough else max(",;\t", key=text.count)
+        fields = [value.strip() for value in next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))]
         names = [base_name(value) for value in fields]
         images = tuple(at for at, name in enumerate(names) if is_image(name))
         if not images and (is_header(fields) or not (self.rows or self.header)):
@@ -138,9 +149,11 @@ class TolerantReader:
         self.rows += 1
         if delimiter != ",":
             self._repair("tab-separated" if delimiter == "\t" else "separated by semicolons", line)
-            if any("," in value for value in fields[images[-1] + 1 :] if images):
+        if delimiter != "," or '"' in text:  # else no field has a comma
+            with_points = [DECIMAL_COMMA.sub(r"\1.\2", value) for value in fields]
+            if with_points != fields:
                 self._repair("decimal commas", line)
-                fields = [value.replace(",", ".") for value in fields]
+                fields = with_points
         try:
             self._read_row(line, fields, images, delimiter == ",")
         except UnclearColumns as error:
@@ -182,7 +195,7 @@ class TolerantReader:
                 f"{len(tokens)} numbers where steering, throttle, brake, speed are expected; "
                 "record again, or add the columns",
             )
-        has_point = any("." in token for token in tokens)
+        has_point = any("." in token and NUMBER.fullmatch(token) for token in tokens)
         self._points = self._points or has_point
         if len(tokens) > len(NUMBERS) and by_commas and not has_point:
             # Only the fractions of decimal commas have so many digits, or begin with zeros.
@@ -206,18 +219,19 @@ class TolerantReader:
             if not found and not any(number(token) != number(token) for token in tokens)
         ]
         if self._points:
-            hint = "; the file also has decimal points"
+            hint = ", but the file also has decimal points"
         else:
-            hint = f"; line {other_columns[0]} in none" if other_columns else ""
+            hint = f", but not those in line {other_columns[0]}" if other_columns else ""
         for (shape, joined, line, names, tokens), found in zip(self._pointless, readings, strict=True):
             if self._commas and not hint and len(found) == 1 and joined.is_usual:
                 self._repair("decimal commas", line)
                 self._collect(joined, line, names, found[0])
             elif self._commas or found:
+                ways = f" in {len(found)} ways" if len(found) > 1 else ""
+                reason = f"may be four numbers with decimal commas{ways}{hint}" if found else "are not four numbers"
                 error = UnclearColumns(
                     "ambiguous columns",
-                    f"{','.join(tokens)!r} can be read in {len(found)} ways with decimal commas{hint}; "
-                    "write decimal points, or delete the extra columns",
+                    f"{','.join(tokens)!r} {reason}; write decimal points, or delete the extra columns",
                 )
                 self._reject(line, error)
             else:
