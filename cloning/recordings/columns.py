@@ -40,9 +40,8 @@ HEADER_WORDS = {  # beginnings of other names that headers have for the columns
 }
 MOST_ERRORS = 0.01  # share of a column's values out of range; if there are more, the column is not what it is taken for
 FAST = 10  # mph; a car that drives backwards, with the brake, is slower
-LEAST_BRAKING = (
-    0.75  # share of the fast rows with the brake on in which the speed falls; recordings: 27 of 27 and 3 of 3
-)
+# Share of the fast rows with the brake on in which the speed falls; in two real recordings 27 of 27 and 3 of 3.
+LEAST_BRAKING = 0.75
 
 
 class UnclearColumns(ValueError):
