@@ -291,8 +291,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="Exit status: 0 after Ctrl-C, 1 if the server could not start or if frames could not be saved, 2 if an "
-        "argument is wrong.",
+        epilog="Exit status: 0 after Ctrl-C, 1 if frames could not be saved, 2 if the server could not start.",
     )
     parser.add_argument(
         "model",

@@ -491,7 +491,7 @@ def main(argv: list[str] | None = None) -> int:
         status, message = 128 + error.args[0], "stopped and saved; continue with --resume"
     except KeyboardInterrupt:
         status, message = 128 + SIGNALS[0], f"stopped at once; {files.next_step(arguments.resume)}"
-    if message and rank() == 0:
+    if message and (rank() == 0 or status == 2):  # the other ranks' errors are their own
         print(f"model.py: {message}", file=sys.stderr)
     return leave_processes(status)
 

@@ -5,39 +5,38 @@ disk; films, saved frames and recordings do not wait, so the ones of the last se
 """
 
 import errno
+import functools
 import os
+import re
+import secrets
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-LEFT_BEHIND = 3600.0  # s: the temporary file of a process that still writes is not so old
+TEMPORARY_NAME = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part")
+LEFT_BEHIND = 86_400.0  # s: the temporary file of a process that still writes is not so old
 
 
 @contextmanager
-def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]:
+def written_whole(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the same folder and rename it to `path` when the block ends without an exception.
 
     A process killed at any time leaves the old file or the new one, complete. After an exception the temporary file
-    is deleted and the old file stays. The block writes and closes the temporary file (which is called `.NAME.part`);
-    if the block does not create the temporary file, an existing `path` stays as it is.
+    is deleted and the old file stays. The block writes and closes the temporary file; if it does not create it, an
+    existing `path` stays as it is. The temporary file (`.NAME.RANDOM.part`) is no other process's, so several may write
+    `path` at the same time, and the last one to finish wins. The first use in a folder deletes those that are a day
+    old, which killed processes left.
 
-    per_process: give each process its own temporary file, so that several may write `path` at the same time; the last
-    one to finish wins. Of those in the folder, all that are an hour old are deleted: killed processes left them.
     Raises OSError with the name `path`, not the temporary one, for example when the disk is full, and at once when
     `path` is a folder.
     """
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part" if per_process else f".{path.name}.part")
+    _clean(path.absolute().parent)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)  # left by a process that was killed
-            if per_process:
-                for other in path.parent.glob(".*.part"):
-                    if time.time() - other.stat().st_mtime > LEFT_BEHIND:
-                        other.unlink()
         yield temporary
         if temporary.exists():
             os.replace(temporary, path)
@@ -48,6 +47,15 @@ def written_whole(path: str | Path, per_process: bool = False) -> Iterator[Path]
             reason = error.strerror or str(error)  # NumPy's OSError has a message but no errno
             raise OSError(error.errno or errno.EIO, reason, str(path)) from error
         raise
+
+
+@functools.cache  # once: a folder of saved frames takes long to list
+def _clean(folder: Path) -> None:
+    """Delete what killed processes left in a folder, if it can be deleted."""
+    with suppress(OSError):
+        for entry in os.scandir(folder):
+            if TEMPORARY_NAME.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > LEFT_BEHIND:
+                os.unlink(entry)
 
 
 def write(path: str | Path, data: bytes) -> None:

@@ -7,7 +7,9 @@ when it loads them. Files of earlier versions have no digest and rely on these c
 import hashlib
 import io
 import math
+import re
 import reprlib
+import sys
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,22 +20,21 @@ import torch
 from cloning.errors import ModelError
 from cloning.files import write
 
-MAX_SIZE = 100_000_000  # bytes; the largest file of this project has 7 million
+MAX_SIZE = 30_000_000  # bytes of a file, and of its contents in memory; the largest file of this project has 7 million
+MAX_STRUCTURE = 2_000_000  # bytes of all but the tensors: 30,000 epochs; each of them can become 72 in memory
+TENSOR = re.compile("[^/]+/data/")  # the start of the name of a tensor's entry
 PLAIN = (str, int, float, bool, type(None))
 
 
 def save(path: str | Path, contents: Mapping[str, object]) -> None:
-    """Write a file of dicts, lists, tuples, tensors and plain values, with their digest. Raises OSError.
-
-    Each non-empty dict, list, tuple and tensor may be contained only once.
-    """
+    """Write a file of dicts, lists, tuples, tensors and plain values, with their digest. Raises OSError."""
     buffer = io.BytesIO()
     torch.save({**contents, "digest": compute_digest(contents)}, buffer)
     write(path, buffer.getvalue())
 
 
 def load(path: str | Path, remedy: str) -> dict[str, Any]:
-    """Return the contents of a file, without running code from it, in memory of about the file's size.
+    """Return the contents of a file, without running code from it, with 500 MB of memory at most.
 
     remedy: how to get a good file, as the end of an error's message. Raises ModelError for a file that is missing, not
     of `save`, or changed since it was saved.
@@ -59,7 +60,7 @@ def load(path: str | Path, remedy: str) -> dict[str, Any]:
 
 
 def matching(found: object, expected: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return tensors of a file that have the names, shapes and kinds of number of `expected`, and are finite.
+    """Return copies of tensors of a file that have the names, shapes and kinds of number of `expected`, and are finite.
 
     Raises ValueError, saying what differs.
     """
@@ -76,7 +77,7 @@ def matching(found: object, expected: Mapping[str, torch.Tensor]) -> dict[str, t
             raise ValueError(f"{name} is {shown(value)}, not a tensor {tuple(like.shape)}, {like.dtype}")
         if not value.to(like.dtype).isfinite().all():
             raise ValueError(f"{name} contains numbers that are not finite")
-    return {name: found[name] for name in expected}
+    return {name: found[name].clone() for name in expected}  # a file's tensors may share their memory
 
 
 def shown(value: object) -> str:
@@ -94,20 +95,20 @@ def is_number(value: object, least: float = -math.inf, most: float = math.inf) -
 def compute_digest(contents: object) -> str:
     """Return a digest of dicts, lists, tuples, tensors and plain values, whichever file they are in.
 
-    Raises ValueError for any other value, for a tensor that is only a view, and for what is contained twice: a small
-    file could otherwise stand for any amount of data.
+    What is contained several times counts each time. Raises ValueError for any other value and for more than MAX_SIZE
+    bytes in all: a small file could otherwise stand for any amount of data.
     """
-    digest, seen = hashlib.blake2b(digest_size=16), set()
+    digest, size = hashlib.blake2b(digest_size=16), 0
 
     def add(value: object) -> None:
+        nonlocal size
+        size += sys.getsizeof(value) + (value.nbytes if isinstance(value, torch.Tensor) else 0)
+        if size > MAX_SIZE:
+            raise ValueError(f"its contents have more than {MAX_SIZE:,} bytes")
         if isinstance(value, torch.Tensor):
-            if value.untyped_storage().nbytes() != value.nbytes:
-                raise ValueError("a tensor is a view of another one")
-            first_time(value.untyped_storage().data_ptr() if value.nbytes else None)
             digest.update(f"{value.dtype} {tuple(value.shape)}:".encode())
             digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
         elif isinstance(value, (dict, list, tuple)):
-            first_time(id(value) if value else None)
             digest.update(f"{'dict' if isinstance(value, dict) else type(value).__name__} {len(value)}:".encode())
             for item in value.items() if isinstance(value, dict) else [value]:
                 for part in item:
@@ -116,12 +117,6 @@ def compute_digest(contents: object) -> str:
             digest.update(f"{value!r}:".encode())
         else:
             raise ValueError(f"a value is of type {type(value).__name__}")
-
-    def first_time(identity: int | None) -> None:
-        if identity in seen:
-            raise ValueError("a value is contained twice")
-        if identity is not None:
-            seen.add(identity)
 
     add(contents)
     return digest.hexdigest()
@@ -137,6 +132,9 @@ def _check_archive(file: IO[bytes]) -> None:
         unpacked = sum(entry.file_size for entry in entries)
         if unpacked > size or any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise ValueError("it is compressed")
+        structure = sum(entry.file_size for entry in entries if not TENSOR.match(entry.filename))
+        if structure > MAX_STRUCTURE:
+            raise ValueError(f"it has {structure:,} bytes that are not tensors")
         if damaged := archive.testzip():
             raise ValueError(f"the checksum of {damaged} is wrong")
     file.seek(0)

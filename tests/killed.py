@@ -19,9 +19,10 @@ import torch
 from kill_points import Ended, Warm
 from PIL import Image
 
+from cloning.files import TEMPORARY_NAME
+
 ALL = bool(os.environ.get("ALL_KILL_POINTS"))  # see `chosen`
 KILLED = -signal.SIGKILL
-PART = re.compile(r"\.(.+)\.part")
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -29,7 +30,7 @@ PART = re.compile(r"\.(.+)\.part")
 
 
 def is_temporary(path: Path) -> bool:
-    return bool(PART.fullmatch(path.name))
+    return bool(TEMPORARY_NAME.fullmatch(path.name))
 
 
 def check_whole(folder: Path) -> None:
@@ -132,9 +133,9 @@ class Place:
         return self.warm.wait(process)
 
     def age_temporaries(self) -> None:
-        """As if the next run came a day later."""
+        """As if the next run came two days later."""
         for path in self.folder.rglob(".*.part"):
-            os.utime(path, (time.time() - 86_400,) * 2)
+            os.utime(path, (time.time() - 2 * 86_400,) * 2)
 
     def whole_run(self) -> tuple[dict[str, object], list[str]]:
         """The command without a kill: what it leaves, and its points."""
@@ -201,6 +202,7 @@ class Place:
             assert self.run(self.command, bytes=length).status == -signal.SIGXFSZ
             check_whole(self.folder)
             assert not (self.folder / name).exists()
+            self.age_temporaries()
             self.goes_on(wanted)
 
     def report(self, points: str) -> None:

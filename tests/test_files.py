@@ -22,11 +22,10 @@ def test_a_folder_is_refused_at_once(tmp_path, monkeypatch, name):
         check_folders(name)
 
 
-@pytest.mark.parametrize("per_process", [False, True])
-def test_a_file_appears_only_when_it_is_complete(tmp_path, per_process):
+def test_a_file_appears_only_when_it_is_complete(tmp_path):
     path = tmp_path / "film.mp4"
     path.write_bytes(b"old")
-    with written_whole(path, per_process) as temporary:
+    with written_whole(path) as temporary:
         temporary.write_bytes(b"new")
         assert temporary.parent == tmp_path
         assert path.read_bytes() == b"old"
@@ -80,22 +79,32 @@ def test_an_error_in_another_file_keeps_its_name(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-def test_what_a_killed_process_left_is_not_taken_for_the_file(tmp_path):
-    (tmp_path / ".film.mp4.part").write_bytes(b"half")
-    with written_whole(tmp_path / "film.mp4"):
-        pass
-    assert os.listdir(tmp_path) == []
+def test_several_may_write_a_file_at_the_same_time(tmp_path):
+    """The first one to finish does not put the other's half under the file's name."""
+    path = tmp_path / "film.mp4"
+    with written_whole(path) as first, open(first, "wb") as film:
+        film.write(b"first")
+        with written_whole(path) as second:
+            second.write_bytes(b"second")
+        assert path.read_bytes() == b"second"
+        film.write(b", whole")
+    assert path.read_bytes() == b"first, whole"
+    assert os.listdir(tmp_path) == ["film.mp4"]
 
 
-def test_what_killed_processes_left_goes_after_an_hour(tmp_path):
-    """Each process has its own temporary file, which no later process would otherwise write or delete."""
-    old, new = tmp_path / ".other.npz.1.part", tmp_path / ".checked.npz.2.part"
-    for path, age in ((old, 3700), (new, 3500)):
+def test_what_killed_processes_left_goes_after_a_day(tmp_path):
+    """Each use has its own temporary file, which nobody else would ever write or delete."""
+    old, new, foreign = (
+        tmp_path / ".other.npz.0123abcd.part",
+        tmp_path / ".film.mp4.89ef0123.part",
+        tmp_path / ".a.part",
+    )
+    for path, age in ((old, 86_500), (new, 86_300), (foreign, 86_500)):
         path.write_bytes(b"half")
         os.utime(path, (time.time() - age,) * 2)
-    with written_whole(tmp_path / "checked.npz", per_process=True) as temporary:
-        temporary.write_bytes(b"new")
-    assert sorted(os.listdir(tmp_path)) == [new.name, "checked.npz"], "another process may still write the new one"
+    write(tmp_path / "film.mp4", b"new")
+    left = {new.name, foreign.name, "film.mp4"}
+    assert set(os.listdir(tmp_path)) == left, "another process may still write the new one"
 
 
 def test_a_block_that_writes_nothing_changes_nothing(tmp_path):

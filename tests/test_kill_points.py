@@ -200,7 +200,7 @@ def driving(warm, model_file, jpegs, tmp_path):
     begin = tmp_path / "begin"
     (begin / "run1").mkdir(parents=True)
     (begin / "run1" / "2018_07_16_17_11_43_382.jpg").write_bytes(jpegs[7])
-    (begin / "run1" / ".2018_07_16_17_11_43_383.jpg.part").write_bytes(jpegs[7][:100])
+    (begin / "run1" / ".2018_07_16_17_11_43_383.jpg.0123abcd.part").write_bytes(jpegs[7][:100])
     command = ["drive.py", model_file, "run1", "--port", 0]
     place = Place(warm, tmp_path / "place", command, command, begin)
     car = Car(place, jpegs)

@@ -3,8 +3,11 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import threading
+import time
 from dataclasses import replace
 
 import av
@@ -280,6 +283,21 @@ def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording):
     with pytest.raises(SimulatorError, match="not finite"):
         command.drive_at_limits(recording, human(recording), driver, {1.0: None, 2.0: None, 3.0: None}, parallel=True)
     assert len(rows) < 110
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot send itself Ctrl-C")
+def test_ctrl_c_ends_a_drive_that_waits_for_a_server(recording):
+    """Not after the 60 seconds of --wait."""
+
+    def driver(frame):
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+        time.sleep(20)  # as ClientSession, until its patience ends
+        raise SimulatorError("no usable answer")
+
+    with pytest.raises(KeyboardInterrupt):
+        begin = time.monotonic()
+        command.drive_at_limits(recording, human(recording), driver, {1.0: None, 2.5: None}, parallel=False)
+    assert time.monotonic() - begin < 15
 
 
 def test_all_outputs_are_tried_and_every_failure_is_reported():

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from conftest import HERE, ROOT, SHORT, log, render_recording, run_here, run_mod
 from PIL import Image
 
 import model
+from cloning.errors import RecordingError
 from cloning.training import options
 from cloning.training.checkpoint import Progress
+from cloning.training.distributed import FirstRankFailed
 
 
 def test_what_a_run_prints(finished, sample_recording):
@@ -296,3 +299,13 @@ def test_two_processes_print_once_and_the_losses_of_both(finished, two_processes
         for output in (finished[0].stdout, two_processes[0].stdout)
     ]
     assert len(logs[0]) == 4 and logs[1] == pytest.approx(logs[0], abs=2e-4)  # the global losses; bfloat16 rounds
+
+
+def test_a_rank_prints_the_error_that_it_alone_meets(monkeypatch, tmp_path):
+    """And not the one that rank 0 meets, which prints it."""
+    monkeypatch.setattr(model, "rank", lambda: 1)
+    own = RecordingError("1.jpg: cut short")
+    for error, printed in ((own, "model.py: 1.jpg: cut short\n"), (FirstRankFailed(), "")):
+        monkeypatch.setattr(model, "run", Mock(side_effect=error))
+        done = run_here("--output", tmp_path / "model.pt")
+        assert (done.returncode, done.stderr) == (2, printed)

@@ -161,7 +161,7 @@ def _write_cache(cache: Path, names: np.ndarray, states: np.ndarray, digests: np
     images["name"], images["state"], images["digest"] = names, states, digests
     try:
         cache.parent.mkdir(parents=True, exist_ok=True)
-        with written_whole(cache, per_process=True) as temporary, open(temporary, "wb") as file:
+        with written_whole(cache) as temporary, open(temporary, "wb") as file:
             np.savez(file, rules=RULES, images=images)
     except OSError as error:
         print(f"{cache}: {error.strerror}; the next run will check all images again")

@@ -12,12 +12,11 @@ from functools import partial
 from pathlib import Path
 
 from cloning.errors import FolderError
-from cloning.files import written_whole
+from cloning.files import TEMPORARY_NAME, written_whole
 from cloning.recordings.format import parse_time_stamp, time_stamp
 
 # The prefix is that of a recording's centre frames, which video.py films, too.
 FRAME_NAME = re.compile(r"(?:center_)?(\d{4}(?:_\d\d){5}_\d{3})\.jpg")
-PARTIAL_NAME = re.compile(r"\.(.+)\.part")  # a frame that was being written when the process was killed
 MAX_QUEUED = 2000  # frames, about 30 MB; with more waiting in memory, driving waits for the disk
 Jobs = queue.Queue[Callable[[], None] | None]  # what the saving thread does next; None ends it
 log = logging.getLogger("drive")  # the log of drive.py
@@ -39,8 +38,8 @@ def check_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise FolderError(f"{folder}: not a folder; name a folder for the frames")
     for entry in folder.iterdir():
-        partial = PARTIAL_NAME.fullmatch(entry.name)
-        name = partial[1] if partial else entry.name
+        temporary = TEMPORARY_NAME.fullmatch(entry.name)  # of a frame that a killed process was writing
+        name = temporary[1] if temporary else entry.name
         is_saved_frame = taken_at(name) and not name.startswith("center_")  # a recording's frame is never deleted
         if not entry.is_file() or not is_saved_frame:
             raise FolderError(

@@ -26,7 +26,7 @@ class RecordingWriter:
     """Writes samples into a folder: three images and a row of `driving_log.csv` each.
 
     The row is written after its images are complete: a process killed at any time leaves a readable recording, and at
-    most three whole images and a temporary file, `.NAME.part`, that no row names.
+    most three whole images and a temporary file that no row names.
     """
 
     def __init__(self, folder: str | Path, start: datetime = DEFAULT_START):

@@ -89,6 +89,7 @@ def drive_at_limits(
     """Return the drives of a recording at each limit, in the order of `watchers`.
 
     parallel: drive in a thread per limit. If one drive fails, or on Ctrl-C, the others stop at their next row.
+    Otherwise drive in this thread, which Ctrl-C interrupts also while it waits for a server.
     """
     rows = sum(len(line.stretch) for line in lines)
     stopped = threading.Event()
@@ -107,7 +108,9 @@ def drive_at_limits(
 
             return drive(recording, lines, limit, driver, watch)
 
-    with ThreadPoolExecutor(len(watchers) if parallel else 1) as pool:
+    if not parallel:
+        return [drive_at(limit) for limit in watchers]
+    with ThreadPoolExecutor(len(watchers)) as pool:
         drives = [pool.submit(drive_at, limit) for limit in watchers]
         try:
             return [done.result() for done in drives]

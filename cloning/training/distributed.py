@@ -37,8 +37,15 @@ def join_processes(device_name: str) -> None:
     dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
 
 
+class FirstRankFailed(UserError):
+    """The error of rank 0 on the other ranks; rank 0 reports it."""
+
+
 def from_first_rank(make: Callable[[], Result]) -> Result:
-    """Call `make` on rank 0 and return its result on every rank. Raises its UserError or OSError on every rank."""
+    """Call `make` on rank 0 and return its result on every rank.
+
+    Raises its UserError or OSError on rank 0, FirstRankFailed on the others.
+    """
     outcome: list[Result | UserError | OSError | None] = [None]
     if rank() == 0:
         try:
@@ -48,7 +55,7 @@ def from_first_rank(make: Callable[[], Result]) -> Result:
     if dist.is_initialized():
         dist.broadcast_object_list(outcome)
     if isinstance(outcome[0], (UserError, OSError)):
-        raise outcome[0]
+        raise outcome[0] if rank() == 0 else FirstRankFailed
     return cast(Result, outcome[0])
 
 
