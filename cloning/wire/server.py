@@ -2,6 +2,7 @@
 
 import ipaddress
 import json
+import logging
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -18,6 +19,7 @@ MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them se
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 MAX_UNREAD = 64  # packets that wait for a client; the simulator has 3 telemetries in flight
 UNREADABLE = object()  # what a handler is given for a telemetry that is too long or not JSON
+log = logging.getLogger(__name__)
 
 
 class Json:
@@ -44,6 +46,7 @@ class Client(engineio.socket.Socket):
         super().__init__(server, sid)
         self.account, self.polled = Account(), False
         self.websocket: WebSocket | None = None
+        server.clients.add(self)
 
     def receive(self, packet: Any) -> None:
         """Handle a packet; whatever it is, the client is alive."""
@@ -52,6 +55,8 @@ class Client(engineio.socket.Socket):
         self.last_ping = time.time()
         if not self.upgraded:  # the websocket has taken a turn for its packet
             TURNS.take(self.account)
+        if packet.packet_type == engineio.packet.PING and packet.data != "probe":
+            packet.data = None  # else the pong would be as long as the ping
         super().receive(packet)
 
     def send(self, packet: Any) -> None:
@@ -73,8 +78,9 @@ class Client(engineio.socket.Socket):
     def close(self, wait: bool = True, abort: bool = False) -> None:
         """End the session, and forget it; never wait until the client has read everything."""
         super().close(wait=False, abort=abort)
+        self.server.sockets.pop(self.sid, None)
         if not self.websocket:  # else it counts as a client until its connection ends
-            self.server.sockets.pop(self.sid, None)
+            self.server.clients.discard(self)
 
     def hang_up(self) -> None:
         """End the session and its connection at once."""
@@ -102,13 +108,15 @@ class Client(engineio.socket.Socket):
         super().handle_post_request(environ)
 
     def _websocket_handler(self, ws: WebSocket) -> Any:
+        if self.websocket or self.closed:
+            return []
         self.websocket = ws
         try:
             return super()._websocket_handler(ws)
         finally:
             self.websocket = None
             if self.closed:
-                self.server.sockets.pop(self.sid, None)
+                self.server.clients.discard(self)
 
 
 engineio.socket.Socket = Client  # of which python-engineio makes one for each session
@@ -134,29 +142,48 @@ def _is_payload(body: bytes) -> bool:
     return True
 
 
+def _opens_websocket(environ: WSGIEnvironment) -> bool:
+    """Return whether a request with the header Upgrade has all that python-engineio and eventlet look for.
+
+    With a part of it, they would take it for a poll, or fail on it.
+    """
+    options = [option.strip() for option in environ.get("HTTP_CONNECTION", "").lower().split(",")]
+    return (
+        environ["HTTP_UPGRADE"].lower() == "websocket"
+        and "upgrade" in options
+        and environ.get("HTTP_SEC_WEBSOCKET_VERSION") == "13"
+        and "HTTP_SEC_WEBSOCKET_KEY" in environ
+    )
+
+
 class Engine(engineio.Server):
     """python-engineio's server for a few clients, which refuses requests that it would fail on."""
+
+    def __init__(self, *args: Any, **options: Any):
+        """Begin without clients; the arguments are those of engineio.Server."""
+        super().__init__(*args, **options)
+        # Those with a session or a websocket. python-engineio's own table forgets a session that has ended, but the
+        # websocket of such a session may still be open, and take time.
+        self.clients: set[Client] = set()
 
     def handle_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
         """Answer a request."""
         query = parse_qs(environ.get("QUERY_STRING", ""))
-        upgrade = "websocket" in environ.get("HTTP_UPGRADE", "").lower()
-        client = self.sockets.get(query.get("sid", [""])[0])
+        upgrade = "HTTP_UPGRADE" in environ
         if query.get("EIO") not in (["3"], ["4"]):
             reason = "EIO must be 3 or 4, the version of Engine.IO."
         elif query.get("transport") != ["websocket" if upgrade else "polling"]:
             reason = "transport must be websocket, with the header Upgrade: websocket, or polling, without it."
-        elif upgrade and (environ.get("HTTP_SEC_WEBSOCKET_VERSION"), "HTTP_SEC_WEBSOCKET_KEY" in environ) != (
-            "13",
-            True,
-        ):
-            reason = "A websocket needs the headers Sec-WebSocket-Version: 13 and Sec-WebSocket-Key."
+        elif upgrade and not _opens_websocket(environ):
+            reason = (
+                "A websocket needs the headers Upgrade: websocket, Connection: Upgrade, Sec-WebSocket-Version: 13 "
+                "and Sec-WebSocket-Key."
+            )
         elif "j" in query:
             reason = "JSONP is not supported."
-        elif upgrade and client and client.websocket:
-            reason = "This session has a websocket already."
-        elif "sid" not in query and not self._make_room():
+        elif environ["REQUEST_METHOD"] == "GET" and "sid" not in query and not self._make_room():
             reason = f"{MAX_CLIENTS} clients are connected already."
+            log.warning(f"a further client is refused: {reason}")
             return refuse(start_response, "503 Service Unavailable", reason)
         else:
             return super().handle_request(environ, start_response)
@@ -164,9 +191,9 @@ class Engine(engineio.Server):
 
     def _make_room(self) -> bool:
         """Return whether there is room for another client; end the quietest one's session for that."""
-        if len(self.sockets) < MAX_CLIENTS:
+        if len(self.clients) < MAX_CLIENTS:
             return True
-        quietest = min(self.sockets.values(), key=lambda client: client.last_ping)
+        quietest = min(self.clients, key=lambda client: client.last_ping)
         if time.time() < quietest.last_ping + QUIET:
             return False
         quietest.hang_up()

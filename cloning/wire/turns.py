@@ -28,6 +28,7 @@ class Turns:
         self.clock = 0.0  # what the account at work had used when its turn began
         self.waiting: list[tuple[Account, Any]] = []  # in the order of arrival, each with the event that ends its wait
         self.working: Account | None = None
+        self.passing_on = False  # whether the hub is to call `_pass_on`
         self.began, self.price = 0.0, 1.0  # time.thread_time(); see `take`
 
     def take(self, account: Account, price: float = 1.0) -> None:
@@ -38,8 +39,8 @@ class Turns:
         account.used = max(account.used, self.clock)
         waiter = (account, eventlet.Event())
         self.waiting.append(waiter)
-        if self.working is None and len(self.waiting) == 1:
-            eventlet.hubs.get_hub().schedule_call_global(0, self._pass_on)
+        if not self.passing_on:
+            self._schedule()
         try:
             waiter[1].wait()
         except BaseException:  # a timeout, or the end of this thread
@@ -54,6 +55,7 @@ class Turns:
         The hub does this when the one at work has given it the thread back. It asks for new input before it wakes the
         next one.
         """
+        self.passing_on = False
         if self.working:
             self.working.used += self.price * (time.thread_time() - self.began)
             self.working = None
@@ -62,7 +64,12 @@ class Turns:
             self.waiting.remove(next_one)
             self.working, self.clock, self.began = next_one[0], next_one[0].used, time.thread_time()
             next_one[1].send()
-            eventlet.hubs.get_hub().schedule_call_global(0, self._pass_on)
+            self._schedule()
+
+    def _schedule(self) -> None:
+        """Let the hub call `_pass_on`, after all that it has to call already."""
+        self.passing_on = True
+        eventlet.hubs.get_hub().schedule_call_global(0, self._pass_on)
 
 
 TURNS = Turns()  # of the one thread
