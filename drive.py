@@ -365,10 +365,11 @@ def main() -> int:
     except (UserError, OSError) as error:
         return program.failed("drive.py", error)
     port = listener.getsockname()[1]
+    watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(args.host, args.host)
     print(
         f"Driving with {model}{' (the model that comes with the project)' if model == SHIPPED_MODEL else ''}.\n"
         f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
-        f"Watch at http://127.0.0.1:{port}/ . Ctrl-C ends.",
+        f"Watch at http://{f'[{watched}]' if ':' in watched else watched}:{port}/ . Ctrl-C ends.",
         file=sys.stderr,
         flush=True,
     )

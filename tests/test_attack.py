@@ -192,6 +192,17 @@ def test_all_pages_share_a_picture(jpegs, monkeypatch):
     assert pages.open == 0
 
 
+def test_a_new_page_gets_the_last_minute_in_as_many_rows_as_it_can_show(jpegs, monkeypatch):
+    server, now = drive.DriveServer(Network().eval()), time.time()
+    session = server.sessions["sid"] = drive.Session(server, {})
+    session.answer(telemetry(jpegs[0]))
+    session.history.extend(page.DrivenFrame(now - 50 + at / 120, 0, 9, 0.5, 3) for at in range(5 * page.SHOWN_FRAMES))
+    monkeypatch.setattr(page, "image", lambda *_: "picture")
+    times = [row[0] for row in json.loads(next(page.Pages(server, with_attention=False).events())[6:])["rows"]]
+    assert len(times) <= page.SHOWN_FRAMES and times == sorted(times)
+    assert times[-1] == session.history[-1].time and times[-1] - times[0] > 49
+
+
 def test_who_has_worked_least_goes_first():
     turns, order = Turns(), []
 

@@ -3,6 +3,7 @@
 import base64
 import itertools
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from cloning.wire.turns import STRANGERS, TURNS
 
 SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
+SHOWN_FRAMES = 1200  # at most, in one event: as many as a graph has pixels; a new page gets the whole minute
 UPDATE_INTERVAL = 0.1  # s between two pictures
 QUIET_INTERVALS = 10  # without driving, after which a page gets a sign that the server is there
 MAX_PAGES = 64  # open at once
@@ -138,7 +140,8 @@ class Pages:
             self.picture = image(self.server, session, self.with_attention)
         if last not in self.texts:
             rows = [frame for frame in frames_since(session.history, last) if frame.time <= self.until]
-            event = {"session": id(session), "rows": rows, "image": self.picture}
+            thinned = rows[:: -math.ceil(len(rows) / SHOWN_FRAMES)][::-1]  # with the last one
+            event = {"session": id(session), "rows": thinned, "image": self.picture}
             self.texts[last] = f"data: {json.dumps(event)}\n\n"
         return self.texts[last]
 
