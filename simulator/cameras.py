@@ -91,10 +91,6 @@ class Buffer:
         pixels = np.frombuffer(self.image.get_ram_image_as("RGB"), np.uint8)
         return np.ascontiguousarray(pixels.reshape(-1, self.shape[2], 3)[::-1]).reshape(self.shape)
 
-    def close(self) -> None:
-        """Release the image's memory."""
-        self.engine.remove_all_windows()
-
 
 class Cameras:
     """The car's cameras in a scene."""

@@ -1,20 +1,21 @@
 """The stand-in simulator as a Gymnasium environment; importing this module registers it.
 
-    import gymnasium
-    import numpy as np
-
-    import simulator.environment
+    import gymnasium, numpy, simulator.environment, torch
     from cloning.pilot.network import SHIPPED_MODEL, load_model, steer
 
-    env = gymnasium.make(simulator.environment.ID, track="lake", speed=15)
-    network, (frame, info), ended = load_model(SHIPPED_MODEL), env.reset(seed=0), False
-    while not ended:
-        frame, reward, terminated, truncated, info = env.step(np.array([steer(network, frame), 1.0], np.float32))
-        ended = terminated or truncated
-    print(info)
+    env = gymnasium.make("behavioral-cloning/Drive-v0", track="lake", speed=15)
+    network = load_model(SHIPPED_MODEL)
+    torch.set_num_threads(1)  # for a single frame, several threads mostly wait for one another
+    frame, info = env.reset()
+    terminated = truncated = False
+    while not (terminated or truncated):
+        action = numpy.float32([steer(network, frame), 1.0])
+        frame, reward, terminated, truncated, info = env.step(action)
+    print("left the road" if terminated else "drove a lap", info)
 
 `gymnasium.make_vec(simulator.environment.ID, num_envs=2, vectorization_mode="async")` runs several environments, each
-in a process of its own. Several in one process do not disturb one another either, but use one core.
+in a process of its own. Several in one process do not disturb one another either, but share one core. Nearly all of a
+step's time goes into rendering the frame in software, on one core.
 """
 
 import math
@@ -78,7 +79,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         for name, value, valid, allowed in (
             ("track", track, track in ROADS, " or ".join(map(repr, sorted(ROADS)))),
             ("direction", direction, direction in ("ccw", "cw", None), "'ccw', 'cw' or None"),
-            ("look", look, look >= 0 and look == int(look), "a whole number from 0"),
+            ("look", look, look >= 0 and look % 1 == 0, "a whole number from 0"),
             ("speed", speed, 1 <= speed <= TOP_SPEED_MPH, f"1 to {TOP_SPEED_MPH} (mph)"),
             ("laps", laps, 0 < laps < math.inf, "a number above 0"),
             ("render_mode", render_mode, render_mode in (None, "rgb_array"), "'rgb_array' or None"),
@@ -102,17 +103,20 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         m, right positive (default 0), say where to start. Raises SimulatorError if the road is not there.
         """
         super().reset(seed=seed)
+        self.ended = True  # until the car stands on the road
         self.run = Run(self.track, "autonomous")
         self.run.car.speed_limit = self.speed * MPH
         if self.random_start:
             self.run.s = self.np_random.uniform(0, self.track.length)
-        self.place(**(options or {}))
+        self._place(**(options or {}))
         self.clock = SampleClock(1 / SAMPLE_RATE)
         self.ended = False
-        return self.observation(), self.info()
+        return self._frame(), self._info()
 
-    def place(self, s: float | None = None, offset: float = 0.0) -> None:
-        """Place the car on the road; s, offset: see `reset`; s is None for where it is. Raises SimulatorError."""
+    def _place(self, s: float | None = None, offset: float = 0.0, **unknown: object) -> None:
+        """Place the car on the road; s, offset: see `reset`, None for where it is. Raises SimulatorError."""
+        if unknown:
+            raise SimulatorError(f"option {', '.join(unknown)}: the options of reset are s and offset")
         if s is not None:
             if not 0 <= s < self.track.length:
                 raise SimulatorError(f"s {s!r}: it must be at least 0 and less than {self.track.length:.1f} (m)")
@@ -135,10 +139,10 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         if self.ended:
             raise gymnasium.error.ResetNeeded("call reset() before the first step and after the end of an episode")
-        commands = np.clip(np.asarray(action, float), -1, 1)
+        commands = np.asarray(action, float)
         if commands.shape != (2,) or not np.isfinite(commands).all():
             raise gymnasium.error.InvalidAction(f"{action!r}: an action is two finite numbers, steering and throttle")
-        steering, throttle = commands.tolist()
+        steering, throttle = np.clip(commands, -1, 1).tolist()
         before = self.run.travelled
         stayed = self.run.advance(steering, throttle)
         while stayed and not self.clock.due(self.run.time):
@@ -146,13 +150,13 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         reward = float(self.run.travelled - before) - (0 if stayed else DEPARTURE_PENALTY)
         finished = bool(self.run.travelled >= self.laps * self.track.length)
         self.ended = finished or not stayed
-        return self.observation(), reward, not stayed, finished, self.info()
+        return self._frame(), reward, not stayed, finished, self._info()
 
-    def observation(self) -> np.ndarray:
+    def _frame(self) -> np.ndarray:
         """Render the centre camera's present frame: uint8 (160, 320, 3), RGB."""
         return self.cameras.frames(self.run.car.node.get_transform())[0]
 
-    def info(self) -> dict[str, Any]:
+    def _info(self) -> dict[str, Any]:
         """Return the present state; see the class."""
         return {
             "s": float(self.run.s),
@@ -162,15 +166,9 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
             "laps": self.run.laps,
         }
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """Render the view from behind the car: uint8 (360, 640, 3), RGB; None without a render mode."""
         return self.view.frame(self.run) if self.view else None
-
-    def close(self) -> None:
-        """Release the renderer's buffers."""
-        self.cameras.buffer.close()
-        if self.view:
-            self.view.buffer.close()
 
 
 gymnasium.register(ID, entry_point=f"{__name__}:{Drive.__name__}", max_episode_steps=MAX_STEPS)
