@@ -2,10 +2,7 @@
 
 import math
 import re
-import subprocess
-import sys
 import textwrap
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -21,7 +18,6 @@ from simulator.car import STEP
 from simulator.run import Run
 from simulator.world import Scene
 
-ROOT = Path(__file__).resolve().parent.parent
 STRAIGHT = {"s": 300.0}  # where the lake's road is straight for 50 m
 
 
@@ -188,11 +184,3 @@ def test_the_documented_example_drives_the_shipped_network(capsys):
     example = re.search(r"\n((?: {4}.*\n|\n)+)", environment.__doc__)[1]
     exec(textwrap.dedent(example).replace("speed=15", "speed=15, laps=0.03"), {})
     assert re.match(r"drove a lap \{'s': .*'departures': 0", capsys.readouterr().out)
-
-
-def test_the_simulators_commands_do_not_load_gymnasium():
-    code = (
-        "import sys, simulator.__main__, simulator.client, simulator.film, simulator.record, simulator.report;"
-        "sys.exit('gymnasium' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
