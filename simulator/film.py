@@ -25,6 +25,23 @@ def place_chase_camera(camera: NodePath, transform: TransformState) -> None:
     camera.look_at(transform.get_pos() + ahead * TARGET_AHEAD + Vec3(0, 0, TARGET_HEIGHT))
 
 
+class ChaseView:
+    """The view from behind the car."""
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        self.camera = scene.root.attach_new_node(Camera("film", lens(FILM_ROWS, FILM_COLUMNS)))
+        self.camera.node().set_camera_mask(OUTSIDE)
+        self.buffer = Buffer(FILM_ROWS, FILM_COLUMNS, [self.camera])
+
+    def frame(self, run: Run) -> np.ndarray:
+        """Render the view with its caption: uint8 (360, 640, 3), RGB."""
+        transform = run.car.node.get_transform()
+        self.scene.move_car(transform)
+        place_chase_camera(self.camera, transform)
+        return caption(self.buffer.render()[0], run)
+
+
 class ChaseFilm(DriveFilm):
     """A film of 15 frames per simulated second."""
 
@@ -32,19 +49,12 @@ class ChaseFilm(DriveFilm):
         """Open the film. Raises OutputError."""
         # At a better quality, rendered frames show no more detail, but the file is five times as large.
         super().__init__(path, SAMPLE_RATE, quality=28)
-        self.scene, self.clock = scene, SampleClock()
-        self.camera = scene.root.attach_new_node(Camera("film", lens(FILM_ROWS, FILM_COLUMNS)))
-        self.camera.node().set_camera_mask(OUTSIDE)
-        self.buffer = Buffer(FILM_ROWS, FILM_COLUMNS, [self.camera])
+        self.view, self.clock = ChaseView(scene), SampleClock()
 
     def watch(self, run: Run) -> None:
         """Append a frame if one is due; call this after each physics step."""
-        if self.error or not self.clock.due(run.time):
-            return
-        transform = run.car.node.get_transform()
-        self.scene.move_car(transform)
-        place_chase_camera(self.camera, transform)
-        self.add(caption(self.buffer.render()[0], run))
+        if not self.error and self.clock.due(run.time):
+            self.add(self.view.frame(run))
 
 
 def caption(frame: np.ndarray, run: Run) -> np.ndarray:

@@ -50,7 +50,7 @@ class Trajectory:
 
 
 class Run:
-    """The car on its track, in simulated time, which only `step` advances.
+    """The car on its track, in simulated time, which only `step` and `advance` advance.
 
     s, offset   the car's position: metres along the track and to the right of its centre line
     time        simulated seconds
@@ -100,6 +100,16 @@ class Run:
 
         steering, throttle: see `Car.step`.
         """
+        stayed = self.advance(steering, throttle)
+        if not stayed:
+            self.set_back()
+        return stayed
+
+    def advance(self, steering: float, throttle: float) -> bool:
+        """Drive for one physics step; return False if the car left the road, and leave it where it is.
+
+        steering, throttle: see `Car.step`.
+        """
         self.steering, self.throttle = steering, throttle
         self.car.step(steering, throttle)
         self.time += STEP
@@ -120,7 +130,6 @@ class Run:
         side = self.off_road()
         if side:
             self.departures.append(Departure(self.time, self.s, self.car.speed, position.x, position.y, side))
-            self.set_back()
         return not side
 
     def off_road(self) -> str:

@@ -120,7 +120,7 @@ def test_films_the_drive(tmp_path):
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 5
     assert list(tmp_path.iterdir()) == [tmp_path / "drive.mp4"]
     with pytest.raises(OutputError, match=r"\.mp4"):
-        ChaseFilm(str(tmp_path / "nowhere" / "drive.mp4"), film.scene)
+        ChaseFilm(str(tmp_path / "nowhere" / "drive.mp4"), film.view.scene)
 
 
 def test_jpegs_are_the_simulators_size_and_rgb():

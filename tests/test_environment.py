@@ -1,0 +1,186 @@
+"""The Gymnasium environment: against Gymnasium's own checks, and against the simulator driven without it."""
+
+import math
+import re
+import textwrap
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+from cloning.errors import SimulatorError
+from cloning.recordings.format import SAMPLE_RATE
+from simulator import environment, scenery
+from simulator.cameras import Cameras
+from simulator.car import STEP
+from simulator.run import Run
+from simulator.world import Scene
+
+STRAIGHT = {"s": 300.0}  # where the lake's road is straight for 50 m
+
+
+@pytest.fixture(scope="module")
+def lake():
+    """The lake without Gymnasium's wrappers."""
+    return gymnasium.make(environment.ID, laps=0.01).unwrapped
+
+
+def drive(env, actions, **reset):
+    """The frames and the infos of an episode's first steps."""
+    steps = [env.reset(**reset)]
+    for action in actions:
+        frame, _, _, _, info = env.step(np.float32(action))
+        steps.append((frame, info))
+    return np.stack([frame for frame, _ in steps]), [info for _, info in steps]
+
+
+@pytest.mark.filterwarnings("error")
+def test_gymnasium_finds_no_fault():
+    env = gymnasium.make(environment.ID, track="jungle", random_start=True, render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.reset(seed=0)
+    assert env.render().shape == (360, 640, 3)
+
+
+def test_the_observation_is_the_centre_cameras_frame(lake):
+    frame, info = lake.reset(options={"s": 300, "offset": 1.5})
+    run = Run(lake.track, "autonomous")
+    run.s = 300
+    run.set_back(1.5)
+    eyes = Cameras(Scene(scenery.build("lake")), ("center",))
+    assert np.array_equal(frame, eyes.frames(run.car.node.get_transform())[0])
+    assert (info["s"], info["offset"]) == (300, 1.5)
+    assert info["speed"] == 0
+
+
+def test_a_step_lasts_until_the_next_of_15_frames_a_second(lake):
+    lake.reset()
+    times = []
+    for _ in range(20):
+        lake.step(np.float32([0, 0]))
+        times.append(lake.run.time)
+    assert times == pytest.approx([STEP * math.ceil(n / SAMPLE_RATE / STEP - 1e-9) for n in range(1, 21)])
+
+
+def test_rewards_are_the_metres_driven_and_steering_is_right_positive(lake):
+    for side in (-1, 1):
+        _, before = lake.reset(options=STRAIGHT)
+        rewards, truncated = [], False
+        while not truncated:
+            _, reward, terminated, truncated, info = lake.step(np.float32([side * 0.1, 1]))
+            assert not terminated
+            rewards.append(reward)
+        assert sum(rewards) == pytest.approx(info["s"] - before["s"], abs=1e-6)
+        assert 0.01 * lake.track.length <= sum(rewards) < 0.012 * lake.track.length
+        assert 0.1 < side * info["offset"] < 2
+        assert info["departures"] == 0
+
+
+def test_the_episode_ends_where_the_car_leaves_the_road(lake):
+    lake.reset(options={**STRAIGHT, "offset": 2})
+    rewards, terminated = [], False
+    while not terminated:
+        frame, reward, terminated, truncated, info = lake.step(np.float32([0.5, 1]))
+        assert not truncated
+        rewards.append(reward)
+    assert min(rewards[:-1]) > -0.01
+    assert -100 <= rewards[-1] < -98
+    run = Run(lake.track, "autonomous")
+    run.s = 300
+    run.set_back(2)
+    while run.step(0.5, 1):
+        pass
+    assert lake.run.departures == run.departures
+    assert info["departures"] == 1
+    assert info["offset"] == run.trajectory.offset[-1] > 2  # it has not been set back
+    assert info["speed"] > 3
+    with pytest.raises(ResetNeeded):
+        lake.step(np.float32([0, 1]))
+    again, info = lake.reset()
+    assert info["departures"] == info["offset"] == 0
+    assert not np.array_equal(frame, again)
+
+
+def test_the_car_never_exceeds_the_set_speed_and_a_lap_is_counted():
+    env = gymnasium.make(environment.ID, speed=10, laps=2).unwrapped
+    env.reset()
+    env.run.travelled = env.track.length - 8
+    speeds = [env.step(np.float32([0, 2]))[4]["speed"] for _ in range(45)]
+    assert max(speeds) == pytest.approx(10, abs=0.01)
+    assert env.step(np.float32([0, 1]))[4]["laps"] == 1
+
+
+def test_seeds_choose_the_start_and_two_environments_do_not_disturb_each_other():
+    actions = [(0.1 * math.sin(n), 1.0) for n in range(12)]
+    one, two = (gymnasium.make(environment.ID, random_start=True) for _ in range(2))
+    frames, infos = drive(one, actions, seed=5)
+    two.reset(seed=6)
+    for env in (one, two):
+        env.reset(seed=5)
+    for action, frame in zip(actions, frames[1:], strict=True):
+        assert np.array_equal(one.step(np.float32(action))[0], frame)
+        assert np.array_equal(two.step(np.float32(action))[0], frame)
+    starts = [infos[0]["s"], *(one.reset(seed=seed)[1]["s"] for seed in (6, 7))]
+    assert len(set(starts)) == 3
+    assert one.reset(options=STRAIGHT)[1]["s"] == 300
+
+
+def test_environments_in_processes_of_their_own_see_the_same(lake):
+    actions = [(0.2, 1.0)] * 5
+    frames, _ = drive(lake, actions)
+    vector = gymnasium.make_vec(environment.ID, num_envs=2, vectorization_mode="async")
+    try:
+        both, _ = drive(vector, [[action, action] for action in actions])
+    finally:
+        vector.close()
+    assert np.array_equal(both, np.stack([frames, frames], axis=1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"track": "moon"}, "'jungle' or 'lake'"),
+        ({"direction": "left"}, "'ccw', 'cw' or None"),
+        ({"look": 0.5}, "a whole number"),
+        ({"look": math.inf}, "a whole number"),
+        ({"speed": 31}, r"1 to 30 \(mph\)"),
+        ({"laps": math.nan}, "a number above 0"),
+    ],
+)
+def test_wrong_arguments_are_reported(arguments, message):
+    (name,) = arguments
+    with pytest.raises(SimulatorError, match=f"^{name} .* it must be {message}"):
+        gymnasium.make(environment.ID, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"s": 2000}, "less than 1137.9"),
+        ({"s": math.nan}, "less than 1137.9"),
+        ({"offset": -3.5, "s": 300}, "the road's left edge; at 300.0 m the edges are at -3.95 and 3.95 m"),
+        ({"offset": math.inf}, "it must be a number"),
+        ({"speed": 3}, "option speed: the options of reset are s and offset"),
+    ],
+)
+def test_wrong_options_are_reported_and_begin_no_episode(lake, options, message):
+    lake.reset()
+    with pytest.raises(SimulatorError, match=message):
+        lake.reset(options=options)
+    with pytest.raises(ResetNeeded):
+        lake.step(np.float32([0, 1]))
+
+
+@pytest.mark.parametrize("action", [[math.nan, 1], [0, math.inf], [0], 0.5])
+def test_an_action_that_is_not_two_finite_numbers_is_refused(lake, action):
+    lake.reset()
+    with pytest.raises(InvalidAction, match="two finite numbers"):
+        lake.step(action)
+
+
+def test_the_documented_example_drives_the_shipped_network(capsys):
+    example = re.search(r"\n((?: {4}.*\n|\n)+)", environment.__doc__)[1]
+    exec(textwrap.dedent(example).replace("speed=15", "speed=15, laps=0.015"), {})
+    assert re.match(r"drove a lap \{'s': .*'departures': 0", capsys.readouterr().out)
