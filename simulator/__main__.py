@@ -143,7 +143,7 @@ def add_road(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--track",
         default="lake",
-        help=f"{', '.join(ROADS)}, or road-1, road-2 and so on: roads generated from their number (default %(default)s)",
+        help=f"{', '.join(ROADS)}, or a road generated from its number: road-1, road-2 and so on (default %(default)s)",
     )
     parser.add_argument(
         "--direction",

@@ -39,13 +39,25 @@ VERGE_EDGE = 9.8  # m from the centre line to the end of the verge, which hides 
 HARD_SHOULDER = 0.35  # m of asphalt beyond the lines
 KERB_WIDTH, WALL_HEIGHT, RAIL_DISTANCE = 0.9, 0.8, 0.5  # m; the last from the edge of the road
 POST_SPACING = 6.0  # m between a rail's posts
+PLANT_TEXTURES: dict[str, Callable[[Generator], np.ndarray]] = {
+    "pine": textures.pine,
+    "palm": textures.palm,
+    "bush": textures.bush,
+    "reeds": textures.reeds,
+}
 
 
 @dataclass(frozen=True)
 class Plant:
-    """A kind of plant: its texture, colour, number, height in m, width for that, and least distance from the road."""
+    """A kind of plant.
 
-    texture: Callable[[Generator], np.ndarray]
+    kind     key of PLANT_TEXTURES
+    height   m: least and greatest
+    width    relative to the height
+    nearest  least distance from the road's centre line, m
+    """
+
+    kind: str
     colour: Colour
     count: int
     height: tuple[float, float]
@@ -76,7 +88,6 @@ class Land:
     haze: float = 0.6
 
 
-PINE, PALM, BUSH, REEDS = textures.pine, textures.palm, textures.bush, textures.reeds
 MEADOW = Land(
     (0.62, 0.70, 0.30),
     (0.86, 0.80, 0.42),
@@ -84,9 +95,9 @@ MEADOW = Land(
     hills=(1.5, 3.0),
     slope=(11, 50),
     plants=(
-        Plant(BUSH, (0.28, 0.34, 0.12), 900, (0.5, 2.2), 1.6, 10.5),
-        Plant(REEDS, (0.50, 0.54, 0.20), 700, (0.4, 1.0), 1.6, 9.0),
-        Plant(PINE, (0.42, 0.48, 0.22), 260, (6, 12), 0.7, 14),
+        Plant("bush", (0.28, 0.34, 0.12), 900, (0.5, 2.2), 1.6, 10.5),
+        Plant("reeds", (0.50, 0.54, 0.20), 700, (0.4, 1.0), 1.6, 9.0),
+        Plant("pine", (0.42, 0.48, 0.22), 260, (6, 12), 0.7, 14),
     ),
 )
 FOREST = Land(
@@ -96,9 +107,9 @@ FOREST = Land(
     hills=(5.0, 6.0),
     slope=(11, 26),
     plants=(
-        Plant(PINE, (0.36, 0.40, 0.20), 1300, (8, 16), 0.55, 12),
-        Plant(PINE, (0.30, 0.38, 0.22), 1300, (6, 14), 0.5, 12),
-        Plant(BUSH, (0.24, 0.30, 0.10), 900, (0.5, 1.6), 1.8, 9.5),
+        Plant("pine", (0.36, 0.40, 0.20), 1300, (8, 16), 0.55, 12),
+        Plant("pine", (0.36, 0.40, 0.20), 1300, (6, 14), 0.5, 12),
+        Plant("bush", (0.24, 0.30, 0.10), 900, (0.5, 1.6), 1.8, 9.5),
     ),
     haze=0.7,
 )
@@ -109,8 +120,8 @@ DESERT = Land(
     hills=(3.0, 5.0),
     slope=(11, 45),
     plants=(
-        Plant(BUSH, (0.46, 0.44, 0.24), 900, (0.4, 1.1), 1.9, 9.5),
-        Plant(PALM, (0.46, 0.48, 0.22), 120, (5, 9), 0.9, 13),
+        Plant("bush", (0.46, 0.44, 0.24), 900, (0.4, 1.1), 1.9, 9.5),
+        Plant("palm", (0.46, 0.48, 0.22), 120, (5, 9), 0.9, 13),
     ),
     boulders=16,
     haze=0.8,
@@ -122,8 +133,8 @@ CANYON = Land(
     hills=(13.0, 9.0),
     slope=(12, 5),
     plants=(
-        Plant(BUSH, (0.34, 0.36, 0.16), 1200, (0.4, 1.5), 1.8, 9.5),
-        Plant(PINE, (0.38, 0.42, 0.22), 300, (4, 9), 0.6, 11),
+        Plant("bush", (0.34, 0.36, 0.16), 1200, (0.4, 1.5), 1.8, 9.5),
+        Plant("pine", (0.38, 0.42, 0.22), 300, (4, 9), 0.6, 11),
     ),
     terrace=4.0,
     haze=0.4,
@@ -135,8 +146,8 @@ HIGHLAND = Land(
     hills=(2.0, 15.0),
     slope=(11, 38),
     plants=(
-        Plant(REEDS, (0.58, 0.56, 0.30), 1100, (0.3, 0.9), 1.8, 9.0),
-        Plant(PINE, (0.30, 0.36, 0.26), 500, (4, 10), 0.5, 13),
+        Plant("reeds", (0.58, 0.56, 0.30), 1100, (0.3, 0.9), 1.8, 9.0),
+        Plant("pine", (0.30, 0.36, 0.26), 500, (4, 10), 0.5, 13),
     ),
     boulders=14,
 )
@@ -148,6 +159,7 @@ COMMON_COLOURS: Palette = {
     "white": (0.97, 0.97, 0.95),
     "seam": (0.36, 0.35, 0.32),
     "kerb": (1.0, 0.98, 0.95),
+    "grass": (0.52, 0.58, 0.28),
     "dirt": (0.72, 0.54, 0.36),
     "wall": (0.74, 0.72, 0.67),
     "rail": (0.72, 0.73, 0.74),
@@ -162,10 +174,17 @@ def weather(random: Generator, land: Land) -> tuple[Light, Palette]:
     azimuth, elevation = random.uniform(0, 2 * np.pi), np.radians(random.uniform(28, 65))
     sun = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
     sunlight, fill = (colour * random.uniform(0.9, 1.05) for colour in (SUNLIGHT, FILL))
-    grey = random.uniform(0.5, 0.9) * random.uniform(0.97, 1.03, 3)
-    base = COMMON_COLOURS | {"ground": land.ground, "patch": land.patch, "steep": land.steep, "asphalt": tuple(grey)}
+    base = COMMON_COLOURS | {"ground": land.ground, "patch": land.patch, "steep": land.steep}
+    base |= {plant.kind: plant.colour for plant in land.plants}
     palette = {name: tuple(np.clip(np.array(c) * random.uniform(0.94, 1.06, 3), 0, 1)) for name, c in base.items()}
+    palette["asphalt"] = tuple(random.uniform(0.55, 0.9) * random.uniform(0.97, 1.03, 3))
     return Light(sun, tuple(sunlight), tuple(fill)), palette
+
+
+def sample(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Return the pixels of a texture laid over the land, GRID_SPACING m each, at positions (..., 2)."""
+    column, row = np.moveaxis(np.floor(positions / GRID_SPACING).astype(int), -1, 0)
+    return image[row % len(image), column % len(image)]
 
 
 class Terrain:
@@ -187,21 +206,18 @@ class Terrain:
         self.distance = away.min(axis=-1)
         weight = 1 / np.maximum(away, 1.0) ** 4
         level = (weight * road[:, 2]).sum(axis=-1) / weight.sum(axis=-1)
-        cell = tuple((np.floor(self.positions / GRID_SPACING).astype(int) % 256).T)
-        slow, rough = (
-            textures.clouds(random, 256, coarsest, octaves).T[cell].T for coarsest, octaves in ((24, 4), (6, 3))
-        )
+        slow = sample(textures.clouds(random, 256, 24, 4), self.positions)
+        rough = sample(textures.clouds(random, 256, 6, 3), self.positions)
         foot, reach = land.slope
         rise = np.clip((self.distance - foot) / reach, 0, 1)
+        rise = rise * rise * (3 - 2 * rise)
         mean, spread = land.hills
         tall = relief * (mean + spread * slow)
         if land.terrace:
             tall = np.round(np.maximum(tall, 0) / land.terrace) * land.terrace
-        self.height = (
-            level - 0.3 + tall * rise * rise * (3 - 2 * rise) + 0.3 * rough * np.clip((self.distance - 8) / 8, 0, 1)
-        )
+        bumps = 0.3 * rough * np.clip((self.distance - 8) / 8, 0, 1)
         lowest = np.where(away < CLEAR_DISTANCE, road[:, 2], np.inf).min(axis=-1)
-        self.height = np.minimum(self.height, lowest - 0.8)
+        self.height = np.minimum(level - 0.3 + tall * rise + bumps, lowest - 0.8)
         self.height_at = RegularGridInterpolator(self.axes[::-1], self.height, bounds_error=False, fill_value=None)
         self.distance_at = RegularGridInterpolator(self.axes[::-1], self.distance, bounds_error=False, fill_value=None)
 
@@ -220,7 +236,7 @@ def ground(terrain: Terrain, random: Generator, light: Light, palette: Palette, 
     points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1).reshape(-1, 3)
     mesh = Mesh(points, np.ones_like(points), points[:, :2] / 11.0, grid(*terrain.distance.shape), soil)
     steep = np.clip((0.90 - flatness(mesh)) * 5, 0, 1)
-    tone = textures.clouds(random, 256, 12, 5)[tuple((np.floor(points[:, :2] / 4).astype(int) % 256).T)][:, None]
+    tone = sample(textures.clouds(random, 256, 12, 5), points[:, :2])[:, None]
     patch = np.clip(0.25 + 0.5 * tone, 0, 1)
     level = np.array(palette["ground"]) * (1 - patch) + np.array(palette["patch"]) * patch
     mesh.colours[:] = (level * (1 - steep) + np.array(palette["steep"]) * steep) * (1 + 0.08 * tone)
@@ -239,14 +255,14 @@ def road(track: Track, marking: str, random: Generator, look: Look, soil: np.nda
         ),
         "white": (Line(edge - 0.1, 0.1, palette["white"]), Line(0.0, 0.08, palette["white"], DASH / (DASH + GAP))),
     }.get(marking, ())
-    asphalt = textures.asphalt(random, grain=random.uniform(0.03, 0.15) * look.grain, spots=look.spots)
+    asphalt = textures.asphalt(random, grain=random.uniform(0.03, 0.12) * look.grain, spots=look.spots)
     s, offsets = whole_lap(track, 2.0), np.linspace(-end, end, 7)
     painted = textures.paint_lines(asphalt, palette["asphalt"], end, lines)
     surface = Material(palette["asphalt"], painted, DASH + GAP, across=0.5 + offsets / (2 * end))
     meshes = [replace(ribbon(track, s, offsets, 0.0, surface), sheen=look.sheen)]
     for side in (LEFT, RIGHT):
         inner = (end - 0.02, end + 1.4) if marking != "dirt" else (end + 1.2, end + 2.0)
-        verge = Material(palette["ground"], soil, 6.0)
+        verge = Material(palette["grass" if marking == "grass" else "ground"], soil, 6.0)
         meshes.append(
             illuminate(roadside(track, s, side, (*inner, VERGE_EDGE), (-0.01, -0.06, -0.8), verge), light, face_up=True)
         )
@@ -264,7 +280,7 @@ def border(track: Track, marking: str, side: int, look: Look, soil: np.ndarray) 
         dirt = Material(palette["dirt"], soil, 5.0)
         return [roadside(track, s, side, (edge - 0.02, edge + 1.3), (0.0, -0.02), dirt)]
     if marking == "wall":
-        stone = Material(palette["wall"], soil, 3.0)
+        stone = Material(palette["wall"], soil, 3.0, across=(0, 0.3))
         faces = (((0.0, 0.0), (0, 1)), ((0.0, 0.4), (1, 1)), ((0.4, 0.4), (1, -2)))
         return [
             roadside(track, s, side, np.add(edge, across), WALL_HEIGHT * np.array(up), stone) for across, up in faces
@@ -287,7 +303,7 @@ def posts(track: Track, look: Look) -> list[Mesh]:
     return [illuminate(merge(boxes), look.light)]
 
 
-def vegetation(terrain: Terrain, land: Land, random: Generator, density: float) -> list[Mesh]:
+def vegetation(terrain: Terrain, land: Land, random: Generator, palette: Palette, density: float) -> list[Mesh]:
     """Return the land's plants, most of them near the road; density: factor of their number."""
     meshes = []
     low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
@@ -299,19 +315,21 @@ def vegetation(terrain: Terrain, land: Land, random: Generator, density: float) 
         positions = positions[keep][: round(plant.count * density)]
         feet = np.c_[positions, terrain.height_at(positions[:, ::-1]) - 0.1]
         heights = random.uniform(*plant.height, len(feet))
-        colours = np.clip(np.array(plant.colour) * random.uniform(0.75, 1.25, (len(feet), 1)), 0, 1)
-        meshes.append(plants(feet, heights, plant.width * heights, colours, plant.texture(random), random))
+        colours = np.clip(np.array(palette[plant.kind]) * random.uniform(0.75, 1.25, (len(feet), 1)), 0, 1)
+        texture = PLANT_TEXTURES[plant.kind](random)
+        meshes.append(plants(feet, heights, plant.width * heights, colours, texture, random))
     return meshes
 
 
 def boulders(terrain: Terrain, land: Land, random: Generator, light: Light, palette: Palette) -> list[Mesh]:
     """Return boulders on the land beside the road."""
-    texture, meshes = textures.rock(random), []
+    texture = textures.rock(random)
+    meshes: list[Mesh] = []
     low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
     while len(meshes) < land.boulders:
         (x, y), size = random.uniform(low, high), random.uniform(2, 8)
-        if size + 12 < terrain.distance_at((y, x)) < 90:
-            z = float(terrain.height_at((y, x)))
+        if size + 12 < terrain.distance_at((y, x)).item() < 90:
+            z = terrain.height_at((y, x)).item()
             meshes.append(boulder((x, y, z), (size, 0.8 * size, 0.6 * size), random, palette["rock"], texture))
     return [illuminate(merge(meshes), light)] if meshes else []
 
@@ -332,6 +350,6 @@ def scenery(number: int, look: int) -> Scenery:
         *road(track, marking, random, appearance, soil),
         planting.mountains(random, light, palette | {"grass": palette["ground"]}, soil),
         *boulders(terrain, land, random, light, palette),
-        *vegetation(terrain, land, random, appearance.plants),
+        *vegetation(terrain, land, random, palette, appearance.plants),
     ]
     return assemble(meshes, appearance, Haze(palette["horizon"], (100, 600), land.haze))
