@@ -37,7 +37,7 @@ GROUND_MARGIN, FARTHEST = 45.0, 330.0  # m of such ground around the road; m fro
 CLEAR_DISTANCE = 9.5  # m from the centre line within which the ground stays below the road
 VERGE_EDGE = 9.8  # m from the centre line to the end of the verge, which hides the ground's steps
 HARD_SHOULDER = 0.35  # m of asphalt beyond the lines
-KERB_WIDTH, WALL_HEIGHT, RAIL_DISTANCE = 0.9, 0.8, 0.5  # m; the last from the edge of the road
+KERB_WIDTH, WALL_HEIGHT, RAIL_DISTANCE = 0.7, 0.8, 0.5  # m; the last from the edge of the road
 POST_SPACING = 6.0  # m between a rail's posts
 PLANT_TEXTURES: dict[str, Callable[[Generator], np.ndarray]] = {
     "pine": textures.pine,
@@ -275,7 +275,7 @@ def border(track: Track, marking: str, side: int, look: Look, soil: np.ndarray) 
     s, edge, palette = whole_lap(track, 2.0), float(track.edges[0, 0]), look.palette
     if marking == "kerb":
         stripes = Material(palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
-        return [roadside(track, whole_lap(track), side, (edge, edge + KERB_WIDTH), (0.03, 0.06), stripes)]
+        return [roadside(track, whole_lap(track), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
     if marking == "dirt":
         dirt = Material(palette["dirt"], soil, 5.0)
         return [roadside(track, s, side, (edge - 0.02, edge + 1.3), (0.0, -0.02), dirt)]
