@@ -32,13 +32,13 @@ from simulator.scenery.shapes import (
 )
 from simulator.scenery.textures import Line
 
-GRID_SPACING = 4.0  # m between the ground's points around the road
+GRID_SPACING = 5.0  # m between the ground's points around the road
 GROUND_MARGIN, FARTHEST = 45.0, 330.0  # m of such ground around the road; m from there on to the end of the land
 CLEAR_DISTANCE = 9.5  # m from the centre line within which the ground stays below the road
 VERGE_EDGE = 9.8  # m from the centre line to the end of the verge, which hides the ground's steps
 HARD_SHOULDER = 0.35  # m of asphalt beyond the lines
 KERB_WIDTH, WALL_HEIGHT, RAIL_DISTANCE = 0.7, 0.8, 0.5  # m; the last from the edge of the road
-POST_SPACING = 6.0  # m between a rail's posts
+POST_SPACING = 8.0  # m between a rail's posts
 PLANT_TEXTURES: dict[str, Callable[[Generator], np.ndarray]] = {
     "pine": textures.pine,
     "palm": textures.palm,
@@ -107,9 +107,9 @@ FOREST = Land(
     hills=(5.0, 6.0),
     slope=(11, 26),
     plants=(
-        Plant("pine", (0.36, 0.40, 0.20), 1300, (8, 16), 0.55, 12),
-        Plant("pine", (0.36, 0.40, 0.20), 1300, (6, 14), 0.5, 12),
-        Plant("bush", (0.24, 0.30, 0.10), 900, (0.5, 1.6), 1.8, 9.5),
+        Plant("pine", (0.36, 0.40, 0.20), 750, (8, 16), 0.55, 12),
+        Plant("pine", (0.36, 0.40, 0.20), 750, (6, 14), 0.5, 12),
+        Plant("bush", (0.24, 0.30, 0.10), 600, (0.5, 1.6), 1.8, 9.5),
     ),
     haze=0.7,
 )
@@ -253,7 +253,7 @@ def road(track: Track, marking: str, random: Generator, look: Look, soil: np.nda
             Line(edge - 0.44, 0.05, palette["yellow"]),
             Line(edge - 0.05, 0.05, palette["yellow"]),
         ),
-        "white": (Line(edge - 0.1, 0.1, palette["white"]), Line(0.0, 0.08, palette["white"], DASH / (DASH + GAP))),
+        "white": (Line(edge - 0.12, 0.12, palette["white"]), Line(0.0, 0.11, palette["white"], DASH / (DASH + GAP))),
     }.get(marking, ())
     asphalt = textures.asphalt(random, grain=random.uniform(0.03, 0.12) * look.grain, spots=look.spots)
     s, offsets = whole_lap(track, 2.0), np.linspace(-end, end, 7)
