@@ -16,7 +16,9 @@ from simulator import report, scenery
 from simulator.cameras import Cameras
 from simulator.expert import Expert
 from simulator.run import Run
-from simulator.scenery.generated import LANDS, Terrain
+from simulator.scenery.generated import LANDS, Terrain, weather
+from simulator.scenery.generated import road as road_meshes
+from simulator.scenery.looks import Look
 from simulator.world import Scene
 
 NUMBERS = range(1, 101)
@@ -166,6 +168,29 @@ def test_the_land_never_covers_the_road(number):
     for right in np.linspace(-1, 1, 9) * (track.edges[0, 0] + 1):
         positions = track.points[:, :2] + right * track.rightward
         assert np.all(terrain.height_at(positions[:, ::-1]) < track.points[:, 2] - 0.4)
+
+
+@pytest.mark.parametrize("number", range(1, len(MARKINGS) + 1))
+def test_roads_are_marked_as_their_kind_says(number):
+    """The colours painted across the road, and what stands or lies at its right edge."""
+    marking, track = generate(number).marking, Track(f"road-{number}")
+    light, palette = weather(np.random.default_rng(0), LANDS[0])
+    soil = np.full((4, 4, 3), 255, np.uint8)
+    surface, *others = road_meshes(track, marking, np.random.default_rng(0), Look(light, palette), soil)
+    half_width = np.linalg.norm(surface.points[6, :2] - surface.points[0, :2]) / 2
+    offset = np.linspace(-half_width, half_width, surface.texture.shape[1])
+    edge, paint = track.edges[0, 0], surface.texture * surface.colours[0]
+    yellow = (paint[..., 0] - paint[..., 2]).mean(axis=0) > 80
+    white = (paint - paint.mean(axis=1, keepdims=True)).min(axis=2) > 30
+    assert yellow.any() == (marking == "yellow double")
+    assert np.all(np.abs(np.abs(offset[yellow]) - edge + 0.25) < 0.3)
+    at_the_edges, at_the_centre = (white[:, np.abs(np.abs(offset) - at) < 0.05] for at in (edge - 0.12, 0.0))
+    assert (at_the_edges.mean() > 0.95) == (marking == "white")
+    assert (at_the_centre.mean() == pytest.approx(0.5, abs=0.05)) == (marking == "white")
+    at_edge = track.at(0.0, edge)
+    near = [mesh.points - (at_edge.x, at_edge.y, at_edge.z) for mesh in others]
+    height = max(points[np.hypot(points[:, 0], points[:, 1]) < 0.8, 2].max(initial=-1) for points in near)
+    assert height == pytest.approx({"kerb": 0.06, "wall": 0.8, "rail": 0.8}.get(marking, 0.0), abs=0.02)
 
 
 def test_a_look_changes_a_generated_road_and_another_road_looks_different():
