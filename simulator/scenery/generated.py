@@ -151,6 +151,7 @@ HIGHLAND = Land(
     ),
     boulders=14,
 )
+# Road n has the land at (n - 1) modulo their number, as it has the marking; 35 roads have all combinations.
 LANDS = (MEADOW, FOREST, DESERT, CANYON, HIGHLAND)
 COMMON_COLOURS: Palette = {
     "zenith": (0.20, 0.33, 0.57),
@@ -190,16 +191,18 @@ def sample(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
 class Terrain:
     """The height of the ground around the road, on a grid that is finer near the road.
 
-    positions  float64 (rows, columns, 2): m
-    distance   float64 (rows, columns): m to the centre line
-    height     float64 (rows, columns): m
+    positions    float64 (rows, columns, 2): m
+    distance     float64 (rows, columns): m to the centre line
+    height       float64 (rows, columns): m
+    distance_at  functions that interpolate these two at positions (n, 2) given as y, x: (n,)
+    height_at
     """
 
     def __init__(self, track: Track, land: Land, random: Generator, relief: float):
         """relief: factor of the hills' heights."""
         road = track.points[::3]
-        low, high = (bound(track.points[:, :2], axis=0) for bound in (np.min, np.max))
-        self.axes = [grid_axis(*ends) for ends in zip(low - GROUND_MARGIN, high + GROUND_MARGIN, strict=True)]
+        low, high = road[:, :2].min(axis=0) - GROUND_MARGIN, road[:, :2].max(axis=0) + GROUND_MARGIN
+        self.axes = [grid_axis(*ends) for ends in zip(low, high, strict=True)]
         self.positions = np.stack(np.meshgrid(*self.axes), axis=-1)
         rows, columns = self.positions.shape[:2]
         away = cdist(self.positions.reshape(-1, 2), road[:, :2]).reshape(rows, columns, -1)
@@ -218,8 +221,8 @@ class Terrain:
         bumps = 0.3 * rough * np.clip((self.distance - 8) / 8, 0, 1)
         lowest = np.where(away < CLEAR_DISTANCE, road[:, 2], np.inf).min(axis=-1)
         self.height = np.minimum(level - 0.3 + tall * rise + bumps, lowest - 0.8)
-        self.height_at = RegularGridInterpolator(self.axes[::-1], self.height, bounds_error=False, fill_value=None)
-        self.distance_at = RegularGridInterpolator(self.axes[::-1], self.distance, bounds_error=False, fill_value=None)
+        self.height_at = RegularGridInterpolator(self.axes[::-1], self.height)
+        self.distance_at = RegularGridInterpolator(self.axes[::-1], self.distance)
 
 
 def grid_axis(low: float, high: float) -> np.ndarray:
