@@ -24,6 +24,10 @@ class SimulatorError(UserError):
     """The stand-in simulator, its window or its connection cannot continue."""
 
 
+class TrackError(UserError):
+    """A track that does not exist."""
+
+
 class OutputError(UserError):
     """A file that the user asked for cannot be written."""
 

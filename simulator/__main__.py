@@ -140,11 +140,15 @@ def add_wait(parser: argparse.ArgumentParser) -> None:
 
 def add_road(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose a track and its look."""
-    parser.add_argument("--track", choices=sorted(ROADS), default="lake", help="default %(default)s")
+    parser.add_argument(
+        "--track",
+        default="lake",
+        help=f"{', '.join(ROADS)}, or a road generated from its number: road-1, road-2 and so on (default %(default)s)",
+    )
     parser.add_argument(
         "--direction",
         choices=("ccw", "cw"),
-        help="default: as in the real simulator, ccw on the lake and cw in the jungle",
+        help="default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads",
     )
     parser.add_argument(
         "--look",

@@ -15,6 +15,7 @@ LOOKAHEAD, LOOKAHEAD_TIME = 3.0, 0.45  # m plus s of driving: distance to the po
 # The expert's lateral offset varies with this standard deviation, limit and shortest wavelength, all in m. The human
 # drivers of the real recordings are 0.6 m (lake) to 1.6 m (jungle) off the centre on average.
 WANDER, MAX_WANDER, MIN_WAVELENGTH = 0.9, 1.8, 60.0
+WANDER_MARGIN = 2.0  # m that an offset of the expert's choice stays from the edge of a narrow road
 STEERING_TIME = 0.12  # s: time constant of the steering
 PREVIEW_TIME = 0.1  # s: the speed limit is that of the point so far ahead
 
@@ -46,6 +47,7 @@ class Expert:
         self.waves = 2 * np.pi * (waves * random.uniform(0.9, 1.1, len(waves))) / track.length
         self.phases = random.uniform(0, 2 * np.pi, len(waves))
         self.amplitude = wander * math.sqrt(2 / len(waves))
+        self.max_wander = min(MAX_WANDER, float(track.edges.min()) - WANDER_MARGIN)
         self.recordable = True
         self.target = 0.0
         self.steering = 0.0
@@ -53,7 +55,7 @@ class Expert:
     def target_offset(self, travelled: float) -> float:
         """Return the lateral offset in m to steer for after `travelled` m along the track."""
         wander = -self.amplitude * float(np.sin(self.waves * travelled + self.phases).sum())
-        return self.target + MAX_WANDER * math.tanh(wander / MAX_WANDER)
+        return self.target + self.max_wander * math.tanh(wander / self.max_wander)
 
     def drive(self, run: Run) -> tuple[float, float]:
         """Return steering and throttle, both -1..1, for the next step of the run."""

@@ -36,7 +36,7 @@ from cloning.errors import UserError
 from cloning.outputs import write_json, write_output
 from cloning.recordings.log import find_folders
 from cloning.replay.score import ReplayReport
-from cloning.road.track import ROADS
+from cloning.road.track import ROADS, find_road
 from simulator.report import LapReport
 from tools.server_process import start_server
 
@@ -146,6 +146,8 @@ def command_line() -> str:
 def measure(args: argparse.Namespace) -> None:
     """Drive the model on the chosen courses, and write the table. Raises UserError."""
     model = args.model.resolve()
+    for track in args.tracks:
+        find_road(track)
     folders = find_folders(args.recordings) if args.recordings else []
     jobs: list[Callable[[], dict[str, str]]] = [partial(replay, model, folder) for folder in folders]
     jobs += [
@@ -183,7 +185,10 @@ def main() -> int:
         "--recordings", nargs="*", default=[], help="recordings to replay, or folders of recordings (default: none)"
     )
     parser.add_argument(
-        "--tracks", nargs="*", default=list(ROADS), choices=ROADS, help="tracks to drive (default: both)"
+        "--tracks",
+        nargs="*",
+        default=list(ROADS),
+        help=f"tracks to drive, also road-1, road-2 and so on (default: {' '.join(ROADS)})",
     )
     parser.add_argument(
         "--speeds", nargs="*", type=number(int, 1, 30), default=[9, 15, 30], help="set speeds in mph (default 9 15 30)"

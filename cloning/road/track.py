@@ -1,10 +1,12 @@
-"""The simulator's two tracks: their centre lines and edges, and the position of a point relative to them."""
+"""The tracks: their centre lines and edges, and the position of a point relative to them."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from cloning.errors import TrackError
+from cloning.road.generated import generate, road_number
 from cloning.road.motion import right_of, wrap_angle
 
 LEFT, RIGHT = -1, 1  # sides of a road, with the signs of lateral offsets
@@ -26,7 +28,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of one side of a road, in the direction in which the track's file lists its points.
+    """A section of one side of a road, in the direction in which the track's points are listed.
 
     side        LEFT or RIGHT
     start, end  metres along the centre line; a negative start lies before the first point
@@ -41,17 +43,17 @@ class Section:
 class Road:
     """The properties of a track besides its centre line.
 
-    forward               direction in which its file lists the points, "cw" or "ccw"; the real simulator's direction
+    forward               direction in which its points are listed, "cw" or "ccw"; the real simulator's direction
     edge                  metres from the centre line to the edge of the road surface
-    bridge                start and end of the bridge, metres along the centre line
+    bridge                its start and end, metres along the centre line; equal where there is none
     bridge_edge           as edge, on the bridge; None if it is the same
     kerbs, kerb_edge      sections with a kerb, and the edge of the road surface there
-    training, autonomous  x, y at which these modes start, in metres; None: the file's first point
+    training, autonomous  x, y at which these modes start, in metres; None: the first point listed
     """
 
     forward: str
     edge: float
-    bridge: tuple[float, float]
+    bridge: tuple[float, float] = (0.0, 0.0)
     bridge_edge: float | None = None
     kerbs: tuple[Section, ...] = ()
     kerb_edge: float = 0.0
@@ -59,7 +61,7 @@ class Road:
     autonomous: tuple[float, float] | None = None
 
 
-# Kerbs and bridges were measured in recordings of the real simulator that were aligned to the centre lines.
+# The real simulator's two. Kerbs and bridges were measured in its recordings, aligned to the centre lines.
 ROADS = {
     "lake": Road(
         forward="ccw",
@@ -85,6 +87,20 @@ ROADS = {
 }
 
 
+def find_road(name: str) -> tuple[Road, np.ndarray]:
+    """Return a track's properties and the points of its centre line, float64 (n, 2) or (n, 3), m.
+
+    name: a key of ROADS, or road-N for the generated road of the number N. Raises TrackError if there is none.
+    """
+    if name in ROADS:
+        return ROADS[name], np.loadtxt(Path(__file__).with_name(f"{name}.csv"), delimiter=",", skiprows=1)
+    number = road_number(name)
+    if number is None:
+        raise TrackError(f"{name[:40]}: there is no such track; there are {', '.join(ROADS)}, road-1, road-2 and so on")
+    generated = generate(number)
+    return Road(forward="ccw", edge=generated.width / 2), generated.points
+
+
 class Track:
     """A track driven in one direction, as points about 1 m apart; s is the distance from the first point in metres.
 
@@ -100,12 +116,14 @@ class Track:
     """
 
     def __init__(self, name: str, direction: str | None = None):
-        """Load a track; name: a key of ROADS; direction: "cw", "ccw" or None for that of the real simulator."""
+        """Load a track; name: see `find_road`; direction: "cw", "ccw" or None for the road's `forward`.
+
+        Raises TrackError if there is no such track.
+        """
         from scipy.interpolate import CubicSpline  # large, and not needed to train as the report does
 
-        self.name, road = name, ROADS[name]
-        self.direction = direction or road.forward
-        listed = np.loadtxt(Path(__file__).with_name(f"{name}.csv"), delimiter=",", skiprows=1)
+        road, listed = find_road(name)
+        self.name, self.direction = name, direction or road.forward
         if listed.shape[1] == 2:
             listed = np.c_[listed, np.zeros(len(listed))]
         points = np.vstack([listed, listed[:1]])

@@ -1,0 +1,150 @@
+"""Roads made from a number: closed loops with bends, hills and one of the usual kinds of marking.
+
+A random polygon gets round corners and is smoothed; polygons that give too sharp a bend or come too close to themselves
+are refused. The random numbers depend on the road's number alone, so a number always gives the same road.
+"""
+
+import itertools
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+
+# Yellow double lines as on the lake, white lines as in the jungle, or no lines and only an edge of this kind.
+MARKINGS = ("yellow double", "white", "kerb", "grass", "dirt", "wall", "rail")
+NAME = re.compile("road-([1-9][0-9]{0,8})")
+SPACING = 2.0  # m between the points
+MIN_LENGTH, MAX_LENGTH = 600.0, 1500.0  # m
+MIN_WIDTH, MAX_WIDTH = 6.0, 10.0  # m
+MIN_RADIUS = 12.0  # m, of the centre line
+MAX_GRADE, MIN_CREST_RADIUS = 0.25, 40.0  # dz/ds; m, of the height over the distance
+CLEARANCE = 2 * MAX_WIDTH + 4.0  # m between the centre lines of two parts of the road, which are
+APART = 50.0  # m or more apart along the road: a bend of the smallest radius turns back in less
+ROUNDING = 9.0  # m over which corners are averaged, so that the steering need not jump at them
+FLAT_SHARE = 0.12  # share of roads without hills
+
+
+@dataclass(frozen=True)
+class GeneratedRoad:
+    """A road made from a number.
+
+    points   float64 (n, 3): m, the centre line of a closed loop, counter-clockwise, about 2 m apart
+    width    m, of the road surface
+    marking  one of MARKINGS
+    """
+
+    points: np.ndarray
+    width: float
+    marking: str
+
+
+def road_number(name: str) -> int | None:
+    """Return the number in the name of a generated road, as road-7, or None if it is no such name."""
+    match = NAME.fullmatch(name)
+    return int(match[1]) if match else None
+
+
+def generate(number: int) -> GeneratedRoad:
+    """Return the road of a number, 1 or more."""
+    random = np.random.default_rng(number)
+    width = random.uniform(MIN_WIDTH, MAX_WIDTH)
+    winding = 2 * np.pi * random.uniform(1, 2.3)
+    flat = next(loop for loop in (draw_loop(random, winding) for _ in itertools.count()) if loop is not None)
+    points = np.c_[flat, hills(random, len(flat))]
+    # Rounded, because the last bit of a sine differs from machine to machine.
+    return GeneratedRoad(points.round(4), round(width, 2), MARKINGS[(number - 1) % len(MARKINGS)])
+
+
+def draw_loop(random: Generator, winding: float) -> np.ndarray | None:
+    """Draw a closed curve, float64 (n, 2), m, about its middle; None if it breaks one of the limits.
+
+    winding: radians that its bends to both sides have together, at least.
+    """
+    corners = int(random.integers(8, 21))
+    turn = 2 * np.pi * (np.arange(corners) + random.uniform(-0.35, 0.35, corners)) / corners
+    reach = random.uniform(random.uniform(0.1, 0.5), 1, corners)
+    turn += random.uniform(-1.3, 1.3) * reach  # twisted, so that not every part is visible from the middle
+    polygon = np.stack([reach * np.cos(turn) * random.uniform(1, 1.8), reach * np.sin(turn)], axis=-1)
+    perimeter = np.linalg.norm(polygon - np.roll(polygon, 1, axis=0), axis=1).sum()
+    polygon *= random.uniform(1.1 * MIN_LENGTH, 1.1 * MAX_LENGTH) / perimeter
+    radii = random.uniform(1.1, 2) * MIN_RADIUS * random.uniform(1, 4, corners)
+    loop = round_corners(polygon, radii, 1.1 * MIN_RADIUS)
+    if loop is None:
+        return None
+    loop = resample(loop, 1.0)
+    for _ in range(2):
+        loop = moving_average(loop, round(ROUNDING))
+    loop = resample(loop, SPACING)
+    bends = curvatures(loop)
+    length = len(loop) * SPACING
+    if not MIN_LENGTH + SPACING < length < MAX_LENGTH - SPACING or np.abs(bends).max() * 1.02 > 1 / MIN_RADIUS:
+        return None
+    if np.abs(bends).sum() * SPACING < winding or closest_approach(loop) < CLEARANCE:
+        return None
+    start = np.argmin(moving_average(np.abs(bends)[:, None], round(40 / SPACING))[:, 0])  # where it is straightest
+    return np.roll(loop, -start, axis=0) - (loop.min(axis=0) + loop.max(axis=0)) / 2
+
+
+def round_corners(polygon: np.ndarray, radii: np.ndarray, smallest: float) -> np.ndarray | None:
+    """Return a closed polygon, (n, 2), with arcs for corners, (m, 2).
+
+    radii: (n,), m; an arc too large for its corner becomes smaller. None if it would be smaller than `smallest`.
+    """
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    lengths = np.linalg.norm(edges, axis=1)
+    after, before = edges / lengths[:, None], np.roll(edges / lengths[:, None], 1, axis=0)
+    turns = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], (before * after).sum(axis=1))
+    tangent = np.tan(np.abs(turns) / 2)
+    room = 0.49 * np.minimum(lengths, np.roll(lengths, 1))
+    radii = np.minimum(radii, room / np.maximum(tangent, 1e-6))
+    if radii.min() < smallest:
+        return None
+    arcs = []
+    for corner, forward, turn, radius, reach in zip(polygon, before, turns, radii, radii * tangent, strict=True):
+        angle = np.linspace(0, np.abs(turn), max(3, round(radius * np.abs(turn) / 0.5)))[:, None]
+        inwards = np.sign(turn) * np.array([-forward[1], forward[0]])
+        arcs.append(corner - reach * forward + radius * (np.sin(angle) * forward + (1 - np.cos(angle)) * inwards))
+    return np.vstack(arcs)
+
+
+def resample(loop: np.ndarray, spacing: float) -> np.ndarray:
+    """Return points of a closed curve, (n, 2), at equal distances of about `spacing` m."""
+    closed = np.vstack([loop, loop[:1]])
+    along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))]
+    wanted = np.linspace(0, along[-1], round(along[-1] / spacing), endpoint=False)
+    return np.stack([np.interp(wanted, along, column) for column in closed.T], axis=-1)
+
+
+def moving_average(values: np.ndarray, count: int) -> np.ndarray:
+    """Return the means over `count` neighbours along a closed curve; values: (n, k)."""
+    shifts = range(-(count // 2), count - count // 2)
+    return np.mean([np.roll(values, shift, axis=0) for shift in shifts], axis=0)
+
+
+def curvatures(loop: np.ndarray) -> np.ndarray:
+    """Return the curvature at each point of a closed curve, 1/m, left positive: of the circle through three points."""
+    before, after = loop - np.roll(loop, 1, axis=0), np.roll(loop, -1, axis=0) - loop
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    sides = [np.linalg.norm(side, axis=1) for side in (before, after, before + after)]
+    return 2 * cross / np.prod(sides, axis=0)
+
+
+def closest_approach(loop: np.ndarray) -> float:
+    """Return the smallest distance in m between parts of a closed curve that are APART along it."""
+    n, skipped = len(loop), round(APART / SPACING)
+    return min(
+        float(np.linalg.norm(loop - np.roll(loop, shift, axis=0), axis=1).min()) for shift in range(skipped, n // 2 + 1)
+    )
+
+
+def hills(random: Generator, n: int) -> np.ndarray:
+    """Return heights in m along a closed curve of n points: waves of 90 m and more, or 0 for a flat road."""
+    if random.uniform() < FLAT_SHARE:
+        return np.zeros(n)
+    waves = np.arange(1, int(n * SPACING / 90) + 1)
+    phases = 2 * np.pi * (waves * np.arange(n)[:, None] / n + random.uniform(0, 1, len(waves)))
+    height = (np.sin(phases) * random.uniform(0, 1, len(waves)) / waves ** random.uniform(0.5, 1.5)).sum(axis=1)
+    steepest = np.abs(np.roll(height, -1) - height).max() / SPACING
+    sharpest = np.abs(np.roll(height, -1) - 2 * height + np.roll(height, 1)).max() / SPACING**2
+    return height * min(random.uniform(0.1, 0.97) * MAX_GRADE / steepest, 1 / (MIN_CREST_RADIUS * sharpest))

@@ -1,0 +1,358 @@
+"""The scenery of generated roads: one of several kinds of land, and the road's own kind of edge."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.random import Generator
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.distance import cdist
+
+from cloning.road.generated import generate
+from cloning.road.track import LEFT, RIGHT, Track
+from simulator.scenery import looks, planting, textures
+from simulator.scenery.jungle import DASH, GAP
+from simulator.scenery.looks import Look, Palette
+from simulator.scenery.parts import Haze, Scenery, assemble
+from simulator.scenery.shapes import (
+    Colour,
+    Light,
+    Material,
+    Mesh,
+    boulder,
+    box,
+    flatness,
+    grid,
+    illuminate,
+    merge,
+    plants,
+    ribbon,
+    roadside,
+    whole_lap,
+)
+from simulator.scenery.textures import Line
+
+GRID_SPACING = 5.0  # m between the ground's points around the road
+GROUND_MARGIN, FARTHEST = 45.0, 330.0  # m of such ground around the road; m from there on to the end of the land
+CLEAR_DISTANCE = 9.5  # m from the centre line within which the ground stays below the road
+VERGE_EDGE = 9.8  # m from the centre line to the end of the verge, which hides the ground's steps
+HARD_SHOULDER = 0.35  # m of asphalt beyond the lines
+KERB_WIDTH, WALL_HEIGHT, RAIL_DISTANCE = 0.7, 0.8, 0.5  # m; the last from the edge of the road
+POST_SPACING = 8.0  # m between a rail's posts
+PLANT_TEXTURES: dict[str, Callable[[Generator], np.ndarray]] = {
+    "pine": textures.pine,
+    "palm": textures.palm,
+    "bush": textures.bush,
+    "reeds": textures.reeds,
+}
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A kind of plant.
+
+    kind     key of PLANT_TEXTURES
+    height   m: least and greatest
+    width    relative to the height
+    nearest  least distance from the road's centre line, m
+    """
+
+    kind: str
+    colour: Colour
+    count: int
+    height: tuple[float, float]
+    width: float
+    nearest: float = 12.0
+
+
+@dataclass(frozen=True)
+class Land:
+    """A kind of land.
+
+    ground, patch, steep  colours of level ground, of patches on it, and of steep ground
+    hills                 m: mean and spread of the hills' heights above the road
+    slope                 m from the centre line to the hills' feet, and from there to their full height
+    terrace               m: height of the hills' steps; 0 for none
+    boulders              their number
+    haze                  largest share of the haze
+    """
+
+    ground: Colour
+    patch: Colour
+    steep: Colour
+    hills: tuple[float, float]
+    slope: tuple[float, float]
+    plants: tuple[Plant, ...]
+    terrace: float = 0.0
+    boulders: int = 0
+    haze: float = 0.6
+
+
+MEADOW = Land(
+    (0.62, 0.70, 0.30),
+    (0.86, 0.80, 0.42),
+    (0.80, 0.68, 0.48),
+    hills=(1.5, 3.0),
+    slope=(11, 50),
+    plants=(
+        Plant("bush", (0.28, 0.34, 0.12), 900, (0.5, 2.2), 1.6, 10.5),
+        Plant("reeds", (0.50, 0.54, 0.20), 700, (0.4, 1.0), 1.6, 9.0),
+        Plant("pine", (0.42, 0.48, 0.22), 260, (6, 12), 0.7, 14),
+    ),
+)
+FOREST = Land(
+    (0.42, 0.46, 0.22),
+    (0.58, 0.46, 0.28),
+    (0.52, 0.46, 0.36),
+    hills=(5.0, 6.0),
+    slope=(11, 26),
+    plants=(
+        Plant("pine", (0.36, 0.40, 0.20), 750, (8, 16), 0.55, 12),
+        Plant("pine", (0.36, 0.40, 0.20), 750, (6, 14), 0.5, 12),
+        Plant("bush", (0.24, 0.30, 0.10), 600, (0.5, 1.6), 1.8, 9.5),
+    ),
+    haze=0.7,
+)
+DESERT = Land(
+    (0.96, 0.82, 0.58),
+    (0.88, 0.66, 0.44),
+    (0.84, 0.60, 0.42),
+    hills=(3.0, 5.0),
+    slope=(11, 45),
+    plants=(
+        Plant("bush", (0.46, 0.44, 0.24), 900, (0.4, 1.1), 1.9, 9.5),
+        Plant("palm", (0.46, 0.48, 0.22), 120, (5, 9), 0.9, 13),
+    ),
+    boulders=16,
+    haze=0.8,
+)
+CANYON = Land(
+    (0.78, 0.52, 0.34),
+    (0.66, 0.56, 0.32),
+    (0.74, 0.42, 0.28),
+    hills=(13.0, 9.0),
+    slope=(12, 5),
+    plants=(
+        Plant("bush", (0.34, 0.36, 0.16), 1200, (0.4, 1.5), 1.8, 9.5),
+        Plant("pine", (0.38, 0.42, 0.22), 300, (4, 9), 0.6, 11),
+    ),
+    terrace=4.0,
+    haze=0.4,
+)
+HIGHLAND = Land(
+    (0.56, 0.58, 0.42),
+    (0.68, 0.66, 0.56),
+    (0.62, 0.62, 0.60),
+    hills=(2.0, 15.0),
+    slope=(11, 38),
+    plants=(
+        Plant("reeds", (0.58, 0.56, 0.30), 1100, (0.3, 0.9), 1.8, 9.0),
+        Plant("pine", (0.30, 0.36, 0.26), 500, (4, 10), 0.5, 13),
+    ),
+    boulders=14,
+)
+# Road n has the land at (n - 1) modulo their number, as it has the marking; 35 roads have all combinations.
+LANDS = (MEADOW, FOREST, DESERT, CANYON, HIGHLAND)
+COMMON_COLOURS: Palette = {
+    "zenith": (0.20, 0.33, 0.57),
+    "horizon": (0.62, 0.73, 0.88),
+    "yellow": (0.88, 0.76, 0.26),
+    "white": (0.97, 0.97, 0.95),
+    "seam": (0.36, 0.35, 0.32),
+    "kerb": (1.0, 0.98, 0.95),
+    "grass": (0.52, 0.58, 0.28),
+    "dirt": (0.72, 0.54, 0.36),
+    "wall": (0.74, 0.72, 0.67),
+    "rail": (0.72, 0.73, 0.74),
+    "rock": (0.86, 0.82, 0.74),
+    "bonnet": (0.55, 0.54, 0.50),
+}
+SUNLIGHT, FILL = np.array((0.80, 0.75, 0.62)), np.array((0.48, 0.51, 0.54))
+
+
+def weather(random: Generator, land: Land) -> tuple[Light, Palette]:
+    """Draw a road's own light and colours."""
+    azimuth, elevation = random.uniform(0, 2 * np.pi), np.radians(random.uniform(28, 65))
+    sun = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
+    sunlight, fill = (colour * random.uniform(0.9, 1.05) for colour in (SUNLIGHT, FILL))
+    base = COMMON_COLOURS | {"ground": land.ground, "patch": land.patch, "steep": land.steep}
+    base |= {plant.kind: plant.colour for plant in land.plants}
+    palette = {name: tuple(np.clip(np.array(c) * random.uniform(0.94, 1.06, 3), 0, 1)) for name, c in base.items()}
+    palette["asphalt"] = tuple(random.uniform(0.55, 0.9) * random.uniform(0.97, 1.03, 3))
+    return Light(sun, tuple(sunlight), tuple(fill)), palette
+
+
+def sample(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Return the pixels of a texture laid over the land, GRID_SPACING m each, at positions (..., 2)."""
+    column, row = np.moveaxis(np.floor(positions / GRID_SPACING).astype(int), -1, 0)
+    return image[row % len(image), column % len(image)]
+
+
+class Terrain:
+    """The height of the ground around the road, on a grid that is finer near the road.
+
+    positions    float64 (rows, columns, 2): m
+    distance     float64 (rows, columns): m to the centre line
+    height       float64 (rows, columns): m
+    distance_at  functions that interpolate these two at positions (n, 2) given as y, x: (n,)
+    height_at
+    """
+
+    def __init__(self, track: Track, land: Land, random: Generator, relief: float):
+        """relief: factor of the hills' heights."""
+        road = track.points[::3]
+        low, high = road[:, :2].min(axis=0) - GROUND_MARGIN, road[:, :2].max(axis=0) + GROUND_MARGIN
+        self.axes = [grid_axis(*ends) for ends in zip(low, high, strict=True)]
+        self.positions = np.stack(np.meshgrid(*self.axes), axis=-1)
+        rows, columns = self.positions.shape[:2]
+        away = cdist(self.positions.reshape(-1, 2), road[:, :2]).reshape(rows, columns, -1)
+        self.distance = away.min(axis=-1)
+        weight = 1 / np.maximum(away, 1.0) ** 4
+        level = (weight * road[:, 2]).sum(axis=-1) / weight.sum(axis=-1)
+        slow = sample(textures.clouds(random, 256, 24, 4), self.positions)
+        rough = sample(textures.clouds(random, 256, 6, 3), self.positions)
+        foot, reach = land.slope
+        rise = np.clip((self.distance - foot) / reach, 0, 1)
+        rise = rise * rise * (3 - 2 * rise)
+        mean, spread = land.hills
+        tall = relief * (mean + spread * slow)
+        if land.terrace:
+            tall = np.round(np.maximum(tall, 0) / land.terrace) * land.terrace
+        bumps = 0.3 * rough * np.clip((self.distance - 8) / 8, 0, 1)
+        lowest = np.where(away < CLEAR_DISTANCE, road[:, 2], np.inf).min(axis=-1)
+        self.height = np.minimum(level - 0.3 + tall * rise + bumps, lowest - 0.8)
+        self.height_at = RegularGridInterpolator(self.axes[::-1], self.height)
+        self.distance_at = RegularGridInterpolator(self.axes[::-1], self.distance)
+
+
+def grid_axis(low: float, high: float) -> np.ndarray:
+    """Return coordinates GRID_SPACING apart from low to high, and ever wider apart beyond them, in m."""
+    steps = GRID_SPACING * 1.25 ** np.arange(1, 40)
+    outside = np.cumsum(steps)
+    outside = outside[: np.searchsorted(outside, FARTHEST) + 1]
+    inside = np.arange(low, high + GRID_SPACING, GRID_SPACING)
+    return np.r_[low - outside[::-1], inside, inside[-1] + outside]
+
+
+def ground(terrain: Terrain, random: Generator, light: Light, palette: Palette, soil: np.ndarray) -> Mesh:
+    """Return the ground: level or steep, in patches of two colours."""
+    points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1).reshape(-1, 3)
+    mesh = Mesh(points, np.ones_like(points), points[:, :2] / 11.0, grid(*terrain.distance.shape), soil)
+    steep = np.clip((0.90 - flatness(mesh)) * 5, 0, 1)
+    tone = sample(textures.clouds(random, 256, 12, 5), points[:, :2])[:, None]
+    patch = np.clip(0.25 + 0.5 * tone, 0, 1)
+    level = np.array(palette["ground"]) * (1 - patch) + np.array(palette["patch"]) * patch
+    mesh.colours[:] = (level * (1 - steep) + np.array(palette["steep"]) * steep) * (1 + 0.08 * tone)
+    return illuminate(mesh, light, face_up=True)
+
+
+def road(track: Track, marking: str, random: Generator, look: Look, soil: np.ndarray) -> list[Mesh]:
+    """Return the asphalt with its lines, what stands or lies at its edges, and the verges."""
+    palette, light, edge = look.palette, look.light, float(track.edges[0, 0])
+    end = edge + (HARD_SHOULDER if marking in ("yellow double", "white", "rail") else 0.0)
+    lines = {
+        "yellow double": (
+            Line(edge - 0.22, 0.16, palette["seam"]),
+            Line(edge - 0.44, 0.05, palette["yellow"]),
+            Line(edge - 0.05, 0.05, palette["yellow"]),
+        ),
+        "white": (Line(edge - 0.12, 0.12, palette["white"]), Line(0.0, 0.11, palette["white"], DASH / (DASH + GAP))),
+    }.get(marking, ())
+    asphalt = textures.asphalt(random, grain=random.uniform(0.03, 0.12) * look.grain, spots=look.spots)
+    s, offsets = whole_lap(track, 2.0), np.linspace(-end, end, 7)
+    painted = textures.paint_lines(asphalt, palette["asphalt"], end, lines)
+    surface = Material(palette["asphalt"], painted, DASH + GAP, across=0.5 + offsets / (2 * end))
+    meshes = [replace(ribbon(track, s, offsets, 0.0, surface), sheen=look.sheen)]
+    for side in (LEFT, RIGHT):
+        inner = (end - 0.02, end + 1.4) if marking != "dirt" else (end + 1.2, end + 2.0)
+        verge = Material(palette["grass" if marking == "grass" else "ground"], soil, 6.0)
+        meshes.append(
+            illuminate(roadside(track, s, side, (*inner, VERGE_EDGE), (-0.01, -0.06, -0.8), verge), light, face_up=True)
+        )
+        meshes += [illuminate(mesh, light, face_up=True) for mesh in border(track, marking, side, look, soil)]
+    return meshes + (posts(track, look) if marking == "rail" else [])
+
+
+def border(track: Track, marking: str, side: int, look: Look, soil: np.ndarray) -> list[Mesh]:
+    """Return what marks the road's edge on one side, where lines or grass do not."""
+    s, edge, palette = whole_lap(track, 2.0), float(track.edges[0, 0]), look.palette
+    if marking == "kerb":
+        stripes = Material(palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
+        return [roadside(track, whole_lap(track), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
+    if marking == "dirt":
+        dirt = Material(palette["dirt"], soil, 5.0)
+        return [roadside(track, s, side, (edge - 0.02, edge + 1.3), (0.0, -0.02), dirt)]
+    if marking == "wall":
+        stone = Material(palette["wall"], soil, 3.0, across=(0, 0.3))
+        faces = (((0.0, 0.0), (0, 1)), ((0.0, 0.4), (1, 1)), ((0.4, 0.4), (1, -2)))
+        return [
+            roadside(track, s, side, np.add(edge, across), WALL_HEIGHT * np.array(up), stone) for across, up in faces
+        ]
+    if marking == "rail":
+        metal = Material(palette["rail"], textures.plain(), 4.0, across=(0, 1))
+        at = edge + RAIL_DISTANCE
+        return [roadside(track, s, side, (at, at), (0.45, 0.8), metal)]
+    return []
+
+
+def posts(track: Track, look: Look) -> list[Mesh]:
+    """Return the posts of the rails on both sides."""
+    at, white, boxes = float(track.edges[0, 0]) + RAIL_DISTANCE + 0.06, textures.plain(), []
+    for s in np.arange(0, track.length - POST_SPACING / 2, POST_SPACING):
+        for side in (LEFT, RIGHT):
+            place = track.at(s, side * at)
+            foot = (place.x, place.y, place.z - 0.5)
+            boxes.append(box(foot, (0.10, 0.10, 1.3), place.heading, look.palette["rail"], white))
+    return [illuminate(merge(boxes), look.light)]
+
+
+def vegetation(terrain: Terrain, land: Land, random: Generator, palette: Palette, density: float) -> list[Mesh]:
+    """Return the land's plants, most of them near the road; density: factor of their number."""
+    meshes = []
+    low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
+    for plant in land.plants:
+        positions = random.uniform(low, high, (12 * round(plant.count * density), 2))
+        distance = terrain.distance_at(positions[:, ::-1])
+        chance = np.clip(1.5 - distance / 60, 0.05, 1)
+        keep = (distance > plant.nearest) & (distance < 160) & (random.uniform(size=len(distance)) < chance)
+        positions = positions[keep][: round(plant.count * density)]
+        feet = np.c_[positions, terrain.height_at(positions[:, ::-1]) - 0.1]
+        heights = random.uniform(*plant.height, len(feet))
+        colours = np.clip(np.array(palette[plant.kind]) * random.uniform(0.75, 1.25, (len(feet), 1)), 0, 1)
+        texture = PLANT_TEXTURES[plant.kind](random)
+        meshes.append(plants(feet, heights, plant.width * heights, colours, texture, random))
+    return meshes
+
+
+def boulders(terrain: Terrain, land: Land, random: Generator, light: Light, palette: Palette) -> list[Mesh]:
+    """Return boulders on the land beside the road."""
+    texture = textures.rock(random)
+    meshes: list[Mesh] = []
+    low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
+    while len(meshes) < land.boulders:
+        (x, y), size = random.uniform(low, high), random.uniform(2, 8)
+        if size + 12 < terrain.distance_at((y, x)).item() < 90:
+            z = terrain.height_at((y, x)).item()
+            meshes.append(boulder((x, y, z), (size, 0.8 * size, 0.6 * size), random, palette["rock"], texture))
+    return [illuminate(merge(meshes), light)] if meshes else []
+
+
+def scenery(number: int, look: int) -> Scenery:
+    """Return the scenery of a generated road in a look; 0 is the road's own.
+
+    The calls share a random generator, so their order matters.
+    """
+    track, marking, land = Track(f"road-{number}"), generate(number).marking, LANDS[(number - 1) % len(LANDS)]
+    appearance = looks.make_look(look, *weather(np.random.default_rng([number, 1]), land))
+    light, palette = appearance.light, appearance.palette
+    random = np.random.default_rng([number, look])
+    terrain = Terrain(track, land, random, appearance.relief)
+    soil = textures.soil(random)
+    meshes = [
+        ground(terrain, random, light, palette, soil),
+        *road(track, marking, random, appearance, soil),
+        planting.mountains(random, light, palette | {"grass": palette["ground"]}, soil),
+        *boulders(terrain, land, random, light, palette),
+        *vegetation(terrain, land, random, palette, appearance.plants),
+    ]
+    return assemble(meshes, appearance, Haze(palette["horizon"], (100, 600), land.haze))

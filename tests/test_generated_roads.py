@@ -1,0 +1,206 @@
+"""Generated roads: their geometry, that a number always means the same road, and that they can be driven."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from cloning.errors import TrackError
+from cloning.recordings.log import read_recording
+from cloning.road.generated import MARKINGS, generate
+from cloning.road.motion import MPH
+from cloning.road.track import Track
+from simulator import __main__ as simulator
+from simulator import report, scenery
+from simulator.cameras import Cameras
+from simulator.expert import Expert
+from simulator.run import Run
+from simulator.scenery.generated import LANDS, Terrain, weather
+from simulator.scenery.generated import road as road_meshes
+from simulator.scenery.looks import Look
+from simulator.world import Scene
+
+NUMBERS = range(1, 101)
+NO_ROADS = ["road-0", "road--1", "road-1.5", "road-x", "road-01", "road-", "road-1e3", "Road-1", "moon", ""]
+
+
+@pytest.fixture(scope="module")
+def roads():
+    return [generate(number) for number in NUMBERS]
+
+
+def derivatives(points):
+    """First and second derivatives round a closed curve of points at equal distances, by that distance's index."""
+    after, before = np.roll(points, -1, axis=0), np.roll(points, 1, axis=0)
+    return (after - before) / 2, after - 2 * points + before
+
+
+def crosses(a, b, c, d):
+    """Whether the segments from a to b cross those from c to d."""
+
+    def side(p, q, r):
+        (along_x, along_y), (away_x, away_y) = np.moveaxis(q - p, -1, 0), np.moveaxis(r - p, -1, 0)
+        return np.sign(along_x * away_y - along_y * away_x)
+
+    return (side(a, b, c) * side(a, b, d) < 0) & (side(c, d, a) * side(c, d, b) < 0)
+
+
+def test_roads_are_closed_loops_of_600_to_1500_metres(roads):
+    for road in roads:
+        steps = np.linalg.norm(road.points - np.roll(road.points, 1, axis=0), axis=1)
+        assert np.ptp(steps) < 0.1  # also from the last point to the first
+        assert 600 <= steps.sum() <= 1500
+        x, y = road.points[:, :2].T
+        assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() > 0, "its points are listed counter-clockwise"
+
+
+def test_roads_keep_away_from_themselves(roads):
+    """Parts 50 m or more apart along the road leave room for two roads and 4 m between them; none cross."""
+    for road in roads:
+        points, n = road.points[:, :2], len(road.points)
+        apart = np.abs(np.arange(n)[:, None] - np.arange(n))
+        apart = np.minimum(apart, n - apart)
+        distance = np.hypot(*(points[:, None] - points).transpose(2, 0, 1))
+        assert distance[apart >= 25].min() >= 2 * road.width + 4
+        ends = np.roll(points, -1, axis=0)
+        assert not crosses(points[:, None], ends[:, None], points, ends)[apart > 1].any()
+
+
+def test_bends_grades_and_widths_stay_within_limits_and_come_near_them(roads):
+    sharpest, steepest = [], []
+    for road in roads:
+        (dx, dy), (ddx, ddy) = (part[:, :2].T for part in derivatives(road.points))
+        sharpest.append(np.max(np.abs(dx * ddy - dy * ddx) / np.hypot(dx, dy) ** 3))
+        rise = np.abs(np.diff(road.points, axis=0, append=road.points[:1]))
+        steepest.append(np.max(rise[:, 2] / np.hypot(*rise[:, :2].T)))
+    widths = [road.width for road in roads]
+    assert 12 <= 1 / max(sharpest) < 13
+    assert np.mean(1 / np.array(sharpest) < 20) > 0.5
+    assert 0.22 < max(steepest) <= 0.25
+    assert min(steepest) == 0, "some roads are flat, as the lake's is"
+    assert 6 <= min(widths) < 6.5
+    assert 9.5 < max(widths) <= 10
+
+
+def test_every_kind_of_marking_occurs_and_no_two_roads_are_alike(roads):
+    assert {road.marking for road in roads[:10]} == set(MARKINGS)
+    assert len({road.points.tobytes() for road in roads}) == len(roads)
+    assert len({road.width for road in roads}) > 80
+
+
+def test_crests_hide_what_is_behind_them(roads):
+    """An eye 1.2 m above the road does not see all of the next 60 m of some roads."""
+    hidden = 0
+    for road in roads:
+        ahead = np.stack([np.roll(road.points[:, 2], -k) for k in range(1, 31)])
+        slope = (ahead - road.points[:, 2] - 1.2) / (2 * np.arange(1, 31))[:, None]
+        hidden += bool((np.maximum.accumulate(slope, axis=0) > slope + 1e-3).any())
+    assert hidden > 30
+
+
+def test_a_number_gives_the_same_road_in_every_process_and_on_every_machine():
+    script = (
+        "from cloning.road.generated import generate; r = generate(7); print(r.points.tolist(), r.width, r.marking)"
+    )
+    other = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    road = generate(7)
+    assert other == f"{road.points.tolist()} {road.width} {road.marking}\n"
+    # Fixed: these change only if the generator does, and with it every road that somebody has named by its number.
+    assert (len(road.points), road.width, road.marking) == (704, 8.5, "rail")
+    pinned = np.array([[-78.7433, 131.9268, 0.4881], [-6.4434, -174.1179, -1.7779]])
+    assert road.points[[0, 300]] == pytest.approx(pinned, abs=2e-4)
+
+
+@pytest.mark.parametrize("direction", ["ccw", "cw"])
+def test_a_track_of_a_generated_road_lies_where_the_road_does(direction):
+    road, track = generate(3), Track("road-3", direction)
+    assert (track.name, track.direction, Track("road-3").direction) == ("road-3", direction, "ccw")
+    assert np.all(track.edges == road.width / 2)
+    assert track.points[0] == pytest.approx(road.points[0], abs=1e-6)
+    distance = np.linalg.norm(road.points[:, None] - track.points, axis=2).min(axis=1)
+    assert distance.max() < 0.55  # the track's points are 1 m apart
+    turned = -track.curvature.sum() * track.step
+    assert turned == pytest.approx(2 * np.pi if direction == "ccw" else -2 * np.pi, rel=1e-9)
+    assert np.abs(track.curvature).max() < 1 / 12
+    assert set(track.starts) == {"training", "autonomous"}
+
+
+@pytest.mark.parametrize("name", NO_ROADS)
+def test_a_road_that_does_not_exist_is_a_clear_error(name):
+    with pytest.raises(TrackError, match="no such track; there are lake, jungle, road-1, road-2 and so on"):
+        Track(name)
+
+
+@pytest.mark.parametrize("command", [["record", "x"], ["drive"], ["window"]])
+def test_commands_report_a_road_that_does_not_exist(command, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert simulator.main([*command, "--track", "road-0"]) == 2
+    assert "simulator: road-0: there is no such track; there are lake, jungle, road-1" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("name", "direction"), [("road-3", "cw"), ("road-5", "ccw")])
+def test_expert_drives_a_lap_of_a_generated_road(name, direction, tmp_path):
+    """Both have bends of less than 15 m radius and grades of more than 0.15; road-3 is 6.3 m wide."""
+    run = Run(Track(name, direction))
+    assert np.abs(run.track.curvature).max() > 1 / 15
+    assert np.abs(run.track.grade).max() > 0.15
+    expert = Expert(run.track, seed=3, top_speed=15 * MPH)
+    run.car.speed_limit = 15 * MPH
+    while not run.laps:
+        run.step(*expert.drive(run))
+    assert not run.departures
+    assert report.lap_report(run)["track"] == name
+    report.write_picture(tmp_path / "map.png", run)
+    assert (tmp_path / "map.png").stat().st_size > 10_000
+
+
+def test_records_a_generated_road(tmp_path):
+    assert simulator.main(["record", str(tmp_path / "a"), "--track", "road-2", "--laps", "0.005"]) == 0
+    assert len(read_recording(tmp_path / "a")) > 10
+
+
+@pytest.mark.parametrize("number", range(1, 6))
+def test_the_land_never_covers_the_road(number):
+    track = Track(f"road-{number}")
+    terrain = Terrain(track, LANDS[number - 1], np.random.default_rng(number), relief=1.5)
+    for right in np.linspace(-1, 1, 9) * (track.edges[0, 0] + 1):
+        positions = track.points[:, :2] + right * track.rightward
+        assert np.all(terrain.height_at(positions[:, ::-1]) < track.points[:, 2] - 0.4)
+
+
+@pytest.mark.parametrize("number", range(1, len(MARKINGS) + 1))
+def test_roads_are_marked_as_their_kind_says(number):
+    """The colours painted across the road, and what stands or lies at its right edge."""
+    marking, track = generate(number).marking, Track(f"road-{number}")
+    light, palette = weather(np.random.default_rng(0), LANDS[0])
+    soil = np.full((4, 4, 3), 255, np.uint8)
+    surface, *others = road_meshes(track, marking, np.random.default_rng(0), Look(light, palette), soil)
+    half_width = np.linalg.norm(surface.points[6, :2] - surface.points[0, :2]) / 2
+    offset = np.linspace(-half_width, half_width, surface.texture.shape[1])
+    edge, paint = track.edges[0, 0], surface.texture * surface.colours[0]
+    yellow = (paint[..., 0] - paint[..., 2]).mean(axis=0) > 80
+    white = (paint - paint.mean(axis=1, keepdims=True)).min(axis=2) > 30
+    assert yellow.any() == (marking == "yellow double")
+    assert np.all(np.abs(np.abs(offset[yellow]) - edge + 0.25) < 0.3)
+    at_the_edges, at_the_centre = (white[:, np.abs(np.abs(offset) - at) < 0.05] for at in (edge - 0.12, 0.0))
+    assert (at_the_edges.mean() > 0.95) == (marking == "white")
+    assert (at_the_centre.mean() == pytest.approx(0.5, abs=0.05)) == (marking == "white")
+    at_edge = track.at(0.0, edge)
+    near = [mesh.points - (at_edge.x, at_edge.y, at_edge.z) for mesh in others]
+    height = max(points[np.hypot(points[:, 0], points[:, 1]) < 0.8, 2].max(initial=-1) for points in near)
+    assert height == pytest.approx({"kerb": 0.06, "wall": 0.8, "rail": 0.8}.get(marking, 0.0), abs=0.02)
+
+
+def test_a_look_changes_a_generated_road_and_another_road_looks_different():
+    def frame(name, look):
+        run = Run(Track(name))
+        return (
+            Cameras(Scene(scenery.build(name, look)), ("center",)).frames(run.car.node.get_transform())[0].astype(int)
+        )
+
+    one, other_look, other_road = frame("road-9", 0), frame("road-9", 4), frame("road-6", 0)
+    assert np.array_equal(one, frame("road-9", 0))
+    assert np.abs(one - other_look).mean() > 15
+    assert np.abs(one - other_road).mean() > 15
