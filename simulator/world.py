@@ -140,7 +140,7 @@ class MeshGroup:
     def __init__(self, mesh: Mesh, parent: NodePath, shade: Shade | None = None):
         """shade: the scene's shadows, if the mesh is part of the scene and the scene has any."""
         if shade and mesh.road is None:
-            mesh = replace(mesh, colours=mesh.colours * shade.on_points(mesh.points))
+            mesh = replace(mesh, colours=mesh.colours * shade.on_mesh(mesh))
         self.mesh = mesh
         root = parent.attach_new_node("group")
         if shade and mesh.road is not None:

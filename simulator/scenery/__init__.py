@@ -15,8 +15,10 @@ def build(track: str, look: int = 0) -> Scenery:
     Look 0 resembles the real simulator; any other number gives other light, textures and plants on the same road. Look
     n + SHADOWED is look n with shadows.
     """
-    scenery = {"lake": lake, "jungle": jungle}[track].scenery(look % SHADOWED)
+    scenes = {"lake": lake, "jungle": jungle}[track]
+    scenery = scenes.scenery(look % SHADOWED)
     style = make_shade_style(look)
     if style is None:
         return scenery
-    return replace(scenery, shade=Shade(Track(track), scenery.meshes, scenery.light, style))
+    shade = Shade(Track(track), scenery.meshes, scenery.light, style, scenes.SHADOW_ELEVATION)
+    return replace(scenery, shade=shade)

@@ -79,7 +79,11 @@ def make_shade_style(number: int) -> ShadeStyle | None:
     if not base and edition <= len(REAL_STYLES):
         return REAL_STYLES[edition - 1]
     random = np.random.default_rng([number, 11])
-    return ShadeStyle(depth=random.uniform(0.6, 2.5), softness=float(np.exp(random.uniform(*np.log((0.05, 0.8))))))
+    return ShadeStyle(
+        depth=float(np.exp(random.uniform(*np.log((0.8, 6))))),
+        softness=float(np.exp(random.uniform(*np.log((0.05, 0.8))))),
+        elevation=random.uniform(0.7, 1.2),
+    )
 
 
 def vary(random: np.random.Generator, colour: np.ndarray) -> Colour:

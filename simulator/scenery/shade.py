@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from cloning.road.track import Track
-from simulator.scenery.shapes import Colour, Light, Mesh
+from simulator.scenery.shapes import Light, Mesh, normals
 
 STRETCH, OVERLAP = 120.0, 4.0  # m of road with a picture of its own, and m by which that reaches beyond both ends
 LENGTH = STRETCH + 2 * OVERLAP  # m of road in a picture
@@ -27,14 +27,16 @@ THINNEST = 0.05  # m: plants' images that the sun sees narrower than this cast n
 
 @dataclass(frozen=True)
 class ShadeStyle:
-    """How dark and how soft shadows are.
+    """How dark, how soft and how long shadows are.
 
-    depth     exponent of the share of light that the sky alone gives: 1 is physical, more is darker
-    softness  standard deviation of the blur of the shadows' edges on the road, m
+    depth      exponent of the share of light that the sky alone gives: 1 is physical, more is darker
+    softness   standard deviation of the blur of the shadows' edges on the road, m
+    elevation  factor of the elevation of the sun that casts them; below 1 they are longer
     """
 
     depth: float
     softness: float
+    elevation: float = 1.0
 
 
 class ShadowMap:
@@ -94,12 +96,17 @@ class ShadowMap:
 class Shade:
     """The shadows of a scene."""
 
-    def __init__(self, track: Track, meshes: Sequence[Mesh], light: Light, style: ShadeStyle):
+    def __init__(self, track: Track, meshes: Sequence[Mesh], light: Light, style: ShadeStyle, elevation: float):
+        """meshes: of the scene; those with transparent parts are plants as `shapes.plants` makes them.
+
+        elevation: of the sun that casts the shadows, degrees; its azimuth is that of the light's.
+        """
         self.track, self.softness = track, style.softness
-        sun = np.array(light.sun)
-        self.slope = sun[:2] / sun[2]  # m that a shadow lies beside a point, per m of the point's height
-        sky, beam = np.array(light.fill), np.array(light.sunlight) * sun[2]
-        self.factor = (sky / (sky + beam)) ** style.depth  # (3,), of the colours of level ground in the shade
+        azimuth = np.array(light.sun[:2]) / np.hypot(*light.sun[:2])
+        # m that a shadow lies beside a point, per m of the point's height
+        self.slope = azimuth / np.tan(np.radians(elevation * style.elevation))
+        self.light, self.depth = light, style.depth
+        self.factor = self.factors(np.array([[0.0, 0.0, 1.0]]))[0]  # (3,), of the colours of a level road in the shade
         self.plants: list[tuple[np.ndarray, np.ndarray]] = []
         solid = []
         for mesh in meshes:
@@ -118,10 +125,16 @@ class Shade:
         """Return points (n, 3) with their first two coordinates moved along the sun's ray to z = 0."""
         return np.c_[points[:, :2] - points[:, 2:] * self.slope, points[:, 2]]
 
-    def on_points(self, points: np.ndarray) -> np.ndarray:
-        """Return the factors of the colours at points (n, 3): float (n, 3). Plants are left out."""
-        shaded = self.map.shaded(self.project(points), COARSE_MARGIN)
-        return np.where(shaded[:, None], self.factor, 1.0)
+    def factors(self, facing: np.ndarray) -> np.ndarray:
+        """Return the factors of the colours of surfaces in the shade, (n, 3); facing: their unit normals, (n, 3)."""
+        return (np.array(self.light.fill) / self.light.on(facing)) ** self.depth
+
+    def on_mesh(self, mesh: Mesh) -> np.ndarray:
+        """Return the factors of the colours of a mesh's points, float (n, 3); plants cast no shadows on it."""
+        plant = mesh.texture.shape[2] == 4
+        factors = self.factor if plant else self.factors(normals(mesh.points, mesh.faces))
+        shaded = self.map.shaded(self.project(mesh.points), COARSE_MARGIN)
+        return np.where(shaded[:, None], factors, 1.0)
 
     def on_road(self, stretch: int) -> np.ndarray | None:
         """Return the factors of the colours on a stretch of road, 255 for 1, or None if it has no shadow.
