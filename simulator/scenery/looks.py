@@ -8,10 +8,11 @@ from simulator.scenery.shade import ShadeStyle
 from simulator.scenery.shapes import Colour, Light
 
 Palette = dict[str, Colour]
-SHADOWED = 10_000  # look n + SHADOWED is look n with shadows; n + 2 * SHADOWED and so on have other shadows
-# Of look 0, for the first two: like two recordings of the jungle, in which the road's median colour in the shade is
-# (0.26, 0.30, 0.39) and (0.18, 0.22, 0.30) of that in the sun.
-REAL_STYLES = (ShadeStyle(depth=1.0, softness=0.08), ShadeStyle(depth=1.5, softness=0.08))
+SHADOWED = 10_000  # look n + SHADOWED is look n with shadows; with n + 2 * SHADOWED and so on, they are other ones
+# The first two kinds of shadows of look 0 resemble two real recordings of the jungle, in which the road's median colour
+# in the shade is (0.26, 0.30, 0.39) and (0.18, 0.22, 0.30) of that in the sun; in these it is (0.29, 0.31, 0.34) and
+# (0.20, 0.22, 0.25).
+REAL_STYLES = (ShadeStyle(depth=1.35, softness=0.08), ShadeStyle(depth=1.75, softness=0.08))
 
 
 @dataclass(frozen=True)

@@ -48,13 +48,11 @@ class ShadowMap:
         columns, rows = np.ceil((high - low) / pixel).astype(int) + 1
         self.height = np.full((rows, columns), -np.inf, np.float32)
 
-    def paint(self, triangles: np.ndarray) -> None:
-        """Paint triangles, float (n, 3 corners, 3: position on the plane, height), at their lowest corners' heights."""
-        triangles = triangles[self.touched(triangles)]
-        lowest = triangles[..., 2].min(axis=1)
-        order = np.argsort(lowest, kind="stable")
+    def paint(self, triangles: np.ndarray, heights: np.ndarray) -> None:
+        """Paint triangles, float (n, 3 corners, 3: position on the plane, height), each at a single height (n,)."""
+        order = np.argsort(heights, kind="stable")
         corners = np.round((triangles[order, :, :2] - self.low) / self.pixel * 2**SUBPIXEL).astype(np.int32)
-        for polygon, height in zip(corners, lowest[order].tolist(), strict=True):
+        for polygon, height in zip(corners, heights[order].tolist(), strict=True):
             cv2.fillConvexPoly(self.height, polygon, height, shift=SUBPIXEL)
 
     def touched(self, polygons: np.ndarray) -> np.ndarray:
@@ -118,7 +116,7 @@ class Shade:
         self.triangles = np.concatenate(solid)
         near = np.concatenate([self.project(track.points)[:, :2], track.points[:, :2]])
         self.map = ShadowMap(near.min(axis=0) - 250, near.max(axis=0) + 250, COARSE)
-        self.map.paint(self.triangles)
+        self.map.paint(self.triangles, self.triangles[..., 2].min(axis=1))  # so that no slope shades its own foot
         self.pictures: dict[int, np.ndarray | None] = {}
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -161,7 +159,8 @@ class Shade:
         shadows = ShadowMap(points[:, :2].min(axis=0), points[:, :2].max(axis=0), FINE)
         above = self.triangles[..., 2].max(axis=1) > points[:, 2].min()
         triangles = self.triangles[above]
-        shadows.paint(divide(triangles[shadows.touched(triangles)]))
+        triangles = divide(triangles[shadows.touched(triangles)])
+        shadows.paint(triangles, triangles[..., 2].mean(axis=1))
         for corners, texture in self.plants:
             shadows.paint_plants(corners, texture)
         shaded = shadows.shaded(points, FINE_MARGIN).reshape(PICTURE_SHAPE).astype(np.float32)
