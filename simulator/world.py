@@ -196,7 +196,7 @@ class Scene:
     def __init__(self, scenery: Scenery):
         self.scenery = scenery
         self.root = NodePath("scene")
-        shade, together = scenery.shade, {}
+        shade, together = scenery.shade, dict[tuple[int, bool], list[Mesh]]()
         for mesh in scenery.meshes:
             key = (id(mesh.texture), shade is not None and mesh.road is not None)
             together.setdefault(key, []).append(mesh)

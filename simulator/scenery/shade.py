@@ -167,8 +167,8 @@ class Shade:
         if not shaded.any():
             return None
         blur = self.softness / np.array([2 * HALF_WIDTH / columns, LENGTH / rows])
-        shaded = cv2.GaussianBlur(shaded, (0, 0), blur[0], sigmaY=blur[1])
-        return np.round(255 * (1 - (1 - self.factor) * shaded[..., None])).astype(np.uint8)
+        soft = cv2.GaussianBlur(shaded, (0, 0), blur[0], sigmaY=blur[1])
+        return np.round(255 * (1 - (1 - self.factor) * soft[..., None])).astype(np.uint8)
 
     def coordinates(self, road: np.ndarray, stretch: int) -> np.ndarray:
         """Return the texture coordinates, (n, 2), in a stretch's picture of points (n, 2: s, lateral offset)."""
