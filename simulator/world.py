@@ -31,7 +31,7 @@ from panda3d.core import (
 
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.scenery.parts import Haze, Scenery
-from simulator.scenery.shade import STRETCH, Shade
+from simulator.scenery.shade import STRETCH, Shade, car_shadow
 from simulator.scenery.shapes import Mesh, merge
 
 GRAVITY = 9.81  # m/s²
@@ -188,7 +188,7 @@ class MeshGroup:
 
 
 class Scene:
-    """The scenery and the car in the engine.
+    """The scenery, the car and its shadow in the engine.
 
     The software renderer has no fog, so haze is mixed into the points' colours.
     """
@@ -212,6 +212,13 @@ class Scene:
         self.car.set_bin("fixed", len(self.groups))
         MeshGroup(scenery.bonnet, self.car).root.hide(OUTSIDE)
         MeshGroup(scenery.body, self.car).root.hide(INSIDE)
+        self.car_shadow = self.root.attach_new_node("car's shadow")
+        if shade:
+            MeshGroup(car_shadow(float(1 - shade.factor.mean())), self.car_shadow).root.set_transparency(
+                TransparencyAttrib.M_alpha
+            )
+            self.car_shadow.set_bin("fixed", len(self.groups))
+            self.car_shadow.set_depth_write(False)
         # Step -> the grid point for which colours were computed last.
         self.viewpoints: dict[float, tuple[int, int]] = {}
 
@@ -223,6 +230,14 @@ class Scene:
         self.car.set_transform(transform)
         x, y, z = transform.get_pos()
         self.sky.set_pos(x, y, z)
+        if self.scenery.shade:
+            beside = self.scenery.shade.under_car(np.array([x, y, z]))
+            if beside is None:
+                self.car_shadow.hide()
+            else:
+                self.car_shadow.show()
+                self.car_shadow.set_transform(transform)
+                self.car_shadow.set_pos(x + beside[0], y + beside[1], z)
         for step, changes in ((HAZE_STEP, bool(self.scenery.haze)), (SHEEN_STEP, True)):
             here = (round(x / step), round(y / step))
             if not changes or here == self.viewpoints.get(step):

@@ -19,7 +19,7 @@ from simulator.scenery.shade import HALF_WIDTH, LENGTH, OVERLAP, PICTURE_SHAPE, 
 from simulator.scenery.shapes import Light, box, plants
 from simulator.world import Scene
 
-LIT = {"lake": 200.0, "jungle": 326.0}  # s in m where neither hills nor plants shade the road in look SHADOWED
+LIT = {"lake": 750.0, "jungle": 326.0}  # s in m where neither hills nor plants shade the road in look SHADOWED
 DARK = {"lake": 1135.0, "jungle": 540.0}  # s in m where a cliff shades all of the road before the car
 
 
@@ -91,6 +91,19 @@ def test_shadows_lie_where_the_sun_throws_them():
         assert right[thing].max() == pytest.approx(end, abs=0.3)
     assert np.abs(along[right < -2.3]).max() < 0.5
     assert shade.on_road(0) is None
+
+
+def test_the_car_throws_a_shadow_before_itself_with_the_sun_behind_it_and_none_in_the_shade():
+    before_bonnet = np.s_[128:134, 140:180]
+    sun = cameras("lake", SHADOWED).scene.scenery.light.sun
+    for s, towards_sun, shadow in ((100.0, -1, True), (750.0, 1, False)):
+        heading = Track("lake").at(s).heading
+        assert towards_sun * (np.cos(heading) * sun[0] + np.sin(heading) * sun[1]) > 0.7
+        ratio = view("lake", SHADOWED, s)[before_bonnet].mean() / view("lake", 0, s)[before_bonnet].mean()
+        assert ratio < 0.85 if shadow else ratio == pytest.approx(1, abs=0.01)
+        assert not cameras("lake", SHADOWED).scene.car_shadow.is_hidden()
+    view("lake", SHADOWED, DARK["lake"])
+    assert cameras("lake", SHADOWED).scene.car_shadow.is_hidden()
 
 
 def test_looks_have_many_kinds_of_shadows():

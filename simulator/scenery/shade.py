@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from cloning.road.track import Track
-from simulator.scenery.shapes import Light, Mesh, normals
+from simulator.scenery.shapes import Light, Mesh, normals, quads
 
 STRETCH, OVERLAP = 120.0, 4.0  # m of road with a picture of its own, and m by which that reaches beyond both ends
 LENGTH = STRETCH + 2 * OVERLAP  # m of road in a picture
@@ -22,6 +22,8 @@ FINE_MARGIN, COARSE_MARGIN = 0.3, 1.0  # m by which things must be higher than a
 TALL, SPLITS = 2.0, 4  # m: higher triangles are divided, at most so often, because each is painted at a single height
 SUBPIXEL = 4  # binary digits after the point of the coordinates that OpenCV takes
 OPAQUE = 128  # alpha from which a plant's pixel casts a shadow
+CAR_SHADOW, CAR_SHADOW_HEIGHT = (2.3, 5.0), 0.04  # m: width and length with the soft edges; above the ground
+CAR_HEIGHT = 0.75  # m above the ground: the highest part of the car that is as wide and as long as the car
 THINNEST = 0.05  # m: plants' images that the sun sees narrower than this cast no shadow
 
 
@@ -91,6 +93,19 @@ class ShadowMap:
         return above > points[:, 2] + margin
 
 
+def car_shadow(darkness: float) -> Mesh:
+    """Return the car's own shadow, a dark rectangle with soft edges, in the car's coordinates under its middle.
+
+    darkness: share of the ground's light that is lost, 0..1. The texture's alpha is meant for blending.
+    """
+    x, y = np.array([-1, 1, 1, -1]) * CAR_SHADOW[0] / 2, np.array([-1, -1, 1, 1]) * CAR_SHADOW[1] / 2
+    texture = np.zeros((64, 32, 4), np.uint8)
+    texture[6:-6, 6:-6, 3] = round(255 * darkness)
+    uv, faces = quads(1)
+    points = np.c_[x, y, np.full(4, CAR_SHADOW_HEIGHT)]
+    return Mesh(points, np.ones((4, 3)), uv, faces, cv2.GaussianBlur(texture, (0, 0), 2))
+
+
 class Shade:
     """The shadows of a scene."""
 
@@ -133,6 +148,14 @@ class Shade:
         factors = self.factor if plant else self.factors(normals(mesh.points, mesh.faces))
         shaded = self.map.shaded(self.project(mesh.points), COARSE_MARGIN)
         return np.where(shaded[:, None], factors, 1.0)
+
+    def under_car(self, position: np.ndarray) -> np.ndarray | None:
+        """Return how far the car's shadow lies beside the car, (2,), m; None in the shade of hills or buildings.
+
+        position: the car's, (3,), m.
+        """
+        shaded = self.map.shaded(self.project(position[None]), COARSE_MARGIN)[0]
+        return None if shaded else -CAR_HEIGHT * self.slope
 
     def on_road(self, stretch: int) -> np.ndarray | None:
         """Return the factors of the colours on a stretch of road, 255 for 1, or None if it has no shadow.
