@@ -29,7 +29,7 @@ from cloning.errors import SimulatorError
 from cloning.recordings.format import FRAME, SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
 from cloning.road.motion import MPH, TOP_SPEED_MPH
-from cloning.road.track import ROADS, Track
+from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.film import ChaseView
@@ -68,16 +68,15 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         random_start: bool = False,
         render_mode: str | None = None,
     ):
-        """Build the track's scene. Raises SimulatorError for an argument out of its range.
+        """Build the track's scene. Raises TrackError for an unknown track, SimulatorError for other arguments.
 
-        track: "lake" or "jungle"; direction: "ccw", "cw" or None for that of the real simulator; look: 0 like the real
+        track: "lake", "jungle", "road-1", "road-2", …; direction: "ccw", "cw" or None for that of the real simulator; look: 0 like the real
         simulator, any greater number in other light, colours, textures and plants; speed: set speed in mph, 1 to 30,
         which the car never exceeds; laps: after which an episode is truncated, such as 0.5; random_start: begin each
         episode at a random place on the centre line instead of where the autonomous mode does; render_mode: "rgb_array"
         (a view from behind the car) or None.
         """
         for name, value, valid, allowed in (
-            ("track", track, track in ROADS, " or ".join(map(repr, sorted(ROADS)))),
             ("direction", direction, direction in ("ccw", "cw", None), "'ccw', 'cw' or None"),
             ("look", look, look >= 0 and look % 1 == 0, "a whole number from 0"),
             ("speed", speed, 1 <= speed <= TOP_SPEED_MPH, f"1 to {TOP_SPEED_MPH} (mph)"),

@@ -1,5 +1,7 @@
 """A track in the engine: the ground that the car drives on and the scene that the cameras see."""
 
+from dataclasses import replace
+
 import numpy as np
 from panda3d.bullet import (
     BulletPlaneShape,
@@ -21,6 +23,7 @@ from panda3d.core import (
     Point3,
     SamplerState,
     Texture,
+    TextureStage,
     TransformState,
     TransparencyAttrib,
     Vec3,
@@ -28,6 +31,7 @@ from panda3d.core import (
 
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.scenery.parts import Haze, Scenery
+from simulator.scenery.shade import STRETCH, Shade, car_shadow
 from simulator.scenery.shapes import Mesh, merge
 
 GRAVITY = 9.81  # m/s²
@@ -35,6 +39,7 @@ GROUND_HALF_WIDTH = 8.0  # m of ground on each side of a road with climbs; the c
 CELL = 120.0  # m: meshes are divided into square cells, so that the engine can skip those that are out of view
 INSIDE, OUTSIDE = BitMask32.bit(0), BitMask32.bit(1)  # cameras in the car, which see its bonnet; others, its body
 HAZE_STEP, SHEEN_STEP = 25.0, 2.0  # m of camera movement after which haze and sheen are computed again
+SHADE = InternalName.get_texcoord_name("shade")  # texture coordinates in the pictures of the shadows on the road
 SHEEN_START = 3.0  # m from the camera: closer asphalt, seen from above, has no sheen
 
 
@@ -64,15 +69,17 @@ def _column(name: InternalName, size: int, number_type: int, contents: int) -> G
     return array
 
 
-def _vertex_format() -> GeomVertexFormat:
+def _vertex_format(on_road: bool) -> GeomVertexFormat:
     """Return a format with positions, colours and texture coordinates in one array each.
 
-    So the colours can be replaced on their own.
+    So the colours can be replaced on their own. on_road: whether there are texture coordinates for shadows, too.
     """
     vertex_format = GeomVertexFormat()
     vertex_format.add_array(_column(InternalName.get_vertex(), 3, Geom.NT_float32, Geom.C_point))
     vertex_format.add_array(_column(InternalName.get_color(), 4, Geom.NT_uint8, Geom.C_color))
     vertex_format.add_array(_column(InternalName.get_texcoord(), 2, Geom.NT_float32, Geom.C_texcoord))
+    if on_road:
+        vertex_format.add_array(_column(SHADE, 2, Geom.NT_float32, Geom.C_texcoord))
     return GeomVertexFormat.register_format(vertex_format)
 
 
@@ -102,13 +109,15 @@ def _rgba(colours: np.ndarray) -> np.ndarray:
 class MeshCell:
     """The engine's geometry for the faces of a mesh in one cell; `used` are the indices of their points."""
 
-    def __init__(self, mesh: Mesh, faces: np.ndarray):
-        """faces: int (m, 3), indices into the mesh's points."""
+    def __init__(self, mesh: Mesh, faces: np.ndarray, shade_uv: np.ndarray | None = None):
+        """faces: int (m, 3), indices into the mesh's points; shade_uv: (n, 2), the points' SHADE coordinates."""
         self.used, faces = np.unique(faces, return_inverse=True)
-        self.data = GeomVertexData("cell", _vertex_format(), Geom.UH_static)
+        self.data = GeomVertexData("cell", _vertex_format(shade_uv is not None), Geom.UH_static)
         self.data.unclean_set_num_rows(len(self.used))
         memoryview(self.data.modify_array(0)).cast("B")[:] = mesh.points[self.used].astype(np.float32).tobytes()
         memoryview(self.data.modify_array(2)).cast("B")[:] = mesh.uv[self.used].astype(np.float32).tobytes()
+        if shade_uv is not None:
+            memoryview(self.data.modify_array(3)).cast("B")[:] = shade_uv[self.used].astype(np.float32).tobytes()
         self.set_colours(_rgba(mesh.colours[self.used] * 255))
         triangles = GeomTriangles(Geom.UH_static)
         triangles.set_index_type(Geom.NT_uint32)
@@ -126,16 +135,32 @@ class MeshCell:
 
 
 class MeshGroup:
-    """A mesh in the engine, divided into cells."""
+    """A mesh in the engine, divided into cells: a mesh along the road that has shadows into stretches of the road."""
 
-    def __init__(self, mesh: Mesh, parent: NodePath):
+    def __init__(self, mesh: Mesh, parent: NodePath, shade: Shade | None = None):
+        """shade: the scene's shadows, if the mesh is part of the scene and the scene has any."""
+        if shade and mesh.road is None:
+            mesh = replace(mesh, colours=mesh.colours * shade.on_mesh(mesh))
         self.mesh = mesh
         root = parent.attach_new_node("group")
-        squares = np.floor(mesh.points[mesh.faces].mean(axis=1)[:, :2] / CELL).astype(int)
+        if shade and mesh.road is not None:
+            squares = np.floor(mesh.road[mesh.faces].mean(axis=1)[:, :1] / STRETCH).astype(int)
+        else:
+            squares = np.floor(mesh.points[mesh.faces].mean(axis=1)[:, :2] / CELL).astype(int)
         occupied, which = np.unique(squares, axis=0, return_inverse=True)
-        self.cells = [MeshCell(mesh, mesh.faces[which.ravel() == i]) for i in range(len(occupied))]
-        for mesh_cell in self.cells:
-            root.attach_new_node(mesh_cell.node)
+        self.cells = []
+        for i, square in enumerate(occupied.tolist()):
+            faces, on_road, shade_uv = mesh.faces[which.ravel() == i], None, None
+            if shade and mesh.road is not None and (on_road := shade.on_road(square[0])) is not None:
+                shade_uv = shade.coordinates(mesh.road, square[0])
+            mesh_cell = MeshCell(mesh, faces, shade_uv)
+            self.cells.append(mesh_cell)
+            node = root.attach_new_node(mesh_cell.node)
+            if on_road is not None:
+                stage = TextureStage("shade")  # after the default one, by whose colours its own are multiplied
+                stage.set_sort(1)
+                stage.set_texcoord_name(SHADE)
+                node.set_texture(stage, make_texture(on_road, repeat=False, mipmaps=True))
         plant = mesh.texture.shape[2] == 4
         root.set_texture(make_texture(mesh.texture, repeat=not plant, mipmaps=not plant))
         root.set_two_sided(True)
@@ -163,7 +188,7 @@ class MeshGroup:
 
 
 class Scene:
-    """The scenery and the car in the engine.
+    """The scenery, the car and its shadow in the engine.
 
     The software renderer has no fog, so haze is mixed into the points' colours.
     """
@@ -171,10 +196,11 @@ class Scene:
     def __init__(self, scenery: Scenery):
         self.scenery = scenery
         self.root = NodePath("scene")
-        by_texture: dict[int, list[Mesh]] = {}
+        shade, together = scenery.shade, dict[tuple[int, bool], list[Mesh]]()
         for mesh in scenery.meshes:
-            by_texture.setdefault(id(mesh.texture), []).append(mesh)
-        self.groups = [MeshGroup(merge(meshes), self.root) for meshes in by_texture.values()]
+            key = (id(mesh.texture), shade is not None and mesh.road is not None)
+            together.setdefault(key, []).append(mesh)
+        self.groups = [MeshGroup(merge(meshes), self.root, shade) for meshes in together.values()]
         for i, group in enumerate(self.groups):
             # Without a fixed order the engine sorts by memory address, which differs from run to run.
             group.root.set_bin("fixed", i)
@@ -186,6 +212,13 @@ class Scene:
         self.car.set_bin("fixed", len(self.groups))
         MeshGroup(scenery.bonnet, self.car).root.hide(OUTSIDE)
         MeshGroup(scenery.body, self.car).root.hide(INSIDE)
+        self.car_shadow = self.root.attach_new_node("car's shadow")
+        if shade:
+            MeshGroup(car_shadow(float(1 - shade.factor.mean())), self.car_shadow).root.set_transparency(
+                TransparencyAttrib.M_alpha
+            )
+            self.car_shadow.set_bin("fixed", len(self.groups))
+            self.car_shadow.set_depth_write(False)
         # Step -> the grid point for which colours were computed last.
         self.viewpoints: dict[float, tuple[int, int]] = {}
 
@@ -197,6 +230,14 @@ class Scene:
         self.car.set_transform(transform)
         x, y, z = transform.get_pos()
         self.sky.set_pos(x, y, z)
+        if self.scenery.shade:
+            beside = self.scenery.shade.under_car(np.array([x, y, z]))
+            if beside is None:
+                self.car_shadow.hide()
+            else:
+                self.car_shadow.show()
+                self.car_shadow.set_transform(transform)
+                self.car_shadow.set_pos(x + beside[0], y + beside[1], z)
         for step, changes in ((HAZE_STEP, bool(self.scenery.haze)), (SHEEN_STEP, True)):
             here = (round(x / step), round(y / step))
             if not changes or here == self.viewpoints.get(step):

@@ -84,9 +84,9 @@ def line_offset(frames: np.ndarray, columns: list[np.ndarray], rows: range) -> t
     return float((weight * SEARCH).sum() / weight.sum()), len(profiles)
 
 
-def render(track: Track, positions: np.ndarray) -> np.ndarray:
+def render(track: Track, look: int, positions: np.ndarray) -> np.ndarray:
     """Render the three cameras at positions (n, 3), as `rear_axle` takes them: uint8 (n, 3, 160, 320, 3), RGB."""
-    run, cameras = Run(track), Cameras(Scene(scenery.build(track.name)))
+    run, cameras = Run(track), Cameras(Scene(scenery.build(track.name, look)))
     rendered = []
     for position in positions:
         axle, forward = rear_axle(track, position)
@@ -97,8 +97,8 @@ def render(track: Track, positions: np.ndarray) -> np.ndarray:
     return np.array(rendered)
 
 
-def compare(folder: Path, count: int, picture: str | None) -> None:
-    """Compare `count` places of a recording, print the table and write the picture. Raises UserError."""
+def compare(folder: Path, count: int, look: int, picture: str | None) -> None:
+    """Compare `count` places of a recording with a look, print the table and write the picture. Raises UserError."""
     recording = read_recording(folder)
     drives = list(localise_all(stretches(recording), detect_centres(recording)))
     if not drives:
@@ -110,7 +110,7 @@ def compare(folder: Path, count: int, picture: str | None) -> None:
     positions = placed.states[chosen]
     paths = [[recording.path(rows.start + i, camera) for camera in range(len(CAMERAS))] for i in chosen]
     real = np.array([[decode(path.read_bytes()) for path in row] for row in paths])
-    rendered = render(track, positions)
+    rendered = render(track, look, positions)
     print(f"{'':28}{'real':>24}{'rendered':>24}")
     for c, camera in enumerate(CAMERAS):
         colours = [frames[:, c].mean((0, 1, 2)) for frames in (real, rendered)]
@@ -163,10 +163,11 @@ def main() -> int:
     )
     parser.add_argument("recording", type=Path, help="folder of a real recording of the lake or the jungle")
     parser.add_argument("--frames", type=number(int, 1), default=120, help="number of places to compare (default 120)")
+    parser.add_argument("--look", type=number(int, 0), default=0, help="look of the rendered frames (default 0)")
     parser.add_argument("--picture", metavar="FILE.png", help="write real frames above rendered ones")
     args = parser.parse_args()
     try:
-        compare(args.recording, args.frames, args.picture)
+        compare(args.recording, args.frames, args.look, args.picture)
     except UserError as error:
         return program.failed("likeness", error)
     return program.DONE

@@ -1,17 +1,28 @@
 """The scenery of the tracks, the lake, the jungle and generated roads: meshes, textures and plants, in any look."""
 
+from dataclasses import replace
+
 from cloning.road.generated import road_number
+from cloning.road.track import Track
 from simulator.scenery import generated, jungle, lake
+from simulator.scenery.looks import SHADOWED, make_shade_style
 from simulator.scenery.parts import Scenery
+from simulator.scenery.shade import Shade
 
 
 def build(track: str, look: int = 0) -> Scenery:
     """Return the scenery of a track that `cloning.road.track.Track` knows.
 
     Look 0 resembles the real simulator, or is a generated road's own; any other number gives other light, textures and
-    plants on the same road.
+    plants on the same road. Look n + SHADOWED is look n with shadows.
     """
-    number = road_number(track)
-    if number is not None:
-        return generated.scenery(number, look)
-    return {"lake": lake, "jungle": jungle}[track].scenery(look)
+    number, base = road_number(track), look % SHADOWED
+    if number is None:
+        scenes = {"lake": lake, "jungle": jungle}[track]
+        scenery, elevation = scenes.scenery(base), scenes.SHADOW_ELEVATION
+    else:
+        scenery, elevation = generated.scenery(number, base), generated.SHADOW_ELEVATION
+    style = make_shade_style(look)
+    if style is None:
+        return scenery
+    return replace(scenery, shade=Shade(Track(track), scenery.meshes, scenery.light, style, elevation))

@@ -39,6 +39,7 @@ VERGE_EDGE = 9.8  # m from the centre line to the end of the verge, which hides 
 HARD_SHOULDER = 0.35  # m of asphalt beyond the lines
 KERB_WIDTH, WALL_HEIGHT, RAIL_DISTANCE = 0.7, 0.8, 0.5  # m; the last from the edge of the road
 POST_SPACING = 8.0  # m between a rail's posts
+SHADOW_ELEVATION = 24.0  # degrees: of the sun that casts the shadows of shadowed looks, as low as the lake's
 PLANT_TEXTURES: dict[str, Callable[[Generator], np.ndarray]] = {
     "pine": textures.pine,
     "palm": textures.palm,

@@ -63,6 +63,9 @@ PALETTE: Palette = {
     "deck": (0.30, 0.30, 0.30),
     "bonnet": (0.48, 0.46, 0.42),
 }
+# Degrees: elevation of the sun that casts the shadows of shadowed looks. Lower than LIGHT has it, because these cliffs
+# are lower than the real ones: so 16 % of look 10,000's road lie in the shade, as in a real recording with shadows.
+SHADOW_ELEVATION = 36.0
 LIGHT = Light(sun=(0.62, 0.35, 0.70), sunlight=(0.86, 0.82, 0.72), fill=(0.40, 0.42, 0.42))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from cloning.road.camera import height_at_rows
 from simulator.scenery import textures
 from simulator.scenery.looks import Look
+from simulator.scenery.shade import Shade
 from simulator.scenery.shapes import Colour, Light, Mesh, box, grid, illuminate, merge
 
 
@@ -25,14 +26,19 @@ class Haze:
 
 @dataclass(frozen=True)
 class Scenery:
-    """Everything that the cameras see; bonnet and body move with the car, tone is that of `looks.Look`."""
+    """Everything that the cameras see.
+
+    Bonnet and body move with the car; light and tone are those of `looks.Look`; without `shade` nothing casts shadows.
+    """
 
     meshes: list[Mesh]
     sky: Mesh
     bonnet: Mesh
     body: Mesh
+    light: Light
     haze: Haze | None = None
     tone: np.ndarray | None = None
+    shade: Shade | None = None
 
 
 def assemble(meshes: list[Mesh], look: Look, haze: Haze | None = None) -> Scenery:
@@ -40,7 +46,7 @@ def assemble(meshes: list[Mesh], look: Look, haze: Haze | None = None) -> Scener
     palette, light = look.palette, look.light
     sky = dome(textures.sky(palette["zenith"], palette["horizon"]))
     colour = palette["bonnet"]
-    return Scenery(meshes, sky, bonnet(colour, light), body(colour, light), haze, look.tone)
+    return Scenery(meshes, sky, bonnet(colour, light), body(colour, light), light, haze, look.tone)
 
 
 def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:

@@ -20,6 +20,7 @@ class Mesh:
     faces    int (m, 3): indices into the points
     texture  uint8 (rows, columns, 3 RGB or 4 RGBA); with 4 channels, pixels with alpha below half are transparent
     sheen    relative gain in brightness where the mesh is seen far ahead, at a grazing angle
+    road     float (n, 2): s along the track and lateral offset of points of a ribbon along the road, m; else None
     """
 
     points: np.ndarray
@@ -28,6 +29,7 @@ class Mesh:
     faces: np.ndarray
     texture: np.ndarray
     sheen: float = 0.0
+    road: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,15 @@ def ribbon(track: Track, s: ArrayLike, offsets: ArrayLike, heights: ArrayLike, m
     across = offsets / material.metres if material.across is None else np.asarray(material.across, float)
     uv = np.stack(np.broadcast_arrays(across[None, :], (s / material.metres)[:, None]), axis=-1)
     colours = np.broadcast_to(np.asarray(material.colour, float), (n, k, 3))
-    return Mesh(points.reshape(-1, 3), colours.reshape(-1, 3).copy(), uv.reshape(-1, 2), grid(n, k), material.texture)
+    road = np.stack(np.broadcast_arrays(s[:, None], offsets[None, :]), axis=-1)
+    return Mesh(
+        points.reshape(-1, 3),
+        colours.reshape(-1, 3).copy(),
+        uv.reshape(-1, 2),
+        grid(n, k),
+        material.texture,
+        road=road.reshape(-1, 2),
+    )
 
 
 def roadside(track: Track, s: ArrayLike, side: int, offsets: ArrayLike, heights: ArrayLike, material: Material) -> Mesh:
@@ -223,7 +233,8 @@ def box(
 
 
 def merge(meshes: list[Mesh]) -> Mesh:
-    """Return a single mesh of meshes that share a texture."""
+    """Return a single mesh of meshes that share a texture; `road` remains if all have it."""
+    along = [mesh.road for mesh in meshes if mesh.road is not None]
     first = np.cumsum([0] + [len(mesh.points) for mesh in meshes[:-1]])
     return replace(
         meshes[0],
@@ -231,4 +242,5 @@ def merge(meshes: list[Mesh]) -> Mesh:
         colours=np.vstack([mesh.colours for mesh in meshes]),
         uv=np.vstack([mesh.uv for mesh in meshes]),
         faces=np.vstack([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]),
+        road=np.vstack(along) if len(along) == len(meshes) else None,
     )
