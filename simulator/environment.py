@@ -70,11 +70,11 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
     ):
         """Build the track's scene. Raises TrackError for an unknown track, SimulatorError for other arguments.
 
-        track: "lake", "jungle", "road-1", "road-2", …; direction: "ccw", "cw" or None for that of the real simulator; look: 0 like the real
-        simulator, any greater number in other light, colours, textures and plants; speed: set speed in mph, 1 to 30,
-        which the car never exceeds; laps: after which an episode is truncated, such as 0.5; random_start: begin each
-        episode at a random place on the centre line instead of where the autonomous mode does; render_mode: "rgb_array"
-        (a view from behind the car) or None.
+        track: "lake", "jungle", "road-1", "road-2", …; direction: "ccw", "cw" or None for that of the real simulator;
+        look: 0 like the real simulator, any greater number in other light, colours, textures and plants; speed: set
+        speed in mph, 1 to 30, which the car never exceeds; laps: after which an episode is truncated, such as 0.5;
+        random_start: begin each episode at a random place on the centre line instead of where the autonomous mode does;
+        render_mode: "rgb_array" (a view from behind the car) or None.
         """
         for name, value, valid, allowed in (
             ("direction", direction, direction in ("ccw", "cw", None), "'ccw', 'cw' or None"),
