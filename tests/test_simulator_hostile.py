@@ -261,12 +261,9 @@ HOSTILE = [
     (nests_deep, "no usable answer|unusable"),
 ]
 # The error names the last loss of the connection: an attempt that the end of the patience cut short, at times.
+LATE = "|accepts connections but does not answer"
 hostile = pytest.mark.parametrize(
-    ("behave", "message"),
-    [
-        pytest.param(each, f"{words}|accepts connections but does not answer", id=each.__name__)
-        for each, words in HOSTILE
-    ],
+    ("behave", "message"), [pytest.param(each, words + LATE, id=each.__name__) for each, words in HOSTILE]
 )
 
 
