@@ -104,6 +104,12 @@ def test_an_unnamed_column_that_is_none_of_the_four_is_ignored(log, extra):
     assert found.repairs == {"extra columns ignored": [4, 1]}
 
 
+@pytest.mark.parametrize("last", ['"1",', "'1'", "1%"])
+def test_a_number_with_something_clinging_to_it_is_no_word(log, last):
+    with pytest.raises(RecordingError, match="5 numbers where 4 are expected"):
+        log(*[f"{images(at).replace(',', ';')};0;0;0;0;{last}" for at in range(11)])
+
+
 def test_decimal_commas_in_a_file_with_points_are_left_out(log):
     commas = ["1,234E-05,1,0,30,19", "0,1,0,30,19", "-0,05,0,5,0,9,25"]
     found = log(*usual(), *usual(commas, first=10))
