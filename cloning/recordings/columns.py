@@ -28,7 +28,7 @@ SUFFIXES = (".jpg", ".jpeg")
 CAMERA_WORD = re.compile(r"(?<![a-z])(cent(?:er|re)|left|right)(?![a-z])")
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE | re.ASCII)
-TORN = "\"',;% "  # what may cling to a number that was written with other separators or quotes
+WORD = re.compile(r".*[^\W\d_]|\D*$", re.DOTALL)  # a letter, or no digit: else it may be a number, with other marks
 OTHER_UNITS = re.compile(r"deg|rad|°|km|kph|m/s|mps|%|percent", re.IGNORECASE)
 HEADER_WORDS = {  # beginnings of other names that headers have for the columns
     "ct": "center",
@@ -203,7 +203,7 @@ def check_places(shape: Shape) -> None:
     least, greatest = least.min(), greatest.max()
     for line, tokens in zip(shape.lines, shape.tokens, strict=True):
         for token in tokens[len(NUMBERS) :]:
-            if least <= number(token.strip(TORN)) <= greatest:
+            if not WORD.match(token) and not (number(token) < least or number(token) > greatest):
                 raise UnclearColumns(
                     "columns unclear",
                     f"{len(tokens)} numbers where {len(NUMBERS)} are expected, and {token} in line {line} could be "
