@@ -309,3 +309,9 @@ def test_only_names_without_letters_are_taken_to_be_at_their_usual_places(log):
     assert found.repairs == {"header lacks names; usual places taken": [1, 1]}
     with pytest.raises(RecordingError, match="line 1: the header lacks throttle; add"):
         log(HEADER.replace("throttle", "lap"), *usual())
+
+
+def test_a_value_below_the_comma_at_a_headers_end_is_not_read(log):
+    found = log(HEADER + ",", *[line + "," for line in usual()], f"{images(9)},1,0,0,0,0")
+    np.testing.assert_array_equal(numbers(found), np.float32(VALUES))
+    assert [(line, kind) for line, kind, _ in found.rejected] == [(6, "columns unclear")]

@@ -179,6 +179,8 @@ class TolerantReader:
             names = [base_name(by_name[name]) for name in CAMERAS]
             if not all(map(is_image, names)):
                 raise UnclearColumns("not a row", f"{', '.join(names)}: not the three images that the header names")
+            if fields[-1] and (self._columns or ("",))[-1] == f" ({len(fields) - 1})":
+                raise UnclearColumns("columns unclear", f"{fields[-1]!r} is below a comma at the header's end; name it")
             tokens = [by_name[name] for name in NUMBERS]
             self._points = self._points or any("." in token for token in tokens)
             return self._collect(shape, line, names, tokens)
