@@ -104,7 +104,7 @@ def test_an_unnamed_column_that_is_none_of_the_four_is_ignored(log, extra):
     assert found.repairs == {"extra columns ignored": [4, 1]}
 
 
-@pytest.mark.parametrize("last", ['"1",', "'1'", "1%", '"0,5",'])
+@pytest.mark.parametrize("last", ['"1",', "'1'", "1%", '"0,5",', "6.9E-05"])
 def test_a_number_with_something_clinging_to_it_is_no_word(log, last):
     with pytest.raises(RecordingError, match="5 numbers where 4 are expected"):
         log(*[f"{images(at).replace(',', ';')};0;0;0;0;{last}" for at in range(11)])

@@ -28,7 +28,7 @@ SUFFIXES = (".jpg", ".jpeg")
 CAMERA_WORD = re.compile(r"(?<![a-z])(cent(?:er|re)|left|right)(?![a-z])")
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE | re.ASCII)
-WORD = re.compile(r".*[^\W\d_]|\D*$", re.DOTALL)  # a letter, or no digit: else it may be a number, with other marks
+WORD = re.compile(r".*[^\W\d_]|\D*$", re.DOTALL)  # what has a letter, or no digit, if it is no number
 OTHER_UNITS = re.compile(r"deg|rad|°|km|kph|m/s|mps|%|percent", re.IGNORECASE)
 HEADER_WORDS = {  # beginnings of other names that headers have for the columns
     "ct": "center",
@@ -199,16 +199,22 @@ def check_places(shape: Shape) -> None:
             f"{shape.fields} fields below a header that names {len(shape.columns or ())} in another order than the "
             "simulator's; correct the header, or write one above these rows",
         )
-    least, greatest = np.transpose(list(RANGES.values()))
-    least, greatest = least.min(), greatest.max()
     for line, tokens in zip(shape.lines, shape.tokens, strict=True):
         for token in tokens[len(NUMBERS) :]:
-            if not WORD.match(token) and not (number(token) < least or number(token) > greatest):
+            if _may_be_meant(token):
                 raise UnclearColumns(
                     "columns unclear",
                     f"{len(tokens)} numbers where {len(NUMBERS)} are expected, and {token} in line {line} could be "
                     f"meant as well as the others; {SETTLE}",
                 )
+
+
+def _may_be_meant(token: str) -> bool:
+    """Return whether a field may be one of the four numbers, perhaps with other separators or quotes around it."""
+    value = number(token)
+    if math.isnan(value):
+        return not WORD.match(token)
+    return any(least <= value <= greatest for least, greatest in RANGES.values())
 
 
 def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> None:
