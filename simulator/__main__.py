@@ -184,7 +184,7 @@ def run_record(args: argparse.Namespace) -> int:
     for departure in run.departures:
         print(f"left the road at {departure.s:.0f} m after {departure.time:.1f} s")
     print(f"{args.folder}: {rows} rows from {run.time:.0f} simulated seconds, at {pace:.1f} times real time")
-    return 0
+    return program.INCOMPLETE if run.departures else program.DONE
 
 
 def run_drive(args: argparse.Namespace) -> int:

@@ -243,7 +243,7 @@ def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> Non
     if both.any():
         doubt = f"the brake is pressed with the throttle in line {lines[both].min()}"
     elif line := _keeps_its_speed(lines, brake, numbers[:, NUMBERS.index("speed")]):
-        doubt = f"the brake is pressed more than the throttle, but the car does not slow down, such as in line {line}"
+        doubt = f"the brake is pressed more than the throttle, and the car is not seen to slow down in line {line}"
     else:
         return
     raise UnclearColumns("columns unclear", f"{doubt}: are they other columns, or in another order? {SETTLE}")
@@ -258,11 +258,14 @@ def brakes_most(numbers: np.ndarray) -> bool:
 
 
 def _keeps_its_speed(lines: np.ndarray, brake: np.ndarray, speed: np.ndarray) -> int:
-    """Return the first line in which a fast car does not slow down with the brake on; 0 if it usually does."""
+    """Return the first line in which a fast car is not seen to slow down with the brake on; 0 if it usually does."""
     order = np.argsort(lines)
     lines, brake, speed = lines[order], brake[order], speed[order]
     faster = np.diff(speed)
     fast = (np.diff(lines) == 1) & (brake[:-1] > 0) & (brake[1:] > 0) & (speed[:-1] > FAST) & np.isfinite(faster)
+    braking = (brake > 0) & (speed > FAST)
+    if not fast.any() and braking.any():  # in single rows only, which show no change of speed
+        return int(lines[braking][0])
     keeps = fast & (faster >= 0)
     return int(lines[:-1][keeps][0]) if keeps.sum() > (1 - LEAST_BRAKING) * fast.sum() else 0
 

@@ -99,15 +99,15 @@ class TolerantReader:
         """Interpret the rows, because all are known now; open_line: the last one if it has no line end, else 0."""
         self._read_decimal_commas()
         for shape in self._shapes.values():
-            rows = [[number(token) for token in tokens[: len(NUMBERS)]] for tokens in shape.tokens]
+            own = [[number(token) for token in tokens[: len(NUMBERS)]] for tokens in shape.tokens]
             lines = np.concatenate([np.array(shape.lines, np.int32), *(rows.lines for rows in shape.plain)])
-            numbers = np.concatenate([np.reshape(rows, (-1, len(NUMBERS))), *(rows.numbers for rows in shape.plain)])
+            numbers = np.concatenate([np.reshape(own, (-1, len(NUMBERS))), *(rows.numbers for rows in shape.plain)])
             try:
                 check_places(shape)
                 check_numbers(lines, numbers, shape.columns is not None)
             except UnclearColumns as error:
                 for line in lines.tolist():
-                    self._reject(line, error)
+                    self._reject(line, error.kind, str(error))
                 continue
             if shape.columns is None and brakes_most(numbers):
                 for line in sorted(lines.tolist()):
@@ -115,10 +115,10 @@ class TolerantReader:
                         "the brake is pressed more than the throttle, as in braking or driving backwards", line
                     )
             self.plain += shape.plain
-            for line, names, tokens in zip(shape.lines, shape.names, shape.tokens, strict=True):
+            for line, names, tokens, values in zip(shape.lines, shape.names, shape.tokens, own, strict=True):
                 if shape.has_extra_columns:
                     self._repair("extra columns ignored", line)
-                self._add_row(line, names, tokens[: len(NUMBERS)])
+                self._add_row(line, names, tokens[: len(NUMBERS)], values)
         if open_line in self.lines or any(open_line in rows.lines[-1:] for rows in self.plain):
             self._repair("the file ends within this line: its last number may be cut short", open_line)
         self.repairs = dict(sorted(self.repairs.items(), key=lambda item: item[1][1]))
@@ -128,17 +128,14 @@ class TolerantReader:
         text = text.strip("\r\n")
         if NO_CONTENT.fullmatch(text):
             if "\0" in text:
-                self._reject(
-                    line, UnclearColumns("binary zeros", "the file was cut off while it was written; delete the line")
-                )
+                self._reject(line, "binary zeros", "the file was cut off while it was written; delete the line")
             return
         if text.startswith(MERGE_MARKERS):
-            error = UnclearColumns("merge conflict", f"{text[:20]!r}: resolve the merge, delete the line")
-            return self._reject(line, error)
+            return self._reject(line, "merge conflict", f"{text[:20]!r}: resolve the merge, delete the line")
         if len(text) > LONGEST_LINE:
             self.rows += 1
-            error = UnclearColumns("not a row", f"a line of {len(text)} characters: {text[:40]!r}…; delete it")
-            return self._reject(line, error)
+            detail = f"a line of {len(text)} characters: {text[:40]!r}…; delete it"
+            return self._reject(line, "not a row", detail)
         enough = [mark for mark in "\t;," if text.count(mark) >= len(COLUMNS) - 1]  # commas may also be decimal marks
         delimiter = enough[0] if enough else max(",;\t", key=text.count)
         fields = [value.strip() for value in next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))]
@@ -157,7 +154,7 @@ class TolerantReader:
         try:
             self._read_row(line, fields, images, delimiter == ",")
         except UnclearColumns as error:
-            self._reject(line, error)
+            self._reject(line, error.kind, str(error))
 
     def _read_header(self, line: int, fields: list[str]) -> None:
         try:
@@ -231,11 +228,8 @@ class TolerantReader:
             elif self._commas or found:
                 ways = f" in {len(found)} ways" if len(found) > 1 else ""
                 reason = f"may be four numbers with decimal commas{ways}{hint}" if found else "are not four numbers"
-                error = UnclearColumns(
-                    "ambiguous columns",
-                    f"{','.join(tokens)!r} {reason}; write decimal points, or delete the extra columns",
-                )
-                self._reject(line, error)
+                remedy = "write decimal points, or delete the extra columns"
+                self._reject(line, "ambiguous columns", f"{','.join(tokens)!r} {reason}; {remedy}")
             else:
                 self._collect(shape, line, names, tokens)
 
@@ -251,33 +245,28 @@ class TolerantReader:
                     )
                 self._repair("images in another order; ordered by the cameras in their names", line)
         except UnclearColumns as error:
-            return self._reject(line, error)
+            return self._reject(line, error.kind, str(error))
         shape.lines.append(line)
         shape.names.append(ordered)
         shape.tokens.append(tokens)
         return None
 
-    def _add_row(self, line: int, names: Sequence[str], tokens: list[str]) -> None:
+    def _add_row(self, line: int, names: Sequence[str], tokens: list[str], numbers: list[float]) -> None:
         """Add a row if its four tokens are numbers in their ranges, else reject it."""
-        numbers = [number(token) for token in tokens]
         if any(value != value for value in numbers):
-            error = UnclearColumns("not a number", f"{','.join(tokens)!r}; correct or delete the row")
-            return self._reject(line, error)
+            return self._reject(line, "not a number", f"{','.join(tokens)!r}; correct or delete the row")
         for (name, (least, greatest)), value in zip(RANGES.items(), numbers, strict=True):
             if not least <= value <= greatest:
                 lost = " (has its decimal point been lost?)" if name == "speed" else ""
-                error = UnclearColumns(
-                    f"{name} out of range",
-                    f"{name} {value:g} is not in {least}..{greatest}{lost}; correct or delete the row",
-                )
-                return self._reject(line, error)
+                detail = f"{name} {value:g} is not in {least}..{greatest}{lost}; correct or delete the row"
+                return self._reject(line, f"{name} out of range", detail)
         self.names += [name.encode(errors="surrogateescape") for name in names]
         self.numbers += numbers
         self.lines.append(line)
         return None
 
-    def _reject(self, line: int, error: UnclearColumns) -> None:
-        self.rejected.append((line, error.kind, str(error)))
+    def _reject(self, line: int, kind: str, detail: str) -> None:
+        self.rejected.append((line, kind, detail))
 
     def _repair(self, kind: str, line: int) -> None:
         self.repairs.setdefault(kind, [0, line])[0] += 1

@@ -257,10 +257,7 @@ class Checkpoint:
             **more,
             training={
                 "optimizer": self.optimizer.state_dict(),
-                "number": progress.number,
-                "images": progress.images,
-                "loss": progress.loss,
-                "seconds": progress.seconds,
+                **{name: getattr(progress, name) for name in PLACE},
                 "fingerprint": self.fingerprint,
             },
         )

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from cloning.road.generated import generate
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.scenery import looks, planting, textures
-from simulator.scenery.jungle import DASH, GAP
+from simulator.scenery.jungle import CLEAR_DISTANCE, DASH, GAP
 from simulator.scenery.looks import Look, Palette
 from simulator.scenery.parts import Haze, Scenery, assemble
 from simulator.scenery.shapes import (
@@ -34,7 +34,6 @@ from simulator.scenery.textures import Line
 
 GRID_SPACING = 5.0  # m between the ground's points around the road
 GROUND_MARGIN, FARTHEST = 45.0, 330.0  # m of such ground around the road; m from there on to the end of the land
-CLEAR_DISTANCE = 9.5  # m from the centre line within which the ground stays below the road
 VERGE_EDGE = 9.8  # m from the centre line to the end of the verge, which hides the ground's steps
 HARD_SHOULDER = 0.35  # m of asphalt beyond the lines
 KERB_WIDTH, WALL_HEIGHT, RAIL_DISTANCE = 0.7, 0.8, 0.5  # m; the last from the edge of the road
