@@ -200,7 +200,8 @@ def files(draw):
         at = draw(st.integers(0, len(lines) - 1))
         text, row = lines[at]
         damage = draw(st.sampled_from(["cut", "twice", "between"]))
-        if damage == "cut" and row is not None:  # before the numbers end, so that it shows
+        # Before the numbers end, so that it shows; not a row that steers left: it may be the evidence of the order.
+        if damage == "cut" and row is not None and row[1][0] >= 0:
             lines[at] = text[: draw(st.integers(0, max(0, text.lower().rfind(".jp"))))] + "\n", None
         elif damage == "twice":
             lines.insert(at, (text, row))
