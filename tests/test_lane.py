@@ -42,9 +42,10 @@ from simulator import __main__ as simulator
 from simulator.car import STEP
 from simulator.record import record
 from tools import follow_driver, lane_accuracy, train_lane
-from tools.train_lane import consistency_loss, render_strips, strip_homography, visible_mask
+from tools.lane_frames import RenderedScene, render_strips
+from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
-SHORT_TRAINING = ("--looks", "1", "--frames", "6", "--steps", "2")
+SHORT_TRAINING = ("--looks", "1", "--roads", "1", "--frames", "3", "--steps", "2")
 PILOT = ROOT / "cloning" / "pilot" / "shipped.pt"
 UNSEEN = 1003  # a look that the network was not trained on
 
@@ -154,7 +155,7 @@ def test_the_ground_moves_with_the_camera():
     ],
 )
 def test_the_shipped_network_on_rendered_frames(track, look, error, bias, slope):
-    strips, true = render_strips(track, look, 60, 5)
+    strips, true = render_strips(RenderedScene(track, look, 60), 5)
     found = estimate_centres(strips)
     assert np.nanmean(np.abs(found - true)[:, :3]) < error
     assert np.abs(np.nanmean((found - true)[:, :3])) < bias
@@ -163,7 +164,7 @@ def test_the_shipped_network_on_rendered_frames(track, look, error, bias, slope)
 
 
 def test_mirrored_frames_mirror_the_place():
-    strips, _ = render_strips("lake", UNSEEN, 8, 6)
+    strips, _ = render_strips(RenderedScene("lake", UNSEEN, 8), 6)
     found, mirrored = estimate_centres(strips), estimate_centres(strips[:, :, ::-1])
     assert mirrored == pytest.approx(-found, abs=0.02)  # two steps of bfloat16 at 3 m
     assert np.array_equal(estimate_centres(strips), found)

@@ -8,6 +8,7 @@ that the network was not trained on. For real recordings only the position of th
 """
 
 import argparse
+import itertools
 import tempfile
 import time
 from pathlib import Path
@@ -44,21 +45,30 @@ from cloning.road.track import ROADS, Track
 from simulator.car import STEP
 from simulator.record import record
 from simulator.scenery import jungle, lake
-from tools.train_lane import render_strips
+from tools.lane_frames import RenderedScene, render_all, shadowed
 
-UNSEEN_LOOKS = range(1000, 1003)  # the network was not trained on them
+UNSEEN_LOOKS = (1000, 1001, 1002)  # the network was not trained on them, nor on these roads
+UNSEEN_ROADS = tuple(f"road-{number}" for number in range(1, 9))
 LINE_OFFSETS = {"lake": lake.INNER_LINE, "jungle": jungle.EDGE_LINE}  # m from the lane's centre to its lines
 GREEN, RED = (0, 220, 0), (0, 0, 255)  # BGR
+
+
+def unseen_courses() -> dict[str, list[tuple[str, int]]]:
+    """Return courses by name, each with its tracks and looks."""
+    courses = {}
+    for name in ROADS:
+        courses[name] = [(name, look) for look in UNSEEN_LOOKS]
+        courses[f"{name}, shadows"] = [(name, shadowed(look)) for look in UNSEEN_LOOKS]
+    courses["roads"] = list(zip(UNSEEN_ROADS, range(1000, 1000 + len(UNSEEN_ROADS)), strict=True))
+    courses["roads, shadows"] = [(road, shadowed(look)) for road, look in courses["roads"]]
+    return courses
 
 
 def measure_frames(network: LaneNetwork) -> None:
     """Print the errors of single rendered frames from random poses, at each distance ahead."""
     print(f"{'rendered frames, m ahead':34}" + "".join(f"{distance:>8g}" for distance in DISTANCES_AHEAD))
-    for name in ROADS:
-        strips, true = (
-            np.concatenate(arrays)
-            for arrays in zip(*(render_strips(name, look, 150, 1) for look in UNSEEN_LOOKS), strict=True)
-        )
+    for name, courses in unseen_courses().items():
+        strips, true = render_all([RenderedScene(track, look, 150) for track, look in courses], seed=1)
         estimated = estimate_centres(strips, network)
         slopes = []
         for x, y in zip(true.T, estimated.T, strict=True):
@@ -75,20 +85,19 @@ def measure_frames(network: LaneNetwork) -> None:
 
 def measure_drives(network: LaneNetwork, laps: float) -> None:
     """Print the errors on recordings of the stand-in simulator, which logs the true position."""
-    for name in ROADS:
-        for look in UNSEEN_LOOKS:
-            with tempfile.TemporaryDirectory() as folder:
-                run, _ = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
-                recording = read_recording(folder)
-                position = fuse_detections(recording, detect_centres(recording, network))
-            step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-            true = np.array(run.trajectory.offset)[step]
-            error = position.lateral_offset - true
-            print(
-                f"{f'rendered drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
-                f"95th percentile {np.quantile(np.abs(error), 0.95):.2f}, bias {error.mean():+.2f}, "
-                f"slope {np.polyfit(true, position.lateral_offset, 1)[0]:.2f}; trusted {position.trusted.mean():.1%}"
-            )
+    for name, look in itertools.chain(*unseen_courses().values()):
+        with tempfile.TemporaryDirectory() as folder:
+            run, _ = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
+            recording = read_recording(folder)
+            position = fuse_detections(recording, detect_centres(recording, network))
+        step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
+        true = np.array(run.trajectory.offset)[step]
+        error = position.lateral_offset - true
+        print(
+            f"{f'rendered drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
+            f"95th percentile {np.quantile(np.abs(error), 0.95):.2f}, bias {error.mean():+.2f}, "
+            f"slope {np.polyfit(true, position.lateral_offset, 1)[0]:.2f}; trusted {position.trusted.mean():.1%}"
+        )
 
 
 def measure_recording(folder: str, network: LaneNetwork) -> None:

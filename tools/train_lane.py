@@ -2,17 +2,17 @@
 
     python -m tools.train_lane data/lake-ccw data/jungle     # on rendered frames and these real recordings
 
-The network learns absolute positions from rendered frames: both tracks in many looks, from known poses. The pose of a
-real frame is unknown, but differences between poses are known: between the cameras of the car, between two rows of a
-drive, and between two warps of a frame. The network learns these from real recordings. Half of all frames are mirrored,
-so that no side is preferred. The weights are written to lane.pt in the current folder, which git ignores. To ship them,
-measure them with `python -m tools.lane_accuracy --network lane.pt`, then copy the file to cloning/lane/lane.pt.
+The network learns absolute positions from rendered frames: both tracks and generated roads in many looks, from known
+poses. The pose of a real frame is unknown, but differences between poses are known: between the cameras of the car,
+between two rows of a drive, and between two warps of a frame. The network learns these from real recordings. Half of
+all frames are mirrored, so that no side is preferred. The weights are written to lane.pt in the current folder, which
+git ignores. To ship them, measure them with `python -m tools.lane_accuracy --network lane.pt`, then copy the file to
+cloning/lane/lane.pt.
 """
 
 import argparse
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from cloning import program
@@ -25,88 +25,30 @@ import numpy as np
 import torch
 
 from cloning.arguments import number
-from cloning.compute import choose_precision, in_precision, one_thread, threads
+from cloning.compute import choose_precision, in_precision, one_thread
 from cloning.errors import UserError
-from cloning.lane.place import centre_ahead
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
     STRIP_SHAPE,
     STRIP_TO_LEVEL,
     LaneNetwork,
-    extract_strip,
     normalize,
     read_strips,
     save_network,
 )
-from cloning.recordings.images import decode
 from cloning.recordings.log import find_folders, read_recording
 from cloning.road.camera import LEVEL_CAMERA_MATRIX, camera_position, homographies
-from cloning.road.motion import CAMERA_FORWARD, MAX_GAP, Stretch, components, forward_vector
-from cloning.road.track import Track
+from cloning.road.motion import MAX_GAP, Stretch, components, forward_vector
+from tools.lane_frames import render_all, scenes
 
-FRAME_SHARES = {"lake": 1, "jungle": 2}  # relative number of rendered frames: hills and narrow bends are harder
-MAX_OFFSET, MAX_YAW = 3.5, 15.0  # m and degrees: lateral offset and heading error in rendered frames
 WARP_DEVIATION = (0.9, 3.0)  # m and degrees: standard deviations of the poses to which real frames are warped
 RENDERED, PAIRS = 96, 40  # rendered frames and pairs of real frames in a batch
 DISTANCE_WEIGHTS = torch.tensor([1.0, 1.0, 0.9, 0.7, 0.5])  # of the errors at DISTANCES_AHEAD
 HUBER_THRESHOLD = 0.3  # m: the loss is quadratic in smaller errors and linear in larger ones
 FLAT_GROUND = 8.0  # m ahead: detections in warped frames are compared up to here; further away the ground is not flat
+BRIGHTNESS = (0.3, 1.4)  # least and greatest factor; dark ones lose digits, as frames in dark shade did
 TRAVEL = (1.0, 8.0)  # m that the car drives between the two frames of a pair
-
-
-# --------------------------------------------------------------------------------------------------
-# Rendered frames, from known poses
-
-
-def render_strips(track_name: str, look: int, frames: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render strips from random poses, and return them with the true positions of the lane's centre.
-
-    The car is off the lane's centre, turned, and pitches and rolls as on its springs, in both directions of the track.
-    Strips: uint8 (n, 32, 160, 3); centres: float32 (n, 5), m to the right of the camera, nan where it is out of sight.
-    """
-    from panda3d.core import Point3, TransformState, Vec3
-
-    from simulator import scenery
-    from simulator.cameras import Cameras, jpeg
-    from simulator.world import Scene
-
-    rng = np.random.default_rng([seed, look, list(FRAME_SHARES).index(track_name)])
-    cameras = Cameras(Scene(scenery.build(track_name, look)), ("center",))
-    tracks = [Track(track_name, direction) for direction in ("ccw", "cw")]
-    strips, centres = np.empty((frames, *STRIP_SHAPE), np.uint8), np.empty((frames, len(DISTANCES_AHEAD)), np.float32)
-    positions = np.sort(rng.uniform(0, tracks[0].length, frames))  # sorted, because haze is computed again every 25 m
-    for k, position in enumerate(positions):
-        direction = rng.integers(2)
-        track, s = tracks[direction], (position, tracks[0].length - position)[direction]
-        right = rng.uniform(-MAX_OFFSET, MAX_OFFSET)
-        large = rng.random() < 0.3
-        yaw = rng.uniform(-MAX_YAW, MAX_YAW) if large else np.clip(rng.normal(0, MAX_YAW / 3), -MAX_YAW, MAX_YAW)
-        place = track.at(s, right)
-        heading = place.heading - np.radians(yaw)
-        pitch = np.degrees(np.arctan(place.grade)) + rng.normal(0.1, 0.5)
-        angles = Vec3(np.degrees(heading) - 90, pitch, rng.normal(0, 0.6))
-        middle = Point3(place.x, place.y, place.z + rng.normal(0.025, 0.03))
-        frame = cameras.frames(TransformState.make_pos_hpr(middle, angles))[0]
-        strips[k] = extract_strip(decode(jpeg(frame)))
-        along = np.array([np.cos(heading), np.sin(heading)])
-        centres[k] = centre_ahead(track, s, np.array([place.x, place.y]) + CAMERA_FORWARD * along, heading)
-    return strips, centres
-
-
-def render_all(looks: range, frames: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run `render_strips` for both tracks in these looks, in several processes.
-
-    Look 0, which resembles the real simulator, gets three times as many frames.
-    """
-    jobs = [
-        (track, look, frames * share * (1 if look else 3), seed)
-        for look in looks
-        for track, share in FRAME_SHARES.items()
-    ]
-    with ProcessPoolExecutor(threads(), mp_context=multiprocessing.get_context("spawn")) as pool:
-        strips, centres = zip(*pool.map(render_strips, *zip(*jobs, strict=True)), strict=True)
-    return np.concatenate(strips), np.concatenate(centres)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -143,7 +85,7 @@ class PhotometricAugmentation:
             for _ in range(rng.integers(1, 4)):  # bands with soft edges
                 angle, edge, width = rng.uniform(0, 2 * np.pi), rng.uniform(-60, 60), rng.uniform(8, 200)
                 depth = np.cos(angle) * (across - columns / 2) + np.sin(angle) * 2 * (down - rows / 2) - edge
-                shadow *= np.where((depth > 0) & (depth < width), rng.uniform(0.35, 0.95), 1)[..., None]
+                shadow *= np.where((depth > 0) & (depth < width), rng.uniform(0.15, 0.95), 1)[..., None]
             shadow[:] = cv2.GaussianBlur(shadow, (0, 0), rng.uniform(0.3, 2))
         yaws = np.radians(rng.normal(0, 4, 512))
         poses = zip(rng.normal(0, 0.8, 512), yaws, strict=True)
@@ -173,7 +115,7 @@ class PhotometricAugmentation:
         if rng.random() < 0.6:
             strip = cv2.add(strip, self.noise[rng.integers(len(self.noise))], dtype=cv2.CV_8U)
         level = (np.arange(256)[:, None] / 255) ** rng.uniform(0.6, 1.6)
-        table = level * rng.uniform(0.6, 1.4) * rng.uniform(0.85, 1.15, 3) * 255
+        table = level * np.exp(rng.uniform(*np.log(BRIGHTNESS))) * rng.uniform(0.85, 1.15, 3) * 255
         return cv2.LUT(strip, np.clip(table, 0, 255).astype(np.uint8)[None])
 
 
@@ -364,14 +306,17 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         prog="train_lane", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
-    parser.add_argument("--looks", type=number(int, 1), default=24, help="looks of each rendered track (default 24)")
+    parser.add_argument(
+        "--looks", type=number(int, 1), default=24, help="looks of each track, each also with shadows (default 24)"
+    )
     parser.add_argument(
         "--frames",
         type=number(int, 1),
-        default=200,
-        help="lake frames per look; twice as many jungle ones (default 200)",
+        default=150,
+        help="frames of the lake in a look, and of each road; twice as many of the jungle (default %(default)s)",
     )
-    parser.add_argument("--steps", type=number(int, 1), default=2400, help="batches to train on (default %(default)s)")
+    parser.add_argument("--roads", type=number(int, 0), default=100, help="generated roads (default %(default)s)")
+    parser.add_argument("--steps", type=number(int, 1), default=3600, help="batches to train on (default %(default)s)")
     parser.add_argument("--seed", type=number(int, 0), default=0, help="of all random choices (default %(default)s)")
     parser.add_argument("--output", type=Path, default=Path("lane.pt"), help="file of weights (default %(default)s)")
     return parser.parse_args(argv)
@@ -382,8 +327,9 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parse(argv)
     try:
         recordings = [RealRecording(folder) for folder in find_folders(arguments.recordings)]
-        print(f"rendering {arguments.looks} looks of {' and '.join(FRAME_SHARES)}", flush=True)
-        strips, centres = render_all(range(arguments.looks), arguments.frames, arguments.seed)
+        chosen = scenes(arguments.looks, arguments.roads, arguments.frames)
+        print(f"rendering {sum(scene.frames for scene in chosen)} frames of {len(chosen)} scenes", flush=True)
+        strips, centres = render_all(chosen, arguments.seed)
         network = train(BatchSampler(strips, centres, recordings, arguments.seed), arguments.steps)
         save_network(arguments.output, network)
     except (UserError, OSError) as error:

@@ -35,6 +35,7 @@ from cloning.road.motion import (
     stretches,
 )
 from cloning.road.warp import SOURCE_ROWS, CroppedView
+from cloning.training import light
 from cloning.training.observations import SEEN_SHAPE, Example, Observations, ValidationSet, Views, center_digests
 from cloning.training.options import Arguments
 
@@ -47,8 +48,6 @@ YAW_DEVIATION, MAX_POSE_YAW = np.radians(8), np.radians(25)
 MAX_SHIFT = 2.4  # m from the recorded trajectory: further away the frames show too little of the road
 CAMERA_REACH = 1.7  # m: a camera this near to a pose may supply its image
 STRAIGHT_WEIGHT = 0.2  # sampling weight on a straight; elsewhere |steering along the lane| is added
-TINTED_SHARE = 0.5  # of the images whose colours are changed
-SATURATION, TINT = (0.1, 1.5), (0.85, 1.15)  # ranges of the factors of saturation, and of red, green and blue each
 MIRRORED_SHARE = 0.5  # of the images in a batch
 VIEW = CroppedView(CROP)
 
@@ -176,7 +175,7 @@ class Lanes:
         distance = np.abs(eye[:, None] - list(CAMERA_OFFSETS.values()))
         near = distance <= np.maximum(CAMERA_REACH, distance.min(1, keepdims=True))
         poses = Poses.of(self, offset, yaw, np.argmax(near * rng.uniform(1, 2, (n, 3)), axis=1), mirrored)
-        poses.colours = np.where((rng.random(n) < TINTED_SHARE)[:, None, None], tints(rng, n), poses.colours)
+        poses.colours, poses.shade = light.tints(rng, n), light.sample_shades(rng, n)
         return poses
 
 
@@ -189,7 +188,8 @@ class Poses:
     warps     float64 (n, 2, 2, 3, 3): homographies from a frame's `SOURCE_ROWS` to what the network sees: from the
               row's own frame and from the earlier one, for the ground and for the sky
     steering  float32 (n,): the label, -1..1
-    colours   float32 (n, 3, 3): matrices by which (red, green, blue) is multiplied
+    colours   float32 (n, 3, 3): matrices by which (red, green, blue) is multiplied, see `light.tints`
+    shade     int16 (n,): shadows, see `light.sample_shades`
     """
 
     camera: np.ndarray
@@ -197,10 +197,11 @@ class Poses:
     warps: np.ndarray
     steering: np.ndarray
     colours: np.ndarray
+    shade: np.ndarray
 
     @staticmethod
     def of(lanes: Lanes, offset: np.ndarray, yaw: np.ndarray, camera: np.ndarray, mirrored: np.ndarray) -> "Poses":
-        """Return the poses at the rows of `lanes`, with unchanged colours; offset, yaw: float (n,), the poses."""
+        """Return the poses at the rows of `lanes`, in unchanged light; offset, yaw: float (n,), the poses."""
         turn = yaw - lanes.yaw
         # The pose relative to the recorded rear axle, in the recorded car's frame: m right, m forward.
         away = offset - lanes.offset
@@ -210,8 +211,9 @@ class Poses:
         own_frame = np.zeros_like(lanes.moved)
         warps = [VIEW.homographies(eye, turn, moved, side, mirrored) for moved in (own_frame, lanes.moved)]
         steering = lanes.steering(offset, yaw)
-        colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
-        return Poses(camera, mirrored, np.stack(warps, axis=1), np.where(mirrored, -steering, steering), colours)
+        labels = np.where(mirrored, -steering, steering)
+        colours, shade = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1)), np.full(len(turn), -1, np.int16)
+        return Poses(camera, mirrored, np.stack(warps, axis=1), labels, colours, shade)
 
     def take(self, rows: np.ndarray) -> "Poses":
         """Return these rows, in this order; rows: indices."""
@@ -228,14 +230,7 @@ class Poses:
         if not seen.all():
             earlier, _ = VIEW.warp(read(camera, True), self.warps[at, 1], mirrored)
             cv2.copyTo(earlier, cv2.bitwise_not(seen), image)
-        return cv2.transform(image, self.colours[at])
-
-
-def tints(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Sample changes of saturation and tint: float32 (n, 3, 3), matrices by which RGB colours are multiplied."""
-    saturation = rng.uniform(*SATURATION, n)[:, None, None]
-    tint = rng.uniform(*TINT, (n, 3, 1))
-    return (tint * (saturation * np.eye(3) + (1 - saturation) / 3)).astype(np.float32)
+        return light.relight(image, self.colours[at], int(self.shade[at]))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

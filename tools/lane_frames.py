@@ -1,0 +1,95 @@
+"""Render frames from known poses, by which the lane network is trained and measured.
+
+The tracks are rendered in many looks, with and without shadows, and so are generated roads, so that neither the light
+nor the road is one that the network knows. Roads below FIRST_ROAD and looks from 101 on are left to measure with.
+"""
+
+import multiprocessing
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from panda3d.core import Point3, TransformState, Vec3
+
+from cloning.compute import threads
+from cloning.lane.place import centre_ahead
+from cloning.lane.reader import DISTANCES_AHEAD, STRIP_SHAPE, extract_strip
+from cloning.recordings.images import decode
+from cloning.road.motion import CAMERA_FORWARD
+from cloning.road.track import Track
+from simulator import scenery
+from simulator.cameras import Cameras, jpeg
+from simulator.scenery.looks import SHADOWED
+from simulator.world import Scene
+
+FRAME_SHARES = {"lake": 1, "jungle": 2}  # relative number of frames: hills and narrow bends are harder
+FIRST_ROAD = 1001  # the first generated road that networks are trained on
+MAX_OFFSET, MAX_YAW = 3.5, 15.0  # m and degrees: lateral offset and heading error
+
+
+class RenderedScene(NamedTuple):
+    """A track in a look, and the number of frames to render of it."""
+
+    track: str
+    look: int
+    frames: int
+
+
+def shadowed(look: int) -> int:
+    """Return a look's twin with shadows: every second one with the dark kind."""
+    return look + SHADOWED * (1 + look % 2)
+
+
+def scenes(looks: int, roads: int, frames: int) -> list[RenderedScene]:
+    """Return what the lane network is trained on: both tracks in so many looks, and so many generated roads.
+
+    Each look of a track comes without and with shadows; every second road has shadows. frames: of a scene, times the
+    track's share. Look 0, which resembles the real simulator, gets three times as many.
+    """
+    tracks = [
+        RenderedScene(track, twin, frames * share * (1 if look else 3))
+        for look in range(looks)
+        for track, share in FRAME_SHARES.items()
+        for twin in (look, shadowed(look))
+    ]
+    chosen = (shadowed(number) if number % 4 < 2 else number for number in range(roads))
+    return tracks + [RenderedScene(f"road-{FIRST_ROAD + k}", look, frames) for k, look in enumerate(chosen)]
+
+
+def render_strips(scene: RenderedScene, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Render strips from random poses, and return them with the true positions of the lane's centre.
+
+    The car is off the lane's centre, turned, and pitches and rolls as on its springs, in both directions of the track.
+    Strips: uint8 (n, 32, 160, 3); centres: float32 (n, 5), m to the right of the camera, nan where it is out of sight.
+    """
+    name, look, frames = scene
+    rng = np.random.default_rng([seed, look, *name.encode()])
+    cameras = Cameras(Scene(scenery.build(name, look)), ("center",))
+    tracks = [Track(name, direction) for direction in ("ccw", "cw")]
+    strips, centres = np.empty((frames, *STRIP_SHAPE), np.uint8), np.empty((frames, len(DISTANCES_AHEAD)), np.float32)
+    positions = np.sort(rng.uniform(0, tracks[0].length, frames))  # sorted, because haze is computed again every 25 m
+    for k, position in enumerate(positions):
+        direction = rng.integers(2)
+        track, s = tracks[direction], (position, tracks[0].length - position)[direction]
+        right = rng.uniform(-MAX_OFFSET, MAX_OFFSET)
+        large = rng.random() < 0.3
+        yaw = rng.uniform(-MAX_YAW, MAX_YAW) if large else np.clip(rng.normal(0, MAX_YAW / 3), -MAX_YAW, MAX_YAW)
+        place = track.at(s, right)
+        heading = place.heading - np.radians(yaw)
+        pitch = np.degrees(np.arctan(place.grade)) + rng.normal(0.1, 0.5)
+        angles = Vec3(np.degrees(heading) - 90, pitch, rng.normal(0, 0.6))
+        middle = Point3(place.x, place.y, place.z + rng.normal(0.025, 0.03))
+        frame = cameras.frames(TransformState.make_pos_hpr(middle, angles))[0]
+        strips[k] = extract_strip(decode(jpeg(frame)))
+        along = np.array([np.cos(heading), np.sin(heading)])
+        centres[k] = centre_ahead(track, s, np.array([place.x, place.y]) + CAMERA_FORWARD * along, heading)
+    return strips, centres
+
+
+def render_all(chosen: Iterable[RenderedScene], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Run `render_strips` for several scenes, in several processes, and return all frames."""
+    jobs = [(scene, seed) for scene in chosen]
+    with ProcessPoolExecutor(threads(), mp_context=multiprocessing.get_context("spawn")) as pool:
+        strips, centres = zip(*pool.map(render_strips, *zip(*jobs, strict=True)), strict=True)
+    return np.concatenate(strips), np.concatenate(centres)
