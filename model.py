@@ -53,7 +53,6 @@ from cloning.training.stop import SIGNALS, Interrupted, StopSignals
 # The numbers of the report's recipe that are not options.
 STRAIGHT, KEEP_STRAIGHT = 0.02, 0.8  # below this |steering| an observation is kept with this probability
 TURN, JITTER = (0.2, 0.5), 0.01  # within this range of |steering| a copy is added, its angle changed by up to 1 %
-PROBLEM_AREAS, REPEATS = ("-repetitive", "-corrections"), 4  # a recording whose name ends like this counts so often
 BLOCK_SECONDS, FOLDS = 2.0, 5  # every fifth block of two seconds is for validation
 FLIP, SHADOW = 0.9, 0.8  # probabilities of these images; the unaltered and the brightened image are always made
 BRIGHTNESS, DARKNESS = (0.4, 1.2), (0.2, 0.5)  # ranges of the factors of HSV value and HLS lightness
@@ -119,9 +118,7 @@ class ReportObservations(Observations):
         jittered = self.steering[turns] * (1 + JITTER * rng.uniform(-1, 1, len(turns)))
         rows = np.concatenate([kept, turns])
         labels = np.concatenate([self.steering[kept], jittered.astype(np.float32)])
-        names = [recording.folder.resolve().name for recording in self.recordings]
-        repeats = np.array([REPEATS if name.endswith(PROBLEM_AREAS) else 1 for name in names])
-        times = repeats[self.recording[rows]]
+        times = self.repeats()[rows]
         return self.take(np.repeat(rows, times), np.repeat(labels, times))
 
     def shuffle(self, rng: np.random.Generator) -> np.ndarray:

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
 from cloning.road.warp import SOURCE_ROWS, ground_mask
-from cloning.training import robust
+from cloning.training import light, robust
+from cloning.training.observations import SEEN_SHAPE
 from cloning.training.robust import Lanes, Poses, RobustObservations
 
 N, SPEED = 300, 20.0  # rows; mph
@@ -301,21 +303,56 @@ def test_drives_too_short_are_named(tmp_path):
     assert "too short" in done.stderr
 
 
-def test_tints_keep_grey_nearly_grey_and_light():
+def test_tints_keep_grey_nearly_grey():
     grey, red = (np.float32([100, 100, 100]), np.float32([200, 50, 50]))
-    colours = robust.tints(np.random.default_rng(0), 1000)
-    assert colours.shape == (1000, 3, 3) and colours.dtype == np.float32
-    made = colours @ grey
-    assert made.min() >= 84.9 and made.max() <= 115.1 and made.std(0) == pytest.approx(8.7, abs=1)
-    paler = np.ptp(colours @ red, axis=1) / 150
+    colours = light.tints(np.random.default_rng(0), 2000)
+    assert colours.shape == (2000, 3, 3) and colours.dtype == np.float32
+    plain = (colours == np.eye(3)).all((1, 2))
+    assert plain.mean() == pytest.approx(1 - light.TINTED_SHARE, abs=0.03)
+    made = (colours @ grey)[~plain]
+    assert made.min() >= 100 * 0.5 * 0.85 - 0.1 and made.max() <= 100 * 1.15 * 1.15 + 0.1
+    brightness = made.mean(1, keepdims=True)
+    assert brightness.min() < 55 and brightness.max() > 110
+    assert (made / brightness).std(0) == pytest.approx(0.07, abs=0.02)
+    paler = np.ptp(colours[~plain] @ red, axis=1) / 150 / brightness[:, 0] * 100
     assert paler.min() < 0.2 and paler.max() > 1.4
 
 
-def test_half_of_the_images_are_tinted(monkeypatch):
-    many = lanes(monkeypatch, 0.05, offset=0.4).take(np.full(1000, 100))
-    poses = many.sample_poses(np.random.default_rng(0), np.zeros(1000, bool))
-    plain = (poses.colours == np.eye(3)).all((1, 2))
-    assert plain.mean() == pytest.approx(0.5, abs=0.03)
+def test_shadows_darken_parts_of_some_images():
+    shades = light.sample_shades(np.random.default_rng(0), 3000)
+    assert (shades >= 0).mean() == pytest.approx(light.SHADED_SHARE, abs=0.03)
+    assert shades.min() == -1 and shades.max() == light.SHADES - 1
+    image = np.full(SEEN_SHAPE, 200, np.uint8)
+    same = np.eye(3, dtype=np.float32)
+    np.testing.assert_array_equal(light.relight(image, same, -1), image)
+    lit = np.stack([light.relight(image, same, number) for number in range(light.SHADES)])
+    assert lit.max() == 200 and lit.min() < 40
+    in_shade = (lit < 150).any(-1).mean((1, 2))
+    assert 0.02 < np.quantile(in_shade, 0.25) < np.quantile(in_shade, 0.75) < 0.9  # neither none nor all of an image
+    red, _, blue = lit[lit[..., 0] < 100].mean(0)
+    assert blue > 1.2 * red  # the sky lights the shade
+
+
+def test_a_pose_with_a_shadow_is_seen_in_it(monkeypatch):
+    many = lanes(monkeypatch, 0.05, offset=0.4).take(np.full(200, 100))
+    poses = many.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
+    grey = np.full((90, 320, 3), 150, np.uint8)
+    views = np.stack([poses.view(at, lambda camera, earlier: grey) for at in range(200)])
+    shaded = np.ptp(views, axis=(1, 2)).max(1) > 20  # of 150 in each colour
+    assert not shaded[poses.shade < 0].any()
+    assert shaded[poses.shade >= 0].mean() > 0.9  # a shadow may be faint
+
+
+def test_problem_areas_are_sampled_four_times_as_often(monkeypatch):
+    def part(folder):
+        rows = np.arange(50)
+        known = lanes(monkeypatch, 0.05).take(rows + 50)
+        recording = SimpleNamespace(folder=Path(folder))
+        return RobustObservations([recording], np.zeros(50, np.int16), rows, rows * 0.0, rows, rows * 1.0, known)
+
+    both = RobustObservations.joined([part("plain"), part("bend-repetitive")])
+    chosen = np.concatenate([both.shuffle(np.random.default_rng(seed)) for seed in range(100)])
+    assert (chosen >= 50).mean() == pytest.approx(0.8, abs=0.02)
 
 
 def test_rows_in_bends_are_sampled_more_often(monkeypatch):

@@ -20,6 +20,7 @@ from cloning.training.image_cache import ImageCache
 from cloning.training.options import Arguments
 
 SEEN_ROWS = slice(CROP[0], FRAME[0] - CROP[1])  # the rows of a frame that the network sees
+PROBLEM_AREAS, REPEATS = ("-repetitive", "-corrections"), 4  # a recording whose name ends like this counts so often
 SEEN_SHAPE = (SEEN_ROWS.stop - SEEN_ROWS.start, *FRAME[1:])  # (75, 320, 3)
 
 
@@ -202,6 +203,11 @@ class Observations(ABC):
             frame=np.concatenate([part.frame for part in parts]),
             time=np.concatenate([part.time for part in parts]),
         )
+
+    def repeats(self) -> np.ndarray:
+        """Return how often each observation counts: int (n,), REPEATS in a recording of problem areas, else 1."""
+        names = [recording.folder.resolve().name for recording in self.recordings]
+        return np.array([REPEATS if name.endswith(PROBLEM_AREAS) else 1 for name in names])[self.recording]
 
     # ---- images
 

@@ -286,8 +286,12 @@ class RobustObservations(Observations):
         return self
 
     def shuffle(self, rng: np.random.Generator) -> np.ndarray:
-        """Sample as many observations as there are, with replacement, bends more often: int (n,), indices."""
-        return rng.choice(len(self), len(self), p=self.lanes.weights())
+        """Sample as many observations as there are, with replacement: int (n,), indices.
+
+        Bends are sampled more often, and recordings of problem areas, as in the report.
+        """
+        weights = self.lanes.weights() * self.repeats()
+        return rng.choice(len(self), len(self), p=weights / weights.sum())
 
     def sample_views(
         self, rows: np.ndarray, cameras: np.ndarray, side_correction: float, rng: np.random.Generator

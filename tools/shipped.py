@@ -1,0 +1,115 @@
+"""Make the network that comes with the project: render recordings, train on them and on real ones.
+
+    python -m tools.shipped data/lake-ccw data/lake-cw data/jungle data/jungle-shadows
+
+Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
+cloning/pilot/shipped.md names the real recordings' repositories, and says how well the network drives. To ship the
+result, measure it with `python -m tools.scoreboard shipped/model.pt`, then copy it to cloning/pilot/shipped.pt.
+
+The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Looks from 101
+on and roads up to 1000 are left to measure with.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("shipped")  # also while the libraries below are loaded
+
+from cloning.arguments import number
+from cloning.errors import RecordingError, UserError
+from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
+from cloning.recordings.log import find_folders
+from cloning.road.track import ROADS, Track
+from simulator.record import record
+from simulator.scenery.looks import SHADOWED
+from tools.lane_frames import FIRST_ROAD, shadowed
+
+ROOT = Path(__file__).resolve().parent.parent
+DIRECTIONS = ("ccw", "cw")
+
+
+class Lap(NamedTuple):
+    """A lap that is rendered."""
+
+    track: str
+    direction: str
+    look: int
+
+
+def laps(looks: int, roads: int) -> list[Lap]:
+    """Return the laps to render: of both tracks in so many looks, and of so many generated roads.
+
+    Look 0, which resembles the real simulator, is driven in both directions, without and with both kinds of shadows,
+    any other look in one direction; every second one has shadows.
+    """
+    twins = (0, SHADOWED, 2 * SHADOWED)
+    chosen = [Lap(track, direction, look) for track in ROADS for direction in DIRECTIONS for look in twins]
+    for look in range(1, looks):
+        twin = shadowed(look) if look % 4 < 2 else look
+        chosen += [Lap(track, DIRECTIONS[look % 2], twin) for track in ROADS]
+    for k in range(roads):
+        twin = shadowed(k) if k % 4 < 2 else k
+        chosen.append(Lap(f"road-{FIRST_ROAD + k}", DIRECTIONS[k % 2], twin))
+    return chosen
+
+
+def render(folder: Path, chosen: list[Lap]) -> None:
+    """Record the laps that are not there yet. Raises RecordingError, SimulatorError, OSError."""
+    for i, lap in enumerate(chosen):
+        recording = folder / f"{lap.track}-{lap.direction}-look{lap.look}"
+        if recording.exists():
+            continue
+        unfinished = folder / "unfinished"
+        shutil.rmtree(unfinished, ignore_errors=True)
+        begin = time.perf_counter()
+        run, rows = record(unfinished, Track(lap.track, lap.direction), laps=1, seed=i, look=lap.look)
+        if run.departures:
+            raise RecordingError(f"{recording}: the expert left the road")
+        unfinished.rename(recording)
+        print(f"{i + 1}/{len(chosen)} {recording.name}: {rows} rows in {time.perf_counter() - begin:.0f} s", flush=True)
+
+
+def repeat(folder: Path, recordings: list[Path]) -> None:
+    """Make folders of the real recordings that training repeats as it does problem areas: their names say so."""
+    for recording in recordings:
+        twin = folder / f"{recording.resolve().name}-repetitive"
+        twin.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(recording / DRIVING_LOG, twin / DRIVING_LOG)
+        if not (twin / IMAGE_FOLDER).exists():
+            (twin / IMAGE_FOLDER).symlink_to((recording / IMAGE_FOLDER).resolve())
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Render and train; return the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="shipped", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recordings", nargs="+", help="real recordings, or folders of recordings")
+    parser.add_argument(
+        "--looks", type=number(int, 1, 101), default=21, help="looks of each track (default %(default)s)"
+    )
+    parser.add_argument("--roads", type=number(int, 0, 101), default=40, help="generated roads (default %(default)s)")
+    parser.add_argument("--epochs", type=number(int, 1), default=20, help="of 60,000 images (default %(default)s)")
+    parser.add_argument("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
+    parser.add_argument("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
+    args = parser.parse_args(argv)
+    try:
+        render(args.folder / "rendered", laps(args.looks, args.roads))
+        repeat(args.folder / "real", find_folders(args.recordings))
+    except (UserError, OSError) as error:
+        return program.failed("shipped", error)
+    training = ("--robust", "--epochs", str(args.epochs), "--seed", str(args.seed), "--resume")
+    folders = (args.folder / "real", args.folder / "rendered", "--output", args.folder / "model.pt")
+    return subprocess.run([sys.executable, ROOT / "model.py", *folders, *training]).returncode
+
+
+if __name__ == "__main__":
+    program.run(main)
