@@ -97,6 +97,7 @@ class ReportObservations(Observations):
 
     label_source: ClassVar[str] = "driver"
     too_few: ClassVar[str] = "--throttle-threshold drops most of them"
+    dropout: ClassVar[bool] = True
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:
@@ -271,11 +272,12 @@ class Generator:
         places = np.full(kinds.shape, -1)
         places[kinds] = rng.permutation(total_images)  # the batch is shuffled
         bits = np.unpackbits(np.frombuffer(rng.bytes(total_images * UNITS // 8), np.uint8))
+        keep = bits.view(bool).reshape(total_images, UNITS) if self.observations.dropout else None
         return Choices(
             observation=chosen,
             camera=camera,
             places=places,
-            keep=bits.view(bool).reshape(total_images, UNITS),
+            keep=keep,
             brightness=rng.uniform(*BRIGHTNESS, n),
             darkness=rng.uniform(*DARKNESS, n),
             line=rng.uniform(0, FRAME[1], (n, 2)),
@@ -301,7 +303,8 @@ class Generator:
         def wait() -> Batch:
             for part in parts:
                 part.result()
-            return Batch(images, labels, choices.keep[order], len(choices.keep))
+            keep = None if choices.keep is None else choices.keep[order]
+            return Batch(images, labels, keep, int((choices.places >= 0).sum()))
 
         return wait
 

@@ -28,7 +28,6 @@ from cloning.lane.place import estimate_lane_position
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
-    STRIP_SHAPE,
     LaneNetwork,
     LanePosition,
     detect_centres,
@@ -106,7 +105,7 @@ def measure_recording(folder: str, network: LaneNetwork) -> None:
     started = time.perf_counter()
     strips = read_strips(recording)
     decoded = time.perf_counter()
-    centres = estimate_centres(strips.reshape(-1, *STRIP_SHAPE), network).reshape(-1, 3, len(DISTANCES_AHEAD))
+    centres = estimate_centres(strips, network)
     estimated = time.perf_counter()
     position = fuse_detections(recording, centres)
     finished = time.perf_counter()

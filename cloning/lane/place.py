@@ -12,21 +12,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from cloning.lane.reader import (
+    ANY_ROAD_WEIGHTS,
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
     LaneNetwork,
     LanePosition,
-    detect_centres,
+    estimate_centres,
     fuse_detections,
+    load_network,
+    read_strips,
 )
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
 from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, wrap_angle
 from cloning.road.track import ROADS, Track
 
-# Measurement noise: standard deviation of a detection at each distance ahead, m. Twice that of a single frame, because
-# the errors of consecutive frames are correlated.
-MEASUREMENT_NOISE = (0.3 + 0.08 * DISTANCES_AHEAD) * 2
+MEASUREMENT_NOISE = 0.3 + 0.08 * DISTANCES_AHEAD  # standard deviation of a detection at each distance ahead, m
+LIKELIHOOD_SCALE = 2 * MEASUREMENT_NOISE  # of the distribution by which a localisation is judged
 OUTLIER_THRESHOLD = 2.0  # standard deviations beyond which a detection gets less weight
 MISSING_DETECTION = 3.0  # standard deviations that are counted where the track is out of the camera's view
 # Process noise: standard deviations of (s, lateral offset, heading error) that each row adds: per metre driven, per
@@ -85,6 +87,7 @@ class TrackFilter:
     def __init__(self, stretch: Stretch, centres: np.ndarray, track: Track) -> None:
         """Prepare a stretch's motion and measurements; centres: float32 (n, 3, 5), of `reader.detect_centres`."""
         self.track, self.step, self.turn = track, np.diff(stretch.driven), np.diff(stretch.heading)
+        self.slip = stretch.slip
         self.measured = np.median(centres + MOUNT_OFFSETS[:, None], axis=1)
 
     def curvature(self, s: float) -> float:
@@ -94,9 +97,9 @@ class TrackFilter:
     def predict(self, row: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the state one row later, (3,), and its Jacobian by this one, (3, 3)."""
         s, right, yaw = state
-        step, turn, bend = self.step[row], self.turn[row], self.curvature(s)
+        step, turn, slip, bend = self.step[row], self.turn[row], self.slip[row], self.curvature(s)
         slower = max(0.3, 1 - bend * right)  # on the inside of a bend the centre line is the shorter path
-        along = step * np.cos(yaw + turn / 2) / slower
+        along = step * np.cos(yaw + turn / 2 + slip) / slower
         road_turn = wrap_angle(self.track.at(s).heading - self.track.at(s + along).heading)
         jacobian = np.array(
             [
@@ -105,7 +108,7 @@ class TrackFilter:
                 [bend - self.curvature(s + along), -bend * along * bend / slower, 1],
             ]
         )
-        moved = s + along, right + step * np.sin(yaw + (turn - road_turn) / 2), yaw + turn - road_turn
+        moved = s + along, right + step * np.sin(yaw + (turn - road_turn) / 2 + slip), yaw + turn - road_turn
         return np.array(moved), jacobian
 
     def expect(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +143,7 @@ class TrackFilter:
             predicted.append((x, p, f))
             expected, jacobian = self.expect(x)
             visible = ~np.isnan(jacobian).any(1)
-            error = np.where(visible, (self.measured[row] - expected) / MEASUREMENT_NOISE, MISSING_DETECTION)
+            error = np.where(visible, (self.measured[row] - expected) / LIKELIHOOD_SCALE, MISSING_DETECTION)
             log_likelihood -= np.log1p(error**2).mean()
             for k in np.flatnonzero(visible):
                 h = jacobian[k]
@@ -208,13 +211,18 @@ def estimate_lane_position(
 ) -> LanePosition:
     """Estimate the position in the lane at every row of a recording.
 
-    Where a stretch is on a known road, from its localisation; elsewhere as `reader.fuse_detections` does.
-    stretches: of the recording, `motion.stretches`; network: the shipped one if None.
-    Raises RecordingError for images that can't be read, ModelError without a usable network.
+    Where a stretch is on a known road, from its localisation; elsewhere as `reader.fuse_detections` does, on a road
+    that is not known at all with the network for any road. stretches: of the recording, `motion.stretches`; network:
+    for all roads, instead of the two that come with the project. Raises RecordingError for images that can't be read,
+    ModelError without a usable network.
     """
-    centres = detect_centres(recording, network)
+    strips = read_strips(recording)
+    centres = estimate_centres(strips, network)
+    localised = list(localise_all(stretches, centres))
+    if not localised:
+        centres = estimate_centres(strips, network or load_network(ANY_ROAD_WEIGHTS))
     position = fuse_detections(recording, centres, stretches)
-    for rows, localisation in localise_all(stretches, centres):
+    for rows, localisation in localised:
         _, lateral_offset, heading_error = localisation.states.T
         position.heading_error[rows] = heading_error
         position.lateral_offset[rows] = lateral_offset + REAR_AXLE * np.sin(heading_error)

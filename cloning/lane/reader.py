@@ -1,8 +1,11 @@
 """Estimates the car's lateral offset and heading error in its lane from camera frames, with a small network.
 
-The network detects where the lane's centre lies at some distances ahead of a camera. With the
-car's motion, detections from frames that were taken a second earlier tell the centre next to the car, too, where no
-camera looks. `tools/train_lane.py` trains the network; `lane.pt` holds the weights that come with the project.
+The network detects where the lane's centre lies at some distances ahead of a camera. With the car's motion, detections
+from frames that were taken a second earlier tell the centre next to the car, too, where no camera looks.
+
+`tools/train_lane.py` trains the network. Two sets of weights come with the project: `lane.pt`, trained on the lake and
+jungle tracks alone, reads these more accurately, also in places where a frame hardly shows the lane; `any_road.pt`,
+trained on generated roads and shadows as well, reads any road.
 """
 
 import functools
@@ -26,6 +29,7 @@ from cloning.road.camera import CAMERA_MATRIX, CAMERA_OFFSETS, LEVEL_CAMERA_MATR
 from cloning.road.motion import AXLE_TO_CAMERA, MAX_GAP, REAR_AXLE, Stretch
 
 SHIPPED_WEIGHTS = Path(__file__).with_name("lane.pt")
+ANY_ROAD_WEIGHTS = Path(__file__).with_name("any_road.pt")
 STRIP_SHAPE = (32, 160, 3)  # rows, columns, RGB
 FIRST_ROW = 60  # of the level frame that a strip shows: the horizon; the bonnet tints the JPEG 64 rows further down
 DISTANCES_AHEAD = np.array([3.0, 4.5, 6.5, 9.0, 13.0], np.float32)  # m from the camera
@@ -122,23 +126,25 @@ def load_network(path: str | Path | None = None) -> LaneNetwork:
 
 
 def estimate_centres(strips: np.ndarray, network: LaneNetwork | None = None) -> np.ndarray:
-    """Detect the lane's centre in strips, uint8 (n, 32, 160, 3): float32 (n, 5), m to the right of the camera.
+    """Detect the lane's centre in strips, uint8 (…, 32, 160, 3): float32 (…, 5), m to the right of the camera.
 
     The centre is detected at DISTANCES_AHEAD. network: the shipped one if None.
     """
     detector = network or load_network()
     device = torch.device("cpu")
     precision = choose_precision(device)
+    flat = strips.reshape(-1, *STRIP_SHAPE)
 
     def detect(start: int) -> np.ndarray:
-        piece = strips[start : start + STRIPS_PER_PIECE]
+        piece = flat[start : start + STRIPS_PER_PIECE]
         inputs = torch.from_numpy(np.stack([normalize(strip) for strip in piece]))
         with torch.inference_mode(), in_precision(precision, device):
             return detector.predict_symmetric(inputs).numpy()
 
     nothing = np.empty((0, len(DISTANCES_AHEAD)), np.float32)
     with ThreadPoolExecutor(threads(), initializer=one_thread) as pool:
-        return np.concatenate([nothing, *pool.map(detect, range(0, len(strips), STRIPS_PER_PIECE))])
+        centres = np.concatenate([nothing, *pool.map(detect, range(0, len(flat), STRIPS_PER_PIECE))])
+    return centres.reshape(*strips.shape[:-3], len(DISTANCES_AHEAD))
 
 
 @dataclass
@@ -176,8 +182,7 @@ def detect_centres(recording: Recording, network: LaneNetwork | None = None) -> 
     m to the right of the camera, at DISTANCES_AHEAD. Raises RecordingError for images that can't be read,
     ModelError without a usable network.
     """
-    strips = read_strips(recording).reshape(-1, *STRIP_SHAPE)
-    return estimate_centres(strips, network).reshape(-1, 3, len(DISTANCES_AHEAD))
+    return estimate_centres(read_strips(recording), network)
 
 
 def fuse_detections(recording: Recording, centres: np.ndarray, stretches: Sequence[Stretch] = ()) -> LanePosition:

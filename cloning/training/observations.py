@@ -78,7 +78,7 @@ class Choices(NamedTuple):
     observation           int (n,): indices of the observations
     camera                int (n,): the camera whose image is used, 0 centre, 1 left, 2 right
     places                int (n, 4): place of each kind of image among the m images, -1 if it is not made
-    keep                  bool (m, 4224): the units of the flattened layer that dropout keeps
+    keep                  bool (m, 4224): the units of the flattened layer that dropout keeps; None: all
     brightness, darkness  float64 (n,): factors of HSV value and HLS lightness
     line                  float64 (n, 2): columns at which the shadow's edge meets the top and bottom of the full frame
     left                  bool (n,): whether the shadow is left of that edge
@@ -88,7 +88,7 @@ class Choices(NamedTuple):
     observation: np.ndarray
     camera: np.ndarray
     places: np.ndarray
-    keep: np.ndarray
+    keep: np.ndarray | None
     brightness: np.ndarray
     darkness: np.ndarray
     line: np.ndarray
@@ -132,6 +132,7 @@ class Observations(ABC):
     cached_rows: ClassVar[slice] = SEEN_ROWS  # of a frame; must end where SEEN_ROWS end
     label_source: ClassVar[str]  # whose steering the label is, as the summary calls it
     too_few: ClassVar[str]  # the reason to print if `select` leaves too few rows
+    dropout: ClassVar[bool]  # whether the network is trained with it
 
     def __post_init__(self) -> None:
         self.cache = ImageCache(self.cached_rows.stop - self.cached_rows.start)

@@ -20,14 +20,14 @@ class Batch:
 
     images      uint8 (n, 75, 320, 3), RGB, cropped
     labels      float32 (n,): steering, -1..1
-    keep        bool (n, 4224): the units of the flattened layer that dropout keeps
+    keep        bool (n, 4224): the units of the flattened layer that dropout keeps; None: all
     total       images in the whole batch, of all processes
     start_next  starts making a later batch; called when this batch's work is in the pool's queue, to be done before it
     """
 
     images: np.ndarray
     labels: np.ndarray
-    keep: np.ndarray
+    keep: np.ndarray | None
     total: int
     start_next: Callable[[], None] = lambda: None
 
@@ -66,9 +66,10 @@ class PieceByPiece(torch.autograd.Function):
 
         def piece(start: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
             part = slice(start, start + PIECE)
+            keep = None if batch.keep is None else batch.keep[part]
             with torch.enable_grad():
                 loss = squared_errors(
-                    network, precision, torch.device("cpu"), batch.images[part], batch.labels[part], batch.keep[part]
+                    network, precision, torch.device("cpu"), batch.images[part], batch.labels[part], keep
                 )
             return loss.detach(), torch.autograd.grad(loss, parameters)
 

@@ -249,6 +249,8 @@ class RobustObservations(Observations):
     cached_rows: ClassVar[slice] = SOURCE_ROWS
     label_source: ClassVar[str] = "recovery steering"
     too_few: ClassVar[str] = "the drives are too short"
+    # As in NVIDIA's paper: no image is seen twice, and with dropout the same number of images drove less well.
+    dropout: ClassVar[bool] = False
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:
