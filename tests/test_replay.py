@@ -367,36 +367,3 @@ def test_stretches_are_joined_in_one_report(folder, tmp_path):
     recording.time[150:] += 60
     done = replay.drive(recording, human(recording), 1.0, lambda frame: frame.human_steering)
     assert len(human(recording)) == 2 and sum(done.seconds) == pytest.approx(298 * 0.067, abs=0.01)
-
-
-def test_the_scoreboard_keeps_its_columns(tmp_path, model):
-    folder = render_recording(tmp_path / "lake", rows=40)
-    for name, extra in (("one", ["--what", "untrained"]), ("two", [])):
-        done = subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "tools.scoreboard",
-                model,
-                "--name",
-                name,
-                "--recordings",
-                folder,
-                "--tracks",
-                "--table",
-                tmp_path / "table.md",
-                *extra,
-            ],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=200,
-        )
-        assert done.returncode == 0, done.stderr
-    lines = (tmp_path / "table.md").read_text(encoding="utf-8").splitlines()
-    assert "| course | one | two |" in lines
-    rows = [line.split("|")[1:-1] for line in lines if line.startswith("| real lake, 1 m from")]
-    assert len(rows) == 1 and rows[0][1] == rows[0][2] and "%" in rows[0][1]
-    assert lines[lines.index("* one: untrained") + 1] == (
-        "  * `python -m tools.scoreboard model.pt --name one --recordings lake --tracks --table table.md`"
-    )
