@@ -160,12 +160,12 @@ def test_laps_are_counted_by_their_departures(times, laps, finished, expected):
 
 
 def test_a_road_may_be_driven_in_its_own_look():
-    looks = [scoreboard.look(text) for text in ("3", "own", "own+10000")]
+    looks = [scoreboard.parse_look(text) for text in ("3", "own", "own+10000")]
     assert [scoreboard.look_of("road-7", chosen) for chosen in looks] == [3, 7, 10007]
     assert [scoreboard.look_of("jungle", chosen) for chosen in looks] == [3, 0, 10000]
     for wrong in ("mine", "own3", "3+4", "-1"):
         with pytest.raises(argparse.ArgumentTypeError, match="is not a number, own"):
-            scoreboard.look(wrong)
+            scoreboard.parse_look(wrong)
 
 
 def test_a_command_names_many_roads_as_the_shell_does():

@@ -123,7 +123,7 @@ def drive_in_sample(track: str, look: int, trained_on: Sequence[str]) -> bool:
         rendered = RENDERED.match(name)
         if rendered and rendered[1] == track and (road_number(track) is not None or int(rendered[3]) == look):
             return True
-        if not rendered and look == 0 and re.match(r"[a-z]*", name)[0] == track:  # type: ignore[index]  # always matches
+        if not rendered and look == 0 and re.fullmatch(rf"{track}\d*", name.split("-")[0]):
             return True
     return False
 
@@ -145,7 +145,7 @@ def mark(in_sample: bool) -> str:
 
 def replay_line(recording: str) -> str | None:
     """Return the line of the summary to which a real recording belongs by its name, or None."""
-    return "shadows" if "shadow" in recording else next((track for track in ROADS if recording.startswith(track)), None)
+    return SHADOWS if "shadow" in recording else next((track for track in ROADS if recording.startswith(track)), None)
 
 
 def drive_line(track: str, look: int) -> str:

@@ -116,15 +116,16 @@ def drive_laps(ports: SimpleQueue[int], mph: int, laps: float, place: tuple[str,
             file = Path(folder) / "report.json"
             road = ("--track", track, "--direction", direction, "--look", str(look))
             status, errors = simulate(file, "drive", *road, "--laps", str(laps), "--port", str(port))
-            if not file.exists():
-                raise UserError(f"{track} {direction}, look {look}: {errors}")
+            # A car that stands still is the model's fault, anything else is not.
+            if not file.exists() or (status == program.FAILED and "the car has stood still" not in errors):
+                raise UserError(f"{track} {direction}, {mph} mph, look {look}: {errors}")
             report: LapReport = json.loads(file.read_text(encoding="utf-8"))
     finally:
         ports.put(port)
     return driven(report, mph, look, laps, finished=status != program.FAILED)
 
 
-def look(text: str) -> tuple[bool, int]:
+def parse_look(text: str) -> tuple[bool, int]:
     """Parse an item of --looks: return whether the road's number is to be added, and a number."""
     match = re.fullmatch(r"(own)(?:\+(\d+))?|(\d+)", text)
     if not match:
@@ -134,7 +135,7 @@ def look(text: str) -> tuple[bool, int]:
 
 
 def look_of(track: str, chosen: tuple[bool, int]) -> int:
-    """Return the look in which a track is driven; chosen: of `look`. The lake's and the jungle's own one is look 0."""
+    """Return the look in which a track is driven; chosen: of `parse_look`. The lake's and the jungle's own one is look 0."""
     own, look_number = chosen
     return look_number + ((road_number(track) or 0) if own else 0)
 
@@ -154,7 +155,7 @@ def trained_on(model: Path, more: Sequence[str]) -> list[str]:
 
 def natural(text: str) -> list[int | str]:
     """Return a sort key by which numbers in texts are sorted by value."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", text)]
+    return [int(part) if at % 2 else part for at, part in enumerate(re.split(r"(\d+)", text))]
 
 
 def read_board(file: Path) -> Board:
@@ -277,7 +278,7 @@ def main() -> int:
     parser.add_argument(
         "--looks",
         nargs="*",
-        type=look,
+        type=parse_look,
         default=[(False, chosen) for chosen in (0, *UNSEEN_LOOKS)],
         help="looks of the tracks: numbers, own for look N of road-N (0 of the lake and the jungle), or own+10000 for "
         "the same with shadows (default 0 101 102)",
