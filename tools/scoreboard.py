@@ -135,7 +135,7 @@ def parse_look(text: str) -> tuple[bool, int]:
 
 
 def look_of(track: str, chosen: tuple[bool, int]) -> int:
-    """Return the look in which a track is driven; chosen: of `parse_look`. The lake's and the jungle's own one is look 0."""
+    """Return the look in which a track is driven; chosen: of `parse_look`. The two known tracks' own look is 0."""
     own, look_number = chosen
     return look_number + ((road_number(track) or 0) if own else 0)
 
