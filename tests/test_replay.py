@@ -14,19 +14,23 @@ import av
 import cv2
 import numpy as np
 import pytest
+import real_recordings
 import torch
 from conftest import ROOT, render_recording
 from drive_process import serving
 
 from cloning.errors import SimulatorError, UserError
 from cloning.lane.reader import LanePosition
+from cloning.lane.recovery import LaneAhead
 from cloning.pilot.network import Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
 from cloning.replay.autonomy import LIMITS
-from cloning.replay.score import steering_metrics
+from cloning.replay.score import driving_metrics, steering_metrics
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
+
+ORACLE_DRIVER = replay.ReplayFrame.recovery_steering
 
 try:
     import resource
@@ -119,6 +123,38 @@ def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
     assert not line.is_lane_centre and not line.offset.any()
 
 
+def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, monkeypatch):
+    """From the human's path, 0.8 m right of the lane's centre; where that path is the reference, it stays on it."""
+    offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
+    trusted = np.ones(len(recording), bool)
+    monkeypatch.setattr("cloning.lane.place.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
+    for by_lane, begin in ((True, 0.8), (False, 0.0)):
+        done = replay.drive(recording, replay.reference_lines(recording, by_lane), 1.0, ORACLE_DRIVER)
+        assert not done.interventions and done.offset[0] == pytest.approx(begin)
+        after_2_s = np.abs(done.offset[30:])
+        assert after_2_s.max() < 0.3 and after_2_s.mean() < 0.15, "it cuts the slalom's bends a little"
+
+
+@pytest.mark.parametrize("known", [[], [0], [3, 8]])
+def test_where_the_lane_ahead_is_unknown_the_nearest_known_rows_tell(known):
+    n = 10
+    goal = np.stack([np.arange(n), np.full(n, 6.0)], axis=1).astype(np.float32)
+    ahead = LaneAhead(np.zeros(n), np.zeros(n), goal, np.isin(np.arange(n), known))
+    right = ahead.extended().goal[:, 0].tolist()
+    assert right == {0: list(range(n)), 1: [0] * n, 2: [3, 3, 3, 3, 4, 5, 6, 7, 8, 8]}[len(known)]
+
+
+def test_the_oracle_drives_the_real_jungle():
+    """Without an intervention at either limit, as nothing else does: so the measure allows it."""
+    if not (folders := [folder for folder in real_recordings.FOLDERS if folder.name == "jungle"]):
+        pytest.skip(real_recordings.MISSING)
+    recording = replay.load_recording(folders[0])
+    lines = replay.reference_lines(recording)
+    for limit in LIMITS:
+        metrics = driving_metrics(replay.drive(recording, lines, limit, ORACLE_DRIVER))
+        assert metrics["interventions"] == 0 and metrics["distance_mean_m"] == pytest.approx(0.15, abs=0.02)
+
+
 def test_a_car_is_set_back_onto_the_line_and_along_it(recording):
     [line] = human(recording)
     line = replace(line, offset=np.full(300, 0.8), yaw=np.full(300, 0.1), is_lane_centre=True)
@@ -198,6 +234,12 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
         "distance_mean_m": 0,
         "distance_p95_m": 0,
     }
+    oracle = one["compared"]["oracle"]
+    assert oracle["autonomy_percent"] == 100 and oracle["distance_mean_m"] == pytest.approx(0.11, abs=0.03)
+    assert (
+        f"oracle (the recovery steering itself, driven): autonomy 100.0 %, 0 interventions; distance from the "
+        f"reference: mean {oracle['distance_mean_m']:.2f} m"
+    ) in alone.stdout
     assert (tmp_path / "way.png").read_bytes()[:4] == b"\x89PNG"
     assert film_frames(tmp_path / "seen.mp4") == 300
     assert av.open(str(tmp_path / "seen.mp4")).streams.video[0].width == 1280
@@ -325,36 +367,3 @@ def test_stretches_are_joined_in_one_report(folder, tmp_path):
     recording.time[150:] += 60
     done = replay.drive(recording, human(recording), 1.0, lambda frame: frame.human_steering)
     assert len(human(recording)) == 2 and sum(done.seconds) == pytest.approx(298 * 0.067, abs=0.01)
-
-
-def test_the_scoreboard_keeps_its_columns(tmp_path, model):
-    folder = render_recording(tmp_path / "lake", rows=40)
-    for name, extra in (("one", ["--what", "untrained"]), ("two", [])):
-        done = subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "tools.scoreboard",
-                model,
-                "--name",
-                name,
-                "--recordings",
-                folder,
-                "--tracks",
-                "--table",
-                tmp_path / "table.md",
-                *extra,
-            ],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=200,
-        )
-        assert done.returncode == 0, done.stderr
-    lines = (tmp_path / "table.md").read_text(encoding="utf-8").splitlines()
-    assert "| course | one | two |" in lines
-    rows = [line.split("|")[1:-1] for line in lines if line.startswith("| real lake, 1 m from")]
-    assert len(rows) == 1 and rows[0][1] == rows[0][2] and "%" in rows[0][1]
-    assert lines[lines.index("* one: untrained") + 1] == (
-        "  * `python -m tools.scoreboard model.pt --name one --recordings lake --tracks --table table.md`"
-    )

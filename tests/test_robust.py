@@ -13,6 +13,7 @@ import torch
 from conftest import ROOT, SHORT, finished_run, render_recording, run_here, run_model, weights
 
 import model
+from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
 from cloning.pilot.network import CROP
 from cloning.recordings.format import FRAME
@@ -83,7 +84,7 @@ def test_a_shifted_car_comes_back_and_stays(monkeypatch, steering, right, yaw):
 
 def test_the_label_grows_with_offset_and_yaw(monkeypatch):
     one = lanes(monkeypatch).take(np.array([50]))
-    limit = robust.MAX_LABEL_OFFSET
+    limit = recovery.MAX_LABEL_OFFSET
     by_offset = [float(one.steering(right, 0.0)[0]) for right in np.linspace(-limit, limit, 9)]
     by_yaw = [float(one.steering(0.0, yaw)[0]) for yaw in np.linspace(-0.2, 0.2, 9)]
     for found in (by_offset, by_yaw):
@@ -111,7 +112,7 @@ def test_where_most_is_not_trusted_the_humans_path_is_the_lane(monkeypatch):
 
 def test_the_lane_ahead_is_not_known_before_a_break(monkeypatch):
     found = lanes(monkeypatch, pause_after=149)
-    rows = robust.LOOKAHEAD / (SPEED * MPH / 15)
+    rows = recovery.LOOKAHEAD / (SPEED * MPH / 15)
     missing = np.flatnonzero(~found.known)
     for end in (150, N):
         assert len(missing[(missing < end) & (missing > end - 100)]) == pytest.approx(rows, abs=1)
@@ -211,7 +212,7 @@ def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording)
     assert "lane ahead unknown" in done.stdout
     row = next(line for line in done.stdout.splitlines() if line.startswith("total"))
     assert int(row.split()[-1]) == 60 - int(row.split()[-2])
-    metres = 2 * robust.HEADING_CHORD + robust.LOOKAHEAD  # at the beginning and at the end
+    metres = 2 * recovery.HEADING_CHORD + recovery.LOOKAHEAD  # at the beginning and at the end
     assert int(row.split()[-2]) == pytest.approx(metres / (30.19 * MPH * 0.067), abs=2)
     assert "correlation with the recovery steering" in done.stdout
     for name in ("training_generator_LRC_0.png", "training_generator_augmented-0.png"):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.errors import RecordingError
+from cloning.lane.recovery import LaneAhead
 from cloning.recordings.check import check_images
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.images import encode
@@ -43,12 +44,14 @@ class ReferenceLine:
     offset          float64 (n,): m from the line to the human driver's car, right positive
     yaw             float64 (n,): radians from the line to the human driver's heading, right positive
     is_lane_centre  if not, the line is the human driver's path, and offset and yaw are 0
+    ahead           the lane ahead at each row, along the same line, known or extended
     """
 
     stretch: Stretch
     offset: np.ndarray
     yaw: np.ndarray
     is_lane_centre: bool
+    ahead: LaneAhead
 
     @property
     def rows(self) -> slice:
@@ -115,9 +118,10 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
     for stretch in driven:
         rows = stretch.rows
         sure = np.asarray(trusted[rows], bool)
+        ahead = LaneAhead.of_stretch(stretch, offset[rows], sure).extended()
         if sure.mean() < MIN_TRUSTED:
             n = len(stretch)
-            lines.append(ReferenceLine(stretch, np.zeros(n), np.zeros(n), is_lane_centre=False))
+            lines.append(ReferenceLine(stretch, np.zeros(n), np.zeros(n), is_lane_centre=False, ahead=ahead))
             continue
         every, known = np.arange(len(sure)), np.flatnonzero(sure)
         offsets, yaws = (np.interp(every, known, values[rows][sure].astype(float)) for values in (offset, yaw))
@@ -128,7 +132,7 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
                 part = stretch
                 if b - a < len(stretch):
                     part = Stretch.of(recording, slice(rows.start + a, rows.start + b))
-                lines.append(ReferenceLine(part, offsets[a:b], yaws[a:b], is_lane_centre=True))
+                lines.append(ReferenceLine(part, offsets[a:b], yaws[a:b], True, ahead.take(slice(a, b))))
     return lines
 
 
@@ -186,6 +190,7 @@ class ReplayFrame:
 
     def __init__(self, recording: Recording, views: StretchViews, car: ReplayedCar, at: int):
         self.views, self.at, self.pose = views, at, (car.right, car.yaw)
+        self.ahead = car.line.ahead.take(slice(at, at + 1))
         self.row = car.line.rows.start + at
         self.speed = float(recording.speed[self.row])  # mph
         self.human_steering = float(car.human_steering[at])  # -1..1
@@ -205,6 +210,15 @@ class ReplayFrame:
         if not any(self.pose):
             return self.views.jpeg(self.at)
         return encode(self.view, VIEW_JPEG_QUALITY)
+
+    def recovery_steering(self) -> float:
+        """Return the recovery steering from the car's pose, -1..1: the label of `model.py --robust`.
+
+        The lane ahead is that of the reference line, so the human driver's path where that is the reference.
+        """
+        right, yaw = self.pose
+        human_yaw = float(self.ahead.yaw[0])
+        return float(self.ahead.steering(self.ahead.offset[0] + right * np.cos(human_yaw), human_yaw + yaw)[0])
 
 
 Driver = Callable[[ReplayFrame], float]  # returns steering, -1..1

@@ -16,6 +16,7 @@ from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, dri
 SMOOTHED_ROWS = 9  # rows (0.6 s) over which steering is averaged before it is correlated
 LISTED = 10  # interventions that the text lists for each limit
 HUMAN = "the human"  # the report's key of the human driver's own steering
+ORACLE = "oracle"  # that of the recovery steering, the label of `model.py --robust`: the best that the measure allows
 
 
 class DrivingMetrics(TypedDict):
@@ -95,9 +96,9 @@ def steering_metrics(steering: np.ndarray, human: np.ndarray) -> SteeringMetrics
 
 
 def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list[Drive], asked: str) -> ReplayReport:
-    """Return the report of a recording's drives, one per limit, with those of three yardsticks.
+    """Return the report of a recording's drives, one per limit, with those of four yardsticks.
 
-    The yardsticks are steering 0, the recording's mean steering, and the human driver's own steering.
+    The yardsticks are steering 0, the recording's mean steering, the human driver's own steering, and the oracle.
     lines: of `reference_lines`; asked: the reference that the user chose, "lane" or "human".
     """
     human = np.array(drives[0].human_steering)
@@ -106,6 +107,7 @@ def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list
         "steering 0": lambda frame: 0.0,
         "mean steering": lambda frame: mean,
         HUMAN: lambda frame: frame.human_steering,
+        ORACLE: ReplayFrame.recovery_steering,
     }
     rows = sum(len(line.stretch) for line in lines)
     by_lane = sum(len(line.stretch) for line in lines if line.is_lane_centre)
@@ -157,14 +159,12 @@ def report_text(report: ReplayReport) -> str:
     if report["reference_asked"] == "lane" and by_human:
         lines.append("  the lane centre cannot be estimated reliably where the human driver's path is used instead")
     for limit, metrics in report["limits"].items():
-        lines.append(
-            f"limit {limit} m: autonomy {metrics['autonomy_percent']:.1f} %, {metrics['interventions']} interventions; "
-            f"distance from the reference: mean {metrics['distance_mean_m']:.2f} m, "
-            f"95th percentile {metrics['distance_p95_m']:.2f} m"
-        )
+        lines.append(f"limit {limit} m: {_driving(metrics)}")
+        lines.append(f"  oracle (the recovery steering itself, driven): {_driving(metrics['compared'][ORACLE])}")
         yardsticks = (
             f"{_plain(name)} {other['autonomy_percent']:.0f} % ({other['interventions']})"
             for name, other in metrics["compared"].items()
+            if name != ORACLE
         )
         lines.append("  yardsticks, autonomy (interventions): " + ", ".join(yardsticks))
         lines += [
@@ -183,6 +183,14 @@ def report_text(report: ReplayReport) -> str:
         f"(yardsticks: {errors}); correlation, both smoothed over {SMOOTHED_ROWS} rows: {correlation}"
     )
     return "\n".join(lines)
+
+
+def _driving(metrics: DrivingMetrics) -> str:
+    """Return the metrics of one drive in the text."""
+    return (
+        f"autonomy {metrics['autonomy_percent']:.1f} %, {metrics['interventions']} interventions; distance from the "
+        f"reference: mean {metrics['distance_mean_m']:.2f} m, 95th percentile {metrics['distance_p95_m']:.2f} m"
+    )
 
 
 def _plain(name: str) -> str:

@@ -3,9 +3,7 @@
 These are NVIDIA's shifts and rotations by viewpoint transform (arXiv 1604.07316, section 5). The label of a warped
 frame, the recovery steering, drives the car from its pose back to the lane's centre.
 
-A pose is that of the rear axle's middle: lateral offset from the lane's centre (m) and heading error (radians), both
-positive to the right. The lane's frame of a row has its origin on the lane's centre next to the recorded car's rear
-axle, and its forward axis along the lane.
+Poses and the lane's frame are those of `cloning/lane/recovery.py`.
 """
 
 import functools
@@ -18,20 +16,16 @@ import cv2
 import numpy as np
 
 from cloning.lane.place import estimate_lane_position
+from cloning.lane.recovery import LOOKAHEAD, LaneAhead
 from cloning.pilot.network import CROP
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
 from cloning.road.motion import (
     AXLE_TO_CAMERA,
-    MIN_TRUSTED,
-    OFF_ROAD,
-    REAR_AXLE,
     Stretch,
     components,
     forward_vector,
-    right_of,
-    steering_for,
     stretches,
 )
 from cloning.road.warp import SOURCE_ROWS, CroppedView
@@ -39,9 +33,6 @@ from cloning.training import light
 from cloning.training.observations import SEEN_SHAPE, Example, Observations, ValidationSet, Views, center_digests
 from cloning.training.options import Arguments
 
-LOOKAHEAD = 6.0  # m along the lane's centre, to the point that the recovery steering aims at
-MAX_LABEL_OFFSET = 1.0  # m: from a larger lateral offset the car returns at the same angle as from this one
-HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far behind to so far ahead
 MAX_POSE_OFFSET = 2.0  # m: the lateral offsets of sampled poses are uniform between - and + this
 # Radians: standard deviation and limit of the heading errors of sampled poses, which are normally distributed.
 YAW_DEVIATION, MAX_POSE_YAW = np.radians(8), np.radians(25)
@@ -53,29 +44,19 @@ VIEW = CroppedView(CROP)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# The lane next to the recorded car, and the recovery steering
+# The lane next to the recorded car
 
 
 @dataclass
-class Lanes:
-    """The lane at each of n rows of recordings, and an earlier row that shows what a warped frame lacks.
+class Lanes(LaneAhead):
+    """The lane ahead at each of n rows of recordings, and an earlier row that shows what a warped frame lacks.
 
-    offset, yaw  float32 (n,): the recorded car's pose
-    goal         float32 (n, 2): the lane's centre LOOKAHEAD further on: m right and forward in the lane's frame
-    known        bool (n,): whether the lane ahead is known; if not, ignore the other columns
-    earlier      int32 (n,): the recording's row EARLIER_FRAME metres earlier, or the first one of the stretch
-    moved        float32 (n, 3): the rear axle in the earlier row, relative to this one: m right, m forward, radians
+    earlier  int32 (n,): the recording's row EARLIER_FRAME metres earlier, or the first one of the stretch
+    moved    float32 (n, 3): the rear axle in the earlier row, relative to this one: m right, m forward, radians
     """
 
-    offset: np.ndarray
-    yaw: np.ndarray
-    goal: np.ndarray
-    known: np.ndarray
     earlier: np.ndarray
     moved: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.yaw)
 
     @staticmethod
     def unknown(n: int) -> "Lanes":
@@ -105,32 +86,12 @@ class Lanes:
     def _fill(self, stretch: Stretch, offset: np.ndarray, trusted: np.ndarray) -> None:
         """Set the rows of a stretch; offset: of the car's middle, m; trusted: rows where it can be relied on."""
         rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
-        axle = np.stack([stretch.right, stretch.forward], axis=1)
-        # Points of the lane's centre in the stretch's frame, and the metres driven at which the car passes them. If too
-        # few rows are trusted, the driven trajectory counts as the lane's centre.
-        centre, passed, to_centre = axle, driven, np.zeros(len(driven))
-        sure = np.flatnonzero(trusted)
-        if len(sure) >= MIN_TRUSTED * len(driven):
-            to_centre = np.interp(np.arange(len(driven)), sure, offset[sure])
-            passed = driven + REAR_AXLE  # the estimate is that of the car's middle
-            side = right_of(forward_vector(np.interp(passed, driven, heading)))
-            centre = axle + REAR_AXLE * forward_vector(heading) - to_centre[:, None] * side
-
-        def centre_at(metres: np.ndarray) -> np.ndarray:
-            return np.stack([np.interp(metres, passed, centre[:, i]) for i in (0, 1)], axis=1)
-
-        # Not the estimated heading error: it would not agree with the driven trajectory as this heading does.
-        chord = centre_at(driven + HEADING_CHORD) - centre_at(driven - HEADING_CHORD)
-        lane_heading = np.arctan2(*chord.T)
-        along = forward_vector(lane_heading)
-        self.offset[rows] = components(axle - centre_at(driven), along)[:, 0]
-        self.yaw[rows] = np.angle(np.exp(1j * (heading - lane_heading)))
-        goal = centre_at(driven + LOOKAHEAD) - axle + self.offset[rows, None] * right_of(along)
-        goal = components(goal, along)
-        known = (driven >= 2 * HEADING_CHORD) & (driven + LOOKAHEAD <= driven[-1]) & (np.abs(to_centre) < OFF_ROAD)
-        self.goal[rows], self.known[rows] = np.where(known[:, None], goal, self.goal[rows]), known
+        ahead = LaneAhead.of_stretch(stretch, offset, trusted)
+        for column in fields(LaneAhead):
+            getattr(self, column.name)[rows] = getattr(ahead, column.name)
         earlier = np.maximum(np.searchsorted(driven, driven - EARLIER_FRAME, "right") - 1, 0)
         self.earlier[rows] = rows.start + earlier
+        axle = np.stack([stretch.right, stretch.forward], axis=1)
         back = components(axle[earlier] - axle, forward_vector(heading))
         self.moved[rows] = np.column_stack([back, heading[earlier] - heading])
 
@@ -138,17 +99,6 @@ class Lanes:
     def joined(parts: list["Lanes"]) -> "Lanes":
         """Return the rows of all parts, one part after the other."""
         return Lanes(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(Lanes)))
-
-    def take(self, rows: np.ndarray) -> "Lanes":
-        """Return these rows, in this order; rows: indices."""
-        return Lanes(*(getattr(self, column.name)[rows] for column in fields(self)))
-
-    def steering(self, offset: float | np.ndarray, yaw: float | np.ndarray) -> np.ndarray:
-        """Return the recovery steering from a pose at each row, by pure pursuit of the goal: float32 (n,), -1..1."""
-        right = self.goal[:, 0] - np.clip(offset, -MAX_LABEL_OFFSET, MAX_LABEL_OFFSET)
-        forward = self.goal[:, 1]
-        right_of_car = right * np.cos(yaw) - forward * np.sin(yaw)
-        return steering_for(2 * right_of_car / (right**2 + forward**2)).astype(np.float32)
 
     def weights(self) -> np.ndarray:
         """Return the probability of sampling each row, higher in bends: float64 (n,), sum 1."""

@@ -1,0 +1,238 @@
+"""The scoreboard: what is in sample and what the summary pools, by hand; and the command itself."""
+
+import argparse
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+from conftest import ROOT, render_recording
+
+from cloning.errors import UserError
+from cloning.pilot.network import Network, save_model
+from tools import score_table, scoreboard
+from tools.score_table import drive_in_sample, replay_in_sample, table
+
+TRAINED_ON = ["jungle3", "lake-ccw", "jungle-cw-look5", "jungle-cw-look10007", "road-8-ccw-look8"]
+
+
+def test_a_recording_is_in_sample_by_its_name_or_that_of_a_numbered_copy():
+    assert replay_in_sample("jungle", TRAINED_ON) and replay_in_sample("lake-ccw", TRAINED_ON)
+    assert not replay_in_sample("jungle-shadows", TRAINED_ON) and not replay_in_sample("lake-cw", TRAINED_ON)
+    assert not replay_in_sample("jungle-cw", TRAINED_ON), "a rendered recording is no copy of a real one"
+
+
+@pytest.mark.parametrize(
+    ("track", "look", "in_sample"),
+    [
+        ("jungle", 5, True),
+        ("jungle", 6, False),
+        ("jungle", 10005, False),  # with shadows, which look 5 has not
+        ("jungle", 10007, True),
+        ("jungle", 7, False),
+        ("lake", 5, False),
+        ("lake", 0, True),  # trained on real recordings of both
+        ("jungle", 0, True),
+        ("jungle", 10000, False),
+        ("road-8", 8, True),
+        ("road-8", 300, True),  # its bends are known
+        ("road-80", 8, False),
+    ],
+)
+def test_a_drive_is_in_sample_by_track_and_look(track, look, in_sample):
+    assert drive_in_sample(track, look, TRAINED_ON) == in_sample
+
+
+def test_without_a_real_recording_look_0_is_held_out():
+    assert not drive_in_sample("jungle", 0, ["jungle-cw-look5", "lake-ccw"])
+
+
+def drive(track, look=0, speed_mph=10, **more):
+    values = {"laps": 1, "laps_with_departure": 0, "departures": 0, "distance_km": 1.0}
+    values |= {"offset_mean_m": 0.2, "offset_max_m": 0.5, "roughness_per_s": 0.1}
+    return {"track": track, "direction": "cw", "speed_mph": speed_mph, "look": look, **values, **more}
+
+
+def replayed(percent, interventions, metres):
+    return {"autonomy_percent": percent, "interventions": interventions, "distance_mean_m": metres}
+
+
+@pytest.fixture
+def board():
+    """Two networks, "one" trained on TRAINED_ON, "two" on nothing of this, with results in other sections."""
+    one = {
+        "replays": {
+            "jungle": {"1": replayed(94.0, 1, 0.2)},
+            "jungle-shadows": {"1": replayed(40.0, 10, 0.3)},
+            "jungle-2": {"1": replayed(70.0, 10, 0.4)},
+            "jungle-fast": {"1": replayed(70.0, 2, 0.4)},
+        },
+        "drives": [
+            drive("jungle", 0, departures=5, laps_with_departure=1),
+            drive("jungle", 6, departures=3, laps=10, laps_with_departure=2, distance_km=12.0),
+            drive("lake", 10003, departures=1, laps_with_departure=1, distance_km=2.0),
+            drive("road-8", 8),
+            drive("road-1001", 1001, distance_km=3.0, offset_mean_m=0.1, roughness_per_s=0.2),
+            drive("road-1002", 1002, departures=2, laps_with_departure=1, offset_mean_m=0.5, roughness_per_s=0.4),
+            drive("road-1002", 11002),
+            drive("road-1001", 1001, 15),
+        ],
+    }
+    recordings = {
+        "jungle": {"seconds": 100.0, "lane_centre_percent": 100.0, "oracle": {"1": replayed(100.0, 0, 0.12)}},
+        "jungle-shadows": {"seconds": 100.0, "lane_centre_percent": 75.4, "oracle": {"1": replayed(94.0, 1, 0.13)}},
+        "jungle-2": {"seconds": 200.0, "lane_centre_percent": 100.0, "oracle": {}},
+        "jungle-fast": {"seconds": 40.0, "lane_centre_percent": 100.0, "oracle": {}},
+    }
+    two = {"replays": {"jungle": {"1": replayed(88.0, 2, 0.5)}}, "drives": []}
+    about = {"what": "trained somehow", "commands": ["a command"], "sha256": ""}
+    networks = {"one": {**about, "trained_on": TRAINED_ON, **one}, "two": {**about, "trained_on": ["other"], **two}}
+    return {"recordings": recordings, "networks": networks}
+
+
+def cells(text: str, row: str) -> list[str]:
+    """The cells of the only row with this title."""
+    [line] = [line for line in text.splitlines() if line.startswith(f"| {row} |")]
+    return line.strip("| ").split(" | ")[1:]
+
+
+def test_a_line_of_the_summary_pools_held_out_results_else_those_in_sample(board):
+    text = table(board)
+    jungle = cells(text, "one: jungle")
+    assert jungle == [
+        "70.0 %, 12 interventions in 240 s, held out",  # 1 - 12 * 6 / 240; not `jungle`, which it was trained on
+        "8 of 10 laps without a departure, 0.25 departures per km, held out",  # not look 0
+    ]
+    assert cells(text, "one: shadows") == [
+        "40.0 %, 10 interventions in 100 s, held out",
+        "0 of 1 laps without a departure, 0.50 departures per km, held out",
+    ]
+    # Of 1001 and 1002: four laps, one of which left the road twice in 6 km.
+    assert cells(text, "one: unknown roads") == [
+        "-",
+        "3 of 4 laps without a departure, 0.33 departures per km, held out",
+    ]
+    assert cells(text, "two: jungle") == ["88.0 %, 2 interventions in 100 s, held out", "-"]
+    del board["networks"]["one"]["replays"]["jungle-2"], board["networks"]["one"]["replays"]["jungle-fast"]
+    assert cells(table(board), "one: jungle")[0] == "94.0 %, 1 intervention in 100 s, in sample"
+    assert "limit 2.5 m" not in text and "one: lake" not in text and "two: shadows" not in text, "nothing to show"
+
+
+def test_a_row_names_the_reference_and_shows_the_oracle(board):
+    text = table(board)
+    assert cells(text, "jungle, limit 1 m") == [
+        "100.0 %, 0 interventions, 0.12 m",
+        "94.0 %, 1 intervention, 0.20 m, in sample",
+        "88.0 %, 2 interventions, 0.50 m, held out",
+    ]
+    assert cells(text, "jungle-shadows, limit 1 m, 75 % of it from the lane's centre")[2] == "-"
+
+
+def test_generated_roads_share_a_row_and_columns_without_results_are_left_out(board):
+    drives = table(board).split("## Laps in the stand-in simulator")[1]
+    assert "two" not in drives.split("## Measured with")[0]
+    assert cells(drives, "jungle cw, 10 mph, look 6") == [
+        "3 departures in 12.0 km, 0.20 m, at most 0.50 m, roughness 0.10/s, held out"
+    ]
+    # By distance: 3 km at 0.1 m and 1 km at 0.5 m; 3 km at 0.2 and 1 km at 0.4.
+    assert cells(drives, "10 mph, looks without shadows, held out") == [
+        "2 roads: 1 of 2 laps without a departure, 0.50 departures per km, 0.20 m, roughness 0.25/s"
+    ]
+    assert cells(drives, "10 mph, looks with shadows, held out")[0].startswith("1 road: 1 of 1 laps")
+    assert cells(drives, "10 mph, looks without shadows, in sample")[0].startswith("1 road: 1 of 1 laps")
+    assert cells(drives, "15 mph, looks without shadows, held out")[0].startswith("1 road: 1 of 1 laps")
+
+
+@pytest.mark.parametrize(
+    ("times", "laps", "finished", "expected"),
+    [([], 2, True, (2, 0)), ([3, 99], 2, True, (2, 1)), ([3, 101], 2, True, (2, 2)), ([], 5, False, (3, 1))],
+)
+def test_laps_are_counted_by_their_departures(times, laps, finished, expected):
+    report = {
+        **{"track": "lake", "direction": "cw", "laps": 2, "seconds_a_lap": [100.0, 80.0], "distance_m": 2260.0},
+        **{"offset_mean_m": 0.1, "offset_max_m": 0.2, "steering_roughness_per_s": 0.3},
+        "departures": [{"time_s": time} for time in times],
+    }
+    result = score_table.driven(report, 9, 0, laps, finished)
+    assert (result["laps"], result["laps_with_departure"]) == expected
+    assert result["departures"] == len(times) and result["distance_km"] == 2.26
+
+
+def test_a_road_may_be_driven_in_its_own_look():
+    looks = [scoreboard.parse_look(text) for text in ("3", "own", "own+10000")]
+    assert [scoreboard.look_of("road-7", chosen) for chosen in looks] == [3, 7, 10007]
+    assert [scoreboard.look_of("jungle", chosen) for chosen in looks] == [3, 0, 10000]
+    for wrong in ("mine", "own3", "3+4", "-1"):
+        with pytest.raises(argparse.ArgumentTypeError, match="is not a number, own"):
+            scoreboard.parse_look(wrong)
+
+
+def test_a_command_names_many_roads_as_the_shell_does():
+    words = ["--tracks", *(f"road-{n}" for n in range(98, 102)), "road-7", "lake", "--name", "a b"]
+    assert " ".join(scoreboard.shortened(words)) == "--tracks road-{98..101} road-7 lake --name 'a b'"
+
+
+def test_what_a_model_was_trained_on_is_in_its_file(tmp_path):
+    folders = ["/home/me/data/lake-ccw", "C:\\data\\jungle2", "lake-cw-look3"]
+    save_model(tmp_path / "model.pt", Network(), arguments={"recordings": folders})
+    assert scoreboard.trained_on(tmp_path / "model.pt", ["more"]) == ["jungle2", "lake-ccw", "lake-cw-look3", "more"]
+    save_model(tmp_path / "weights.pt", Network())
+    assert scoreboard.trained_on(tmp_path / "weights.pt", ["more"]) == ["more"]
+    with pytest.raises(UserError, match=r"does not say what it was trained on; .* --trained-on"):
+        scoreboard.trained_on(tmp_path / "weights.pt", [])
+
+
+@pytest.fixture
+def measured(tmp_path):
+    """A function that runs the command on a model and returns its process."""
+
+    def measure(model, name, *more):
+        command = [sys.executable, "-m", "tools.scoreboard", model, "--name", name, "--table", tmp_path / "table.md"]
+        return subprocess.run([*command, *more], cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+    return measure
+
+
+def test_the_scoreboard_keeps_its_columns(tmp_path, measured):
+    folder = render_recording(tmp_path / "lake", rows=40)
+    for name, seed, extra in (("one", 1, ["--what", "untrained"]), ("two", 2, ["--trained-on", "lake"])):
+        torch.manual_seed(seed)
+        save_model(tmp_path / f"{name}.pt", Network(), arguments={"recordings": ["/data/jungle"]})
+        done = measured(tmp_path / f"{name}.pt", name, "--recordings", folder, "--tracks", *extra)
+        assert done.returncode == 0, done.stderr
+    text = (tmp_path / "table.md").read_text(encoding="utf-8")
+    oracle, one, two = cells(text, "lake, limit 1 m, 0 % of it from the lane's centre")
+    assert "%" in oracle and one.endswith("m, held out") and two.endswith("m, in sample")
+    lines = text.splitlines()
+    assert lines[lines.index("* one: untrained") + 1] == (
+        "  * `python -m tools.scoreboard one.pt --name one --table table.md --recordings lake --tracks`"
+    )
+    before = (tmp_path / "table.json").read_bytes()
+    done = measured(tmp_path / "two.pt", "one", "--tracks")
+    assert done.returncode == 2 and "one: has results of another model file; give another --name" in done.stderr
+    assert (tmp_path / "table.json").read_bytes() == before
+
+
+def test_results_in_another_form_are_left_alone(tmp_path, measured, model_file):
+    (tmp_path / "table.json").write_text('{"shipped": {}}', encoding="utf-8")
+    done = measured(model_file, "one", "--trained-on", "lake", "--tracks")
+    assert done.returncode == 2 and "table.json: holds results in another form" in done.stderr
+    assert (tmp_path / "table.json").read_text(encoding="utf-8") == '{"shipped": {}}'
+
+
+def test_drives_share_a_server_and_are_replaced(tmp_path, measured, model_file):
+    """Two drives at each speed, on the road's own look; a second run replaces the first one's results."""
+    road = ("--trained-on", "lake", "--tracks", "road-3", "--looks", "own", "--speeds", "20", "--laps")
+    for laps in ("0.03", "0.02"):
+        done = measured(model_file, "one", *road, laps)
+        assert done.returncode == 0, done.stderr
+    board = json.loads((tmp_path / "table.json").read_text(encoding="utf-8"))
+    drives = board["networks"]["one"]["drives"]
+    assert [(drive["track"], drive["direction"], drive["look"]) for drive in drives] == [
+        ("road-3", "ccw", 3),
+        ("road-3", "cw", 3),
+    ]
+    assert {drive["laps"] for drive in drives} == {0.02} and {drive["speed_mph"] for drive in drives} == {20}
+    [cell] = cells((tmp_path / "table.md").read_text(encoding="utf-8"), "20 mph, looks without shadows, held out")
+    assert cell.startswith("1 road: ")
