@@ -41,6 +41,7 @@ from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS, FRAME
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
 from cloning.training import summary
+from cloning.training.adam import Adam
 from cloning.training.checkpoint import Checkpoint, Progress, RunFiles, fingerprint, resumed_arguments
 from cloning.training.distributed import from_first_rank, join_processes, leave_processes, rank, summed, world
 from cloning.training.observations import SEEN_SHAPE, Augmented, Choices, Example, Observations, Views, center_digests
@@ -348,7 +349,7 @@ class TrainingRun:
         self.errors: torch.nn.Module = SquaredErrors(self.network, self.precision, self.device, self.pool)
         if world() > 1:
             self.errors = DistributedDataParallel(self.errors)
-        self.optimizer = torch.optim.Adam(self.network.parameters(), arguments.learning_rate, fused=True)
+        self.optimizer = Adam(self.network.parameters())
         self.generator = Generator(training, arguments, self.pool, ahead=1 if self.device.type == "cpu" else 4)
         self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
         data = fingerprint(training, validation)
@@ -388,8 +389,7 @@ class TrainingRun:
                 # DistributedDataParallel takes the mean over the processes, each of which has a share of the sum.
                 (loss * (world() / batch.total)).backward()
                 done = (len(progress.history) + progress.images / samples) / self.arguments.epochs
-                self.optimizer.param_groups[0]["lr"] = self.training.learning_rate(self.arguments, done)
-                self.optimizer.step()
+                self.optimizer.step(self.training.learning_rate(self.arguments, done))
                 self.optimizer.zero_grad()
                 progress.number += 1
                 progress.images += batch.total

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import functools
 import os
 import sys
 
@@ -38,9 +39,15 @@ def choose_precision(device: torch.device) -> torch.dtype:
     if device.type == "cuda":
         fast = torch.cuda.is_bf16_supported(including_emulation=False)
     else:
-        has = torch.cpu.get_capabilities()
-        fast = device.type == "cpu" and bool(has.get("avx512_bf16", False) or has.get("amx_bf16", False))
+        vectors = bool(torch.cpu.get_capabilities().get("avx512_bf16", False))
+        fast = device.type == "cpu" and (vectors or has_amx())
     return torch.bfloat16 if fast else torch.float32
+
+
+@functools.cache
+def has_amx() -> bool:
+    """Return whether the processor multiplies bfloat16 matrices in tiles (Intel's AMX)."""
+    return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
 
 
 def in_precision(precision: torch.dtype, device: torch.device) -> contextlib.AbstractContextManager[object]:

@@ -14,8 +14,10 @@ from conftest import ROOT
 from torch import nn
 
 from cloning import tensors
+from cloning.compute import in_precision
 from cloning.errors import ModelError
 from cloning.files import write
+from cloning.pilot import network as network_module
 from cloning.pilot.network import SHIPPED_MODEL, Network, layer_table, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.training.pieces import SquaredErrors, squared_errors
@@ -67,6 +69,37 @@ def test_forward_is_the_recipes(network, frames):
     expected = nn.Sequential(*layers[:-1])(torch.from_numpy(np.ascontiguousarray(x)))[:, 0]
     torch.testing.assert_close(network(frames), expected)
     torch.testing.assert_close(network(frames[:, 60:135]), expected)  # cropped already
+
+
+@pytest.mark.parametrize("size", [(36, 158), (16, 77), (15, 20), (9, 11)])
+def test_convolution_in_blocks_is_torchs(size):
+    torch.manual_seed(0)
+    plain = nn.Conv2d(24, 36, 5, 2).double()
+    images = torch.randn(3, 24, *size, dtype=torch.float64, requires_grad=True)
+    blocks = nn.functional.conv2d(network_module.in_blocks(images), network_module.in_blocks(plain.weight), plain.bias)
+    expected, direction = plain(images), torch.randn_like(blocks)
+    torch.testing.assert_close(blocks, expected, rtol=1e-12, atol=1e-12)
+    inputs = (images, *plain.parameters())
+    for got, wanted in zip(
+        torch.autograd.grad(blocks, inputs, direction), torch.autograd.grad(expected, inputs, direction), strict=True
+    ):
+        torch.testing.assert_close(got, wanted, rtol=1e-12, atol=1e-11)
+
+
+def test_only_training_in_bfloat16_with_amx_computes_in_blocks(network, frames, monkeypatch):
+    calls, in_blocks = [], network_module.in_blocks
+    monkeypatch.setattr(network_module, "in_blocks", lambda x: calls.append(x.shape[1:]) or in_blocks(x))
+    for amx in (False, True):
+        monkeypatch.setattr(network_module, "has_amx", lambda amx=amx: amx)
+        with torch.inference_mode(), in_precision(torch.bfloat16, torch.device("cpu")):
+            network(frames)
+        network(frames).sum().backward()  # float32
+        assert not calls
+        with in_precision(torch.bfloat16, torch.device("cpu")):
+            steering = network(frames)
+            steering.sum().backward()
+        assert calls == [(24, 36, 158), (24, 5, 5)] * amx
+    torch.testing.assert_close(steering, network(frames), rtol=0, atol=0.01)
 
 
 def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):

@@ -245,12 +245,14 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_r
 def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
     sample_recording, tmp_path, monkeypatch, options, begins
 ):
-    steps = []  # (finished epochs, images of this epoch after the step, rate of the step)
+    rates, steps = [], []  # rates of the steps; (finished epochs, images of this epoch after the step, its rate)
 
     def note(run, *models):
         if not models:
-            steps.append((len(run.progress.history), run.progress.images, run.optimizer.param_groups[0]["lr"]))
+            steps.append((len(run.progress.history), run.progress.images, rates[-1]))
 
+    step = model.Adam.step
+    monkeypatch.setattr(model.Adam, "step", lambda optimizer, rate: rates.append(rate) or step(optimizer, rate))
     monkeypatch.setattr(model, "SAVE_SECONDS", -1)
     monkeypatch.setattr(model.TrainingRun, "save", note)
     monkeypatch.setattr(model.TrainingRun, "summary", lambda run: "")  # of model files that are not written

@@ -98,7 +98,7 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
             run.pool.submit(int).result()  # wait for the next batch's images, whose time belongs to (a)
             started = time.perf_counter()
             (run.errors(fixed_batch) / fixed_batch.total).backward()
-            run.optimizer.step()
+            run.optimizer.step(run.arguments.learning_rate)
             run.optimizer.zero_grad()
             synchronize(run.device)
             spent, steps = spent + time.perf_counter() - started, steps + 1

@@ -29,6 +29,7 @@ from cloning.files import write
 from cloning.outputs import check_folders
 from cloning.pilot.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
 from cloning.tensors import matching, shown
+from cloning.training.adam import Adam, zeros
 from cloning.training.distributed import from_first_rank
 from cloning.training.observations import Observations
 from cloning.training.options import Arguments, option
@@ -224,7 +225,7 @@ class Checkpoint:
         files: RunFiles,
         arguments: Arguments,
         network: Network,
-        optimizer: torch.optim.Optimizer,
+        optimizer: Adam,
         data_fingerprint: str,
     ):
         """network, optimizer: whose state is saved and restored; data_fingerprint: of `fingerprint`."""
@@ -256,7 +257,7 @@ class Checkpoint:
             self.network,
             **more,
             training={
-                "optimizer": self.optimizer.state_dict(),
+                "optimizer": {"state": self.optimizer.state},
                 **{name: getattr(progress, name) for name in PLACE},
                 "fingerprint": self.fingerprint,
             },
@@ -288,13 +289,11 @@ class Checkpoint:
             raise ValueError("the optimizer's state is not that of this network")
         state = {}
         for number, parameter in parameters.items():
-            expected = {"step": torch.zeros(()), "exp_avg": parameter.detach(), "exp_avg_sq": parameter.detach()}
             try:
-                state[number] = matching(averages[number], expected)
+                state[number] = matching(averages[number], zeros(parameter))
             except ValueError as error:
                 raise ValueError(f"in the optimizer's state {number}: {error}") from None
-        groups = self.optimizer.state_dict()["param_groups"]
-        self.optimizer.load_state_dict({"state": state, "param_groups": groups})
+        self.optimizer.restore(state)
 
     def set_aside(self, path: Path) -> None:
         """Copy an earlier run's file to its name with -previous, or -previous-2 …; nothing if there is a copy already.
