@@ -36,7 +36,7 @@ from cloning.lane.reader import (
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
-from cloning.road.motion import REAR_AXLE, Stretch, stretches
+from cloning.road.motion import MIN_TRUSTED, REAR_AXLE, Stretch, stretches
 from cloning.road.track import Track
 from simulator import __main__ as simulator
 from simulator.car import STEP
@@ -143,15 +143,15 @@ def test_the_ground_moves_with_the_camera():
     assert not visible_mask(strip_homography(1, 0))[-1, -1] and visible_mask(strip_homography(1, 0))[-1, 0]
 
 
-# m: mean absolute error up to 6.5 m ahead, its mean, and the slope's difference from 1. Measured: 0.164, +0.026, 0.020;
-# 0.260, -0.046, 0.023; 0.264, +0.084, 0.069; 0.283, +0.013, 0.039.
+# m: mean absolute error up to 6.5 m ahead, its mean, and the slope's difference from 1. Measured: 0.193, -0.030, 0.028;
+# 0.233, -0.075, 0.017; 0.300, +0.046, 0.152; 0.309, -0.013, 0.024.
 @pytest.mark.parametrize(
     "track, look, error, bias, slope",
     [
-        ("lake", 0, 0.21, 0.035, 0.026),
-        ("lake", UNSEEN, 0.33, 0.06, 0.03),
-        ("jungle", 0, 0.34, 0.11, 0.09),
-        ("jungle", UNSEEN, 0.36, 0.02, 0.05),
+        ("lake", 0, 0.24, 0.04, 0.036),
+        ("lake", UNSEEN, 0.30, 0.095, 0.03),
+        ("jungle", 0, 0.38, 0.06, 0.19),
+        ("jungle", UNSEEN, 0.39, 0.03, 0.035),
     ],
 )
 def test_the_shipped_network_on_rendered_frames(track, look, error, bias, slope):
@@ -179,6 +179,17 @@ def test_a_rendered_drive(drive):
     rolling = slice(SAMPLE_RATE, None)
     assert np.abs(found.lateral_offset - true)[rolling].mean() < 0.17  # measured: 0.136
     assert np.abs(found.heading_error).max() < np.radians(11.5)  # measured: 9.3
+
+
+def test_a_road_that_no_network_was_trained_on(tmp_path):
+    """In a look that none was trained on, with shadows; other such roads have 0.05 to 0.36 m."""
+    run, _ = record(tmp_path / "road", Track("road-5"), 0.15, 20, seed=3, look=10105)
+    recording = read_recording(tmp_path / "road")
+    found = estimate_lane_position(recording, stretches(recording))
+    steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
+    error = np.abs(found.lateral_offset - np.array(run.trajectory.offset)[steps])
+    assert error[SAMPLE_RATE:].mean() < 0.25  # measured: 0.191
+    assert found.trusted.mean() > 0.95  # measured: 1
 
 
 def test_the_side_cameras_appear_where_they_are_mounted(drive):
@@ -222,7 +233,7 @@ def test_noise_is_an_unknown_road(tmp_path):
 
 def test_frames_of_another_kind_are_an_unknown_road(sample_recording):
     recording = read_recording(sample_recording)
-    assert estimate_lane_position(recording, stretches(recording)).trusted.mean() < 0.35  # measured: 0.267
+    assert estimate_lane_position(recording, stretches(recording)).trusted.mean() < MIN_TRUSTED  # measured: 0.583
 
 
 @pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)

@@ -211,17 +211,19 @@ def estimate_lane_position(
 ) -> LanePosition:
     """Estimate the position in the lane at every row of a recording.
 
-    Where a stretch is on a known road, from its localisation; elsewhere as `reader.fuse_detections` does, on a road
-    that is not known at all with the network for any road. stretches: of the recording, `motion.stretches`; network:
-    for all roads, instead of the two that come with the project. Raises RecordingError for images that can't be read,
-    ModelError without a usable network.
+    Where a stretch is on a known road, from its localisation; elsewhere as `reader.fuse_detections` does. If no stretch
+    is, the network for any road reads the recording, too, and the one that can be trusted in more rows counts.
+    stretches: of the recording, `motion.stretches`; network: to use instead of the two that come with the project.
+    Raises RecordingError for images that can't be read, ModelError without a usable network.
     """
     strips = read_strips(recording)
     centres = estimate_centres(strips, network)
     localised = list(localise_all(stretches, centres))
-    if not localised:
-        centres = estimate_centres(strips, network or load_network(ANY_ROAD_WEIGHTS))
     position = fuse_detections(recording, centres, stretches)
+    if not localised and network is None:
+        centres = estimate_centres(strips, load_network(ANY_ROAD_WEIGHTS))
+        on_any_road = fuse_detections(recording, centres, stretches)
+        position = max(position, on_any_road, key=lambda reading: reading.trusted.mean())
     for rows, localisation in localised:
         _, lateral_offset, heading_error = localisation.states.T
         position.heading_error[rows] = heading_error
