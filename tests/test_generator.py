@@ -8,12 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from conftest import render_recording
 
 import model
 from cloning.recordings.check import check_images
 from cloning.recordings.log import Recording, read_recording
 from cloning.training.observations import center_digests
+from cloning.training.pieces import SquaredErrors
 from model import Arguments, Generator, ReportObservations, brighten, shade, split
 from tools.bench_training import one_by_one
 
@@ -198,6 +200,18 @@ def test_a_batch_depends_on_seed_and_number_alone(generator):
     np.testing.assert_array_equal(third.keep, again.keep)
     other = Generator(generator.observations, Arguments(seed=1), generator.pool, ahead=1)
     assert not np.array_equal(other.sample(3).camera, generator.sample(3).camera)
+
+
+def test_without_dropout_a_batch_is_the_same_but_keeps_every_unit(generator, monkeypatch):
+    usual = next(generator.batches(3))
+    monkeypatch.setattr(type(generator.observations), "dropout", False)
+    batch = next(generator.batches(3))
+    assert batch.keep is None and batch.total == usual.total
+    np.testing.assert_array_equal(batch.images, usual.images)
+    network, pool = model.Network().eval(), generator.pool
+    errors = SquaredErrors(network, torch.float32, torch.device("cpu"), pool)(batch)
+    predicted = network(torch.from_numpy(batch.images)).detach().numpy()
+    assert float(errors) == pytest.approx(float(((predicted - batch.labels) ** 2).sum()), rel=1e-4)
 
 
 def test_two_ranks_make_the_batch_that_one_process_makes(generator, monkeypatch):
