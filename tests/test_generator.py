@@ -211,7 +211,7 @@ def test_without_dropout_a_batch_is_the_same_but_keeps_every_unit(generator, mon
     network, pool = model.Network().eval(), generator.pool
     errors = SquaredErrors(network, torch.float32, torch.device("cpu"), pool)(batch)
     predicted = network(torch.from_numpy(batch.images)).detach().numpy()
-    assert float(errors) == pytest.approx(float(((predicted - batch.labels) ** 2).sum()), rel=1e-4)
+    assert errors.item() == pytest.approx(float(((predicted - batch.labels) ** 2).sum()), rel=1e-4)
 
 
 def test_two_ranks_make_the_batch_that_one_process_makes(generator, monkeypatch):

@@ -21,6 +21,7 @@ def test_a_recording_is_in_sample_by_its_name_or_that_of_a_numbered_copy():
     assert replay_in_sample("jungle", TRAINED_ON) and replay_in_sample("lake-ccw", TRAINED_ON)
     assert not replay_in_sample("jungle-shadows", TRAINED_ON) and not replay_in_sample("lake-cw", TRAINED_ON)
     assert not replay_in_sample("jungle-cw", TRAINED_ON), "a rendered recording is no copy of a real one"
+    assert replay_in_sample("bend", ["bend-repetitive"]) and not replay_in_sample("bend", ["bend-left"])
 
 
 @pytest.mark.parametrize(

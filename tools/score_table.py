@@ -9,6 +9,7 @@ from typing import TypedDict, TypeVar
 from cloning.replay.autonomy import LIMITS, autonomy
 from cloning.road.generated import road_number
 from cloning.road.track import ROADS
+from cloning.training.observations import PROBLEM_AREAS
 from simulator.report import LapReport
 from simulator.scenery.looks import SHADOWED
 
@@ -109,8 +110,12 @@ def course(drive: Driven) -> tuple[str, str, int, int]:
 
 
 def replay_in_sample(recording: str, trained_on: Sequence[str]) -> bool:
-    """Return whether a network was trained on a real recording, or on copies of it with numbers after its name."""
-    return any(re.fullmatch(re.escape(recording) + r"\d*", name) for name in trained_on)
+    """Return whether a network was trained on a real recording, or on copies of it.
+
+    Copies have numbers after the name, or an ending by which training repeats them.
+    """
+    copies = re.compile(rf"{re.escape(recording)}\d*({'|'.join(PROBLEM_AREAS)})?")
+    return any(copies.fullmatch(name) for name in trained_on)
 
 
 def drive_in_sample(track: str, look: int, trained_on: Sequence[str]) -> bool:
