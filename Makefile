@@ -3,7 +3,12 @@
 # make demo   record, train and drive a lap in the stand-in simulator: about 15 minutes on 2 cores. To continue after an
 #             interruption, run it again.
 
+# make shipped RECORDINGS="FOLDER …"
+#             train a network like cloning/pilot/shipped.pt on these recordings and on rendered ones, and measure it:
+#             see tools/shipped.py
+
 PYTHON ?= python3
+RECORDINGS ?= data
 BIN = .venv/bin
 # Debian's python3 comes without ensurepip, which venv needs, and panda3d's wheel needs libX11 even without a screen.
 APT = ./.ci/apt
@@ -46,4 +51,7 @@ demo/lap.json: demo/trained
 	$(BIN)/python drive.py demo/model.pt & server=$$!; trap "kill $$server" EXIT; \
 	$(BIN)/python -m simulator drive --track lake --report $@ --picture demo/lap.png --film demo/lap.mp4
 
-.PHONY: test lint demo
+shipped: .venv/installed
+	$(BIN)/python -m tools.shipped $(RECORDINGS)
+
+.PHONY: test lint demo shipped

@@ -1,13 +1,11 @@
-"""Make the network that comes with the project: render recordings, train on them and on real ones.
+"""Make a network like the one that comes with the project: render recordings, train on them and on real ones, measure.
 
+    make shipped RECORDINGS="data/lake-ccw data/lake-cw data/jungle data/jungle-shadows"     # or the same without make:
     python -m tools.shipped data/lake-ccw data/lake-cw data/jungle data/jungle-shadows
 
 Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
-cloning/pilot/shipped.md names the real recordings' repositories, and says how well the network drives. To ship the
-result, measure it with `python -m tools.scoreboard shipped/model.pt`, then copy it to cloning/pilot/shipped.pt.
-
 The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Looks from 101
-on and roads up to 1000 are left to measure with.
+on and roads up to 1000 are left to measure with: shipped/scoreboard.md has the results.
 """
 
 import argparse
@@ -34,6 +32,9 @@ from tools.lane_frames import FIRST_ROAD, shadowed
 
 ROOT = Path(__file__).resolve().parent.parent
 DIRECTIONS = ("ccw", "cw")
+# What is driven in the end: both tracks in look 0 and in one that was not trained on, without and with shadows, and ten
+# roads that were not trained on.
+MEASURED = ("--tracks", *ROADS, *(f"road-{k}" for k in range(1, 11)), "--looks", "own", "own+10000", "101", "10101")
 
 
 class Lap(NamedTuple):
@@ -88,7 +89,7 @@ def repeat(folder: Path, recordings: list[Path]) -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Render and train; return the exit status."""
+    """Render, train and measure; return the exit status."""
     parser = argparse.ArgumentParser(
         prog="shipped", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -108,7 +109,12 @@ def main(argv: list[str] | None = None) -> int:
         return program.failed("shipped", error)
     training = ("--robust", "--epochs", str(args.epochs), "--seed", str(args.seed), "--resume")
     folders = (args.folder / "real", args.folder / "rendered", "--output", args.folder / "model.pt")
-    return subprocess.run([sys.executable, ROOT / "model.py", *folders, *training]).returncode
+    status = subprocess.run([sys.executable, ROOT / "model.py", *folders, *training]).returncode
+    if status != program.DONE:
+        return status
+    board = ("--name", "shipped", "--speeds", "15", *MEASURED, "--table", args.folder / "scoreboard.md")
+    command = [sys.executable, "-m", "tools.scoreboard", args.folder / "model.pt", "--recordings", *args.recordings]
+    return subprocess.run([*command, *board]).returncode
 
 
 if __name__ == "__main__":

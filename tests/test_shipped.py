@@ -1,0 +1,79 @@
+"""What the network that comes with the project is trained on, and that an interrupted rendering continues."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cloning.errors import RecordingError
+from cloning.recordings.log import read_recording
+from cloning.road.generated import road_number
+from cloning.training.observations import PROBLEM_AREAS
+from simulator.scenery.looks import SHADOWED
+from tools import shipped
+from tools.lane_frames import FIRST_ROAD, scenes
+from tools.shipped import Lap, laps, render, repeat
+
+
+def test_what_is_left_to_measure_with_is_not_trained_on():
+    for rendered in (laps(101, 101), scenes(101, 101, 10)):
+        assert all(lap.look % SHADOWED <= 100 for lap in rendered)
+        assert all((road_number(lap.track) or FIRST_ROAD) >= FIRST_ROAD for lap in rendered)
+    assert len(set(laps(21, 40))) == len(laps(21, 40)) == 2 * (2 * 3 + 20) + 40
+
+
+def test_every_kind_of_lap_is_rendered_in_both_directions_and_lights():
+    chosen = laps(21, 40)
+    for start in ("lake", "jungle", "road-"):
+        some = [lap for lap in chosen if lap.track.startswith(start)]
+        kinds = {(lap.direction, lap.look >= SHADOWED) for lap in some}
+        assert kinds == {(direction, shadows) for direction in ("ccw", "cw") for shadows in (False, True)}
+        assert {lap.look // SHADOWED for lap in some} == {0, 1, 2}, "without shadows, and with both kinds"
+        assert 0.4 < np.mean([lap.look >= SHADOWED for lap in some]) < 0.6
+
+
+def test_rendering_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
+    recorded = []
+
+    def record(folder, track, laps, seed, look):
+        folder.mkdir(parents=True)
+        recorded.append((track.name, track.direction, look, seed))
+        if len(recorded) == 2:
+            raise KeyboardInterrupt
+        return SimpleNamespace(departures=[]), 1
+
+    monkeypatch.setattr(shipped, "record", record)
+    chosen = [Lap("lake", "ccw", 0), Lap("lake", "cw", 10_000), Lap("road-1001", "ccw", 1)]
+    with pytest.raises(KeyboardInterrupt):
+        render(tmp_path, chosen)
+    render(tmp_path, chosen)
+    assert [seed for *_, seed in recorded] == [0, 1, 1, 2]
+    names = ["lake-ccw-look0", "lake-cw-look10000", "road-1001-ccw-look1"]
+    assert sorted(folder.name for folder in tmp_path.iterdir()) == names
+
+
+def test_a_lap_that_left_the_road_is_not_trained_on(tmp_path, monkeypatch):
+    def record(folder, *_, **__):
+        folder.mkdir(parents=True)
+        return SimpleNamespace(departures=["one"]), 1
+
+    monkeypatch.setattr(shipped, "record", record)
+    with pytest.raises(RecordingError, match="lake-ccw-look0: the expert left the road"):
+        render(tmp_path, [Lap("lake", "ccw", 0)])
+    assert not (tmp_path / "lake-ccw-look0").exists()
+
+
+def test_a_repeated_recording_is_read_like_the_original(sample_recording, tmp_path):
+    for _ in range(2):  # a second run changes nothing
+        repeat(tmp_path, [sample_recording])
+    (twin,) = tmp_path.iterdir()
+    assert twin.name.endswith(PROBLEM_AREAS)
+    original, repeated = read_recording(sample_recording), read_recording(twin)
+    np.testing.assert_array_equal(repeated.steering, original.steering)
+    assert repeated.path(0).read_bytes() == original.path(0).read_bytes()
+
+
+def test_recordings_that_are_not_there_are_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(shipped, "render", lambda *_: None)
+    assert shipped.main([str(tmp_path / "none"), "--folder", str(tmp_path / "out")]) == 2
+    assert "none: no such folder" in capsys.readouterr().err
