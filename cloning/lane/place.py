@@ -212,11 +212,22 @@ def estimate_lane_position(
     stretches: of the recording, `motion.stretches`; network: the shipped one if None.
     Raises RecordingError for images that can't be read, ModelError without a usable network.
     """
-    centres = detect_centres(recording, network)
+    return place(recording, stretches, detect_centres(recording, network))[0]
+
+
+def place(
+    recording: Recording, stretches: list[Stretch], centres: np.ndarray
+) -> tuple[LanePosition, list[tuple[slice, Localisation]]]:
+    """Return the position in the lane at every row of a recording, and where its stretches are on known roads.
+
+    As `estimate_lane_position`; centres: float32 (n, 3, 5), of `reader.detect_centres`. The second value has the rows
+    and the localisation of each stretch that `localise_all` places.
+    """
     position = fuse_detections(recording, centres, stretches)
-    for rows, localisation in localise_all(stretches, centres):
+    placed = list(localise_all(stretches, centres))
+    for rows, localisation in placed:
         _, lateral_offset, heading_error = localisation.states.T
         position.heading_error[rows] = heading_error
         position.lateral_offset[rows] = lateral_offset + REAR_AXLE * np.sin(heading_error)
         position.trusted[rows] = True
-    return position
+    return position, placed
