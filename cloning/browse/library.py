@@ -170,7 +170,7 @@ def _figures(folder: Path, version: str, cuts: tuple[Cut, ...]) -> dict[str, Any
     """Return a recording's figures: a few kB, so that a list of recordings need not be read again."""
     recording = _read(folder, version)
     is_cut = cut_rows(folder, list(cuts), recording.names, recording.images[:, 0])
-    return summary.figures(recording, is_cut.any(0))
+    return summary.figures(recording, np.logical_or.reduce(is_cut))
 
 
 @functools.lru_cache(maxsize=1000)

@@ -78,9 +78,10 @@ def write_result(folder: Path, look: str, of: str, result: Result) -> None:
     """Write a look's result; of: the `stamp` from before the look. Raises OSError."""
     file = result_file(folder, look)
     file.parent.mkdir(parents=True, exist_ok=True)
-    about = np.frombuffer(json.dumps({"stamp": of, **result.about}).encode(), np.uint8)
+    names, columns = list(result.columns), np.array(list(result.columns.values()), np.float32)
+    about = np.frombuffer(json.dumps({"stamp": of, "columns": names, **result.about}).encode(), np.uint8)
     with written_whole(file) as temporary, open(temporary, "wb") as opened:
-        np.savez(opened, about=about, images=result.images, **result.columns)
+        np.savez(opened, about=about, images=result.images, columns=columns)
 
 
 def read_result(folder: Path, look: str) -> Result | None:
@@ -88,14 +89,13 @@ def read_result(folder: Path, look: str) -> Result | None:
     wanted = stamp(folder, look)
     try:
         with np.load(result_file(folder, look)) as file:
-            columns = {name: file[name] for name in file.files}
-        about = json.loads(columns.pop("about").tobytes())
-        images = columns.pop("images")
+            about, images, columns = json.loads(file["about"].tobytes()), file["images"], file["columns"]
+        named = dict(zip(about["columns"], columns, strict=True))
     except FileNotFoundError:
         return None
     except Exception:  # whatever a damaged file makes NumPy raise; the look is repeated and replaces it
         return None
-    return Result(images, columns, about) if about.get("stamp") == wanted else None
+    return Result(images, named, about) if about["stamp"] == wanted else None
 
 
 class Looks:

@@ -64,7 +64,8 @@ def create_app(library: Library) -> flask.Flask:
         response = flask.Response(library.jpeg(identifier, row, camera, version()), mimetype="image/jpeg")
         response.headers["Cache-Control"] = f"private, max-age={KEPT}"
         response.add_etag()
-        return response.make_conditional(flask.request)
+        response.make_conditional(flask.request)
+        return response
 
     @app.post("/recordings/<identifier>/cuts")
     def cut(identifier: str) -> dict[str, Any]:

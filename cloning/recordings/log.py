@@ -125,12 +125,10 @@ def print_findings(recording: Recording) -> None:
             print(f"{path}: line {line}: left out: {detail}")
         if len(rejected) > SHOWN_PER_KIND:
             print(f"{path}: … and {len(rejected) - SHOWN_PER_KIND} more of this kind")
-    for cut, count in recording.cuts:
-        rows = "1 row is" if count == 1 else f"{count} rows are"
-        stretch = f"from {cut.first} to {cut.last}"
-        print(
-            f"{recording.folder / EXCLUDED}: line {cut.line}: {rows} cut, {stretch}: {cut.reason or 'no reason given'}"
-        )
+    for cut, size in recording.cuts:
+        count = "1 row is" if size == 1 else f"{size} rows are"
+        stretch = f"from {cut.first} to {cut.last}: {cut.reason or 'no reason given'}"
+        print(f"{recording.folder / EXCLUDED}: line {cut.line}: {count} left out, {stretch}")
 
 
 def read_recording(folder: str | Path) -> Recording:

@@ -39,22 +39,20 @@ function draw(overview, card) {
   }
   const histogram = make("div", "", {class: "histogram"});
   const lines = Object.entries({
-    "": overview.folder,
     frames: `${overview.frames.toLocaleString("en")}, ${(overview.seconds / 60).toFixed(1)} minutes`,
     road: road(overview),
-    speed: overview.speed ? `${overview.speed[1].toFixed(1)} mph on average, at most ${overview.speed[2].toFixed(1)}` : "–",
+    speed: overview.speed ? `${overview.speed[1].toFixed(1)} mph, at most ${overview.speed[2].toFixed(1)}` : "–",
     "steering 0": overview.zeros == null ? "–" : `${(100 * overview.zeros).toFixed(0)} % of the frames`,
     repaired: many(overview.repairs.reduce((sum, [, rows]) => sum + rows, 0), "row"),
     refused: many(overview.rejected, "row") + (overview.unusable ? `, ${many(overview.unusable, "row")} for an image` : ""),
-    cut: `${many(overview.cut_frames, "frame")}` +
+    cut: many(overview.cut_frames, "frame") +
       (overview.cut_frames ? `, ${(100 * overview.cut_frames / overview.frames).toFixed(1)} %` : ""),
+    folder: overview.folder,
   });
   card.replaceChildren(
     heading,
     make("div", "", {class: "pictures"}, map(overview), histogram),
-    make("dl", "", {}, ...lines.flatMap(([name, value]) => name
-      ? [make("dt", name), make("dd", value)] : [])),
-    make("p", overview.folder, {class: "quiet", style: "margin: .4rem 0 0; font-size: .85rem; overflow-wrap: anywhere"}),
+    make("dl", "", {}, ...lines.flatMap(([name, value]) => [make("dt", name), make("dd", value)])),
   );
   bars(overview.histogram, histogram);
 }

@@ -3,7 +3,7 @@ import {clock, element, make} from "./common.js";
 
 const MODEL_COLOURS = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]; // told apart by the colour-blind too
 const LEFT = 56, RIGHT = 12; // px; browse.css has them for the bar
-const HEIGHT = 104;
+const HEIGHT = 84, TIMES = 20; // px of a plot, and of the times below the last one
 
 export class Plots {
   // columns: arrays by name; models: their names; seek: called with the row that was clicked
@@ -11,7 +11,7 @@ export class Plots {
     Object.assign(this, {columns, models, seek, stretches: [], row: 0, zoom: null});
     this.count = columns.seconds.length;
     this.rows = Array.from({length: this.count}, (_, row) => row);
-    this.resizing = new ResizeObserver(() => this.plots?.forEach(plot => plot.setSize(this.size())));
+    this.resizing = new ResizeObserver(() => this.plots?.forEach((plot, at) => plot.setSize(this.size(at == this.plots.length - 1))));
     this.resizing.observe(element("plots"));
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.redo = () => this.build();
@@ -19,8 +19,8 @@ export class Plots {
     this.build();
   }
 
-  size() {
-    return {width: Math.max(200, element("plots").clientWidth), height: HEIGHT};
+  size(isLast) {
+    return {width: Math.max(200, element("plots").clientWidth), height: HEIGHT + (isLast ? TIMES : 0)};
   }
 
   close() {
@@ -45,12 +45,12 @@ export class Plots {
       {title: "Lateral offset, right positive", unit: " m", digits: 2, curves: [{name: "", values: offset}]},
     ];
     this.shown = [];
-    this.plots = kinds.map(kind => this.plot(kind));
+    this.plots = kinds.map((kind, at) => this.plot(kind, at == kinds.length - 1));
     if (this.zoom) this.setZoom(...this.zoom);
     this.goTo(this.row);
   }
 
-  plot({title, unit, digits, range, curves}) {
+  plot({title, unit, digits, range, curves}, isLast) {
     const colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
     const figure = make("figure"), caption = make("figcaption", "", {}, make("span", title)), place = make("div");
     for (const curve of curves) {
@@ -65,11 +65,11 @@ export class Plots {
       grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
     const bound = Math.max(1, ...curves.filter(({values}) => values && !range).map(({values}) => largest(values)));
     const plot = new uPlot({
-      ...this.size(), legend: {show: false}, padding: [4, RIGHT, 0, 0],
+      ...this.size(isLast), legend: {show: false}, padding: [6, RIGHT, isLast ? 0 : 6, 0],
       cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
       scales: {x: {time: false, range: (_, low, high) => [low, high]}, y: {range: range ?? [-bound, bound]}},
       axes: [
-        {...axis, size: 22, values: (_, rows) => rows.map(row => this.time(row))},
+        {...axis, size: isLast ? TIMES : 0, values: (_, rows) => rows.map(row => isLast ? this.time(row) : "")},
         {...axis, size: LEFT},
       ],
       series: [{}, ...curves.map(curve => ({stroke: curve.colour, width: 1, points: {show: false}, spanGaps: false}))],

@@ -155,9 +155,9 @@ function goTo(row, step = 0) {
   open.frames.show(open.row, step);
   open.plots.goTo(open.row);
   element("scrub").value = open.row;
-  const time = clock(open.columns.seconds[open.row]), speed = open.columns.speed[open.row].toFixed(1);
+  const time = clock(open.columns.seconds[open.row]);
   element("scrub").setAttribute("aria-valuetext", time);
-  element("where").textContent = `${time} of ${clock(open.columns.seconds.at(-1))}, frame ${open.row + 1} of ${open.count}, ${speed} mph`;
+  element("where").textContent = `${time} of ${clock(open.columns.seconds.at(-1))}, frame ${open.row + 1} of ${open.count}`;
   clearTimeout(open.noting);
   open.noting = setTimeout(() => open && history.replaceState(null, "", `#/${open.id}/${open.row}`), 300);
 }
