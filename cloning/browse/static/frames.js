@@ -1,20 +1,23 @@
-// The three cameras: the newest row that is asked for is drawn as soon as it is there; rows after it are loaded ahead.
+// The three cameras: a row that is asked for is drawn as soon as it is there, unless a later one was drawn before.
 import {element} from "./common.js";
 
 const CAMERAS = ["left", "center", "right"], NAMES = {left: "Left", center: "Centre", right: "Right"};
 const KEPT = 60; // rows whose pictures stay decoded: 600 kB each
 const AHEAD = 4; // rows that are loaded ahead while playing
+const AT_ONCE = 3; // rows that are loaded at the same time; of those asked for meanwhile, only the last one is
 
 export class Frames {
-  constructor(id, version, count, onError) {
-    Object.assign(this, {id, version, count, onError, wanted: -1, drawn: -1, busy: false, closed: false});
+  constructor(id, version, count) {
+    Object.assign(this, {id, version, count, closed: false});
+    this.wanted = undefined; // the row to load next
+    this.asked = this.drawn = this.loading = 0; // numbers of the last question and of the one drawn, and how many load
     this.loaded = new Map(); // row -> promise of its pictures, the oldest first
   }
 
   // Show a row; step: the rows to load ahead are so far apart, 0 for none.
   show(row, step = 0) {
     this.wanted = row;
-    this.draw();
+    if (this.loading < AT_ONCE) this.draw();
     for (let ahead = 1; step && ahead <= AHEAD; ahead++) {
       const next = row + ahead * step;
       if (next >= 0 && next < this.count) this.load(next);
@@ -26,17 +29,16 @@ export class Frames {
   }
 
   async draw() {
-    if (this.busy) return;
-    this.busy = true;
-    while (this.drawn != this.wanted && !this.closed) {
-      const row = this.wanted, pictures = await this.load(row);
-      if (this.closed) return;
+    this.loading += 1;
+    while (this.wanted != undefined && !this.closed) {
+      const row = this.wanted, number = ++this.asked;
+      this.wanted = undefined;
+      const pictures = await this.load(row);
+      if (this.closed || number < this.drawn) continue;
+      this.drawn = number;
       CAMERAS.forEach((camera, at) => paint(camera, pictures[at]));
-      this.drawn = row;
-      const gone = pictures.find(({status}) => status == 409 || status == undefined);
-      if (gone?.message) this.onError(gone.message);
     }
-    this.busy = false;
+    this.loading -= 1;
   }
 
   load(row) {
@@ -54,7 +56,7 @@ export class Frames {
       return {picture: await createImageBitmap(await answer.blob())};
     } catch (error) {
       this.loaded.delete(row);
-      return {message: "This frame could not be loaded: is the program that shows the recordings still there?"};
+      return {message: "The program that shows the recordings does not answer."};
     }
   }
 }

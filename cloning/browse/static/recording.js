@@ -46,7 +46,7 @@ export async function showRecording(id, row) {
   leaveRecording(); // two clicks may have opened two
   const count = columns.seconds.length;
   open = {id, details, columns, count, row: 0, marks: {}, done: [], playing: 0};
-  open.frames = new Frames(id, details.version, count, notice);
+  open.frames = new Frames(id, details.version, count);
   open.plots = new Plots(columns, details.models.map(({name}) => name), seek);
   element("title").textContent = `/ ${details.name}`;
   document.title = details.name;
