@@ -75,10 +75,10 @@ class Page:
         assert "exceptionDetails" not in done, done
         return done["result"].get("value")
 
-    def wait(self, code: str, seconds: float = 20.0):
-        """Wait until a JavaScript expression is true; return its value."""
+    def wait(self, code: str, seconds: float = 20.0) -> None:
+        """Wait until a JavaScript expression is true."""
         try:
-            return self.until(lambda: self.run(code), seconds)
+            self.until(lambda: self.run(f"Boolean({code})"), seconds)
         except AssertionError as error:
             raise AssertionError(f"{code}: {error}; the page shows: {self.run('document.body.innerText')}") from None
 

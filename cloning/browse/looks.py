@@ -24,6 +24,7 @@ from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
 
 RULES = 1  # of what a result contains: counted up when they change
 LANE = "lane"  # the look for the position in the lane; every other look is the path of a model file
+COMMAND = (sys.executable, "-m", "cloning.browse.estimate")
 PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
 
 
@@ -158,10 +159,8 @@ class Looks:
                     return
                 self.running, self.progress = self.waiting.pop(0), 0.0
                 folder, look = self.running
-                command = [sys.executable, "-m", "cloning.browse.estimate", str(folder), look]
-                self.process = subprocess.Popen(
-                    command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace"
-                )
+                command, pipe = [*COMMAND, str(folder), look], subprocess.PIPE
+                self.process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, errors="replace")
             before, message = "", ""
             with contextlib.suppress(RecordingError):
                 before = stamp(folder, look)
