@@ -1,9 +1,10 @@
 // The curves of a recording, one above the other, over its rows; drawn by uPlot.
-import {clock, element, make} from "./common.js";
+import {element, make} from "./common.js";
 
 const MODEL_COLOURS = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]; // told apart by the colour-blind too
 const LEFT = 56, RIGHT = 12; // px; browse.css has them for the bar
 const HEIGHT = 84, TIMES = 20; // px of a plot, and of the times below the last one
+const STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 1800, 3600], TIME_SPACE = 70; // s between two times; px
 
 export class Plots {
   // columns: arrays by name; models: their names; seek: called with the row that was clicked
@@ -11,7 +12,8 @@ export class Plots {
     Object.assign(this, {columns, models, seek, stretches: [], row: 0, zoom: null});
     this.count = columns.seconds.length;
     this.rows = Array.from({length: this.count}, (_, row) => row);
-    this.resizing = new ResizeObserver(() => this.plots?.forEach((plot, at) => plot.setSize(this.size(at == this.plots.length - 1))));
+    this.resizing = new ResizeObserver(() =>
+      this.plots.forEach((plot, at) => plot.setSize(this.size(at == this.plots.length - 1))));
     this.resizing.observe(element("plots"));
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.redo = () => this.build();
@@ -69,8 +71,9 @@ export class Plots {
       cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
       scales: {x: {time: false, range: (_, low, high) => [low, high]}, y: {range: range ?? [-bound, bound]}},
       axes: [
-        {...axis, size: isLast ? TIMES : 0, values: (_, rows) => rows.map(row => isLast ? this.time(row) : "")},
-        {...axis, size: LEFT},
+        {...axis, size: isLast ? TIMES : 0, splits: (plot, _, low, high) => this.times(plot.width, low, high),
+          values: (_, rows) => rows.map(row => isLast ? this.time(row) : "")},
+        {...axis, size: LEFT, space: 22},
       ],
       series: [{}, ...curves.map(curve => ({stroke: curve.colour, width: 1, points: {show: false}, spanGaps: false}))],
       hooks: {
@@ -88,9 +91,21 @@ export class Plots {
     return plot;
   }
 
+  // The rows at round times, at most one for each TIME_SPACE px.
+  times(width, low, high) {
+    const {seconds} = this.columns, from = seconds[Math.ceil(low)], to = seconds[Math.floor(high)], rows = [];
+    const step = STEPS.find(step => (to - from) / step < width / TIME_SPACE) ?? STEPS.at(-1);
+    for (let row = Math.ceil(low), next = Math.ceil(from / step) * step; row <= high; row++) {
+      if (seconds[row] < next) continue;
+      rows.push(row);
+      next = (Math.floor(seconds[row] / step) + 1) * step;
+    }
+    return rows;
+  }
+
   time(row) {
-    const seconds = this.columns.seconds[Math.round(row)];
-    return seconds == undefined ? "" : clock(seconds);
+    const seconds = this.columns.seconds[row];
+    return `${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}`;
   }
 
   listen(plot, here) {
