@@ -15,6 +15,7 @@ async function route() {
   try {
     await (id ? showRecording(id, Number(row) || 0) : showList());
   } catch (error) {
+    element("recording").hidden = true;
     notice(error.message);
   }
 }

@@ -43,9 +43,10 @@ export async function showRecording(id, row) {
   const names = ["steering", "throttle", "speed", "seconds"], columns = {};
   const parts = await Promise.all(names.map(name => column(id, details.version, name)));
   names.forEach((name, at) => columns[name] = parts[at]);
-  leaveRecording(); // two clicks may have opened two
-  const count = columns.seconds.length;
-  open = {id, details, columns, count, row: 0, marks: {}, done: [], playing: 0};
+  const again = open?.id == id ? open : undefined; // what this page has done stays undoable when it reads again
+  leaveRecording();
+  const count = columns.seconds.length, marks = again?.details.version == details.version ? again.marks : {};
+  open = {id, details, columns, count, marks, done: again?.done ?? [], row: 0, playing: 0};
   open.frames = new Frames(id, details.version, count);
   open.plots = new Plots(columns, details.models.map(({name}) => name), seek);
   element("title").textContent = `/ ${details.name}`;
@@ -302,8 +303,10 @@ export function pressed(key, shift) {
   return Boolean(action);
 }
 
-for (const button of document.querySelectorAll("[data-key]")) button.onclick = () => pressed(button.dataset.key, false);
-element("scrub").oninput = () => open && seek(Number(element("scrub").value));
-for (const [id, key] of [["jump-offset", "f"], ["jump-stop", "s"], ["jump-difference", "d"]]) {
-  element(id).onclick = event => pressed(key, event.shiftKey);
+for (const button of document.querySelectorAll("[data-key]")) {
+  button.onclick = event => {
+    pressed(button.dataset.key, event.shiftKey);
+    if (event.detail) button.blur(); // clicked with the mouse: Space is again for playing
+  };
 }
+element("scrub").oninput = () => open && seek(Number(element("scrub").value));
