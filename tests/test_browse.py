@@ -19,6 +19,7 @@ from browser import CHROMIUM, chromium
 from conftest import HERE, ROOT
 from test_excluded import center
 
+from cloning.browse import __main__ as browse
 from cloning.browse import estimate, looks, summary
 from cloning.browse.library import Library
 from cloning.browse.looks import LANE, Result, read_result, stamp, write_result
@@ -336,14 +337,13 @@ def test_torch_is_not_imported_to_serve():
     assert done.stdout == "False\n"
 
 
-def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path):
+def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, monkeypatch, capsys):
     for arguments, words in (
         ([tmp_path], f"{tmp_path}: no driving_log.csv in or below it"),
         ([sample_recording, "--model", tmp_path / "m.pt"], f"{tmp_path / 'm.pt'}: no such model file"),
     ):
-        command = [sys.executable, "-m", "cloning.browse", *map(str, arguments), "--port", "0"]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
-        assert done.returncode == 2 and done.stderr.startswith(f"browse: {words}")
+        monkeypatch.setattr(sys, "argv", ["browse", *map(str, arguments), "--port", "0"])
+        assert browse.main() == 2 and capsys.readouterr().err.startswith(f"browse: {words}")
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -313,7 +313,7 @@ def test_a_cut_killed_anywhere(warm, lake, tmp_path):
 
 def test_an_estimate_of_the_lane_killed_anywhere(warm, lake, tmp_path):
     command = ["cloning.browse.estimate", lake, "lane"]
-    Place(warm, tmp_path / "place", command, command).killed_everywhere(2)
+    Place(warm, tmp_path / "place", command, command).killed_everywhere(1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -144,7 +144,7 @@ class Library:
         """Cut a stretch; first, last: file names of centre images. Raises RecordingError, OSError."""
         folder, recording = self.folder(identifier), self.recording(identifier)
         cut = Cut(first, last, one_line(reason))
-        cut_rows(folder, [cut], recording.names, recording.images[:, 0])
+        next(cut_rows(folder, [cut], recording.names, recording.images[:, 0]))  # refuses what is no stretch
         add_cut(folder, cut)
 
     def restore(self, identifier: str, first: str, last: str, reason: str) -> None:
@@ -169,8 +169,10 @@ def _result(folder: Path, look: str, of: str) -> Result:
 def _figures(folder: Path, version: str, cuts: tuple[Cut, ...]) -> dict[str, Any]:
     """Return a recording's figures: a few kB, so that a list of recordings need not be read again."""
     recording = _read(folder, version)
-    is_cut = cut_rows(folder, list(cuts), recording.names, recording.images[:, 0])
-    return summary.figures(recording, np.logical_or.reduce(is_cut))
+    is_cut = np.zeros(len(recording), bool)
+    for rows in cut_rows(folder, cuts, recording.names, recording.images[:, 0]):
+        is_cut |= rows
+    return summary.figures(recording, is_cut)
 
 
 @functools.lru_cache(maxsize=1000)

@@ -160,17 +160,20 @@ class Looks:
                 self.running, self.progress = self.waiting.pop(0), 0.0
                 folder, look = self.running
                 command, pipe = [*COMMAND, str(folder), look], subprocess.PIPE
-                self.process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, errors="replace")
-            before, message = "", ""
+                self.process = subprocess.Popen(
+                    command, stdout=pipe, stderr=subprocess.STDOUT, text=True, errors="replace"
+                )
+            before, message = "", "was ended"
             with contextlib.suppress(RecordingError):
                 before = stamp(folder, look)
             with self.process:
-                assert self.process.stdout and self.process.stderr
+                assert self.process.stdout
                 for line in self.process.stdout:
                     if line.startswith(PROGRESS):
                         self.progress = float(line.removeprefix(PROGRESS))
-                message = self.process.stderr.read().strip()
+                    elif line.strip():
+                        message = line.strip()
             with self.changed:
                 if self.process.returncode and not self.closed:
-                    self.failed[folder, look, before] = message.splitlines()[-1] if message else "was killed"
+                    self.failed[folder, look, before] = message
                 self.process = self.running = None

@@ -7,7 +7,7 @@ import contextlib
 import csv
 import io
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,8 +53,8 @@ def read_cuts(folder: Path) -> list[Cut]:
     return _parse(folder / EXCLUDED, _lines(folder / EXCLUDED))
 
 
-def cut_rows(folder: Path, cuts: list[Cut], names: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return which rows each cut leaves out: bool (cuts, n).
+def cut_rows(folder: Path, cuts: Iterable[Cut], names: np.ndarray, centres: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield which rows each cut leaves out: bool (n,).
 
     A stretch begins at the first row with its first image, and ends at the next one with its last image. Copies of its
     rows elsewhere in the recording are left out with it.
@@ -62,15 +62,15 @@ def cut_rows(folder: Path, cuts: list[Cut], names: np.ndarray, centres: np.ndarr
     Raises RecordingError for an image that no row has, and for a stretch whose end comes before its beginning.
     """
     path = folder / EXCLUDED
-    is_cut = np.zeros((len(cuts), len(centres)), bool)
-    for out, cut in zip(is_cut, cuts, strict=True):
+    for cut in cuts:
         where = f"{path}: line {cut.line}" if cut.line else str(path)
         first, last = (_rows_with(where, name, names, centres) for name in (cut.first, cut.last))
         last = last[last >= first[0]]
         if not len(last):
             raise RecordingError(f"{where}: {cut.last} comes before {cut.first} in the recording; exchange the two")
-        out[:] = np.isin(centres, centres[first[0] : last[0] + 1])
-    return is_cut
+        is_cut = np.zeros(len(names), bool)
+        is_cut[centres[first[0] : last[0] + 1]] = True
+        yield is_cut[centres]
 
 
 def _rows_with(where: str, name: str, names: np.ndarray, centres: np.ndarray) -> np.ndarray:

@@ -7,8 +7,7 @@ export async function ask(path, {binary = false, ...options} = {}) {
   try {
     answer = await fetch(`/recordings${path}`, options);
   } catch (error) {
-    if (error.name != "AbortError") notice("The program that shows the recordings does not answer: start it again.");
-    throw error;
+    throw new Error("The program that shows the recordings does not answer: start it again.");
   }
   if (!answer.ok) {
     const {message} = await answer.json().catch(() => ({message: `${answer.status} ${answer.statusText}`}));

@@ -1,5 +1,5 @@
 // All recordings at a glance.
-import {ask, element, make, many} from "./common.js";
+import {ask, element, make, many, notice} from "./common.js";
 
 const AGAIN = 3000; // ms until a recording whose lane is being estimated is asked for again
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
@@ -27,7 +27,7 @@ async function fill(id, card, known, now) {
     `${(sum("seconds") / 60).toFixed(1)} minutes, ${many(sum("cut_frames"), "frame")} cut`;
   draw(overview, card);
   if (["waiting", "running"].includes(overview.lane?.state)) {
-    setTimeout(() => now == shown && fill(id, card, known, now).catch(() => {}), AGAIN);
+    setTimeout(() => now == shown && fill(id, card, known, now).catch(error => notice(error.message)), AGAIN);
   }
 }
 

@@ -161,7 +161,7 @@ export class Plots {
     }
     for (const {value, unit, digits, values} of this.shown) {
       const number = values?.[row];
-      value.textContent = values == undefined ? "not known yet" : Number.isNaN(number) ? "unknown" : number.toFixed(digits) + unit;
+      value.textContent = values == undefined ? "not known" : Number.isNaN(number) ? "not known here" : number.toFixed(digits) + unit;
     }
     this.plots.forEach(plot => this.move(plot, plot.here));
   }
