@@ -59,6 +59,17 @@ def test_places_with_the_steering_at_its_stop():
     assert summary.at_stop(np.zeros(3)) == [] and summary.largest(np.full(3, np.nan)) == []
 
 
+def test_places_are_those_that_are_not_cut():
+    steering = np.zeros(90, np.float32)
+    steering[[5, 70]] = 1, -1
+    offset, models = np.linspace(0, 3, 90, dtype=np.float32), [np.full(90, 0.1), np.full(90, np.nan)]
+    nothing_cut = summary.places(steering, offset, models, np.zeros(90, bool))
+    assert nothing_cut == {"stop": [5, 70], "offset": [29, 59, 89], "difference": [5, 35, 70]}
+    cut = summary.places(steering, offset, models, np.arange(90) >= 60)
+    assert cut == {"stop": [5], "offset": [29, 59], "difference": [5, 35]}
+    assert summary.places(steering, None, [], np.zeros(90, bool)) == {"stop": [5, 70]}
+
+
 def test_figures_are_those_of_the_rows_that_are_not_cut(sample_recording):
     recording = read_recording(sample_recording)
     is_cut = np.arange(60) < 30

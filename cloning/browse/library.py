@@ -77,22 +77,19 @@ class Library:
         cuts = read_cuts(folder)
         self.looks.hurry(folder)
         models = [{"name": Path(model).name, **self.looks.state(folder, model)} for model in self.models]
-        shown = self.overview(identifier) | {"version": self.version(identifier), "models": models, "cuts": []}
-        is_cut = cut_rows(folder, cuts, recording.names, recording.images[:, 0])
-        for cut, rows in zip(cuts, is_cut, strict=True):
+        lane = {"lane": self.looks.state(folder, LANE)}
+        shown = self.overview(identifier) | lane | {"version": self.version(identifier), "models": models, "cuts": []}
+        is_cut = np.zeros(len(recording), bool)
+        for cut, rows in zip(cuts, cut_rows(folder, cuts, recording.names, recording.images[:, 0]), strict=True):
             edges = np.flatnonzero(np.diff(rows, prepend=False, append=False)).reshape(-1, 2)
             shown["cuts"].append({**cut.__dict__, "frames": int(rows.sum()), "stretches": edges.tolist()})
-        shown["places"] = {"stop": summary.at_stop(recording.steering)}
-        if shown.get("lane", {}).get("state") == "ready":
-            shown["places"]["offset"] = summary.largest(self.column(identifier, OFFSET))
-        differences = [
-            self.column(identifier, f"{MODEL}{number}") - recording.steering
-            for number, model in enumerate(models)
-            if model["state"] == "ready"
-        ]
-        if differences:
-            shown["places"]["difference"] = summary.largest(np.fmax.reduce(np.abs(differences)))
-        return shown
+            is_cut |= rows
+        ready = [OFFSET] if shown["lane"]["state"] == "ready" else []
+        ready += [f"{MODEL}{number}" for number, model in enumerate(models) if model["state"] == "ready"]
+        columns = {name: self.column(identifier, name) for name in ready}
+        return shown | {
+            "places": summary.places(recording.steering, columns.pop(OFFSET, None), [*columns.values()], is_cut)
+        }
 
     def column(self, identifier: str, name: str, version: str | None = None) -> np.ndarray:
         """Return a column of a recording: float32 (n,), nan where nothing is known.

@@ -48,6 +48,22 @@ def at_stop(steering: np.ndarray) -> list[int]:
     return np.flatnonzero((side != 0) & (np.diff(side, prepend=0) != 0)).tolist()
 
 
+def places(
+    steering: np.ndarray, offset: np.ndarray | None, models: list[np.ndarray], is_cut: np.ndarray
+) -> dict[str, list[int]]:
+    """Return the places to jump to, by kind: rows in ascending order; none that is cut.
+
+    steering, offset, models: float32 (n,), the human driver's -1..1, m or None, and models' -1..1; is_cut: bool (n,).
+    """
+    found = {"stop": at_stop(np.where(is_cut, 0, steering))}
+    if offset is not None:
+        found["offset"] = largest(np.where(is_cut, np.nan, offset))
+    if models:
+        difference = np.fmax.reduce([np.abs(model - steering) for model in models])
+        found["difference"] = largest(np.where(is_cut, np.nan, difference))
+    return found
+
+
 def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
     """Return the figures of the log alone; is_cut: bool (n,). Steering and speed are those of the rows not cut."""
     kept = ~is_cut
