@@ -138,6 +138,29 @@ def ended(library: Library, folder: Path, look: str) -> list[dict]:
     return states
 
 
+def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, tmp_path, monkeypatch):
+    folders = []
+    for name, copies in (("large", 3), ("middle", 2), ("small", 1), ("open", 4)):
+        (tmp_path / name / "IMG").mkdir(parents=True)
+        text = (sample_recording / "driving_log.csv").read_text(encoding="utf-8")
+        (tmp_path / name / "driving_log.csv").write_text(text * copies, encoding="utf-8")
+        folders.append(tmp_path / name)
+    code = f"import sys; open({str(tmp_path / 'order')!r}, 'a').write(sys.argv[1] + '\\n'); sys.exit('no')"
+    monkeypatch.setattr(looks, "COMMAND", (sys.executable, "-c", code))
+    library = Library(folders, [])
+    try:
+        with library.looks.changed:  # until all of them wait
+            for folder in folders:
+                library.looks.state(folder, LANE)
+            library.looks.hurry(folders[3])
+        for folder in folders:
+            assert ended(library, folder, LANE)[-1]["state"] == "failed"
+    finally:
+        library.looks.close()
+    order = [Path(line).name for line in (tmp_path / "order").read_text(encoding="utf-8").splitlines()]
+    assert order == ["open", "small", "middle", "large"]
+
+
 def test_a_look_tells_how_far_it_is_and_why_it_failed(logged, monkeypatch):
     code = (
         "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nestimate: no model')"

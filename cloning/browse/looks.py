@@ -100,11 +100,12 @@ def read_result(folder: Path, look: str) -> Result | None:
 
 
 class Looks:
-    """Runs the looks that are asked for, one after the other, in a thread of this process."""
+    """Runs the looks that are asked for, one after the other, the smallest recording first."""
 
     def __init__(self) -> None:
         """Begin with nothing to do."""
-        self.waiting: list[tuple[Path, str]] = []
+        self.waiting: dict[tuple[Path, str], int] = {}  # folder, look -> size of the log, bytes
+        self.urgent: Path | None = None  # the folder whose looks go before all others
         self.failed: dict[tuple[Path, str, str], str] = {}  # folder, look, stamp -> message
         self.ready: set[tuple[Path, str, str]] = set()  # folder, look, stamp
         self.running: tuple[Path, str] | None = None
@@ -120,16 +121,16 @@ class Looks:
         Raises RecordingError as `stamp` does.
         """
         now = folder, look, stamp(folder, look)
-        if now in self.failed:
-            return {"state": "failed", "message": self.failed[now]}
-        if now in self.ready or read_result(folder, look):
-            self.ready.add(now)
-            return {"state": "ready"}
         with self.changed:
+            if now in self.failed:
+                return {"state": "failed", "message": self.failed[now]}
+            if now in self.ready or read_result(folder, look):
+                self.ready.add(now)
+                return {"state": "ready"}
             if self.running == (folder, look):
                 return {"state": "running", "progress": self.progress}
             if (folder, look) not in self.waiting:
-                self.waiting.append((folder, look))
+                self.waiting[folder, look] = file_stamp(folder / DRIVING_LOG)[0]
                 if not self.thread.is_alive():
                     self.thread.start()
                 self.changed.notify()
@@ -137,8 +138,7 @@ class Looks:
 
     def hurry(self, folder: Path) -> None:
         """Put a recording's looks before all others that wait."""
-        with self.changed:
-            self.waiting.sort(key=lambda each: each[0] != folder)
+        self.urgent = folder
 
     def close(self) -> None:
         """End the look that runs, if one does."""
@@ -157,7 +157,9 @@ class Looks:
                     self.changed.wait()
                 if self.closed:
                     return
-                self.running, self.progress = self.waiting.pop(0), 0.0
+                self.running = min(self.waiting, key=lambda each: (each[0] != self.urgent, self.waiting[each]))
+                self.progress = 0.0
+                del self.waiting[self.running]
                 folder, look = self.running
                 command, pipe = [*COMMAND, str(folder), look], subprocess.PIPE
                 self.process = subprocess.Popen(

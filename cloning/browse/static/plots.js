@@ -161,7 +161,7 @@ export class Plots {
     }
     for (const {value, unit, digits, values} of this.shown) {
       const number = values?.[row];
-      value.textContent = values == undefined ? "not known" : Number.isNaN(number) ? "not known here" : number.toFixed(digits) + unit;
+      value.textContent = values == undefined ? "not known" : Number.isNaN(number) ? "not known here" : rounded(number, digits) + unit;
     }
     this.plots.forEach(plot => this.move(plot, plot.here));
   }
@@ -171,6 +171,7 @@ export class Plots {
   }
 }
 
+const rounded = (number, digits) => number.toFixed(digits).replace(/^-(0[.0]*)$/, "$1"); // no -0.00
 const least = values => values.reduce((low, value) => Math.min(low, value), Infinity);
 const largest = values => values.reduce((high, value) => Math.max(high, Math.abs(value) || 0), 0);
 // uPlot leaves gaps at nulls, which typed arrays do not have.
