@@ -47,12 +47,16 @@ def total(counts: list[Counts]) -> Counts:
 
 
 def recordings_table(counts: list[Counts], dropped: str) -> str:
-    """Return a table with a line for each recording and one for all; dropped: the title of that column."""
+    """Return a table with a line for each recording and one for all; dropped: the title of that column.
+
+    It has a column for excluded rows if there are any.
+    """
     width = max(len(row.recording) for row in counts)
-    lines = [f"\n{'recording':{width}}  rows read  excluded  unusable  {dropped}  kept"]
+    is_cut = total(counts).cut > 0
+    lines = [f"\n{'recording':{width}}  rows read{'  excluded' * is_cut}  unusable  {dropped}  kept"]
     for name, rows_read, cut, unusable, off, kept in [*counts, total(counts)]:
-        counted = f"{rows_read:9,}  {cut:8,}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}"
-        lines.append(f"{name:{width}}  {counted}")
+        excluded = f"  {cut:8,}" * is_cut
+        lines.append(f"{name:{width}}  {rows_read:9,}{excluded}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
     return "\n".join(lines)
 
 
