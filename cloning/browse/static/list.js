@@ -4,9 +4,14 @@ import {ask, element, make, many, notice} from "./common.js";
 const AGAIN = 3000; // ms until a recording whose lane is being estimated is asked for again
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
 let shown = 0; // counted up when the list is left, so that answers that come later are dropped
+const known = new Map(); // card -> its recording's overview
+const histograms = new Map(); // card -> its histogram
 
 export function leaveList() {
   shown += 1;
+  histograms.forEach(plot => plot.destroy());
+  histograms.clear();
+  known.clear();
 }
 
 export async function showList() {
@@ -14,20 +19,22 @@ export async function showList() {
   if (now != shown) return;
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);
-  const known = new Map();
-  await Promise.all(recordings.map((recording, at) => fill(recording.id, cards[at], known, now)));
+  await Promise.all(recordings.map((recording, at) => fill(recording.id, cards[at], now)));
 }
 
-async function fill(id, card, known, now) {
+// What is drawn on a canvas does not follow the system's colours by itself.
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => known.forEach(draw));
+
+async function fill(id, card, now) {
   const overview = await ask(`/${id}/overview`);
   if (now != shown) return;
-  known.set(id, overview);
+  known.set(card, overview);
   const all = [...known.values()], sum = name => all.reduce((total, each) => total + (each[name] ?? 0), 0);
   element("total").textContent = `${many(all.length, "recording")}, ${many(sum("frames"), "frame")}, ` +
     `${(sum("seconds") / 60).toFixed(1)} minutes, ${many(sum("cut_frames"), "frame")} cut`;
   draw(overview, card);
   if (["waiting", "running"].includes(overview.lane?.state)) {
-    setTimeout(() => now == shown && fill(id, card, known, now).catch(error => notice(error.message)), AGAIN);
+    setTimeout(() => now == shown && fill(id, card, now).catch(error => notice(error.message)), AGAIN);
   }
 }
 
@@ -54,7 +61,8 @@ function draw(overview, card) {
     make("div", "", {class: "pictures"}, map(overview), histogram),
     make("dl", "", {}, ...lines.flatMap(([name, value]) => [make("dt", name), make("dd", value)])),
   );
-  bars(overview.histogram, histogram);
+  histograms.get(card)?.destroy();
+  histograms.set(card, bars(overview.histogram, histogram));
 }
 
 export function road({lane, roads}) {
@@ -90,7 +98,7 @@ function bars(counts, place) {
   place.setAttribute("role", "img");
   place.setAttribute("aria-label", "Histogram of steering, on a square-root scale");
   place.title = "How many frames have which steering, on a square-root scale";
-  new uPlot({
+  return new uPlot({
     width, height: 100, legend: {show: false}, cursor: {show: false}, padding: [4, 8, 0, 8],
     scales: {x: {time: false, range: [-1, 1]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
       range: (plot, low, high) => [0, Math.max(1, high)]}},
