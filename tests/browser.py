@@ -39,7 +39,7 @@ class Page:
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
 
-    def until(self, condition, seconds: float = 20.0):
+    def until(self, condition, seconds: float = 60.0):
         """Wait until a condition is true; return its value."""
         end = time.monotonic() + seconds
         while not (value := condition()):
@@ -62,7 +62,7 @@ class Page:
 
     def receive(self) -> dict:
         while b"\0" not in self.buffer:
-            assert select.select([self.incoming], [], [], 30)[0], "the browser does not answer"
+            assert select.select([self.incoming], [], [], 60)[0], "the browser does not answer"
             data = os.read(self.incoming, 1 << 20)
             assert data, "the browser has ended"
             self.buffer += data
@@ -75,7 +75,7 @@ class Page:
         assert "exceptionDetails" not in done, done
         return done["result"].get("value")
 
-    def wait(self, code: str, seconds: float = 20.0) -> None:
+    def wait(self, code: str, seconds: float = 60.0) -> None:
         """Wait until a JavaScript expression is true."""
         try:
             self.until(lambda: self.run(f"Boolean({code})"), seconds)

@@ -333,7 +333,7 @@ def test_cuts_over_the_socket(logged):
         assert server.ask(f"{here}/cuts", "POST", one)[0] == 200
         status, data, _ = server.ask(f"{here}/cuts", "POST", two)
         details = json.loads(data)
-        assert status == 200 and details["cut_frames"] == 4
+        assert status == 200 and details["cut_frames"] == 4 and details["changed"] == two | {"line": 0}
         assert [(cut["reason"], cut["frames"], cut["stretches"]) for cut in details["cuts"]] == [
             ("off", 3, [[3, 6]]),
             ("crash, hard", 1, [[10, 11]]),

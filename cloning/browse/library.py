@@ -137,16 +137,22 @@ class Library:
             raise UnknownError(f"no row {row}: the recording has {len(recording)}")
         return recording
 
-    def cut(self, identifier: str, first: str, last: str, reason: str) -> None:
-        """Cut a stretch; first, last: file names of centre images. Raises RecordingError, OSError."""
+    def cut(self, identifier: str, first: str, last: str, reason: str) -> Cut:
+        """Cut a stretch, and return the cut as it is written; first, last: file names of centre images.
+
+        Raises RecordingError, OSError.
+        """
         folder, recording = self.folder(identifier), self.recording(identifier)
         cut = Cut(first, last, one_line(reason))
         next(cut_rows(folder, [cut], recording.names, recording.images[:, 0]))  # refuses what is no stretch
         add_cut(folder, cut)
+        return cut
 
-    def restore(self, identifier: str, first: str, last: str, reason: str) -> None:
-        """Undo a cut. Raises RecordingError, OSError."""
-        delete_cut(self.folder(identifier), Cut(first, last, reason))
+    def restore(self, identifier: str, first: str, last: str, reason: str) -> Cut:
+        """Undo a cut, and return it. Raises RecordingError, OSError."""
+        cut = Cut(first, last, reason)
+        delete_cut(self.folder(identifier), cut)
+        return cut
 
 
 @functools.lru_cache(maxsize=OPEN)

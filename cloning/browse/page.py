@@ -17,8 +17,8 @@ def create_app(library: Library) -> flask.Flask:
 
     `/` is the page; `/recordings` lists identifiers. Below `/recordings/ID`: `overview` and `details`, JSON;
     `columns/NAME`, little-endian float32 (n,); `rows/N`, JSON, and `rows/N/CAMERA.jpg`; `cuts`, to which POST adds and
-    DELETE deletes one, {"first", "last", "reason"}. What depends on the log takes `?version=`, and is refused with 409
-    when the log has changed since. An error is {"message"}.
+    DELETE deletes one, {"first", "last", "reason"}; they answer with the details, and with the cut as "changed". What
+    depends on the log takes `?version=`, and is refused with 409 when it has changed since. An error is {"message"}.
     """
     app = flask.Flask(__name__)
     site.prepare(app, "script-src 'self'", "img-src 'self' data:")
@@ -69,13 +69,13 @@ def create_app(library: Library) -> flask.Flask:
 
     @app.post("/recordings/<identifier>/cuts")
     def cut(identifier: str) -> dict[str, Any]:
-        library.cut(identifier, **stretch())
-        return library.details(identifier)
+        changed = library.cut(identifier, **stretch())
+        return library.details(identifier) | {"changed": changed}
 
     @app.delete("/recordings/<identifier>/cuts")
     def restore(identifier: str) -> dict[str, Any]:
-        library.restore(identifier, **stretch())
-        return library.details(identifier)
+        changed = library.restore(identifier, **stretch())
+        return library.details(identifier) | {"changed": changed}
 
     return app
 

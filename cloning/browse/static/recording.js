@@ -28,8 +28,10 @@ const PLACES = {
   difference: ["places where a model differs most", "No model's steering is there: start with --model, or wait for it."],
 };
 let open; // the recording that is shown, or undefined
+let latest = 0; // number of the last request for a recording: what comes for an earlier one is dropped
 
 export function leaveRecording() {
+  latest += 1;
   if (!open) return;
   clearTimeout(open.timer);
   cancelAnimationFrame(open.playing);
@@ -39,9 +41,11 @@ export function leaveRecording() {
 }
 
 export async function showRecording(id, row) {
+  const mine = ++latest;
   const details = await ask(`/${id}/details`);
   const names = ["steering", "throttle", "speed", "seconds"], columns = {};
   const parts = await Promise.all(names.map(name => column(id, details.version, name)));
+  if (mine != latest) return;
   names.forEach((name, at) => columns[name] = parts[at]);
   const again = open?.id == id ? open : undefined; // what this page has done stays undoable when it reads again
   leaveRecording();
@@ -88,9 +92,13 @@ async function update(details) {
 async function refresh(now) {
   try {
     const details = await ask(`/${now.id}/details`);
-    if (open == now) await update(details);
+    if (open != now) return;
+    if (now.lost) notice();
+    now.lost = false;
+    await update(details);
   } catch (error) {
     if (open != now) return;
+    now.lost = true;
     notice(error.message);
     now.timer = setTimeout(() => refresh(now), IDLE);
   }
@@ -237,17 +245,13 @@ element("reason").onclose = () => {
 
 // Add or delete a cut; what: for the message; undoing: whether this is itself an undo.
 async function change(method, {first, last, reason}, what, undoing = false) {
-  const now = open, before = new Set(now.details.cuts.map(key));
+  const now = open;
   try {
     const details = await ask(`/${now.id}/cuts`, {
       method, headers: {"Content-Type": "application/json"}, body: JSON.stringify({first, last, reason}),
     });
     if (open != now) return;
-    if (!undoing) {
-      const added = details.cuts.find(cut => !before.has(key(cut)));
-      const back = method == "POST" ? ["DELETE", added ?? {first, last, reason}] : ["POST", {first, last, reason}];
-      now.done.push(back);
-    }
+    if (!undoing) now.done.push([method == "POST" ? "DELETE" : "POST", details.changed]);
     if (method == "POST") now.marks = {};
     notice();
     say(`${what[0].toUpperCase()}${what.slice(1)}. ${undoing ? "" : "Z undoes it."}`);
@@ -256,8 +260,6 @@ async function change(method, {first, last, reason}, what, undoing = false) {
     notice(error.message);
   }
 }
-
-const key = ({first, last, reason}) => JSON.stringify([first, last, reason]);
 
 function undo() {
   if (open.marks.first || open.marks.last) {
