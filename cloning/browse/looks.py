@@ -146,7 +146,7 @@ class Looks:
             self.closed = True
             self.changed.notify()
             if self.process:
-                self.process.terminate()
+                self.process.kill()  # its result is whole or not there
         if self.thread.is_alive():
             self.thread.join()
 
