@@ -92,9 +92,7 @@ def read_result(folder: Path, look: str) -> Result | None:
         with np.load(result_file(folder, look)) as file:
             about, images, columns = json.loads(file["about"].tobytes()), file["images"], file["columns"]
         named = dict(zip(about["columns"], columns, strict=True))
-    except FileNotFoundError:
-        return None
-    except Exception:  # whatever a damaged file makes NumPy raise; the look is repeated and replaces it
+    except Exception:  # there is no file yet, or a damaged one, of whatever kind: the look replaces it
         return None
     return Result(images, named, about) if about["stamp"] == wanted else None
 
@@ -124,7 +122,7 @@ class Looks:
         with self.changed:
             if now in self.failed:
                 return {"state": "failed", "message": self.failed[now]}
-            if now in self.ready or read_result(folder, look):
+            if (now in self.ready and result_file(folder, look).exists()) or read_result(folder, look):
                 self.ready.add(now)
                 return {"state": "ready"}
             if self.running == (folder, look):
