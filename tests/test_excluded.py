@@ -1,6 +1,5 @@
 """excluded.csv: which rows a cut leaves out, what every reader says of it, and that cuts are never lost."""
 
-import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -18,14 +17,6 @@ from cloning.replay.replay import load_recording
 HEADER = "first image,last image,reason\n"
 
 
-@pytest.fixture
-def logged(sample_recording, tmp_path) -> Path:
-    """A recording of 60 rows without its images, which a test may change."""
-    (tmp_path / "lake" / "IMG").mkdir(parents=True)
-    shutil.copy(sample_recording / "driving_log.csv", tmp_path / "lake")
-    return tmp_path / "lake"
-
-
 def center(recording: Path, row: int) -> str:
     """The centre image of a row, from the log itself."""
     line = (recording / "driving_log.csv").read_text(encoding="utf-8").splitlines()[row]
@@ -38,24 +29,24 @@ def exclude(recording: Path, *stretches: tuple[int, int, str]) -> Path:
     return recording
 
 
-def test_a_cut_leaves_out_its_rows_and_no_others(logged):
-    whole = read_recording(logged)
-    left = read_recording(exclude(logged, (10, 19, "off the road"), (15, 24, "overlaps"), (59, 59, "")))
+def test_a_cut_leaves_out_its_rows_and_no_others(linked):
+    whole = read_recording(linked)
+    left = read_recording(exclude(linked, (10, 19, "off the road"), (15, 24, "overlaps"), (59, 59, "")))
     kept = [*range(10), *range(25, 59)]
     np.testing.assert_array_equal(left.lines, whole.lines[kept])
     np.testing.assert_array_equal(left.steering, whole.steering[kept])
     assert [rows for _, rows in left.cuts] == [10, 5, 1], "no row is counted twice"
-    assert len(read_uncut(logged)) == 60 and left.rows_read == 60 and left.rejected == []
+    assert len(read_uncut(linked)) == 60 and left.rows_read == 60 and left.rejected == []
 
 
-def test_copies_of_a_cut_row_are_cut_with_it(logged):
-    log = logged / "driving_log.csv"
+def test_copies_of_a_cut_row_are_cut_with_it(linked):
+    log = linked / "driving_log.csv"
     lines = log.read_text(encoding="utf-8").splitlines(keepends=True)
     log.write_text("".join(lines[:5] + lines[2:4] + lines[5:] + lines[2:4]), encoding="utf-8")
-    left = read_recording(exclude(logged, (2, 2, "")))
+    left = read_recording(exclude(linked, (2, 2, "")))
     assert len(left) == 61 and left.cuts[0][1] == 3
     names = {left.name(row) for row in range(len(left))}
-    assert center(logged, 2) not in names and center(logged, 3) in names
+    assert center(linked, 2) not in names and center(linked, 3) in names
 
 
 def test_without_time_stamps_a_stretch_ends_at_the_next_row_with_its_last_image(tmp_path):
@@ -99,30 +90,30 @@ def test_every_command_honours_and_counts_cuts(copied, capsys):
         ("{left},{b},\n", "line 2: {left} is not the centre image"),
     ],
 )
-def test_a_wrong_line_is_named_with_the_remedy(logged, text, words):
-    names = {"a": center(logged, 3), "b": center(logged, 7), "left": center(logged, 3).replace("center", "left")}
-    (logged / "excluded.csv").write_text(HEADER + text.format(**names), encoding="utf-8")
+def test_a_wrong_line_is_named_with_the_remedy(linked, text, words):
+    names = {"a": center(linked, 3), "b": center(linked, 7), "left": center(linked, 3).replace("center", "left")}
+    (linked / "excluded.csv").write_text(HEADER + text.format(**names), encoding="utf-8")
     with pytest.raises(RecordingError, match=words.format(**names)) as error:
-        read_recording(logged)
-    assert str(error.value).startswith(str(logged / "excluded.csv"))
-    before = (logged / "excluded.csv").read_bytes()
+        read_recording(linked)
+    assert str(error.value).startswith(str(linked / "excluded.csv"))
+    before = (linked / "excluded.csv").read_bytes()
     if "fields" in words or "end of data" in words:
         with pytest.raises(RecordingError):
-            add_cut(logged, Cut(names["a"], names["b"], "more"))
-    assert (logged / "excluded.csv").read_bytes() == before
+            add_cut(linked, Cut(names["a"], names["b"], "more"))
+    assert (linked / "excluded.csv").read_bytes() == before
 
 
-def test_a_file_that_is_no_text_and_one_that_leaves_nothing(logged):
-    exclude(logged, (0, 59, "all"))
+def test_a_file_that_is_no_text_and_one_that_leaves_nothing(linked):
+    exclude(linked, (0, 59, "all"))
     with pytest.raises(RecordingError, match=r"excluded.csv: leaves out every row of driving_log.csv; delete a line"):
-        read_recording(logged)
-    (logged / "excluded.csv").write_text(HEADER, encoding="utf-16")
+        read_recording(linked)
+    (linked / "excluded.csv").write_text(HEADER, encoding="utf-16")
     with pytest.raises(RecordingError, match=r"excluded.csv: line 1: not a text in UTF-8; save it as CSV in UTF-8"):
-        read_recording(logged)
-    (logged / "excluded.csv").unlink()
-    (logged / "excluded.csv").mkdir()
+        read_recording(linked)
+    (linked / "excluded.csv").unlink()
+    (linked / "excluded.csv").mkdir()
     with pytest.raises(RecordingError, match=r"excluded.csv: .*; make it a readable file"):
-        read_recording(logged)
+        read_recording(linked)
 
 
 @pytest.mark.parametrize(
@@ -133,28 +124,28 @@ def test_a_file_that_is_no_text_and_one_that_leaves_nothing(logged):
         "First Image, Last Image, Reason\n /data/IMG/{a} , C:\\IMG\\{b}, off \n",
     ],
 )
-def test_hand_written_forms_are_understood(logged, form):
-    a, b = center(logged, 3), center(logged, 7)
-    (logged / "excluded.csv").write_bytes(form.format(a=a, b=b).encode())
-    assert [cut.row() for cut in read_cuts(logged)] == [(a, b, "off")]
-    assert len(read_recording(logged)) == 55
-    add_cut(logged, Cut(b, b, "more"))
-    delete_cut(logged, Cut(b, b, "more"))
-    assert (logged / "excluded.csv").read_bytes().rstrip() == form.format(a=a, b=b).encode().rstrip(), "as it was"
+def test_hand_written_forms_are_understood(linked, form):
+    a, b = center(linked, 3), center(linked, 7)
+    (linked / "excluded.csv").write_bytes(form.format(a=a, b=b).encode())
+    assert [cut.row() for cut in read_cuts(linked)] == [(a, b, "off")]
+    assert len(read_recording(linked)) == 55
+    add_cut(linked, Cut(b, b, "more"))
+    delete_cut(linked, Cut(b, b, "more"))
+    assert (linked / "excluded.csv").read_bytes().rstrip() == form.format(a=a, b=b).encode().rstrip(), "as it was"
 
 
-def test_adding_and_deleting_keep_all_other_lines(logged):
-    log = (logged / "driving_log.csv").read_bytes()
-    cuts = [Cut(center(logged, n), center(logged, n + 1), reason) for n, reason in ((1, 'a "b", c'), (5, ""), (9, "ü"))]
+def test_adding_and_deleting_keep_all_other_lines(linked):
+    log = (linked / "driving_log.csv").read_bytes()
+    cuts = [Cut(center(linked, n), center(linked, n + 1), reason) for n, reason in ((1, 'a "b", c'), (5, ""), (9, "ü"))]
     for cut in cuts:
-        add_cut(logged, cut)
-        add_cut(logged, cut)  # a second time it changes nothing
-    assert [cut.row() for cut in read_cuts(logged)] == [cut.row() for cut in cuts]
-    delete_cut(logged, cuts[1])
-    assert [cut.row() for cut in read_cuts(logged)] == [cuts[0].row(), cuts[2].row()]
+        add_cut(linked, cut)
+        add_cut(linked, cut)  # a second time it changes nothing
+    assert [cut.row() for cut in read_cuts(linked)] == [cut.row() for cut in cuts]
+    delete_cut(linked, cuts[1])
+    assert [cut.row() for cut in read_cuts(linked)] == [cuts[0].row(), cuts[2].row()]
     with pytest.raises(RecordingError, match="is not there any more; it was deleted elsewhere"):
-        delete_cut(logged, cuts[1])
-    assert (logged / "driving_log.csv").read_bytes() == log
+        delete_cut(linked, cuts[1])
+    assert (linked / "driving_log.csv").read_bytes() == log
 
 
 ADD = """
@@ -167,15 +158,15 @@ for n in range(20):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no lock here")
-def test_programs_that_cut_at_the_same_time_lose_nothing(logged):
+def test_programs_that_cut_at_the_same_time_lose_nothing(linked):
     def add(name: str) -> None:
-        subprocess.run([sys.executable, "-c", ADD, str(logged), name], check=True, cwd=ROOT, timeout=120)
+        subprocess.run([sys.executable, "-c", ADD, str(linked), name], check=True, cwd=ROOT, timeout=120)
 
     with ThreadPoolExecutor(3) as pool:
         list(pool.map(add, "xyz"))
-    reasons = [cut.reason for cut in read_cuts(logged)]
+    reasons = [cut.reason for cut in read_cuts(linked)]
     assert sorted(reasons) == sorted(f"{name} {n}" for name in "xyz" for n in range(20))
-    assert sorted(path.name for path in logged.iterdir()) == ["IMG", "driving_log.csv", "excluded.csv"]
+    assert sorted(path.name for path in linked.iterdir()) == ["IMG", "driving_log.csv", "excluded.csv"]
 
 
 def test_a_reason_is_one_line():
