@@ -6,17 +6,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from browse_process import browsing
+from browse_process import browsing, placed
 from browser import CHROMIUM, chromium
 from test_excluded import center
 
-from cloning.browse.looks import LANE, Result, stamp, write_result
 from cloning.recordings.log import read_recording
-from cloning.road.track import Track
 
 
 @pytest.fixture(scope="module")
 def served(sample_recording):
+    placed(sample_recording, np.zeros(60))
     with browsing(sample_recording) as server:
         yield server
 
@@ -25,16 +24,6 @@ def served(sample_recording):
 def page(tmp_path_factory):
     with chromium(tmp_path_factory.mktemp("profile")) as page:
         yield page
-
-
-def placed(folder: Path, offset: np.ndarray) -> None:
-    """As if the lane of a recording had been looked at already; offset: float (n,), m."""
-    recording, track = read_recording(folder), Track("lake")
-    points = track.points[100 : 100 + len(recording), :2].astype(np.float32)
-    columns = {"offset": offset.astype(np.float32), "x": points[:, 0], "y": points[:, 1], "road": np.zeros(len(offset))}
-    found = {"name": "lake", "direction": "ccw", "outline": track.points[:, :2].tolist()}
-    about = {"roads": [found], "longest": 60, "unusable": 0, "first_unusable": []}
-    write_result(folder, LANE, stamp(folder, LANE), Result(recording.images[:, 0], columns, about))
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from browse_process import browsing
+from browse_process import browsing, placed
 from conftest import ROOT
 from test_excluded import center
 
@@ -21,6 +21,7 @@ def served(sample_recording, tmp_path_factory):
     (data / "spoilt").mkdir()
     (data / "spoilt" / "driving_log.csv").write_text("nothing\n", encoding="utf-8")
     (data / "secret.jpg").write_bytes(min((sample_recording / "IMG").iterdir()).read_bytes())
+    placed(sample_recording, np.zeros(60))
     with browsing(sample_recording, data) as server:
         yield server
 
@@ -103,6 +104,7 @@ def test_an_image_that_is_no_frame_is_not_served(linked):
 def test_cuts_over_the_socket(linked):
     """Two pages cut and undo; a wrong request, a changed log and a vanished recording lose nothing."""
     log, names = (linked / "driving_log.csv").read_bytes(), [center(linked, row) for row in range(60)]
+    placed(linked, np.zeros(60))
     with browsing(linked) as server:
         here = server.recordings()["lake"]
         version = server.get(f"{here}/details")["version"]
