@@ -65,6 +65,6 @@ function paint(camera, {picture, message}) {
   const canvas = element(camera), context = canvas.getContext("2d");
   if (picture) context.drawImage(picture, 0, 0);
   else context.clearRect(0, 0, canvas.width, canvas.height);
-  canvas.parentNode.lastElementChild.textContent = message ?? NAMES[camera];
+  canvas.parentNode.lastElementChild.textContent = message?.split(/[\\/]IMG[\\/]/).at(-1) ?? NAMES[camera]; // no folder
   canvas.parentNode.lastElementChild.className = message ? "bad" : "";
 }
