@@ -8,6 +8,7 @@ A cut is a line in excluded.csv beside the recording's driving_log.csv, which is
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 from cloning import program
@@ -20,8 +21,12 @@ from cloning.browse.library import Library
 from cloning.browse.page import create_app
 from cloning.errors import UserError
 from cloning.recordings.log import find_folders
-from cloning.wire import connections
-from cloning.wire.server import refuse_other_sites
+
+try:
+    from cloning.wire import connections
+    from cloning.wire.server import refuse_other_sites
+except UserError as error:  # wrong versions of the socket libraries
+    sys.exit(program.failed("browse", error))
 
 HOST, PORT = "127.0.0.1", 4568  # this machine only; next to the port of drive.py
 
