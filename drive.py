@@ -10,7 +10,6 @@ import gc
 import itertools
 import logging
 import re
-import signal
 import socket
 import statistics
 import sys
@@ -40,7 +39,7 @@ try:
     from cloning.pilot.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
     from cloning.wire import connections
     from cloning.wire import server as wire
-    from cloning.wire.libraries import eventlet, socketio
+    from cloning.wire.libraries import socketio
 except UserError as error:  # wrong versions of the socket libraries
     sys.exit(program.failed("drive.py", error))
 
@@ -229,18 +228,7 @@ def run(server: DriveServer, listener: socket.socket) -> None:
     """Serve, with a status line, until Ctrl-C or a signal that asks to terminate."""
     gc.collect()
     gc.freeze()  # else a client can make the collector look through all the libraries' objects: 0.2 s each time
-    stopped: list[int] = []
-    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # the last one exists on Windows only
-        if hasattr(signal, name):
-            # The handler only notes the signal: python-engineio would catch an exception raised here.
-            signal.signal(getattr(signal, name), lambda number, _: stopped.append(number))
-    serving = eventlet.spawn(connections.serve, listener, server.app)
-    status = StatusLine(server, sys.stderr.isatty())
-    while not stopped and not serving.dead:
-        eventlet.sleep(0.1)
-        status.update()
-    if serving.dead:
-        serving.wait()  # raises the exception that ended it
+    connections.serve_until_stopped(listener, server.app, StatusLine(server, sys.stderr.isatty()).update)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -353,13 +341,7 @@ def main() -> int:
         if args.folder:
             saved_frames.check_folder(args.folder)
         server = DriveServer(network, args.speed)
-        try:
-            listener = connections.listen(args.host, args.port)
-        except OSError as error:
-            raise UserError(
-                f"can't listen on {args.host}:{args.port} ({error.strerror or error}); "
-                "is another server running? Stop it, or choose another --port"
-            ) from None
+        listener = connections.claim_port(args.host, args.port)
         if args.folder:
             server.saver = saver = saved_frames.FrameSaver(args.folder)  # last, because it empties the folder
     except (UserError, OSError) as error:

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import os
+import shutil
 import subprocess
 import sys
 from datetime import datetime, timedelta
@@ -83,6 +84,17 @@ def sample_recording(tmp_path_factory) -> Path:
 def copied(tmp_path) -> Path:
     """A recording of 60 rows that a test may change."""
     return render_recording(tmp_path / "data" / "lake")
+
+
+@pytest.fixture
+def linked(sample_recording, tmp_path) -> Path:
+    """A recording of 60 rows whose images are links, which a test may change."""
+    folder = tmp_path / "data" / "lake"
+    (folder / "IMG").mkdir(parents=True)
+    shutil.copy(sample_recording / "driving_log.csv", folder)
+    for image in (sample_recording / "IMG").iterdir():
+        os.link(image, folder / "IMG" / image.name)
+    return folder
 
 
 @pytest.fixture(scope="session")

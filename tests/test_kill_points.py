@@ -4,8 +4,11 @@ Without ALL_KILL_POINTS=1 in the environment, some of the points are left out: s
 """
 
 import hashlib
+import http.client
+import json
 import os
 import re
+import shutil
 import signal
 import sys
 import time
@@ -19,6 +22,7 @@ from steer_server import STEER, Server
 
 from cloning.errors import RecordingError
 from cloning.recordings.check import check_images
+from cloning.recordings.excluded import Cut, add_cut, read_cuts
 from cloning.recordings.log import read_recording
 from tools.simulator_client import Simulator, telemetry
 
@@ -167,6 +171,17 @@ def test_recording_on_a_full_disk(warm, tmp_path):
 # Saving frames
 
 
+def printed_port(place: Place, process: int, pattern: str) -> int | None:
+    """The port that a server prints, None if it is gone."""
+    for _ in range(600):
+        if port := re.search(pattern, place.warm.output.read_text(encoding="utf-8")):
+            return int(port[1])
+        if not place.warm.alive(process):
+            return None
+        time.sleep(0.02)
+    raise AssertionError("the server never listened")
+
+
 class Car:
     """A simulator that sends six telemetries, or until the server is gone, and then has the server end."""
 
@@ -175,14 +190,8 @@ class Car:
 
     def drive(self, process: int) -> None:
         self.answers = 0
-        for _ in range(600):
-            printed = self.place.warm.output.read_text(encoding="utf-8")
-            if "Watch at" in printed:
-                break
-            if not self.place.warm.alive(process):
-                return
-            time.sleep(0.02)
-        port = int(re.search(r"Listening on [\d.]+:(\d+)", printed)[1])
+        if not (port := printed_port(self.place, process, r"Listening on [\d.]+:(\d+)[\s\S]+Watch at")):
+            return
         try:
             with Simulator(port) as simulator:
                 simulator.open()
@@ -254,6 +263,57 @@ def test_driving_on_a_full_disk(driving, jpegs):
         assert f"drive.py: run1: {lost} of 6 frames were not saved" in ended.printed.splitlines()[-1]
         assert saved(place.folder / "run1") == jpegs[: 6 - lost]
         assert not list((place.folder / "run1").glob(".*"))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Browsing
+
+
+def test_a_cut_killed_anywhere(warm, lake, tmp_path):
+    """An earlier cut stays; the new one is there or not, and can be made again."""
+    names = rows_of(lake)
+    recorded = tmp_path / "begin" / "lake"
+    (recorded / "IMG").mkdir(parents=True)
+    shutil.copy(lake / "driving_log.csv", recorded)
+    earlier, new = (Cut(*(names[row][0][0].decode() for row in rows), "off") for rows in ((1, 2), (5, 9)))
+    add_cut(recorded, earlier)
+    command, answers = ["cloning.browse", "lake", "--port", 0], []
+    place = Place(warm, tmp_path / "place", command, command, tmp_path / "begin")
+
+    def cut(process: int) -> None:
+        if not (port := printed_port(place, process, r"http://[\d.]+:(\d+)/")):
+            return
+        try:
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+            connection.request("GET", "/recordings")
+            here = json.loads(connection.getresponse().read())[0]["id"]
+            body = json.dumps({"first": new.first, "last": new.last, "reason": new.reason})
+            connection.request("POST", f"/recordings/{here}/cuts", body, {"Content-Type": "application/json"})
+            answers.append(connection.getresponse().read().decode())
+            connection.close()
+        except (ConnectionError, http.client.HTTPException):
+            return
+        os.kill(process, signal.SIGINT)
+
+    def checked() -> None:
+        cuts = [each.row() for each in read_cuts(place.folder / "lake")]
+        assert cuts in ([earlier.row()], [earlier.row(), new.row()])
+        assert len(read_recording(place.folder / "lake")) in (38, 33)
+
+    place.companion, place.checked = cut, checked
+    place.killed_everywhere(4)
+    _, points = place.whole_run()
+    for number in (number for number, point in enumerate(points, 1) if point.startswith("write")):
+        place.restore()
+        assert place.run(command, full=number).status == 0
+        assert "excluded.csv: No space left on device" in json.loads(answers[-1])["message"]
+        assert [each.row() for each in read_cuts(place.folder / "lake")] == [earlier.row()]
+        assert sorted(path.name for path in (place.folder / "lake").iterdir()) == sorted(os.listdir(recorded))
+
+
+def test_an_estimate_of_the_lane_killed_anywhere(warm, lake, tmp_path):
+    command = ["cloning.browse.estimate", lake, "lane"]
+    Place(warm, tmp_path / "place", command, command).killed_everywhere(1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ steering, speed and time stamps predict the rear axle's state, and the lane's ce
 corrects it. The filter gives less weight to detections that are outliers.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from cloning.lane.reader import (
     ANY_ROAD_WEIGHTS,
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
+    SHIPPED_WEIGHTS,
     LaneNetwork,
     LanePosition,
     estimate_centres,
@@ -209,24 +210,49 @@ def localise_all(stretches: list[Stretch], centres: np.ndarray) -> Iterator[tupl
 def estimate_lane_position(
     recording: Recording, stretches: list[Stretch], network: LaneNetwork | None = None
 ) -> LanePosition:
-    """Estimate the position in the lane at every row of a recording.
+    """Estimate the position in the lane at every row of a recording, as `place` does.
 
-    Where a stretch is on a known road, from its localisation; elsewhere as `reader.fuse_detections` does. If no stretch
-    is, the network for any road reads the recording, too, and the one that can be trusted in more rows counts.
     stretches: of the recording, `motion.stretches`; network: to use instead of the two that come with the project.
     Raises RecordingError for images that can't be read, ModelError without a usable network.
     """
     strips = read_strips(recording)
-    centres = estimate_centres(strips, network)
-    localised = list(localise_all(stretches, centres))
-    position = fuse_detections(recording, centres, stretches)
-    if not localised and network is None:
-        centres = estimate_centres(strips, load_network(ANY_ROAD_WEIGHTS))
-        on_any_road = fuse_detections(recording, centres, stretches)
-        position = max(position, on_any_road, key=lambda reading: reading.trusted.mean())
-    for rows, localisation in localised:
-        _, lateral_offset, heading_error = localisation.states.T
-        position.heading_error[rows] = heading_error
-        position.lateral_offset[rows] = lateral_offset + REAR_AXLE * np.sin(heading_error)
-        position.trusted[rows] = True
-    return position
+
+    def detect(detector: LaneNetwork) -> np.ndarray:
+        return estimate_centres(strips, detector)
+
+    return place(recording, stretches, detect, [network] if network else shipped_networks())[0]
+
+
+def shipped_networks() -> Iterator[LaneNetwork]:
+    """Yield the networks that come with the project: for the known tracks, then for any road. Raises ModelError."""
+    return map(load_network, (SHIPPED_WEIGHTS, ANY_ROAD_WEIGHTS))
+
+
+def place(
+    recording: Recording,
+    stretches: list[Stretch],
+    detect: Callable[[LaneNetwork], np.ndarray],
+    networks: Iterable[LaneNetwork],
+) -> tuple[LanePosition, list[tuple[slice, Localisation]]]:
+    """Return the position in the lane at every row of a recording, and where its stretches are on known roads.
+
+    Where a stretch is on a known road, the position is from its localisation; elsewhere `reader.fuse_detections` gives
+    it. The second value has the rows and the localisation of each stretch that `localise_all` places. If it places
+    none with a network, the next one is tried; if none places any, the one counts that is trusted in most rows.
+
+    stretches: of the recording; detect: returns what `reader.detect_centres` does with a network.
+    """
+    positions = []
+    for network in networks:
+        centres = detect(network)
+        position = fuse_detections(recording, centres, stretches)
+        placed = list(localise_all(stretches, centres))
+        for rows, localisation in placed:
+            _, lateral_offset, heading_error = localisation.states.T
+            position.heading_error[rows] = heading_error
+            position.lateral_offset[rows] = lateral_offset + REAR_AXLE * np.sin(heading_error)
+            position.trusted[rows] = True
+        if placed:
+            return position, placed
+        positions.append(position)
+    return max(positions, key=lambda position: position.trusted.sum()), []

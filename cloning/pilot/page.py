@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import flask
 import numpy as np
 
-from cloning.pilot import attention
+from cloning.pilot import attention, site
 from cloning.pilot.network import Network
 from cloning.recordings.images import encode
 from cloning.wire.libraries import eventlet
@@ -57,16 +57,8 @@ class Server(Protocol):
 def create_app(server: Server) -> flask.Flask:
     """Return the web application: `/` is the page, `/live` its figures and pictures as server-sent events."""
     app = flask.Flask(__name__)
+    site.prepare(app, "script-src 'self' 'unsafe-inline'", "img-src data:")
     pages = {False: Pages(server, with_attention=False), True: Pages(server, with_attention=True)}
-
-    @app.after_request
-    def restrict(response: flask.Response) -> flask.Response:
-        response.headers["Content-Security-Policy"] = (
-            "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
-            "connect-src 'self'; frame-ancestors 'none'"
-        )
-        response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
-        return response
 
     @app.get("/")
     def index() -> str:

@@ -30,7 +30,7 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
     """
     names, folder = recording.names, recording.folder / IMAGE_FOLDER
     states = _file_states(folder, names)
-    cache = _cache_file(folder)
+    cache = cache_file(folder)
     digests, is_known = _read_cache(cache, names, states)
     is_missing = states[:, 0] < 0
     reasons: dict[int, str] = dict.fromkeys(np.flatnonzero(is_missing).tolist(), MISSING)
@@ -125,11 +125,14 @@ def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
     return states
 
 
-def _cache_file(folder: Path) -> Path:
-    """Return the file in which the usable images of a folder are remembered."""
+def cache_file(folder: Path, of: str = "") -> Path:
+    """Return the file in the user's cache folder in which the results of a slow look at a folder are remembered.
+
+    of: what looked, as part of the file's name; empty for `check_images`.
+    """
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
-    return home / "behavioral-cloning" / f"{name}.npz"
+    return home / "behavioral-cloning" / f"{name}{of}.npz"
 
 
 def _cache_columns(names: np.dtype) -> np.dtype:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.errors import RecordingError
+from cloning.recordings.excluded import EXCLUDED, Cut, cut_rows, read_cuts
 from cloning.recordings.format import COLUMNS, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE
 from cloning.recordings.plain import as_narrow_as_possible, line_starts, read_blocks, read_plain
 from cloning.recordings.tolerant import TolerantReader
@@ -40,6 +41,7 @@ class Recording:
     rows_read  rows in the csv, usable or not
     repairs    rows that were interpreted, by kind of repair: kind -> [rows, first line]
     rejected   rows that were left out: (line, kind, detail)
+    cuts       stretches that `excluded.csv` leaves out, and how many rows each leaves out that none before it does
     digests    uint64 (m,): of the image files' contents; None before `check_images` has set them
     """
 
@@ -55,6 +57,7 @@ class Recording:
     rows_read: int
     repairs: dict[str, list[int]] = field(default_factory=dict)
     rejected: list[tuple[int, str, str]] = field(default_factory=list)
+    cuts: list[tuple[Cut, int]] = field(default_factory=list)
     digests: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -64,6 +67,10 @@ class Recording:
         """Keep only these rows, in this order; rows: a mask, bool (n,), or indices."""
         for column in ("images", "steering", "throttle", "brake", "speed", "time", "lines"):
             setattr(self, column, getattr(self, column)[rows])
+
+    def drop_copies(self) -> None:
+        """Keep only the first of successive rows with the same centre image: copies that oversampling made."""
+        self.keep(np.r_[True, np.diff(self.images[:, 0]) != 0])
 
     def name(self, row: int, camera: int = 0) -> str:
         """Return the file name of a row's image; camera: 0 centre, 1 left, 2 right."""
@@ -105,7 +112,7 @@ def logs_below(path: Path) -> Iterator[Path]:
 
 
 def print_findings(recording: Recording) -> None:
-    """Print a recording's repairs, and the first five rejected rows of each kind, with file, line and remedy."""
+    """Print a recording's repairs, cuts, and first five rejected rows of each kind, with file, line and remedy."""
     path = recording.folder / DRIVING_LOG
     for kind, (rows, line) in recording.repairs.items():
         count = "1 row is" if rows == 1 else f"{rows} rows are"
@@ -118,9 +125,31 @@ def print_findings(recording: Recording) -> None:
             print(f"{path}: line {line}: left out: {detail}")
         if len(rejected) > SHOWN_PER_KIND:
             print(f"{path}: … and {len(rejected) - SHOWN_PER_KIND} more of this kind")
+    for cut, size in recording.cuts:
+        count = "1 row is" if size == 1 else f"{size} rows are"
+        stretch = f"from {cut.first} to {cut.last}: {cut.reason or 'no reason given'}"
+        print(f"{recording.folder / EXCLUDED}: line {cut.line}: {count} left out, {stretch}")
 
 
 def read_recording(folder: str | Path) -> Recording:
+    """Read a folder's `driving_log.csv` without the stretches that its `excluded.csv` leaves out.
+
+    Raises RecordingError as `read_uncut` does, and if `excluded.csv` is wrong or leaves out every row.
+    """
+    recording = read_uncut(folder)
+    cuts = read_cuts(recording.folder)
+    is_cut = np.zeros(len(recording), bool)
+    for cut, rows in zip(cuts, cut_rows(recording.folder, cuts, recording.names, recording.images[:, 0]), strict=True):
+        recording.cuts.append((cut, int((rows & ~is_cut).sum())))
+        is_cut |= rows
+    if is_cut.all() and cuts:
+        raise RecordingError(f"{recording.folder / EXCLUDED}: leaves out every row of {DRIVING_LOG}; delete a line")
+    if cuts:
+        recording.keep(~is_cut)
+    return recording
+
+
+def read_uncut(folder: str | Path) -> Recording:
     """Read a folder's `driving_log.csv`; images are in the folder's own `IMG/`, whatever paths the csv has.
 
     Raises RecordingError if the file is not such a csv, or has no usable row.

@@ -97,7 +97,7 @@ def load_recording(folder: str | Path) -> Recording:
     print_findings(recording)
     if not len(recording):
         raise RecordingError(f"{recording.folder / DRIVING_LOG}: no usable row is left to replay")
-    recording.keep(np.r_[True, np.diff(recording.images[:, 0]) != 0])  # copies of oversampled rows follow one another
+    recording.drop_copies()
     return recording
 
 

@@ -23,10 +23,11 @@ MIN_CORRELATION = 0.3  # with the labels; below it, the model has hardly learned
 
 
 class Counts(NamedTuple):
-    """Counts of a recording's rows: read from the csv, unusable, dropped by `Observations.select`, and kept."""
+    """Counts of a recording's rows: read from the csv, cut, unusable, dropped by `Observations.select`, and kept."""
 
     recording: str
     rows_read: int
+    cut: int
     unusable: int
     dropped: int
     kept: int
@@ -34,22 +35,28 @@ class Counts(NamedTuple):
     @staticmethod
     def of(recording: Recording, kept: int) -> "Counts":
         """Return the counts of a checked recording; kept: number of its rows that are kept."""
-        usable = len(recording)
-        return Counts(str(recording.folder), recording.rows_read, recording.rows_read - usable, usable - kept, kept)
+        usable, cut = len(recording), sum(rows for _, rows in recording.cuts)
+        unusable = recording.rows_read - cut - usable
+        return Counts(str(recording.folder), recording.rows_read, cut, unusable, usable - kept, kept)
 
 
 def total(counts: list[Counts]) -> Counts:
     """Return the sums over all recordings."""
-    rows_read, unusable, dropped, kept = (int(sum(column)) for column in list(zip(*counts, strict=True))[1:])
-    return Counts("total", rows_read, unusable, dropped, kept)
+    rows_read, cut, unusable, dropped, kept = (int(sum(column)) for column in list(zip(*counts, strict=True))[1:])
+    return Counts("total", rows_read, cut, unusable, dropped, kept)
 
 
 def recordings_table(counts: list[Counts], dropped: str) -> str:
-    """Return a table with a line for each recording and one for all; dropped: the title of that column."""
+    """Return a table with a line for each recording and one for all; dropped: the title of that column.
+
+    It has a column for excluded rows if there are any.
+    """
     width = max(len(row.recording) for row in counts)
-    lines = [f"\n{'recording':{width}}  rows read  unusable  {dropped}  kept"]
-    for name, rows_read, unusable, off, kept in [*counts, total(counts)]:
-        lines.append(f"{name:{width}}  {rows_read:9,}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
+    is_cut = total(counts).cut > 0
+    lines = [f"\n{'recording':{width}}  rows read{'  excluded' * is_cut}  unusable  {dropped}  kept"]
+    for name, rows_read, cut, unusable, off, kept in [*counts, total(counts)]:
+        excluded = f"  {cut:8,}" * is_cut
+        lines.append(f"{name:{width}}  {rows_read:9,}{excluded}  {unusable:8,}  {off:{len(dropped)},}  {kept:,}")
     return "\n".join(lines)
 
 

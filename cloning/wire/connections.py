@@ -2,11 +2,13 @@
 
 import errno
 import io
+import signal
 import socket
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
+from cloning.errors import UserError
 from cloning.wire.libraries import eventlet
 from cloning.wire.turns import STRANGERS, TURNS
 
@@ -131,6 +133,34 @@ def listen(host: str, port: int) -> socket.socket:
     """Return a listening socket; port 0 chooses a free one. Raises OSError if the port is taken."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     return eventlet.listen((host, port), family, reuse_port=False)  # eventlet's default would share a taken port
+
+
+def claim_port(host: str, port: int) -> socket.socket:
+    """Return a listening socket, as `listen` does. Raises UserError, with the remedy, if the port is taken."""
+    try:
+        return listen(host, port)
+    except OSError as error:
+        raise UserError(
+            f"can't listen on {host}:{port} ({error.strerror or error}); is another server running? Stop it, or "
+            "choose another --port"
+        ) from None
+
+
+def serve_until_stopped(
+    listener: socket.socket, app: WSGIApplication, update: Callable[[], None] = lambda: None
+) -> None:
+    """Serve the application until Ctrl-C or a signal that asks to terminate; update: called ten times a second."""
+    stopped: list[int] = []
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # the last one exists on Windows only
+        if hasattr(signal, name):
+            # The handler only notes the signal: python-engineio would catch an exception raised here.
+            signal.signal(getattr(signal, name), lambda number, _: stopped.append(number))
+    serving = eventlet.spawn(serve, listener, app)
+    while not stopped and not serving.dead:
+        eventlet.sleep(0.1)
+        update()
+    if serving.dead:
+        serving.wait()  # raises the exception that ended it
 
 
 def serve(listener: socket.socket, app: WSGIApplication) -> None:

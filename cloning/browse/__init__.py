@@ -1,0 +1,1 @@
+"""Browse: a page on this machine that shows recordings, and cuts stretches from them."""

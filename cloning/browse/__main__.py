@@ -1,0 +1,82 @@
+"""Show recordings in a browser, play them, and cut stretches from them; training and replays leave these out.
+
+    python -m cloning.browse                                 # the recordings below data/
+    python -m cloning.browse data/lake-ccw data/jungle       # these recordings
+    python -m cloning.browse data --model model.pt           # also show how a model would steer
+
+A cut is a line in excluded.csv beside the recording's driving_log.csv, which is never changed.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("browse")
+
+from cloning.arguments import MAX_PORT, number
+from cloning.browse.library import Library
+from cloning.browse.page import create_app
+from cloning.errors import UserError
+from cloning.recordings.log import find_folders
+
+try:
+    from cloning.wire import connections
+    from cloning.wire.server import refuse_other_sites
+except UserError as error:  # wrong versions of the socket libraries
+    sys.exit(program.failed("browse", error))
+
+HOST, PORT = "127.0.0.1", 4568  # this machine only; next to the port of drive.py
+
+
+def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
+    """Parse the command line; arguments: those of this process if None."""
+    parser = argparse.ArgumentParser(
+        prog="python -m cloning.browse",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="Exit status: 0 after Ctrl-C, 2 if the server could not start.",
+    )
+    parser.add_argument(
+        "recordings", nargs="*", help="recordings, or folders of recordings (default: data)", metavar="FOLDER"
+    )
+    parser.add_argument(
+        "--model", nargs="+", type=Path, default=[], metavar="model.pt", help="show the steering of these models"
+    )
+    parser.add_argument(
+        "--port",
+        type=number(int, 0, MAX_PORT),
+        default=PORT,
+        help="port to listen on, on this machine only (default %(default)s; 0: any free one)",
+    )
+    return parser.parse_intermixed_args(arguments)
+
+
+def main() -> int:
+    """Serve the page until Ctrl-C; return the exit status."""
+    arguments = parse_arguments()
+    try:
+        folders = find_folders(arguments.recordings or ["data"])
+        for model in arguments.model:
+            if not model.is_file():
+                raise UserError(f"{model}: no such model file; `python model.py` trains one")
+        listener = connections.claim_port(HOST, arguments.port)
+    except (UserError, OSError) as error:
+        return program.failed("browse", error)
+    library = Library(folders, arguments.model)
+    print(
+        f"{len(folders)} recording{'s' * (len(folders) != 1)}. "
+        f"Open http://{HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.",
+        flush=True,
+    )
+    try:
+        connections.serve_until_stopped(listener, refuse_other_sites(create_app(library)))
+    finally:
+        library.looks.close()
+    return program.DONE
+
+
+if __name__ == "__main__":
+    program.run(main)

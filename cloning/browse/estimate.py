@@ -1,0 +1,120 @@
+"""Estimate where the car is on the road in each row of a recording, or how a model steers; see `looks.py`.
+
+python -m cloning.browse.estimate RECORDING lane        # lateral offset, and the place on a known track
+python -m cloning.browse.estimate RECORDING model.pt    # the model's steering
+"""
+
+import argparse
+import copy
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("estimate")
+
+import numpy as np
+import torch
+
+from cloning.browse.looks import LANE, PROGRESS, Result, stamp, write_result
+from cloning.compute import one_thread
+from cloning.cores import threads
+from cloning.errors import ModelError, UserError
+from cloning.lane.place import place, shipped_networks
+from cloning.lane.reader import LaneNetwork, detect_centres
+from cloning.pilot.network import load_model, steer
+from cloning.recordings.check import check_images
+from cloning.recordings.images import read_frame
+from cloning.recordings.log import Recording, read_uncut
+from cloning.road.motion import stretches
+
+PART_ROWS = 256  # that are looked at at once: with their strips, 12 MB
+SHOWN_REJECTED = 5  # rows with unusable images that the page lists
+
+
+def main() -> int:
+    """Look at a recording and write the result; return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording", type=Path, help="folder with a driving_log.csv")
+    parser.add_argument("look", help=f"{LANE}, or a model file")
+    arguments = parser.parse_args()
+    if hasattr(os, "nice"):
+        os.nice(10)  # the page, and whatever else the user does, goes first
+    try:
+        folder, look = arguments.recording, arguments.look
+        before = stamp(folder, look)
+        recording = read_uncut(folder)
+        check_images(recording, threads(), show_progress=False)
+        recording.drop_copies()
+        result = lane(recording) if look == LANE else steering(recording, look)
+        write_result(folder, look, before, result)
+    except (UserError, OSError) as error:
+        return program.failed("estimate", error)
+    return program.DONE
+
+
+def lane(recording: Recording) -> Result:
+    """Return the columns offset (m, right positive), x and y (m, where the track is known), road, and the tracks.
+
+    road is an index into about["roads"], -1 where the track is not known; offset is nan where it is not trusted.
+    """
+    n = len(recording)
+
+    def detect(network: LaneNetwork) -> np.ndarray:
+        of_parts = [detect_centres(part, network) for part in parts(recording)]
+        return np.concatenate(of_parts or [np.empty((0, 3, 5), np.float32)])
+
+    position, placed = place(recording, stretches(recording), detect, shipped_networks())
+    x, y = np.full((2, n), np.nan, np.float32)
+    road, roads = np.full(n, -1, np.float32), []
+    for rows, localisation in placed:
+        track = localisation.track
+        found = {"name": track.name, "direction": track.direction, "outline": track.points[:, :2].round(1).tolist()}
+        if found not in roads:
+            roads.append(found)
+        road[rows] = roads.index(found)
+        places = [track.at(s, right) for s, right, _ in localisation.states.tolist()]
+        x[rows], y[rows] = np.array([(at.x, at.y) for at in places]).T
+    offset = np.where(position.trusted, position.lateral_offset, np.nan).astype(np.float32)
+    about = {"roads": roads, "longest": max(map(len, stretches(recording)), default=0)}
+    return Result(recording.images[:, 0], {"offset": offset, "x": x, "y": y, "road": road}, about | rejected(recording))
+
+
+def steering(recording: Recording, model: str) -> Result:
+    """Return the column steering, -1..1: with the arithmetic of drive.py. Raises ModelError."""
+    torch.set_num_threads(1)
+    network = load_model(model)
+
+    def steer_frame(path: Path) -> float:
+        return float(steer(network, read_frame(path)))
+
+    values: list[float] = []
+    try:
+        with ThreadPoolExecutor(threads(), initializer=one_thread) as pool:
+            for part in parts(recording):
+                values += pool.map(steer_frame, [part.path(row) for row in range(len(part))])
+    except ArithmeticError as error:
+        raise ModelError(f"{model}: {error}; train the model again") from None
+    return Result(recording.images[:, 0], {"steering": np.array(values, np.float32)}, rejected(recording))
+
+
+def parts(recording: Recording) -> Iterator[Recording]:
+    """Yield a recording in parts of PART_ROWS, and print how much of it is done before each."""
+    for start in range(0, len(recording), PART_ROWS):
+        print(f"{PROGRESS}{start / len(recording):.3f}", flush=True)
+        part = copy.copy(recording)
+        part.keep(np.arange(start, min(start + PART_ROWS, len(recording))))
+        yield part
+
+
+def rejected(recording: Recording) -> dict[str, object]:
+    """Return how many rows have an unusable image, and the first of them: [line, detail]."""
+    unusable = [(line, detail) for line, kind, detail in recording.rejected if kind.startswith("image ")]
+    return {"unusable": len(unusable), "first_unusable": unusable[:SHOWN_REJECTED]}
+
+
+if __name__ == "__main__":
+    program.run(main)

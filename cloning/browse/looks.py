@@ -1,0 +1,179 @@
+"""Slow looks at recordings: where the car is on the road, and how models steer; each in a process of its own.
+
+A process takes its memory along when it ends, and leaves its result in the user's cache folder, where it stays until
+the recording changes. `estimate.py` is what runs in it.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cloning.errors import RecordingError
+from cloning.files import written_whole
+from cloning.recordings.check import cache_file
+from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
+
+RULES = 1  # of what a result contains: counted up when they change
+LANE = "lane"  # the look for the position in the lane; every other look is the path of a model file
+COMMAND = (sys.executable, "-m", "cloning.browse.estimate")
+PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a look has found.
+
+    images  int32 (k,): the centre images, as in `Recording.images`, that the columns belong to
+    columns float32 (k,), by name
+    about   everything else, in JSON's types
+    """
+
+    images: np.ndarray
+    columns: dict[str, np.ndarray]
+    about: dict[str, Any]
+
+    def column(self, name: str, centres: np.ndarray) -> np.ndarray:
+        """Return a column in the rows of a recording: float32 (n,), nan in those not looked at.
+
+        centres: int32 (n,), the rows' centre images.
+        """
+        values = np.full(max(centres.max(initial=0), self.images.max(initial=0)) + 1, np.nan, np.float32)
+        values[self.images] = self.columns[name]
+        return values[centres]
+
+
+def stamp(folder: Path, look: str) -> str:
+    """Return what tells whether a result is still of the same files: their sizes and times of change.
+
+    Raises RecordingError if the log, the images or the model is gone.
+    """
+    paths = [folder / DRIVING_LOG, folder / IMAGE_FOLDER, *([] if look == LANE else [Path(look)])]
+    return f"{RULES} {[file_stamp(path) for path in paths]}"
+
+
+def file_stamp(path: Path) -> tuple[int, int]:
+    """Return size and time of change in ns of a file or folder. Raises RecordingError if it is gone."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}; put it back, or leave the recording out") from None
+    return status.st_size, status.st_mtime_ns
+
+
+def result_file(folder: Path, look: str) -> Path:
+    """Return the file in the user's cache folder for a look's result."""
+    model = "" if look == LANE else "-" + hashlib.blake2b(os.fsencode(Path(look).resolve()), digest_size=6).hexdigest()
+    return cache_file(folder, f"-{LANE if look == LANE else 'steering'}{model}")
+
+
+def write_result(folder: Path, look: str, of: str, result: Result) -> None:
+    """Write a look's result; of: the `stamp` from before the look. Raises OSError."""
+    file = result_file(folder, look)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    names, columns = list(result.columns), np.array(list(result.columns.values()), np.float32)
+    about = np.frombuffer(json.dumps({"stamp": of, "columns": names, **result.about}).encode(), np.uint8)
+    with written_whole(file) as temporary, open(temporary, "wb") as opened:
+        np.savez(opened, about=about, images=result.images, columns=columns)
+
+
+def read_result(folder: Path, look: str) -> Result | None:
+    """Return a look's result, None if there is none of these files yet. Raises RecordingError as `stamp` does."""
+    wanted = stamp(folder, look)
+    try:
+        with np.load(result_file(folder, look)) as file:
+            about, images, columns = json.loads(file["about"].tobytes()), file["images"], file["columns"]
+        named = dict(zip(about["columns"], columns, strict=True))
+    except Exception:  # there is no file yet, or a damaged one, of whatever kind: the look replaces it
+        return None
+    return Result(images, named, about) if about["stamp"] == wanted else None
+
+
+class Looks:
+    """Runs the looks that are asked for, one after the other, the smallest recording first."""
+
+    def __init__(self) -> None:
+        """Begin with nothing to do."""
+        self.waiting: dict[tuple[Path, str], int] = {}  # folder, look -> size of the log, bytes
+        self.urgent: Path | None = None  # the folder whose looks go before all others
+        self.failed: dict[tuple[Path, str, str], str] = {}  # folder, look, stamp -> message
+        self.ready: set[tuple[Path, str, str]] = set()  # folder, look, stamp
+        self.running: tuple[Path, str] | None = None
+        self.progress = 0.0
+        self.process: subprocess.Popen[str] | None = None
+        self.changed = threading.Condition()
+        self.closed = False
+        self.thread = threading.Thread(target=self._run, daemon=True)
+
+    def state(self, folder: Path, look: str) -> dict[str, Any]:
+        """Return how far a look is, for the page; begin it if it is not done: {"state", "progress" or "message"}.
+
+        Raises RecordingError as `stamp` does.
+        """
+        now = folder, look, stamp(folder, look)
+        with self.changed:
+            if now in self.failed:
+                return {"state": "failed", "message": self.failed[now]}
+            if (now in self.ready and result_file(folder, look).exists()) or read_result(folder, look):
+                self.ready.add(now)
+                return {"state": "ready"}
+            if self.running == (folder, look):
+                return {"state": "running", "progress": self.progress}
+            if (folder, look) not in self.waiting:
+                self.waiting[folder, look] = file_stamp(folder / DRIVING_LOG)[0]
+                if not self.thread.is_alive():
+                    self.thread.start()
+                self.changed.notify()
+        return {"state": "waiting"}
+
+    def hurry(self, folder: Path) -> None:
+        """Put a recording's looks before all others that wait."""
+        self.urgent = folder
+
+    def close(self) -> None:
+        """End the look that runs, if one does."""
+        with self.changed:
+            self.closed = True
+            self.changed.notify()
+            if self.process:
+                self.process.kill()  # its result is whole or not there
+        if self.thread.is_alive():
+            self.thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self.changed:
+                while not (self.waiting or self.closed):
+                    self.changed.wait()
+                if self.closed:
+                    return
+                self.running = min(self.waiting, key=lambda each: (each[0] != self.urgent, self.waiting[each]))
+                self.progress = 0.0
+                del self.waiting[self.running]
+                folder, look = self.running
+                command, pipe = [*COMMAND, str(folder), look], subprocess.PIPE
+                self.process = subprocess.Popen(
+                    command, stdout=pipe, stderr=subprocess.STDOUT, text=True, errors="replace"
+                )
+            before, message = "", "was ended"
+            with contextlib.suppress(RecordingError):
+                before = stamp(folder, look)
+            with self.process:
+                assert self.process.stdout
+                for line in self.process.stdout:
+                    if line.startswith(PROGRESS):
+                        self.progress = float(line.removeprefix(PROGRESS))
+                    elif line.strip():
+                        message = line.strip()
+            with self.changed:
+                if self.process.returncode and not self.closed:
+                    self.failed[folder, look, before] = message
+                self.process = self.running = None

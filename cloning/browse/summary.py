@@ -1,0 +1,112 @@
+"""What the page shows of a whole recording: its figures at a glance, and the places worth a look."""
+
+from typing import Any
+
+import numpy as np
+
+from cloning.browse.looks import Result
+from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.log import SHOWN_PER_KIND, Recording
+from cloning.road.motion import MAX_GAP
+
+BINS = 41  # of the histogram of steering, from -1 to 1; the middle one is around 0
+PATH_POINTS = 500  # of a drive on the map
+AT_STOP = 0.999  # |steering| from which the wheels are at their stop
+PLACES = 20  # to jump to, of each kind
+APART = 2 * SAMPLE_RATE  # rows between two of them
+MIN_DIRECTION = 0.05  # share of the rows with a known road below which a road or direction is left out
+
+
+def driven_seconds(time: np.ndarray) -> np.ndarray:
+    """Return the seconds driven until each row, float64 (n,): a break counts as long as a row.
+
+    time: float64 (n,), s, ascending.
+    """
+    pause = np.diff(time)
+    pause[pause > MAX_GAP] = 1 / SAMPLE_RATE
+    return np.r_[0.0, np.cumsum(pause)]
+
+
+def largest(values: np.ndarray, count: int = PLACES, apart: int = APART) -> list[int]:
+    """Return where the largest absolute values are, ascending: at most `count` rows, at least `apart` from each other.
+
+    The largest is taken first, then the largest of those far enough away from it, and so on. values: float (n,),
+    nan where there is none.
+    """
+    size = np.where(np.isnan(values), -1.0, np.abs(values))
+    rows: list[int] = []
+    while len(rows) < count and size.max(initial=0) > 0:
+        row = int(size.argmax())
+        rows.append(row)
+        size[max(0, row - apart + 1) : row + apart] = -1
+    return sorted(rows)
+
+
+def at_stop(steering: np.ndarray) -> list[int]:
+    """Return the first row of each stretch with the wheels at their stop, ascending; steering: float (n,), -1..1."""
+    side = np.sign(steering) * (np.abs(steering) >= AT_STOP)
+    return np.flatnonzero((side != 0) & (np.diff(side, prepend=0) != 0)).tolist()
+
+
+def places(
+    steering: np.ndarray, offset: np.ndarray | None, models: list[np.ndarray], is_cut: np.ndarray
+) -> dict[str, list[int]]:
+    """Return the places to jump to, by kind: rows in ascending order; none that is cut.
+
+    steering, offset, models: float32 (n,), the human driver's -1..1, m or None, and models' -1..1; is_cut: bool (n,).
+    """
+    found = {"stop": at_stop(np.where(is_cut, 0, steering))}
+    if offset is not None:
+        found["offset"] = largest(np.where(is_cut, np.nan, offset))
+    if models:
+        difference = np.fmax.reduce([np.abs(model - steering) for model in models])
+        found["difference"] = largest(np.where(is_cut, np.nan, difference))
+    return found
+
+
+def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
+    """Return the figures of the log alone; is_cut: bool (n,). Steering and speed are those of the rows not cut."""
+    kept = ~is_cut
+    steering, speed = recording.steering[kept], recording.speed[kept]
+    counts, _ = np.histogram(steering, np.linspace(-1, 1, BINS + 1))
+    seconds = driven_seconds(recording.time)
+    return {
+        "frames": len(recording),
+        "seconds": float(seconds[-1]),
+        "cut_frames": int(is_cut.sum()),
+        "histogram": counts.tolist(),
+        "zeros": float((steering == 0).mean()) if len(steering) else None,
+        "speed": [float(function(speed)) for function in (np.min, np.mean, np.max)] if len(speed) else None,
+        "rows_read": recording.rows_read,
+        "repairs": [[kind, rows, line] for kind, (rows, line) in recording.repairs.items()],
+        "rejected": len(recording.rejected),
+        "first_rejected": [[line, detail] for line, _, detail in recording.rejected[:SHOWN_PER_KIND]],
+    }
+
+
+def road_of(result: Result, centres: np.ndarray) -> dict[str, Any]:
+    """Return on which roads and in which directions a recording was driven, and its path on the most driven one.
+
+    result: of the look for the lane; centres: int32 (n,), the rows' centre images. The path is a list of strokes,
+    lists of [x, y] in m, east and north.
+    """
+    about = result.about
+    road, x, y = (result.column(name, centres) for name in ("road", "x", "y"))
+    rows = [int((road == number).sum()) for number in range(len(about["roads"]))]
+    order = sorted(range(len(rows)), key=lambda number: -rows[number])
+    order = [number for number in order if rows[number] >= MIN_DIRECTION * sum(rows)]
+    names = [about["roads"][number]["name"] for number in order]
+    on_map = [number for number in order if names and about["roads"][number]["name"] == names[0]]
+    strokes = []
+    for number in on_map:
+        on_road = np.flatnonzero(road == number)
+        step = max(1, len(on_road) // PATH_POINTS)
+        for stroke in np.split(on_road, np.flatnonzero(np.diff(on_road) > 1) + 1):
+            strokes.append([[round(float(x[row]), 1), round(float(y[row]), 1)] for row in stroke[::step]])
+    return {
+        "roads": [[about["roads"][number][key] for key in ("name", "direction")] for number in order],
+        "outline": about["roads"][on_map[0]]["outline"] if on_map else [],
+        "path": strokes,
+        "unusable": about["unusable"],
+        "first_unusable": about["first_unusable"],
+    }

@@ -1,0 +1,191 @@
+"""The stretches that are cut from a recording: `excluded.csv` beside the log, which itself is never changed.
+
+Each line names the centre images of a stretch's first and last row, and a reason. A cut is undone by deleting its line.
+"""
+
+import contextlib
+import csv
+import io
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cloning.errors import RecordingError
+from cloning.files import write
+from cloning.recordings.format import DRIVING_LOG
+
+if os.name != "nt":
+    import fcntl
+
+EXCLUDED = "excluded.csv"
+HEADER = ("first image", "last image", "reason")
+MAX_REASON = 200  # characters
+BYTES = {"encoding": "utf-8", "errors": "surrogateescape"}  # names of files may hold any bytes
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A stretch that is cut.
+
+    first, last  file names of the centre images of its first and last row
+    reason       one line of text, perhaps empty
+    line         in excluded.csv, from 1; 0 for one that is not written yet
+    """
+
+    first: str
+    last: str
+    reason: str
+    line: int = 0
+
+    def row(self) -> tuple[str, str, str]:
+        """Return its fields, in the order of HEADER."""
+        return self.first, self.last, self.reason
+
+
+def read_cuts(folder: Path) -> list[Cut]:
+    """Return the cuts of a recording's `excluded.csv`, none if there is no such file.
+
+    Raises RecordingError, with the line, for a file that is not as `HEADER` says.
+    """
+    return _parse(folder / EXCLUDED, _lines(folder / EXCLUDED))
+
+
+def cut_rows(folder: Path, cuts: Iterable[Cut], names: np.ndarray, centres: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield which rows each cut leaves out: bool (n,).
+
+    A stretch begins at the first row with its first image, and ends at the next one with its last image. Copies of its
+    rows elsewhere in the recording are left out with it.
+    names, centres: as `Recording` has them: bytes (m,), sorted; int32 (n,), an index into names for each row.
+    Raises RecordingError for an image that no row has, and for a stretch whose end comes before its beginning.
+    """
+    path = folder / EXCLUDED
+    for cut in cuts:
+        where = f"{path}: line {cut.line}" if cut.line else str(path)
+        first, last = (_rows_with(where, name, names, centres) for name in (cut.first, cut.last))
+        last = last[last >= first[0]]
+        if not len(last):
+            raise RecordingError(f"{where}: {cut.last} comes before {cut.first} in the recording; exchange the two")
+        is_cut = np.zeros(len(names), bool)
+        is_cut[centres[first[0] : last[0] + 1]] = True
+        yield is_cut[centres]
+
+
+def _rows_with(where: str, name: str, names: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Return the rows with a centre image, ascending; where: the file and line, for an error."""
+    at = int(np.searchsorted(names, os.fsencode(name)))
+    rows = np.flatnonzero(centres == at) if at < len(names) and names[at] == os.fsencode(name) else np.empty(0, int)
+    if not len(rows):
+        raise RecordingError(
+            f"{where}: {name} is not the centre image of a usable row of {DRIVING_LOG}; name another one, or delete "
+            "the line"
+        )
+    return rows
+
+
+def add_cut(folder: Path, cut: Cut) -> None:
+    """Append a cut to a recording's `excluded.csv`, unless the same one is there; the other lines stay as they are.
+
+    Raises RecordingError if the file is not readable as such, and OSError if it cannot be written; then it stays.
+    """
+
+    def append(lines: list[str], cuts: list[Cut]) -> list[str]:
+        if cut.row() in [each.row() for each in cuts]:
+            return lines
+        ended = [line if line.endswith(("\n", "\r")) else f"{line}\n" for line in lines]
+        return [*(ended or [_line(HEADER)]), _line(cut.row())]
+
+    _change(folder, append)
+
+
+def delete_cut(folder: Path, cut: Cut) -> None:
+    """Delete a cut's line from a recording's `excluded.csv`; the other lines stay as they are.
+
+    Raises RecordingError if it is not there, and the errors of `add_cut`.
+    """
+
+    def delete(lines: list[str], cuts: list[Cut]) -> list[str]:
+        at = [each.line for each in cuts if each.row() == cut.row()]
+        if not at:
+            raise RecordingError(
+                f"{folder / EXCLUDED}: the cut from {cut.first} to {cut.last} is not there any more; it was deleted "
+                "elsewhere"
+            )
+        return lines[: at[-1] - 1] + lines[at[-1] :]
+
+    _change(folder, delete)
+
+
+def one_line(reason: str) -> str:
+    """Return a reason as one line of at most MAX_REASON characters, without control characters."""
+    return " ".join("".join(c if c.isprintable() else " " for c in reason).split())[:MAX_REASON]
+
+
+def _change(folder: Path, change: Callable[[list[str], list[Cut]], list[str]]) -> None:
+    """Replace the file's lines by those that `change` returns, while no other process does the same."""
+    path = folder / EXCLUDED
+    with _locked(folder / DRIVING_LOG):
+        lines = _lines(path)
+        changed = change(lines, _parse(path, lines))
+        if changed != lines:
+            write(path, "".join(changed).encode(**BYTES))
+
+
+@contextlib.contextmanager
+def _locked(log: Path) -> Iterator[None]:
+    """Wait for the lock of a recording's log and hold it until the block ends; on Windows there is none."""
+    try:
+        file = os.open(log, os.O_RDONLY)
+    except OSError as error:
+        raise RecordingError(f"{log}: {error.strerror}; put the recording back, or forget its cuts") from None
+    try:
+        if os.name != "nt":
+            with contextlib.suppress(OSError):  # a network's file system without locks
+                fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(file)
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the file's lines with their ends, none if there is no file. Raises RecordingError if it is not text."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}; make it a readable file") from None
+    if b"\0" in data:
+        raise RecordingError(f"{path}: line 1: not a text in UTF-8; save it as CSV in UTF-8")
+    return io.StringIO(data.decode(**BYTES), newline="").readlines()
+
+
+def _parse(path: Path, lines: list[str]) -> list[Cut]:
+    """Return the cuts in the file's lines. Raises RecordingError."""
+    cuts = []
+    for number, line in enumerate(lines, 1):
+        text = line.removeprefix("\ufeff").strip()
+        try:
+            fields = next(csv.reader([text], strict=True, skipinitialspace=True), [])
+        except csv.Error as error:
+            raise RecordingError(f"{path}: line {number}: {error}; a line is {_line(HEADER).strip()}") from None
+        fields = [field.strip() for field in fields]
+        if not any(fields) or (number == 1 and tuple(field.lower() for field in fields) == HEADER):
+            continue
+        if len(fields) != len(HEADER):
+            raise RecordingError(
+                f"{path}: line {number}: {len(fields)} fields where {len(HEADER)} are expected: "
+                f"{_line(HEADER).strip()}; put a reason that has commas in double quotes"
+            )
+        first, last = (name.replace("\\", "/").rpartition("/")[2] for name in fields[:2])
+        cuts.append(Cut(first, last, fields[2], number))
+    return cuts
+
+
+def _line(fields: tuple[str, ...]) -> str:
+    """Return a line of a csv, with its end."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(fields)
+    return text.getvalue()

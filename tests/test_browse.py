@@ -1,0 +1,167 @@
+"""What the browser of recordings shows: figures, places, and the slow looks at lane and models."""
+
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cloning.browse import estimate, looks, summary
+from cloning.browse.library import Library
+from cloning.browse.looks import LANE, Result, read_result, stamp, write_result
+from cloning.errors import RecordingError
+from cloning.lane.place import Localisation
+from cloning.pilot.network import load_model, steer
+from cloning.recordings.images import read_frame
+from cloning.recordings.log import read_recording
+from cloning.road.track import Track
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Figures
+
+
+def test_seconds_driven_leave_out_breaks():
+    time = np.array([100.0, 100.1, 100.2, 7300.0, 7300.1])
+    np.testing.assert_allclose(summary.driven_seconds(time), [0, 0.1, 0.2, 0.2 + 1 / 15, 0.3 + 1 / 15], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_largest_places_by_brute_force(seed):
+    """The largest value that is left, and then no other within the distance, again and again."""
+    rng = np.random.default_rng(seed)
+    values = np.round(rng.normal(size=200), 1)
+    values[rng.random(200) < 0.3] = np.nan
+    left, wanted = {row for row in range(200) if not np.isnan(values[row]) and values[row]}, []
+    while left and len(wanted) < 5:
+        best = max(left, key=lambda row: (abs(values[row]), -row))
+        wanted.append(best)
+        left = {row for row in left if abs(row - best) >= 12}
+    assert summary.largest(values, 5, 12) == sorted(wanted)
+
+
+def test_places_with_the_steering_at_its_stop():
+    steering = np.array([1, 1, 0.5, -1, 1, 0, -0.9, -1, -1, 0], np.float32)
+    assert summary.at_stop(steering) == [0, 3, 4, 7]
+    assert summary.at_stop(np.zeros(3)) == [] and summary.largest(np.full(3, np.nan)) == []
+
+
+def test_places_are_those_that_are_not_cut():
+    steering = np.zeros(90, np.float32)
+    steering[[5, 70]] = 1, -1
+    offset, models = np.linspace(0, 3, 90, dtype=np.float32), [np.full(90, 0.1), np.full(90, np.nan)]
+    nothing_cut = summary.places(steering, offset, models, np.zeros(90, bool))
+    assert nothing_cut == {"stop": [5, 70], "offset": [29, 59, 89], "difference": [5, 35, 70]}
+    cut = summary.places(steering, offset, models, np.arange(90) >= 60)
+    assert cut == {"stop": [5], "offset": [29, 59], "difference": [5, 35]}
+    assert summary.places(steering, None, [], np.zeros(90, bool)) == {"stop": [5, 70]}
+
+
+def test_figures_are_those_of_the_rows_that_are_not_cut(sample_recording):
+    recording = read_recording(sample_recording)
+    is_cut = np.arange(60) < 30
+    found = summary.figures(recording, is_cut)
+    wanted, _ = np.histogram(recording.steering[30:], 41, (-1, 1))
+    assert found["histogram"] == wanted.tolist() and (found["frames"], found["cut_frames"]) == (60, 30)
+    assert found["seconds"] == pytest.approx(59 * 0.067, abs=0.01)
+    assert found["zeros"] == np.mean(recording.steering[30:] == 0)
+    assert found["speed"] == pytest.approx([30.19] * 3)
+    assert summary.figures(recording, np.ones(60, bool))["speed"] is None
+
+
+def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
+    """Rows placed on the lake at known places get these coordinates; what is not placed has none."""
+    recording, track = read_recording(sample_recording), Track("lake", "cw")
+    s = np.linspace(100, 120, 40)
+    placed = Localisation(track, np.stack([s, np.full(40, 1.5), np.zeros(40)], axis=1), 0.0)
+    monkeypatch.setattr("cloning.lane.place.localise_all", lambda *_: [(slice(10, 50), placed)])
+    monkeypatch.setattr(estimate, "detect_centres", lambda part: np.zeros((len(part), 3, 5), np.float32))
+    result = estimate.lane(recording)
+    x, y = (result.column(name, recording.images[:, 0]) for name in "xy")
+    for row, at in ((10, 100.0), (49, 120.0)):
+        found = track.locate(float(x[row]), float(y[row]))
+        assert found == pytest.approx((at, 1.5), abs=0.02)
+    assert np.isnan(x[:10]).all() and np.isnan(y[50:]).all()
+    road = summary.road_of(result, recording.images[:, 0])
+    assert road["roads"] == [["lake", "cw"]] and len(road["path"]) == 1 and len(road["path"][0]) == 40
+    assert road["path"][0][0] == pytest.approx([x[10], y[10]], abs=0.06)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Looks
+
+
+def test_a_models_steering_is_that_of_drive_py(sample_recording, model_file):
+    recording = read_recording(sample_recording)
+    result = estimate.steering(recording, str(model_file))
+    network = load_model(model_file)
+    wanted = [float(steer(network, read_frame(recording.path(row)))) for row in (0, 31, 59)]
+    np.testing.assert_allclose(result.column("steering", recording.images[:, 0])[[0, 31, 59]], wanted, atol=1e-6)
+
+
+def test_a_result_is_kept_until_the_recording_changes(linked):
+    images = np.array([2, 0], np.int32)
+    result = Result(images, {"offset": np.array([0.5, np.nan], np.float32)}, {"roads": []})
+    assert read_result(linked, LANE) is None
+    write_result(linked, LANE, stamp(linked, LANE), result)
+    found = read_result(linked, LANE)
+    np.testing.assert_array_equal(found.column("offset", np.array([0, 1, 2, 2])), [np.nan, np.nan, 0.5, 0.5])
+    time.sleep(0.02)  # longer than a tick of the file system's clock
+    (linked / "driving_log.csv").touch()
+    assert read_result(linked, LANE) is None
+    shutil.rmtree(linked)
+    with pytest.raises(RecordingError, match=r"driving_log.csv: No such file .*put it back"):
+        read_result(linked, LANE)
+
+
+def ended(library: Library, folder: Path, look: str) -> list[dict]:
+    """The states of a look until it is done or has failed, without repetitions."""
+    states, end = [library.looks.state(folder, look)], time.monotonic() + 60
+    while states[-1]["state"] in ("waiting", "running"):
+        assert time.monotonic() < end, states
+        time.sleep(0.005)
+        if (state := library.looks.state(folder, look)) != states[-1]:
+            states.append(state)
+    return states
+
+
+def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, tmp_path, monkeypatch):
+    folders = []
+    for name, copies in (("large", 3), ("middle", 2), ("small", 1), ("open", 4)):
+        (tmp_path / name / "IMG").mkdir(parents=True)
+        text = (sample_recording / "driving_log.csv").read_text(encoding="utf-8")
+        (tmp_path / name / "driving_log.csv").write_text(text * copies, encoding="utf-8")
+        folders.append(tmp_path / name)
+    code = f"import sys; open({str(tmp_path / 'order')!r}, 'a').write(sys.argv[1] + '\\n'); sys.exit('no')"
+    monkeypatch.setattr(looks, "COMMAND", (sys.executable, "-c", code))
+    library = Library(folders, [])
+    try:
+        with library.looks.changed:  # until all of them wait
+            for folder in folders:
+                library.looks.state(folder, LANE)
+            library.looks.hurry(folders[3])
+        for folder in folders:
+            assert ended(library, folder, LANE)[-1]["state"] == "failed"
+    finally:
+        library.looks.close()
+    order = [Path(line).name for line in (tmp_path / "order").read_text(encoding="utf-8").splitlines()]
+    assert order == ["open", "small", "middle", "large"]
+
+
+def test_a_look_tells_how_far_it_is_and_why_it_failed(linked, monkeypatch):
+    code = (
+        "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nestimate: no model')"
+    )
+    monkeypatch.setattr(looks, "COMMAND", (sys.executable, "-c", code))
+    library = Library([linked], [])
+    try:
+        states = ended(library, linked, LANE)
+        assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
+        assert states[-1] == {"state": "failed", "message": "estimate: no model"}
+        time.sleep(0.02)  # longer than a tick of the file system's clock
+        (linked / "driving_log.csv").touch()
+        assert library.looks.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
+    finally:
+        library.looks.close()
+    assert library.looks.process is None

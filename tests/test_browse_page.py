@@ -1,0 +1,113 @@
+"""The page of recordings in a real Chromium, with the keyboard alone and on every screen."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from browse_process import browsing, placed
+from browser import CHROMIUM, chromium
+from test_excluded import center
+
+from cloning.recordings.log import read_recording
+
+
+@pytest.fixture(scope="module")
+def served(sample_recording):
+    placed(sample_recording, np.zeros(60))
+    with browsing(sample_recording) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    with chromium(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
+    offset = np.where(np.arange(60) == 44, -2.5, 0)
+    placed(linked, offset)
+    names = [center(linked, row) for row in range(60)]
+    with browsing(linked) as server:
+        page.look(1280, 800)
+        page.open(server.base)
+        page.wait("document.querySelector('article dl')")
+        text = page.text()
+        for words in ("60, 0.1 minutes", "lake, counter-clockwise", "30.2 mph", "1 recording, 60 frames"):
+            assert words in text
+        assert page.run("document.querySelectorAll('article svg .path').length") == 1
+        page.press("Tab")
+        page.wait("document.activeElement.id == 'home'")
+        page.press("Tab")
+        page.press("Tab")
+        page.press("Enter")
+        page.wait("document.querySelectorAll('#plots .uplot').length == 4")
+        page.wait("document.querySelector('#where').textContent.endsWith('frame 1 of 60')")
+
+        def at(row: int) -> None:
+            page.wait(f"document.querySelector('#where').textContent.endsWith('frame {row + 1} of 60')")
+
+        for key, shift, row in (("ArrowRight", False, 1), ("ArrowRight", True, 16), ("ArrowLeft", True, 1),
+                                ("End", False, 59), ("f", False, 44), ("Home", False, 0), ("PageDown", False, 59),
+                                ("PageUp", False, 0), ("F", True, 44)):  # fmt: skip
+            page.press(key, shift)
+            at(row)
+        shown = page.run("[...document.querySelectorAll('#plots figcaption')].map(each => each.textContent)")
+        steering = read_recording(linked).steering[44]
+        assert f"{steering:.3f}" in shown[0] and "30.2 mph" in shown[2] and "-2.50 m" in shown[3]
+        left = read_recording(linked).path(44, 1)
+        page.until(lambda: difference(page, "left", left) < 3)
+        for key in "?", "Escape", "i", "ArrowLeft", "ArrowLeft", "o":
+            page.press(key)
+        page.wait("document.querySelector('#said').textContent.startsWith('Marked 3 frames')")
+        page.press("x")
+        page.wait("document.querySelector('#reason[open]')")
+        for key in "off":
+            page.press(key)
+        page.press("Enter")
+        page.wait("document.querySelector('#cuts').textContent.includes('3 frames: off')")
+        text = f"first image,last image,reason\n{names[42]},{names[44]},off\n"
+        assert (linked / "excluded.csv").read_text(encoding="utf-8") == text
+        assert page.run("document.querySelector('#strip i').style.left") == "70%"
+        page.press("z")
+        page.wait("document.querySelector('#cuts').textContent.startsWith('None')")
+        assert (linked / "excluded.csv").read_text(encoding="utf-8") == "first image,last image,reason\n"
+        at(42)
+        page.press(" ")
+        page.wait("document.querySelector('#play').textContent == 'Pause'")
+        page.wait("document.querySelector('#where').textContent.endsWith('frame 60 of 60')")
+        page.wait("document.querySelector('#play').textContent == 'Play'")
+        (linked / "driving_log.csv").unlink()
+        page.press("r")
+        page.wait("document.querySelector('#notice').textContent.includes('driving_log.csv: No such file')")
+        assert [entry for entry in page.complaints() if "409" not in entry] == []
+        assert all(address.startswith((server.base, "data:")) for address in page.addresses()[1:]), "no outside host"
+
+
+def difference(page, camera: str, path: Path) -> float:
+    """The mean difference between a camera's canvas and an image file, in grey levels."""
+    pixels = page.run(
+        f"[...document.querySelector('#{camera}').getContext('2d').getImageData(0, 0, 320, 160).data].join()"
+    )
+    shown = np.array(pixels.split(","), np.uint8).reshape(160, 320, 4)[..., :3]
+    return float(np.abs(shown.astype(int) - cv2.imread(str(path))[..., ::-1]).mean())
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+@pytest.mark.parametrize("width, height, dark", [(390, 844, True), (1280, 800, False), (1920, 1080, True)])
+def test_the_page_fits_every_screen(served, page, width, height, dark):
+    page.look(width, height, dark)
+    page.open("about:blank")
+    page.open(served.base)
+    page.wait("document.querySelector('article dl')")
+    fits = "document.documentElement.scrollWidth <= innerWidth"
+    assert page.run(fits)
+    page.run(f"location.hash = '{served.recordings()['lake sample'].replace('recordings/', '#/').lstrip('/')}/5'")
+    page.wait("document.querySelector('#where').textContent.endsWith('frame 6 of 60')")
+    assert page.run(fits)
+    ink, paper = page.run("[getComputedStyle(document.body).color, getComputedStyle(document.body).backgroundColor]")
+    level = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
+    assert (level[0] > level[1]) == dark and abs(level[0] - level[1]) > 400
