@@ -76,7 +76,7 @@ def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
     s = np.linspace(100, 120, 40)
     placed = Localisation(track, np.stack([s, np.full(40, 1.5), np.zeros(40)], axis=1), 0.0)
     monkeypatch.setattr("cloning.lane.place.localise_all", lambda *_: [(slice(10, 50), placed)])
-    monkeypatch.setattr(estimate, "detect_centres", lambda part: np.zeros((len(part), 3, 5), np.float32))
+    monkeypatch.setattr(estimate, "detect_centres", lambda part, _: np.zeros((len(part), 3, 5), np.float32))
     result = estimate.lane(recording)
     x, y = (result.column(name, recording.images[:, 0]) for name in "xy")
     for row, at in ((10, 100.0), (49, 120.0)):

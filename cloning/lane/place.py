@@ -15,7 +15,6 @@ from cloning.lane.reader import (
     ANY_ROAD_WEIGHTS,
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
-    SHIPPED_WEIGHTS,
     LaneNetwork,
     LanePosition,
     estimate_centres,
@@ -225,7 +224,7 @@ def estimate_lane_position(
 
 def shipped_networks() -> Iterator[LaneNetwork]:
     """Yield the networks that come with the project: for the known tracks, then for any road. Raises ModelError."""
-    return map(load_network, (SHIPPED_WEIGHTS, ANY_ROAD_WEIGHTS))
+    return map(load_network, (None, ANY_ROAD_WEIGHTS))
 
 
 def place(
