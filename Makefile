@@ -4,8 +4,8 @@
 #             interruption, run it again.
 
 # make shipped RECORDINGS="FOLDER …"
-#             train a network like cloning/pilot/shipped.pt on these recordings and on rendered ones, and measure it:
-#             see tools/shipped.py
+#             train a network for both tracks, in sun and shade, and for unknown roads, on these recordings and on rendered
+#             ones, and measure it: see tools/shipped.py
 
 PYTHON ?= python3
 RECORDINGS ?= data

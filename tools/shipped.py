@@ -1,4 +1,4 @@
-"""Make a network like the one that comes with the project: render recordings, train on them and on real ones, measure.
+"""Make a network for both tracks, in sun and shade, and for unknown roads: render recordings, train, and measure.
 
     make shipped RECORDINGS="data/lake-ccw data/lake-cw data/jungle data/jungle-shadows"     # or the same without make:
     python -m tools.shipped data/lake-ccw data/lake-cw data/jungle data/jungle-shadows
@@ -6,6 +6,8 @@
 Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
 The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Looks from 101
 on and roads up to 1000 are left to measure with: shipped/scoreboard.md has the results.
+
+The network that comes with the project was made before this existed; writeup_report.md compares the two.
 """
 
 import argparse
