@@ -1,12 +1,14 @@
 """What the network that comes with the project is trained on, and that an interrupted rendering continues."""
 
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cloning.errors import RecordingError
-from cloning.recordings.log import read_recording
+from cloning.recordings.excluded import EXCLUDED
+from cloning.recordings.log import read_recording, read_uncut
 from cloning.road.generated import road_number
 from cloning.training.observations import PROBLEM_AREAS
 from simulator.scenery.looks import SHADOWED
@@ -63,12 +65,18 @@ def test_a_lap_that_left_the_road_is_not_trained_on(tmp_path, monkeypatch):
     assert not (tmp_path / "lake-ccw-look0").exists()
 
 
-def test_a_repeated_recording_is_read_like_the_original(sample_recording, tmp_path):
-    for _ in range(2):  # a second run changes nothing
-        repeat(tmp_path, [sample_recording])
-    (twin,) = tmp_path.iterdir()
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_repeated_recording_is_read_like_the_original(sample_recording, tmp_path, cut):
+    source, folder = tmp_path / "lake", tmp_path / "repeated"
+    shutil.copytree(sample_recording, source)
+    for is_cut in (True, cut):  # a second run takes over what has changed
+        names = [read_uncut(source).name(row) for row in (3, 9)]
+        (source / EXCLUDED).write_text(",".join(names) + ",off the road\n" if is_cut else "", encoding="utf-8")
+        repeat(folder, [source])
+    (twin,) = folder.iterdir()
     assert twin.name.endswith(PROBLEM_AREAS)
-    original, repeated = read_recording(sample_recording), read_recording(twin)
+    original, repeated = read_recording(source), read_recording(twin)
+    assert len(repeated) == 60 - 7 * cut
     np.testing.assert_array_equal(repeated.steering, original.steering)
     assert repeated.path(0).read_bytes() == original.path(0).read_bytes()
 

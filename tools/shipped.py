@@ -25,6 +25,7 @@ if __name__ == "__main__":
 
 from cloning.arguments import number
 from cloning.errors import RecordingError, UserError
+from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
 from cloning.recordings.log import find_folders
 from cloning.road.track import ROADS, Track
@@ -86,6 +87,9 @@ def repeat(folder: Path, recordings: list[Path]) -> None:
         twin = folder / f"{recording.resolve().name}-repetitive"
         twin.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(recording / DRIVING_LOG, twin / DRIVING_LOG)
+        (twin / EXCLUDED).unlink(missing_ok=True)
+        if (recording / EXCLUDED).exists():
+            shutil.copyfile(recording / EXCLUDED, twin / EXCLUDED)
         if not (twin / IMAGE_FOLDER).exists():
             (twin / IMAGE_FOLDER).symlink_to((recording / IMAGE_FOLDER).resolve())
 
