@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from browser import CHROMIUM, chromium
 from drive_process import serving
 
 from tools.simulator_client import Simulator, fragments, telemetry
@@ -299,35 +300,22 @@ def test_the_page_and_its_events(server, jpegs):
             assert live["image"].startswith("data:image/jpeg;base64,/9j/")
 
 
-@pytest.mark.skipif(not shutil.which("chromium"), reason="no Chromium here")
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
 def test_the_page_in_a_real_browser(server, jpegs, tmp_path):
-    with Simulator(server.port) as simulator:
+    sky = cv2.resize(cv2.imdecode(np.frombuffer(jpegs[0], np.uint8), cv2.IMREAD_COLOR), None, fx=2, fy=2)[:130]
+
+    def shows_the_sky() -> bool:
+        """Whether the page shows the camera's image, whose upper part has no line."""
+        page.screenshot(tmp_path / "page.png")
+        return cv2.matchTemplate(cv2.imread(f"{tmp_path}/page.png"), sky, cv2.TM_SQDIFF_NORMED).min() < 0.01
+
+    with Simulator(server.port) as simulator, chromium(tmp_path / "profile") as page:
         simulator.open()
         simulator.drive(telemetry(jpegs[0], speed="8.5000"))
-        subprocess.run(
-            [
-                "chromium",
-                "--headless",
-                "--no-sandbox",
-                "--disable-gpu",
-                "--disable-quic",
-                "--no-first-run",
-                "--disable-background-networking",
-                "--disable-component-update",
-                "--disable-sync",
-                "--timeout=4000",
-                "--window-size=1000,800",
-                f"--screenshot={tmp_path}/page.png",
-                f"--user-data-dir={tmp_path}/profile",
-                f"http://127.0.0.1:{server.port}/",
-            ],
-            capture_output=True,
-            timeout=60,
-            check=True,
-        )
-    sky = cv2.resize(cv2.imdecode(np.frombuffer(jpegs[0], np.uint8), cv2.IMREAD_COLOR), None, fx=2, fy=2)[:130]
-    match = cv2.matchTemplate(cv2.imread(f"{tmp_path}/page.png"), sky, cv2.TM_SQDIFF_NORMED)
-    assert match.min() < 0.01, "the page shows the camera's image, whose upper part has no line"
+        page.look(1000, 800)
+        page.open(f"http://127.0.0.1:{server.port}/")
+        page.wait(f"location.port == '{server.port}' && document.readyState == 'complete'")
+        page.until(shows_the_sky)
 
 
 CLIENT = """
