@@ -1,0 +1,81 @@
+"""Make the film at the top of README.md: a network drives both tracks, and what it looks at is shown in magenta.
+
+python -m tools.readme_film                     # the network that comes with the project
+python -m tools.readme_film model.pt film.gif   # another one, into another file
+
+Left the lake, right the jungle, each with and without shadows, as the stand-in simulator renders them.
+"""
+
+import argparse
+from pathlib import Path
+
+from cloning import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("readme_film")
+
+import gymnasium
+import numpy as np
+import torch
+from PIL import Image
+
+import simulator.environment as environment
+from cloning.errors import UserError
+from cloning.outputs import check_folders
+from cloning.pilot.attention import overlay, visual_backprop
+from cloning.pilot.network import SHIPPED_MODEL, Network, load_model
+from cloning.recordings.format import SAMPLE_RATE
+from simulator.scenery.looks import SHADOWED
+
+FILM = Path(__file__).resolve().parent.parent / "diagnostic_images" / "report" / "driving.gif"
+TRACKS = ("lake", "jungle")
+LOOKS = (0, SHADOWED)  # without shadows, then with them
+STARTS, SECONDS = {"lake": 28, "jungle": 20}, 4  # s from the start of a lap, and of each clip
+EVERY = 2  # frames: 7.5 a second are enough
+COLOURS = 96  # of the palette; a GIF has at most 256
+
+
+def clip(network: Network, track: str, look: int) -> list[np.ndarray]:
+    """Drive at 15 mph and return the frames of a clip with the overlay: uint8 (160, 320, 3), RGB."""
+    env = gymnasium.make(environment.ID, track=track, look=look, speed=15)
+    frames: list[np.ndarray] = []
+    frame, _ = env.reset(seed=0)
+    for step in range((STARTS[track] + SECONDS) * SAMPLE_RATE):
+        steering, mask = visual_backprop(network, frame)
+        if step >= STARTS[track] * SAMPLE_RATE and step % EVERY == 0:
+            picture = overlay(frame, steering, mask)
+            frames.append(picture[::2, ::2])
+        frame, _, terminated, _, _ = env.step(np.array([steering, 1], np.float32))
+        if terminated:
+            raise UserError(f"the network leaves the road of the {track} in look {look}; film another one")
+    env.close()
+    return frames
+
+
+def main() -> int:
+    """Drive the clips and write the film; return the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="readme_film", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("model", nargs="?", default=SHIPPED_MODEL, help="model file (default: the shipped network)")
+    parser.add_argument("film", nargs="?", default=str(FILM), help="GIF to write (default: the one in README.md)")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    try:
+        check_folders(arguments.film)
+        network = load_model(arguments.model)
+        clips = [np.concatenate([clip(network, track, look) for look in LOOKS]) for track in TRACKS]
+    except UserError as error:
+        return program.failed("readme_film", error)
+    pictures = [Image.fromarray(picture) for picture in np.concatenate(clips, axis=2)]
+    palette = pictures[0].quantize(COLOURS)  # one for all: colours that change from frame to frame flicker
+    first, *rest = [picture.quantize(COLOURS, palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    first.save(
+        arguments.film, save_all=True, append_images=rest, duration=1000 * EVERY // SAMPLE_RATE, loop=0, optimize=True
+    )
+    print(f"{arguments.film}: {len(pictures)} frames, {Path(arguments.film).stat().st_size / 1e6:.1f} MB")
+    return program.DONE
+
+
+if __name__ == "__main__":
+    program.run(main)
