@@ -21,8 +21,8 @@ from simulator.run import Run
 from simulator.world import Scene
 
 TOO_FAR = 1.0  # m from the lane's centre at which the expert takes over, as the human does in NVIDIA's evaluation
-# It hands back after two seconds this near to the centre and this well aligned with it. For 95 % of a lap of the jungle
-# it is so itself (0.73 m and 7.3° at 15 mph, 0.74 m and 8.3° at 30 mph), and --robust uses no drive below two seconds.
+# It hands back after two seconds this near to the centre and this well aligned with it. In the jungle it is so itself
+# some 95 % of the time (up to 0.73 m and 7.3° at 15 mph, 0.74 m and 8.3° at 30 mph). --robust uses no shorter drive.
 NEAR, ALIGNED, NEAR_TIME = 0.75, math.radians(8), 2.0  # m, radians, s
 
 
