@@ -31,7 +31,7 @@ from cloning.errors import UserError
 from cloning.pilot.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.recordings.format import FRAME
-from cloning.road.motion import TOP_SPEED_MPH
+from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.wire.protocol import PORT
 
 try:
@@ -44,7 +44,6 @@ except UserError as error:  # wrong versions of the socket libraries
     sys.exit(program.failed("drive.py", error))
 
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
-SET_SPEED = 9.0  # mph, as in Udacity's drive.py
 log = logging.getLogger("drive")
 
 
@@ -136,7 +135,9 @@ class Session:
 class DriveServer:
     """Serves steering to up to MAX_CLIENTS simulators, and the page to browsers."""
 
-    def __init__(self, network: Network, set_speed: float = SET_SPEED, saver: saved_frames.FrameSaver | None = None):
+    def __init__(
+        self, network: Network, set_speed: float = SET_SPEED_MPH, saver: saved_frames.FrameSaver | None = None
+    ):
         """set_speed: mph; saver: saves the frames, or None."""
         self.network, self.set_speed, self.saver = network, set_speed, saver
         self.sessions: dict[str, Session] = {}
@@ -293,7 +294,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--speed",
         type=number(float, 0.1, 1000),
-        default=SET_SPEED,
+        default=SET_SPEED_MPH,
         help=f"set speed in mph; the car does at most {TOP_SPEED_MPH} (default %(default)g)",
     )
     parser.add_argument(

@@ -4,6 +4,7 @@
     python model.py data/lake-ccw data/lake-cw          # these recordings
     python model.py --robust                            # train for robustness rather than fidelity to the report
     python model.py --resume                            # continue a run that was stopped or killed
+    python model.py --from model.pt                     # begin with the weights of a trained network
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes that share every batch
 
 "The report" is the writeup of the Behavioral Cloning project that is reproduced here; this file follows it from top to
@@ -145,11 +146,7 @@ def split(observations: Observations, seed: int) -> tuple[np.ndarray, np.ndarray
     the same frame, all are in the set of the first. Raises RecordingError if there are too few frames.
     """
     n = len(observations)
-    starts = np.ones(n, bool)  # whether a drive without a break starts here
-    pause = np.diff(observations.time)
-    starts[1:] = (np.diff(observations.recording) != 0) | (pause < 0) | (pause > 1)
-    drive = np.cumsum(starts) - 1
-    second = observations.time - observations.time[starts][drive]
+    drive, second = observations.drives()
     block = np.unique(np.stack([drive, second // BLOCK_SECONDS]), axis=1, return_inverse=True)[1].ravel()
     if block[-1] + 1 < FOLDS:  # less than ten seconds in all
         block = np.arange(n) * FOLDS // n
@@ -335,7 +332,7 @@ class TrainingRun:
     def __init__(
         self, arguments: Arguments, training: Observations, validation: Observations, resumed: dict | None = None
     ):
-        """resumed: a checkpoint to continue from, or None. Raises ModelError if it was trained on other data."""
+        """resumed: a checkpoint to continue or begin with, or None. Raises ModelError if its data are others."""
         self.arguments, self.training, self.validation = arguments, training, validation
         self.device = choose_device(arguments.device)
         self.precision = choose_precision(self.device)
@@ -444,7 +441,7 @@ class TrainingRun:
 
 
 def prepare(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, Observations, Observations, dict | None]:
-    """Return the arguments, the training and validation observations, and the checkpoint to resume or None."""
+    """Return the arguments, the training and validation observations, and what `resumed_arguments` returns."""
     arguments, checkpoint = resumed_arguments(arguments, given)
     kind: type[Observations] = RobustObservations if arguments.robust else ReportObservations
     folders = find_folders(arguments.recordings)
@@ -463,7 +460,7 @@ def run(arguments: Arguments, given: frozenset[str]) -> None:
     training_run = TrainingRun(arguments, training, validation, checkpoint)
     if rank() == 0:
         print(summary.run_header(training_run.network, training_run.device, training_run.precision))
-        training_run.checkpoint.begin(training_run.progress, training_run.precision, resumed=checkpoint is not None)
+        training_run.checkpoint.begin(training_run.progress, training_run.precision)
     try:
         with training_run.stop:
             training_run.train()

@@ -1,4 +1,4 @@
-"""The simulator's commands: `python -m simulator record`, `drive`, `replay` and `window`."""
+"""The simulator's commands: `python -m simulator record`, `drive`, `correct`, `replay` and `window`."""
 
 import argparse
 import functools
@@ -15,8 +15,9 @@ if __name__ == "__main__":
 from cloning.arguments import MAX_PORT, address, number
 from cloning.errors import UserError
 from cloning.outputs import check_folders, run_all, write_json
+from cloning.recordings.format import PROBLEM_AREAS
 from cloning.replay.autonomy import LIMITS
-from cloning.road.motion import TOP_SPEED_MPH
+from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.road.track import ROADS, Track
 from cloning.wire.protocol import PORT
 
@@ -73,6 +74,30 @@ def add_drive(commands: "Subparsers") -> None:
     add_road(parser)
 
 
+def add_correct(commands: "Subparsers") -> None:
+    """Add the options of `correct`."""
+    parser = commands.add_parser(
+        "correct",
+        help="let drive.py drive, and record the expert, who takes over where the car is off the lane's centre",
+        epilog="Exit status: as that of drive.",
+    )
+    parser.set_defaults(run=run_correct)
+    parser.add_argument(
+        "folder", help=f"folder for the new recording; its name must end in {' or '.join(PROBLEM_AREAS)}"
+    )
+    add_laps(parser)
+    parser.add_argument(
+        "--speed",
+        type=number(float, 1, TOP_SPEED_MPH),
+        default=SET_SPEED_MPH,
+        help="the expert's set speed in mph, which the car never exceeds: give drive.py the same (default %(default)g, "
+        "as that of drive.py)",
+    )
+    add_server(parser)
+    add_wait(parser)
+    add_road(parser)
+
+
 def add_replay(commands: "Subparsers") -> None:
     """Add the options of `replay`."""
     parser = commands.add_parser(
@@ -107,8 +132,16 @@ def add_window(commands: "Subparsers") -> None:
     """Add the options of `window`."""
     parser = commands.add_parser("window", help="drive and record by hand, or watch drive.py drive")
     parser.set_defaults(run=run_window)
-    parser.add_argument("--folder", help="folder for the recording (default data/window-DATE-TIME)")
-    parser.add_argument("--autonomous", action="store_true", help="let drive.py drive; W or S takes over")
+    parser.add_argument(
+        "--folder",
+        help="folder for the recording (default data/window-DATE-TIME, or data/window-DATE-TIME-corrections with "
+        "--autonomous)",
+    )
+    parser.add_argument(
+        "--autonomous",
+        action="store_true",
+        help="let drive.py drive; W or S takes over, and only then is anything recorded",
+    )
     add_server(parser)
     add_road(parser)
 
@@ -165,7 +198,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
         prog="python -m simulator", description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
-    for add in (add_replay, add_record, add_drive, add_window):
+    for add in (add_replay, add_record, add_drive, add_correct, add_window):
         add(commands)
     return parser.parse_args(argv)
 
@@ -218,6 +251,22 @@ def run_drive(args: argparse.Namespace) -> int:
     return program.INCOMPLETE if run.departures else program.DONE
 
 
+def run_correct(args: argparse.Namespace) -> int:
+    """Let drive.py drive with corrections by the expert; print a lap report and what was recorded."""
+    from simulator import report
+    from simulator.correct import connect
+
+    track = Track(args.track, args.direction)
+    client = connect(args.folder, track, args.look, args.speed, args.host, args.port, args.wait)
+
+    def print_report() -> None:
+        if client.run.time:
+            print(f"{report.report_text(report.lap_report(client.run, client))}\n{client.summary()}")
+
+    run_all(lambda: client.drive(args.laps), print_report, client.recording.close, client.recording.remove_if_empty)
+    return program.INCOMPLETE if client.run.departures else program.DONE
+
+
 def run_replay(args: argparse.Namespace) -> int:
     """Let a model drive real recordings."""
     from cloning.replay import command
@@ -245,7 +294,8 @@ def run_window(args: argparse.Namespace) -> int:
 
     from simulator.window import Window
 
-    folder = args.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}"
+    kind = PROBLEM_AREAS[-1] if args.autonomous else ""
+    folder = args.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}{kind}"
     server = (args.host, args.port) if args.autonomous else None
     opened = Window(Track(args.track, args.direction), folder, args.look, server)
     try:

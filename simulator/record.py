@@ -62,6 +62,12 @@ def _render(track: str, look: int, transform: TransformState) -> list[bytes]:
     return [jpeg(frame) for frame in _cameras(track, look).frames(transform)]
 
 
+def write_row(recording: RecordingWriter, cameras: Cameras, run: Run) -> None:
+    """Render the three cameras, and add a row of the run's present state to a recording. Raises RecordingError."""
+    images = [jpeg(frame) for frame in cameras.frames(run.car.node.get_transform())]
+    recording.add(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph)
+
+
 def record(
     folder: str | Path,
     track: Track,

@@ -18,16 +18,17 @@ from panda3d.core import (
 )
 
 from cloning.errors import SimulatorError
-from cloning.recordings.writer import RecordingWriter, SampleClock
+from cloning.recordings.writer import RecordingWriter, SampleClock, check_name_of_corrections
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import scenery
-from simulator.cameras import FAR_PLANE, NEAR_PLANE, Cameras, jpeg
+from simulator.cameras import FAR_PLANE, NEAR_PLANE, Cameras
 from simulator.car import STEP
 from simulator.client import RemoteDriver
 from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks
 from simulator.film import place_chase_camera
+from simulator.record import write_row
 from simulator.run import Run
 from simulator.world import INSIDE, OUTSIDE, Scene
 
@@ -69,10 +70,13 @@ class Window(ShowBase):
     """The window; its run is `simulation`, because ShowBase has a method `run`."""
 
     def __init__(self, track: Track, folder: str | Path, look: int = 0, server: tuple[str, int] | None = None):
-        """Open the window. Raises SimulatorError.
+        """Open the window. Raises SimulatorError, and RecordingError for a name that does not say what is recorded.
 
         folder: of the recording, created when recording first starts; server: host and port of drive.py if it drives.
+        Then only what the person drives is recorded: the corrections.
         """
+        if server:
+            check_name_of_corrections(folder)
         try:
             super().__init__(windowType="onscreen")
         except Exception as error:
@@ -88,6 +92,7 @@ class Window(ShowBase):
         self.cameras = Cameras(self.scene)
         self.controls, self.gamepad = Controls(), Gamepad()
         self.remote: RemoteDriver | None = None
+        self.by_hand = not server  # whether the person drove before the last frame
         if server:
             host, port = server
             self.remote = RemoteDriver(host, port, Cameras(self.scene, ("center",)))
@@ -144,31 +149,34 @@ class Window(ShowBase):
         by_hand = not self.remote or self.controls.pedals(held) != 0
         if self.remote:
             self.remote.poll(by_hand, self.simulation)
+        if by_hand and not self.by_hand:
+            self.begin_drive()
+        self.by_hand = by_hand
         driver: Controls | RemoteDriver = self.remote if self.remote and not by_hand else self.controls
         while now - self.simulated_until >= STEP:
             self.simulated_until = max(self.simulated_until + STEP, now - MAX_DELAY)
             self.controls.step(held, mouse, pad)
             self.simulation.car.speed_limit = self.controls.set_speed * MPH
             self.simulation.step(driver.steering, driver.throttle)
-            if self.recording and self.recording_on and self.clock.due(self.simulation.time):
-                self.write_row(self.recording)
+            if self.recording and self.recording_on and by_hand and self.clock.due(self.simulation.time):
+                write_row(self.recording, self.cameras, self.simulation)
         for action in self.controls.take_actions():
             getattr(self, f"do_{action}")()
         self.show(by_hand)
         return int(task.cont)
 
-    def write_row(self, recording: RecordingWriter) -> None:
-        """Render the cameras and add a row to the recording."""
-        run = self.simulation
-        images = [jpeg(frame) for frame in self.cameras.frames(run.car.node.get_transform())]
-        recording.add(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph)
+    def begin_drive(self) -> None:
+        """Let what is recorded from now on be a drive of its own."""
+        self.clock = SampleClock(self.simulation.time)
+        if self.recording:
+            self.recording.begin_drive()
 
     def do_record(self) -> None:
         """Start or stop recording."""
         if self.recording is None:
             self.recording = RecordingWriter(self.folder, start=datetime.now())
         self.recording_on = not self.recording_on
-        self.clock = SampleClock(self.simulation.time)
+        self.begin_drive()
 
     def do_save(self) -> None:
         """Save the car's position."""
@@ -196,6 +204,7 @@ class Window(ShowBase):
         """Close the recording and the connection."""
         if self.recording:
             self.recording.close()
+            self.recording.remove_if_empty()
         if self.remote:
             self.remote.close()
 
@@ -220,7 +229,9 @@ class Window(ShowBase):
         if self.remote:
             lines.append(f"drive.py: {self.remote.state}" + ("   you drive" if by_hand else ""))
         if self.recording:
-            state = "recording" if self.recording_on else "recording stopped"
+            state = "recording stopped"
+            if self.recording_on:
+                state = "recording" if by_hand else "recording when you drive"
             lines.append(f"{state}: {self.recording.rows} rows in {self.recording.folder}")
         lines.append("F1: help")
         self.text.setText("\n".join(lines))

@@ -105,7 +105,8 @@ def test_training_on_a_full_disk(warm, lake, tmp_path):
 # Recording
 
 
-RECORD = ["simulator", "record", "recorded", "--laps", "0.00002"]
+RECORDED = "recorded-corrections"
+RECORD = ["simulator", "record", RECORDED, "--laps", "0.00002"]
 
 
 def rows_of(folder: Path) -> list[tuple]:
@@ -123,19 +124,30 @@ def rows_of(folder: Path) -> list[tuple]:
     return list(zip(images, [tuple(map(float, row)) for row in numbers], strict=True))
 
 
-def test_recording_killed_anywhere(warm, tmp_path):
+@pytest.fixture(params=["record", "correct"])
+def recording(warm, tmp_path, request):
+    if request.param == "record":
+        yield Place(warm, tmp_path / "place", RECORD, RECORD)
+        return
+    with ServerForAll("1") as server:  # so the expert takes over after 4 m
+        command = ["simulator", "correct", RECORDED, "--laps", "0.004", "--port", server.port]
+        yield Place(warm, tmp_path / "place", command, command)
+
+
+def test_recording_killed_anywhere(recording):
     """A killed recording can be trained on; one that has no row yet is begun again by the same command."""
-    place = Place(warm, tmp_path / "place", RECORD, RECORD)
+    place = recording
     place.whole_run()
-    complete = rows_of(place.folder / "recorded")
+    complete = rows_of(place.folder / RECORDED)
+    assert complete
 
     def next_run(wanted: dict[str, object]) -> None:
-        log = place.folder / "recorded" / "driving_log.csv"
+        log = place.folder / RECORDED / "driving_log.csv"
         if not log.exists() or not log.stat().st_size:
             place.goes_on(wanted)
             return
         assert rows_of(log.parent) in [complete[:count] for count in range(len(complete) + 1)]
-        ended = place.run(RECORD)
+        ended = place.run(place.command)
         assert ended.status == 2 and "exists already; name another folder, or delete this one" in ended.printed
 
     place.killed_everywhere(2, next_run)
@@ -145,7 +157,7 @@ def test_recording_on_a_full_disk(warm, tmp_path):
     """The rows before it are complete, also if the process is killed while it takes back the last one."""
     place = Place(warm, tmp_path / "place", RECORD, RECORD)
     _, points = place.whole_run()
-    complete = rows_of(place.folder / "recorded")
+    complete = rows_of(place.folder / RECORDED)
     writes = [number for number, point in enumerate(points, 1) if point.startswith("write")]
     for full in writes if ALL else spread(writes, 2):
         place.restore()
@@ -153,8 +165,8 @@ def test_recording_on_a_full_disk(warm, tmp_path):
         assert ended.status == 2 and "No space left on device; the" in ended.printed, ended.printed
         assert "Traceback" not in ended.printed
         check_whole(place.folder)
-        log = (place.folder / "recorded" / "driving_log.csv").read_bytes()
-        images = {path.name for path in (place.folder / "recorded" / "IMG").iterdir()}
+        log = (place.folder / RECORDED / "driving_log.csv").read_bytes()
+        images = {path.name for path in (place.folder / RECORDED / "IMG").iterdir()}
         rows = log.count(b"\n")
         assert f"the {rows} rows before it" in ended.printed
         assert log == b"" or log.endswith(b"\n")
@@ -163,8 +175,8 @@ def test_recording_on_a_full_disk(warm, tmp_path):
             place.restore()
             assert place.run(RECORD, full=full, kill=kill).status == KILLED
             check_whole(place.folder)
-            if (place.folder / "recorded" / "driving_log.csv").stat().st_size:
-                assert rows_of(place.folder / "recorded") == complete[:rows]
+            if (place.folder / RECORDED / "driving_log.csv").stat().st_size:
+                assert rows_of(place.folder / RECORDED) == complete[:rows]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -345,10 +357,10 @@ def simulator_drive(warm, tmp_path):
 
 
 class ServerForAll(Server):
-    """Answers every session, one after the other, until it is closed."""
+    """Answers every session, one after the other, until it is closed, with the same steering."""
 
-    def __init__(self):
-        super().__init__(lambda packet, n: [STEER % ("0", "0.3")], sessions=10_000)
+    def __init__(self, steering="0"):
+        super().__init__(lambda packet, n: [STEER % (steering, "0.3")], sessions=10_000)
 
     def __exit__(self, *_):
         self.sessions = 0

@@ -8,9 +8,9 @@ import pytest
 
 from cloning.errors import RecordingError
 from cloning.recordings.excluded import EXCLUDED
+from cloning.recordings.format import PROBLEM_AREAS
 from cloning.recordings.log import read_recording, read_uncut
 from cloning.road.generated import road_number
-from cloning.training.observations import PROBLEM_AREAS
 from simulator.scenery.looks import SHADOWED
 from tools import shipped
 from tools.lane_frames import FIRST_ROAD, scenes

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 from typing import TypedDict, TypeVar
 
+from cloning.recordings.format import PROBLEM_AREAS
 from cloning.replay.autonomy import LIMITS, autonomy
 from cloning.road.generated import road_number
 from cloning.road.track import ROADS
-from cloning.training.observations import PROBLEM_AREAS
 from simulator.report import LapReport
 from simulator.scenery.looks import SHADOWED
 

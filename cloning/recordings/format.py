@@ -10,6 +10,9 @@ COLUMNS = (*CAMERAS, *NUMBERS)
 # Of the numbers that the simulator writes: only steering has a sign. The car reaches 30 mph, on a slope a little more.
 RANGES = {"steering": (-1, 1), "throttle": (0, 1), "brake": (0, 1), "speed": (0, 100)}
 SAMPLE_RATE = 15  # rows a second
+DRIVE_GAP = 1.0  # s: rows further apart are of different drives
+# Training repeats a recording whose name ends like this, as the report does with problem areas, so many times.
+PROBLEM_AREAS, REPEATS = ("-repetitive", "-corrections"), 4
 FRAME = (160, 320, 3)  # rows, columns, RGB of a camera's image
 TIME_STAMP = "%Y_%m_%d_%H_%M_%S_%f"  # in the names of images, with milliseconds in place of microseconds
 MAX_NAME = 255  # bytes of a file's name

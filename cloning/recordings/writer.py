@@ -11,7 +11,16 @@ from typing import Self
 
 from cloning.errors import RecordingError
 from cloning.files import written_whole
-from cloning.recordings.format import CAMERAS, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE, time_stamp
+from cloning.recordings.format import (
+    CAMERAS,
+    DRIVE_GAP,
+    DRIVING_LOG,
+    IMAGE_FOLDER,
+    PROBLEM_AREAS,
+    REPEATS,
+    SAMPLE_RATE,
+    time_stamp,
+)
 
 # The start of a recording with seed 0, so that the same command makes the same file names on any day.
 DEFAULT_START = datetime(2018, 1, 1, 12)
@@ -20,6 +29,17 @@ DEFAULT_START = datetime(2018, 1, 1, 12)
 def csharp_number(value: float) -> str:
     """Return a number as C# writes a float: with seven significant digits, for example 6.9E-05."""
     return re.sub(r"E([+-]\d)$", r"E\g<1>", f"{value:.7G}").replace("-0", "0") if value == 0 else f"{value:.7G}"
+
+
+def check_name_of_corrections(folder: str | Path) -> None:
+    """Raise RecordingError if training would not repeat a recording of this name, as it does with problem areas."""
+    path = Path(folder).absolute()
+    if not path.name.endswith(PROBLEM_AREAS):
+        remedy = path.with_name(f"{path.name}{PROBLEM_AREAS[-1]}")
+        raise RecordingError(
+            f"{folder}: model.py repeats corrections {REPEATS} times only if the folder's name ends in "
+            f"{' or '.join(PROBLEM_AREAS)}; name it {remedy.name}"
+        )
 
 
 class RecordingWriter:
@@ -76,9 +96,21 @@ class RecordingWriter:
             ) from error
         self.rows += 1
 
+    def begin_drive(self) -> None:
+        """Let the next samples be a drive of their own: they are dated later, by more than a drive's longest pause."""
+        self.start += timedelta(seconds=DRIVE_GAP)
+
     def close(self) -> None:
         """Close driving_log.csv."""
         self.log.close()
+
+    def remove_if_empty(self) -> None:
+        """Remove a closed recording without a row, which no program could read; what else is in its folder stays."""
+        if not self.rows:
+            (self.folder / DRIVING_LOG).unlink()
+            for folder in (self.images, self.folder):
+                if not any(folder.iterdir()):
+                    folder.rmdir()
 
     def __enter__(self) -> Self:
         return self

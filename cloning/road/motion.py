@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 MPH = 0.44704  # m/s
 TOP_SPEED_MPH = 30  # the simulator clamps the car's speed to it
+SET_SPEED_MPH = 9.0  # as in Udacity's drive.py
 FULL_LOCK = 25.0  # degrees of the front wheels at steering 1
 WHEELBASE = 2.87  # m
 REAR_AXLE = 1.6  # m behind the car's middle

@@ -145,15 +145,15 @@ class Progress:
 def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, dict[str, Any] | None]:
     """Return a run's arguments and, with --resume, its checkpoint, which supplies arguments that are not given.
 
-    given: the names of the arguments on the command line. The checkpoint is None for a new run. Raises ModelError.
+    given: the names of the arguments on the command line. For a new run the checkpoint is None, or with --from the
+    weights to begin with, without a state of training. Raises ModelError.
     """
     files = RunFiles(arguments.output)
     path = files.resume
-    if not arguments.resume:
-        return arguments, None
-    if not path.exists():
-        print(f"{path}: nothing to resume yet; starting a new run")
-        return arguments, None
+    if not arguments.resume or not path.exists():
+        if arguments.resume:
+            print(f"{path}: nothing to resume yet; starting a new run")
+        return arguments, _first_weights(arguments.from_) if arguments.from_ else None
     saved = load_checkpoint(path, NEW_RUN)
     if "training" not in saved:
         raise ModelError(f"{path}: contains no state to resume; give the --output of the run")
@@ -162,9 +162,10 @@ def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Argu
     except ValueError as error:
         raise _unusable(path, error) from None
     for name in sorted(given - MAY_CHANGE):
-        if name in initial and initial[name] != getattr(arguments, name):
+        began = initial.get(name, getattr(Arguments(), name))  # an earlier version had no such option
+        if began != getattr(arguments, name):
             raise ModelError(
-                f"{path}: the run began with {option(name)} {initial[name]}, not {getattr(arguments, name)}; "
+                f"{path}: the run began with {option(name)} {began!r}, not {getattr(arguments, name)!r}; "
                 f"leave the option out, or {NEW_RUN}"
             )
     for model in (files.last, files.best):
@@ -173,6 +174,24 @@ def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Argu
                 f"{model}: damaged, or of another run than {path.name}, which would replace it; move it away first"
             )
     return replace(arguments, **{name: value for name, value in initial.items() if name not in given}), saved
+
+
+def _first_weights(path: str) -> dict[str, Any]:
+    """Return what `Checkpoint.restore` needs of a model file with whose weights a new run begins. Raises ModelError."""
+    saved = load_checkpoint(path, "name a model file of model.py")
+    weights = {name: saved.get(name) for name in ("recipe", "network")}
+    try:
+        _restore_network(Network(), weights)
+    except ValueError as error:
+        raise ModelError(f"{path}: its contents do not fit this program: {error}; name another model file") from None
+    return weights
+
+
+def _restore_network(network: Network, saved: dict[str, Any]) -> None:
+    """Give the network the weights of a checkpoint. Raises ValueError if they, or their recipe, do not fit."""
+    if read_recipe(saved) != (network.crop, network.scale, network.offset):
+        raise ValueError("its recipe is not that of this program's training")
+    restore_weights(network, saved)
 
 
 def _initial_arguments(saved: dict[str, Any]) -> dict[str, Any]:
@@ -231,17 +250,20 @@ class Checkpoint:
         """network, optimizer: whose state is saved and restored; data_fingerprint: of `fingerprint`."""
         self.files, self.arguments, self.network, self.optimizer = files, arguments, network, optimizer
         self.fingerprint = data_fingerprint
+        self.resumed = False  # whether `restore` found a state of this run
 
-    def begin(self, progress: Progress, precision: torch.dtype, resumed: bool) -> None:
+    def begin(self, progress: Progress, precision: torch.dtype) -> None:
         """Write training_arguments.json and, first, unless the run is resumed, its first state."""
-        if not resumed:
+        if not self.resumed:
             if _has_finished_epoch(self.files.resume):
                 self.set_aside(self.files.resume)
             self.save(progress)
         settings = {**asdict(self.arguments), "precision": str(precision), "versions": versions()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
-        if resumed:
+        if self.resumed:
             print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
+        elif self.arguments.from_:
+            print(f"begins with the weights of {self.arguments.from_}")
 
     def save(self, progress: Progress, *models: Path) -> None:
         """Write the network to these files, then model-resume.pt with all that --resume needs. Raises OSError."""
@@ -264,18 +286,19 @@ class Checkpoint:
         )
 
     def restore(self, saved: dict[str, Any]) -> Progress:
-        """Load a checkpoint into network and optimizer and return its progress.
+        """Load a checkpoint of `resumed_arguments` into network and optimizer, and return its progress.
 
         Raises ModelError if the run was trained on other data.
         """
-        path = self.files.resume
+        if "training" not in saved:  # with --from, a new run
+            _restore_network(self.network, saved)
+            return Progress()
+        path, self.resumed = self.files.resume, True
         try:
             progress, state = _progress(saved), saved["training"]
             if state.get("fingerprint") != self.fingerprint:
                 raise ModelError(f"{path}: the run began with other recordings; restore them, or {NEW_RUN}")
-            if read_recipe(saved) != (self.network.crop, self.network.scale, self.network.offset):
-                raise ValueError("its recipe is not that of this program's training")
-            restore_weights(self.network, saved)
+            _restore_network(self.network, saved)
             self._restore_optimizer(state.get("optimizer"), has_begun=progress.number > 0)
         except ValueError as error:
             raise _unusable(path, error) from None

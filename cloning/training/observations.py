@@ -13,14 +13,13 @@ import numpy as np
 
 from cloning.errors import RecordingError
 from cloning.pilot.network import CROP
-from cloning.recordings.format import FRAME
+from cloning.recordings.format import DRIVE_GAP, FRAME, PROBLEM_AREAS, REPEATS
 from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.log import Recording
 from cloning.training.image_cache import ImageCache
 from cloning.training.options import Arguments
 
 SEEN_ROWS = slice(CROP[0], FRAME[0] - CROP[1])  # the rows of a frame that the network sees
-PROBLEM_AREAS, REPEATS = ("-repetitive", "-corrections"), 4  # a recording whose name ends like this counts so often
 SEEN_SHAPE = (SEEN_ROWS.stop - SEEN_ROWS.start, *FRAME[1:])  # (75, 320, 3)
 
 
@@ -209,6 +208,17 @@ class Observations(ABC):
         """Return how often each observation counts: int (n,), REPEATS in a recording of problem areas, else 1."""
         names = [recording.folder.resolve().name for recording in self.recordings]
         return np.array([REPEATS if name.endswith(PROBLEM_AREAS) else 1 for name in names])[self.recording]
+
+    def drives(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the drive without a break that each observation is of, and the time since its start.
+
+        int (n,), numbered from 0 in the order of the observations; float64 (n,), seconds.
+        """
+        starts = np.ones(len(self), bool)
+        pause = np.diff(self.time)
+        starts[1:] = (np.diff(self.recording) != 0) | (pause < 0) | (pause > DRIVE_GAP)
+        drive = np.cumsum(starts) - 1
+        return drive, self.time - self.time[starts][drive]
 
     # ---- images
 

@@ -31,6 +31,7 @@ class Arguments:
     side_correction: float = 0.2
     strict: bool = False
     robust: bool = False
+    from_: str = ""
     output: str = "model.pt"
     resume: bool = False
 
@@ -41,8 +42,8 @@ REPORT_ONLY = ("throttle_threshold", "side_correction")  # options without an ef
 
 
 def option(name: str) -> str:
-    """Return the option that sets a field of Arguments: batch_size -> --batch-size."""
-    return f"--{name.replace('_', '-')}"
+    """Return the option that sets a field of Arguments: batch_size -> --batch-size; from_, a Python word -> --from."""
+    return f"--{name.rstrip('_').replace('_', '-')}"
 
 
 def parse(argv: list[str] | None = None) -> tuple[Arguments, frozenset[str]]:
@@ -109,6 +110,12 @@ def build_parser() -> argparse.ArgumentParser:
         "--seed",
         type=number(int, 0, MAX_SEED),
         help=text("seed", "on the same machine, the same seed repeats the same run"),
+    )
+    group.add_argument(
+        "--from",
+        dest="from_",
+        metavar="MODEL",
+        help="begin with the weights of this model file (default: random weights)",
     )
     group.add_argument(
         "--device",

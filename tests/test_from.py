@@ -1,0 +1,95 @@
+"""model.py --from: a run that begins with the weights of a trained network."""
+
+import json
+import shutil
+
+import pytest
+import torch
+from conftest import SHORT, run_here, same, weights
+
+import model
+
+
+@pytest.fixture
+def base(finished, tmp_path):
+    """The model of a finished run, under another name."""
+    return shutil.copy(finished[1] / "model.pt", tmp_path / "base.pt")
+
+
+def files(folder):
+    return [path for path in folder.rglob("*") if path.is_file()] if folder.exists() else []
+
+
+def test_a_run_begins_with_the_weights_of_the_file_and_nothing_else_of_it(sample_recording, base, tmp_path):
+    options = model.parse([str(sample_recording), "--from", str(base), "--output", str(tmp_path / "run" / "model.pt")])
+    run = model.TrainingRun(*model.prepare(*options))
+    run.pool.shutdown()
+    assert same(run.network.state_dict(), weights(base))
+    assert run.progress.number == 0 and not run.progress.history and not run.optimizer.state
+    assert not run.checkpoint.resumed
+
+
+def test_it_is_resumed_exactly_without_the_file(sample_recording, base, tmp_path):
+    whole, parts = tmp_path / "whole" / "model.pt", tmp_path / "parts" / "model.pt"
+    command = (sample_recording, *SHORT, "--from", base)
+    assert run_here(*command, "--output", whole).returncode == 0
+    begun = run_here(*command, "--epochs", 1, "--output", parts)
+    assert f"begins with the weights of {base}" in begun.stdout
+    base.unlink()
+    resumed = run_here("--epochs", 2, "--resume", "--output", parts)
+    assert resumed.returncode == 0 and "resumed in epoch 2" in resumed.stdout
+    assert same(weights(whole), weights(parts))
+    for output in (whole, parts):
+        assert json.loads(output.with_name("training_arguments.json").read_bytes())["from_"] == str(base)
+
+
+def test_a_run_from_its_own_output_keeps_the_earlier_model(sample_recording, base, tmp_path):
+    """`model.py --from model.pt` in the folder of the earlier run, the shortest command."""
+    before = weights(base)
+    done = run_here(sample_recording, *SHORT, "--epochs", 1, "--from", base, "--output", base)
+    assert done.returncode == 0, done.stderr
+    assert same(weights(tmp_path / "base-previous.pt"), before)
+    assert not same(weights(base), before)
+
+
+def test_resume_refuses_another_file_to_begin_with(finished, sample_recording, base, tmp_path):
+    output = tmp_path / "run" / "model.pt"
+    assert run_here(sample_recording, *SHORT, "--epochs", 1, "--from", base, "--output", output).returncode == 0
+    refused = run_here("--resume", "--from", "other.pt", "--output", output)
+    assert refused.returncode == 2 and f"the run began with --from {str(base)!r}, not 'other.pt'" in refused.stderr
+    plain = shutil.copytree(finished[1], tmp_path / "plain")
+    refused = run_here("--resume", "--from", base, "--output", plain / "model.pt")
+    assert refused.returncode == 2 and "the run began with --from ''" in refused.stderr
+
+
+def no_model(path):
+    path.write_bytes(b"steering,throttle")
+
+
+def flipped_bit(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def other_recipe(path):
+    saved = torch.load(path, weights_only=True)
+    saved["recipe"]["crop"] = (50, 35)
+    del saved["digest"]
+    torch.save(saved, path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda path: path.unlink(), "no such file"),
+        (no_model, "damaged"),
+        (flipped_bit, "damaged"),
+        (other_recipe, "recipe"),
+    ],
+)
+def test_an_unusable_file_is_named_before_anything_is_written(sample_recording, base, tmp_path, change, words):
+    change(base)
+    done = run_here(sample_recording, *SHORT, "--from", base, "--output", tmp_path / "run" / "model.pt")
+    assert done.returncode == 2 and done.stderr.startswith(f"model.py: {base}: ") and words in done.stderr
+    assert "name a" in done.stderr and not files(tmp_path / "run")
