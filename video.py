@@ -107,9 +107,12 @@ def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None
 
 def load_overlay(model_file: Path) -> Overlay:
     """Return the overlay that shows a model's steering and what it looks at. Raises ModelError."""
-    from cloning.pilot import attention  # imports torch, which takes longer than making a short film
+    import torch  # takes longer to import than a short film to make
+
+    from cloning.pilot import attention
     from cloning.pilot.network import load_model
 
+    torch.set_num_threads(1)  # more threads are slower for single frames, and the encoder uses the other cores
     network = load_model(model_file)
 
     def overlay(frame: np.ndarray) -> np.ndarray:

@@ -38,23 +38,17 @@ class FilmWriter:
     thread only. After an error the unfinished film is deleted at once.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        rate: Fraction | int,
-        quality: int = 18,
-        preset: str = "medium",
-        max_bits: int | None = None,
-    ):
+    def __init__(self, path: str | Path, rate: Fraction | int, quality: int = 18, max_bits: int | None = None):
         """Open the film; it appears at `path` when it is closed.
 
-        rate: frames per second; quality: x264's crf, 0..51, lower is better; preset: x264's, slower ones make smaller
-        files; max_bits: bits/s above which the quality is lowered, or None. Raises OSError.
+        rate: frames per second; quality: x264's crf, 0..51, lower is better; max_bits: bits/s above which the quality
+        is lowered, or None. Raises OSError.
         """
         import av  # slow to import, and not needed without a film
 
         self.path, self.rate, self.av = Path(path), rate, av
-        self.options = {"crf": str(quality), "preset": preset}
+        # The preset "medium" takes three times as long, and its films of frames with an overlay are as large.
+        self.options = {"crf": str(quality), "preset": "veryfast"}
         if max_bits:
             self.options |= {"maxrate": str(max_bits), "bufsize": str(2 * max_bits)}
         self.stream: VideoStream | None = None
@@ -110,8 +104,7 @@ class DriveFilm:
         self.path = path
         self.error: OSError | None = None
         try:
-            # With the preset "medium", encoding would take longer than driving.
-            self.writer = FilmWriter(path, rate, quality, "veryfast", max_bits)
+            self.writer = FilmWriter(path, rate, quality, max_bits)
         except OSError as error:
             raise OutputError(
                 f"{path}: {error.strerror}; name another file, in a folder that can be written"
