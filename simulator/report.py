@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 JUMP = 3.0  # m: between plotted points further apart the car was set back, so no line joins them
-MAP_INCHES, MARGIN = 7.5, 15.0  # the longer side of the map, and m that it shows around the centre line
+MAP_INCHES, MARGIN = 6.0, 15.0  # the longer side of the map, and m that it shows around the centre line
 ARROW_OFFSET, ARROW_LENGTH = 11.0, 35.0  # m from the centre line to the right, and m
 
 
@@ -189,12 +189,12 @@ def write_picture(path: str | Path, run: Run) -> None:
         along.axvline(driven, color="tab:red", linewidth=1)
         along.annotate(f"{departure.time:.0f} s", (driven, -scale), (3, 3), **name)
     title = report_text(lap_report(run)).splitlines()[0]
-    above.set(xlabel="east, m", ylabel="north, m", title=title.replace(", ", "\n", 1) if map_inches[0] < 7 else title)
+    above.set(xlabel="east, m", ylabel="north, m", title=title.replace(", ", "\n", 1) if map_inches[0] < 5.5 else title)
     along.set(xlabel="distance driven, m", ylabel="m right of the\ncentre line", ylim=(-1.05 * scale, 1.05 * scale))
     along.set_xlim(0, max(1.0, run.distance))
     along.grid(alpha=0.3)
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110)
+    figure.savefig(picture, format="png", dpi=130)
     write_output(path, picture.getvalue())
 
 

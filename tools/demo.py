@@ -41,10 +41,10 @@ IMAGES = 20_000  # to train on: 15,000 from one lap already kept a car on the la
 RECORDED = [Lap("lake", "ccw", look=0), Lap("lake", "cw", look=0)]
 TEMPLATE = Path(__file__).with_name("demo.html")
 # Printed at the end, and shown on the page: what to type, and what it does.
+ACTIVATE = "source .venv/bin/activate"  # of the environment that make installs; README.md has other systems'
 NEXT = (
-    ("source .venv/bin/activate", "first, in every new terminal (on Windows: .venv\\Scripts\\activate)"),
     ("python -m simulator window", "drive yourself: the arrow keys steer, R records to data/, F1 shows all keys"),
-    (f"python drive.py {MODEL.as_posix()}", "drive the real simulator: start it in AUTONOMOUS MODE meanwhile"),
+    (f"python drive.py {MODEL.as_posix()}", "drive the real simulator: then start it in AUTONOMOUS MODE"),
     ("python model.py --robust", "train on your own recordings, which are all those below data/"),
 )
 
@@ -77,11 +77,10 @@ class Drive:
         return json.loads((self.folder / "lap.json").read_text(encoding="utf-8"))
 
 
-# The longest first, so that the two others take as long together, on the second core.
 DRIVES = [
-    Drive("jungle", "The jungle, by the network that comes with the project", SHIPPED_MODEL, "jungle", "cw", 15),
     Drive("lake-ccw", "The lake, by the network just trained", MODEL, "lake", "ccw", 30),
     Drive("lake-cw", "The lake the other way round", MODEL, "lake", "cw", 30),
+    Drive("jungle", "The jungle, by the network that comes with the project", SHIPPED_MODEL, "jungle", "cw", 15),
 ]
 
 
@@ -125,9 +124,9 @@ def drive(lap: Drive) -> None:
 
 
 def drive_all() -> None:
-    """Drive all laps, as many at the same time as there are cores. Raises UserError."""
+    """Drive all laps, as many at the same time as there are cores. Raises UserError, OSError."""
     with ThreadPoolExecutor(threads()) as pool:
-        list(pool.map(drive, DRIVES))
+        list(pool.map(drive, reversed(DRIVES)))  # the jungle takes as long as both laps of the lake
 
 
 def in_words(report: LapReport) -> str:
@@ -155,7 +154,12 @@ def page() -> str:
     ]
     steps = [f"<dt><code>{html.escape(command)}</code><dd>{html.escape(text)}" for command, text in NEXT]
     return string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        style=STYLE, films="\n".join(figures), maps="\n".join(maps), steps="\n".join(steps), images=f"{IMAGES:,}"
+        style=STYLE,
+        films="\n".join(figures),
+        maps="\n".join(maps),
+        steps="\n".join(steps),
+        activate=ACTIVATE,
+        images=f"{IMAGES:,}",
     )
 
 
@@ -182,7 +186,8 @@ def main(argv: list[str] | None = None) -> int:
     except (UserError, OSError) as error:
         return program.failed("demo", error)
     width = max(len(command) for command, _ in NEXT)
-    print(f"\nLook at it in a browser: {(FOLDER / 'index.html').resolve().as_uri()}\n\nThree things to do next:")
+    print(f"\nLook at it in a browser: {(FOLDER / 'index.html').resolve().as_uri()}")
+    print(f"\nThree things to do next, after `{ACTIVATE}` in every new terminal:")
     print("\n".join(f"  {command:{width}}  # {text}" for command, text in NEXT))
     return program.INCOMPLETE if any(lap.report()["departures"] for lap in DRIVES) else program.DONE
 
