@@ -353,7 +353,7 @@ class TrainingRun:
         self.checkpoint = Checkpoint(self.files, arguments, self.network, self.optimizer, data)
         self.validation_sets = validation.validation_sets(arguments.seed)
         self.progress = self.checkpoint.restore(resumed) if resumed else Progress()
-        self.stop, self.saved_at = StopSignals(), time.monotonic()
+        self.pace, self.stop, self.saved_at = summary.Pace(arguments), StopSignals(), time.monotonic()
 
     def train(self) -> None:
         """Train the remaining epochs. Raises Interrupted, after saving the state, if a signal stops the run."""
@@ -369,7 +369,7 @@ class TrainingRun:
                 write(self.files.losses, loss_picture(history))
             self.save(self.files.last, *[self.files.best] * is_best)
             if rank() == 0:
-                print(summary.epoch_line(history[-1], self.arguments.samples_per_epoch), flush=True)
+                print(summary.epoch_line(history[-1]), flush=True)
 
     def epoch(self, batches: Iterator[Batch]) -> None:
         """Train on whole batches until the epoch has at least `samples_per_epoch` images, as Keras 1 counts."""
@@ -395,7 +395,7 @@ class TrainingRun:
                 progress.loss += squared_error
                 progress.seconds = time.monotonic() - started
                 bar.update(batch.total)
-                bar.set_postfix(loss=f"{progress.loss / progress.images:.4f}")
+                bar.set_postfix_str(self.pace.after_batch(batch.total, progress))
                 if stopped:
                     self.save()
                     raise Interrupted(self.stop.received or SIGNALS[-1])

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Callable
 from datetime import datetime
 from fractions import Fraction
-from itertools import pairwise
 from pathlib import Path
 
 from cloning import program
@@ -25,13 +24,11 @@ from tqdm import tqdm
 
 from cloning.arguments import number, ratio
 from cloning.errors import UserError
-from cloning.film import FilmWriter
+from cloning.film import FilmWriter, frame_rate
 from cloning.recordings import saved_frames
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import decode, read_jpeg
 
-MAX_FRAME_GAP = 1.0  # s: a longer gap between two frames is a pause, which does not count for the rate
-MAX_RATE = 240.0  # frames/s that a film is given without --fps
 FPS_RANGE = 0.01, 1000.0  # frames/s that can be given
 
 Overlay = Callable[[np.ndarray], np.ndarray]  # from a frame to the film's picture, both uint8 (rows, columns, 3), RGB
@@ -74,17 +71,6 @@ def print_note(message: str) -> None:
     print(f"video.py: {message}", file=sys.stderr)
 
 
-def frame_rate(times: list[datetime]) -> Fraction:
-    """Return frames per second, 1..240, from the frames' times without pauses; for a single frame, that of recordings.
-
-    It is the mean, not the median, because frames arrive in bunches of two or three.
-    """
-    gaps = [(after - before).total_seconds() for before, after in pairwise(times)]
-    gaps = [gap for gap in gaps if gap < MAX_FRAME_GAP]
-    rate = min(MAX_RATE, max(1.0, len(gaps) / sum(gaps))) if sum(gaps) else SAMPLE_RATE
-    return Fraction(rate).limit_denominator(1000)
-
-
 def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = None) -> int:
     """Write `folder`.mp4 next to the folder, and return how many unreadable frames were left out.
 
@@ -92,7 +78,7 @@ def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None
     A frame is readable if training could read it: a whole JPEG of 320x160 pixels. Raises FilmError, OSError.
     """
     frames = find_frames(folder)
-    fps = fps or frame_rate([time for time, _ in frames])
+    fps = fps or frame_rate([(time - frames[0][0]).total_seconds() for time, _ in frames], SAMPLE_RATE)
     path = folder.with_name(folder.name + ".mp4")
     unreadable: list[str] = []
     reason: ValueError | None = None  # of the first unreadable frame
@@ -121,9 +107,12 @@ def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None
 
 def load_overlay(model_file: Path) -> Overlay:
     """Return the overlay that shows a model's steering and what it looks at. Raises ModelError."""
-    from cloning.pilot import attention  # imports torch, which takes longer than making a short film
+    import torch  # takes longer to import than a short film to make
+
+    from cloning.pilot import attention
     from cloning.pilot.network import load_model
 
+    torch.set_num_threads(1)  # more threads are slower for single frames, and the encoder uses the other cores
     network = load_model(model_file)
 
     def overlay(frame: np.ndarray) -> np.ndarray:

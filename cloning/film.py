@@ -1,8 +1,9 @@
 """Write films: H.264 in mp4 files that are either complete or absent."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,21 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 
+MAX_FRAME_GAP = 1.0  # s: a longer gap between two frames is a pause, which does not count for the rate
+MAX_RATE = 240.0  # frames/s that a film is given from its frames' times
+
+
+def frame_rate(times: Sequence[float], otherwise: float) -> Fraction:
+    """Return frames per second, 1..240, from the frames' times in seconds without pauses.
+
+    It is the mean, not the median, because frames arrive in bunches of two or three. otherwise: the rate if no time
+    passes between the frames, as with a single one.
+    """
+    gaps = [gap for before, after in pairwise(times) if 0 <= (gap := after - before) < MAX_FRAME_GAP]
+    rate = min(MAX_RATE, max(1.0, len(gaps) / sum(gaps))) if sum(gaps) else otherwise
+    return Fraction(rate).limit_denominator(1000)
+
+
 class FilmWriter:
     """Writes an mp4 film: H.264 in yuv420p, which browsers and desktop players show.
 
@@ -22,16 +38,19 @@ class FilmWriter:
     thread only. After an error the unfinished film is deleted at once.
     """
 
-    def __init__(self, path: str | Path, rate: Fraction | int, quality: int = 18, preset: str = "medium"):
+    def __init__(self, path: str | Path, rate: Fraction | int, quality: int = 18, max_bits: int | None = None):
         """Open the film; it appears at `path` when it is closed.
 
-        rate: frames per second; quality: x264's crf, 0..51, lower is better; preset: x264's, slower ones make smaller
-        files. Raises OSError.
+        rate: frames per second; quality: x264's crf, 0..51, lower is better; max_bits: bits/s above which the quality
+        is lowered, or None. Raises OSError.
         """
         import av  # slow to import, and not needed without a film
 
         self.path, self.rate, self.av = Path(path), rate, av
-        self.options = {"crf": str(quality), "preset": preset}
+        # The preset "medium" takes three times as long, and its films of frames with an overlay are as large.
+        self.options = {"crf": str(quality), "preset": "veryfast"}
+        if max_bits:
+            self.options |= {"maxrate": str(max_bits), "bufsize": str(2 * max_bits)}
         self.stream: VideoStream | None = None
         self._place = contextlib.ExitStack()  # renames the temporary file when it is closed
         self.temporary = self._place.enter_context(written_whole(path))
@@ -80,13 +99,12 @@ class FilmWriter:
 class DriveFilm:
     """A film of a drive that never interrupts the drive: `close` raises the error if a frame could not be written."""
 
-    def __init__(self, path: str, rate: int, quality: int):
-        """Open the film; rate: frames per second; quality: x264's crf, 0..51, lower is better. Raises OutputError."""
+    def __init__(self, path: str, rate: Fraction | int, quality: int, max_bits: int | None = None):
+        """Open the film; rate, quality, max_bits: of `FilmWriter`. Raises OutputError."""
         self.path = path
         self.error: OSError | None = None
         try:
-            # With the preset "medium", encoding would take longer than driving.
-            self.writer = FilmWriter(path, rate, quality, preset="veryfast")
+            self.writer = FilmWriter(path, rate, quality, max_bits)
         except OSError as error:
             raise OutputError(
                 f"{path}: {error.strerror}; name another file, in a folder that can be written"

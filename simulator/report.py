@@ -3,18 +3,23 @@
 import io
 import math
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 import numpy as np
 
 from cloning.outputs import write_output
 from cloning.road.motion import MPH
-from cloning.road.track import LEFT, RIGHT
+from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import STEP
 from simulator.client import Client
 from simulator.run import Run
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 JUMP = 3.0  # m: between plotted points further apart the car was set back, so no line joins them
+MAP_INCHES, MARGIN = 6.0, 15.0  # the longer side of the map, and m that it shows around the centre line
+ARROW_OFFSET, ARROW_LENGTH = 11.0, 35.0  # m from the centre line to the right, and m
 
 
 class DepartureReport(TypedDict):
@@ -111,7 +116,8 @@ def lap_report(run: Run, client: Client | None = None) -> LapReport:
 def report_text(report: LapReport) -> str:
     """Return a report as lines for a terminal."""
     lines = [
-        f"{report['track']} {report['direction']}: {report['laps']} laps, {report['distance_m']:.0f} m in "
+        f"{report['track']} {report['direction']}: {report['laps']} lap{'s' * (report['laps'] != 1)}, "
+        f"{report['distance_m']:.0f} m in "
         f"{report['simulated_seconds']:.1f} s, {report['mean_speed_mph']:.1f} mph on average"
     ]
     if report["seconds_a_lap"]:
@@ -138,9 +144,9 @@ def report_text(report: LapReport) -> str:
 
 
 def write_picture(path: str | Path, run: Run) -> None:
-    """Plot the track from above as PNG: the car's path, coloured by its distance from the centre line, and departures.
+    """Plot a drive as PNG: the track from above with the car's path, and the lateral offset along the way.
 
-    Raises OutputError.
+    The path's colours reach as far as the car's largest distance from the centre line. Raises OutputError.
     """
     from matplotlib import colors  # here, because loading matplotlib takes long and only this function needs it
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -148,39 +154,56 @@ def write_picture(path: str | Path, run: Run) -> None:
     from matplotlib.figure import Figure
 
     track = run.track
-    figure = Figure(figsize=(9, 8), layout="constrained")
+    wide, high = np.ptp(track.points[:, :2], axis=0) + 2 * MARGIN
+    map_inches = min(MAP_INCHES / wide, MAP_INCHES / high) * np.array([wide, high])
+    figure = Figure(figsize=(map_inches[0] + 1.6, map_inches[1] + 2.8), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot(aspect="equal")
+    above, along = figure.subplots(2, 1, height_ratios=[map_inches[1], 1.7])
+    above.set_aspect("equal")
     ring = np.r_[np.arange(len(track.points)), 0]
     for column, side in enumerate((LEFT, RIGHT)):
         edge = track.points[ring, :2] + side * track.rightward[ring] * track.edges[ring, column, None]
-        axes.plot(*edge.T, color="0.6", linewidth=0.7)
+        above.plot(*edge.T, color="0.6", linewidth=0.7)
     every = max(1, round(0.1 / STEP))
-    path_driven = np.column_stack([run.trajectory.x, run.trajectory.y])[::every]
-    if len(path_driven) > 1:
-        segments = np.stack([path_driven[:-1], path_driven[1:]], axis=1)
-        joined = np.linalg.norm(np.diff(path_driven, axis=0), axis=1) < JUMP
-        lines = LineCollection(list(segments[joined]), cmap="viridis", norm=colors.Normalize(0, 4), linewidth=1.8)
-        lines.set_array(np.abs(run.trajectory.offset)[::every][:-1][joined])
-        axes.add_collection(lines)
-        figure.colorbar(lines, ax=axes, label="distance from the centre line, m", shrink=0.7)
-    start = track.at(track.starts["autonomous"])
-    axes.annotate(
-        "",
-        (start.x + 12 * math.cos(start.heading), start.y + 12 * math.sin(start.heading)),
-        (start.x, start.y),
-        arrowprops={"arrowstyle": "->", "linewidth": 1.5},
-    )
+    trajectory = run.trajectory
+    path_driven = np.column_stack([trajectory.x, trajectory.y])[::every]
+    offset = np.array(trajectory.offset)[::every]
+    metres = np.cumsum(trajectory.speed)[::every] * STEP
+    joined = np.linalg.norm(np.diff(path_driven, axis=0), axis=1) < JUMP
+    scale = max(0.1, math.ceil(10 * np.abs(offset).max(initial=0)) / 10)
+    segments = np.stack([path_driven[:-1], path_driven[1:]], axis=1)
+    lines = LineCollection(list(segments[joined]), cmap="viridis", norm=colors.Normalize(0, scale), linewidth=2.5)
+    lines.set_array(np.abs(offset)[:-1][joined])
+    above.add_collection(lines)
+    figure.colorbar(lines, ax=above, label="m from the centre line", shrink=0.8)
+    mark_start(above, track)
+    whole = metres.copy()
+    whole[np.flatnonzero(~joined) + 1] = np.nan  # no line is plotted across a jump
+    along.plot(whole, offset, linewidth=1)
+    along.axhline(0, color="0.6", linewidth=0.7)
     for departure in run.departures:
-        axes.plot(departure.x, departure.y, "x", color="tab:red", markersize=9, markeredgewidth=2)
-        axes.annotate(
-            f"{departure.time:.0f} s",
-            (departure.x, departure.y),
-            (4, 4),
-            textcoords="offset points",
-            color="tab:red",
-        )
-    axes.set(xlabel="east, m", ylabel="north, m", title=report_text(lap_report(run)).splitlines()[0])
+        above.plot(departure.x, departure.y, "x", color="tab:red", markersize=9, markeredgewidth=2)
+        name = {"color": "tab:red", "textcoords": "offset points"}
+        above.annotate(f"{departure.time:.0f} s", (departure.x, departure.y), (4, 4), **name)
+        driven = float(np.sum(trajectory.speed[: round(departure.time / STEP)]) * STEP)
+        along.axvline(driven, color="tab:red", linewidth=1)
+        along.annotate(f"{departure.time:.0f} s", (driven, -scale), (3, 3), **name)
+    title = report_text(lap_report(run)).splitlines()[0]
+    above.set(xlabel="east, m", ylabel="north, m", title=title.replace(", ", "\n", 1) if map_inches[0] < 5.5 else title)
+    along.set(xlabel="distance driven, m", ylabel="m right of the\ncentre line", ylim=(-1.05 * scale, 1.05 * scale))
+    along.set_xlim(0, max(1.0, run.distance))
+    along.grid(alpha=0.3)
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110)
+    figure.savefig(picture, format="png", dpi=130)
     write_output(path, picture.getvalue())
+
+
+def mark_start(axes: "Axes", track: Track) -> None:
+    """Plot where the autonomous mode starts, and an arrow beside the road in the direction of driving."""
+    start = track.at(track.starts["autonomous"])
+    beside = track.at(track.starts["autonomous"], ARROW_OFFSET)
+    ahead = ARROW_LENGTH * np.array([math.cos(start.heading), math.sin(start.heading)])
+    axes.plot(start.x, start.y, "o", color="black", markersize=6)
+    arrow = {"arrowstyle": "-|>", "linewidth": 1.5, "color": "black"}
+    axes.annotate("", (beside.x + ahead[0], beside.y + ahead[1]), (beside.x, beside.y), arrowprops=arrow)
+    axes.annotate("start", (beside.x, beside.y), -0.35 * ahead, ha="center", va="center", textcoords="offset points")

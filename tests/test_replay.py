@@ -27,7 +27,7 @@ from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
 from cloning.replay.autonomy import LIMITS
-from cloning.replay.score import driving_metrics, steering_metrics
+from cloning.replay.score import ReplayFilm, driving_metrics, steering_metrics
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
 
 ORACLE_DRIVER = replay.ReplayFrame.recovery_steering
@@ -243,6 +243,18 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     assert (tmp_path / "way.png").read_bytes()[:4] == b"\x89PNG"
     assert film_frames(tmp_path / "seen.mp4") == 300
     assert av.open(str(tmp_path / "seen.mp4")).streams.video[0].width == 1280
+
+
+def test_the_film_runs_at_the_recordings_own_rate(recording, tmp_path):
+    recording.time = recording.time * 1.25
+    film = ReplayFilm(str(tmp_path / "seen.mp4"))
+    film.begin(recording)
+    film.add(np.zeros((298, 1280, 3), np.uint8))
+    recording.time = recording.time * 2
+    film.begin(recording)  # of another recording: the film has its rate
+    film.close()
+    rate = 2 * (len(recording) - 1) / (recording.time[-1] - recording.time[0])
+    assert float(av.open(str(tmp_path / "seen.mp4")).streams.video[0].average_rate) == pytest.approx(rate, rel=1e-3)
 
 
 def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):

@@ -14,8 +14,10 @@ from steer_server import STEER, Server, ahead, drive
 
 from cloning.errors import OutputError
 from cloning.outputs import write_json
+from cloning.road.track import Track
 from simulator import report
 from simulator.__main__ import main
+from simulator.run import Run
 
 
 def test_a_report_that_cannot_be_written_is_reported_before_the_drive(tmp_path):
@@ -54,6 +56,15 @@ def test_report_says_what_happened(tmp_path):
     assert cv2.imread(tmp_path / "way.png").std() > 10
     with pytest.raises(OutputError, match="nowhere"):
         write_json(tmp_path / "nowhere" / "report.json", figures)
+
+
+def test_a_drive_that_never_moved_and_one_lap_are_reported(tmp_path):
+    run = Run(Track("lake"))
+    report.write_picture(tmp_path / "stood.png", run)
+    assert cv2.imread(tmp_path / "stood.png").std() > 10
+    assert report.report_text(report.lap_report(run)).startswith("lake ccw: 0 laps, 0 m")
+    run.lap_times.append(80.0)
+    assert report.report_text(report.lap_report(run)).startswith("lake ccw: 1 lap, 0 m")
 
 
 def test_a_round_trip_in_real_time_is_that_of_the_telemetry_that_is_answered():

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from cloning.errors import OutputError
+from cloning.film import DriveFilm
 from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Recovery
-from simulator.film import ChaseFilm
+from simulator.film import MAX_BITS, ChaseFilm
 from simulator.run import Run
 from simulator.world import Scene
 
@@ -121,6 +122,15 @@ def test_films_the_drive(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "drive.mp4"]
     with pytest.raises(OutputError, match=r"\.mp4"):
         ChaseFilm(str(tmp_path / "nowhere" / "drive.mp4"), film.view.scene)
+
+
+def test_a_films_limit_of_bits_holds_for_frames_that_cannot_be_compressed(tmp_path):
+    """Noise takes megabits a second at the films' quality."""
+    random, film = np.random.default_rng(0), DriveFilm(str(tmp_path / "noise.mp4"), 15, 28, MAX_BITS)
+    for _ in range(60):
+        film.add(random.integers(0, 255, (180, 320, 3), np.uint8))
+    film.close()
+    assert 8 * (tmp_path / "noise.mp4").stat().st_size < 1.6 * 4 * MAX_BITS  # the first seconds may fill the buffer
 
 
 def test_jpegs_are_the_simulators_size_and_rgb():

@@ -18,7 +18,7 @@ from PIL import Image
 
 import model
 from cloning.errors import RecordingError
-from cloning.training import options
+from cloning.training import options, pictures, summary
 from cloning.training.checkpoint import Progress
 from cloning.training.distributed import FirstRankFailed
 
@@ -31,9 +31,56 @@ def test_what_a_run_prints(finished, sample_recording):
     assert sum(line.startswith("Epoch ") for line in lines) == 2
     epochs = [line for line in lines if "val_loss" in line]
     assert len(epochs) == 2
-    assert all("/150 [==============================] - " in line for line in epochs)
+    assert all(re.match(r"1[5-9]\d images \[={30}\] - \d+s - loss: ", line) for line in epochs)
     assert any("steer 0" in line and "model-best.pt" in line for line in lines)
+    assert "nan" not in finished[0].stdout
     assert lines[-1] == f"next: python drive.py {finished[1] / 'model.pt'}"
+
+
+def test_a_run_tells_once_how_long_it_will_take_and_then_what_is_left(monkeypatch, capsys):
+    """A batch of 100 images a second, 3 epochs of 3,000 images: 90 seconds in all."""
+    now = 1000.0
+    monkeypatch.setattr(summary, "time", Mock(monotonic=lambda: now))
+    pace, progress = summary.Pace(options.Arguments(epochs=3, samples_per_epoch=3000)), Progress()
+    shown = []
+    for _ in range(31):
+        now, progress.images, progress.loss = now + 1, progress.images + 100, progress.loss + 10
+        shown.append(pace.after_batch(100, progress))
+    assert shown[0] == "loss: 0.1000" and shown[9] == "loss: 0.1000, 80 seconds left in all"
+    progress.finish_epoch(0.1)
+    now, progress.images, progress.loss = now + 61, 6000, 600
+    assert pace.after_batch(6000, progress) == "loss: 0.1000, 0 seconds left in all"
+    assert capsys.readouterr().out == "about 89 seconds for 3 epochs on this machine\n"
+    for seconds, words in ((89, "89 seconds"), (100, "2 minutes"), (5000, "83 minutes"), (9000, "2.5 hours")):
+        assert summary.duration(seconds) == words
+
+
+def test_a_resumed_run_tells_how_long_its_rest_will_take(monkeypatch, capsys):
+    monkeypatch.setattr(summary, "time", Mock(monotonic=Mock(side_effect=map(float, range(100)))))
+    pace, progress = summary.Pace(options.Arguments(epochs=1, samples_per_epoch=10_000)), Progress(images=7000)
+    for _ in range(12):
+        progress.images += 100
+        pace.after_batch(100, progress)
+    assert capsys.readouterr().out == "about 29 seconds for the rest of 1 epoch on this machine\n"
+
+
+def test_an_error_above_that_of_constant_steering_is_explained():
+    labels = np.array([0.0] * 9 + [0.5], np.float32)
+    follows, mean = labels + np.float32(0.3), 0.05
+    text = summary.error_table(labels, mean, {"model.pt": follows}, (0, 1), "driver")
+    assert "model.pt has a larger error than steer 0, because on straights" in text and "nan" not in text
+    text = summary.error_table(labels, mean, {"model.pt": labels}, (0, 1), "driver")
+    assert "larger error" not in text and "hardly follows" not in text
+    text = summary.error_table(labels, mean, {"model.pt": np.zeros_like(labels)}, (0, 1), "driver")
+    assert "model.pt hardly follows the driver" in text
+
+
+def test_the_line_of_a_diagnostic_picture_stays_within_its_image():
+    for rows in (75, 160):
+        for steering in (-1.0, 0.0, 1.0):
+            picture = np.asarray(pictures.panel(np.zeros((rows, 320, 3), np.uint8), "", steering))
+            yellow = (picture == (255, 255, 0)).all(2).nonzero()[0]
+            assert 40 < yellow.min() < yellow.max() < len(picture)
 
 
 def test_what_a_run_leaves(finished):

@@ -62,6 +62,8 @@ def run(options: Options) -> None:
             lines = reference_lines(recording, options.reference == "lane")
             if not lines:
                 raise RecordingError(f"{folder}: no two seconds of driving without a break to replay")
+            if film:
+                film.begin(recording)
             drives = drive_at_limits(recording, lines, driver, watchers, in_process)
             reports.append(replay_report(recording, lines, drives, options.reference))
             print(report_text(reports[-1]), flush=True)

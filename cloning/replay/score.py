@@ -7,13 +7,15 @@ from typing import TypedDict
 import cv2
 import numpy as np
 
-from cloning.film import DriveFilm
+from cloning.film import DriveFilm, frame_rate
 from cloning.outputs import write_output
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, drive
+from cloning.road.camera import FIRST_BONNET_ROW
 
 SMOOTHED_ROWS = 9  # rows (0.6 s) over which steering is averaged before it is correlated
+CAPTION_ROWS = 28  # of the film, above each frame
 LISTED = 10  # interventions that the text lists for each limit
 HUMAN = "the human"  # the report's key of the human driver's own steering
 ORACLE = "oracle"  # that of the recovery steering, the label of `model.py --robust`: the best that the measure allows
@@ -231,17 +233,25 @@ def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> N
 
 
 class ReplayFilm(DriveFilm):
-    """A film of a replay: the model's view and steering on the left, the human driver's on the right."""
+    """A film of a replay: the model's view and steering on the left, the human driver's on the right.
+
+    It shows what is above the bonnet: a view from another pose ends there, and the network sees no more either.
+    """
 
     def __init__(self, path: str):
         """Open the film. Raises OutputError."""
         super().__init__(path, SAMPLE_RATE, quality=24)
 
+    def begin(self, recording: Recording) -> None:
+        """Give the film the recording's own rate, unless it has begun with another recording."""
+        if self.writer.stream is None:
+            self.writer.rate = frame_rate(recording.time.tolist(), SAMPLE_RATE)
+
     def watch(self, frame: ReplayFrame, done: Drive) -> None:
         """Append the row that was just driven."""
         if self.error:
             return
-        caption = f"{done.offset[-1]:+.2f} m   steering {done.steering[-1]:+.3f}   limit {done.limit:g} m"
+        caption = f"model   steering {done.steering[-1]:+.3f}   {done.offset[-1]:+.2f} m   limit {done.limit:g} m"
         if done.interventions:
             caption += f"   interventions {len(done.interventions)}"
         views = [
@@ -252,9 +262,13 @@ class ReplayFilm(DriveFilm):
 
 
 def captioned(frame: np.ndarray, steering: float, caption: str) -> np.ndarray:
-    """Return a frame at twice its size, uint8 (320, 640, 3), RGB, with a caption and the path at this steering."""
+    """Return a frame above the bonnet, at twice its size, with a caption on black and the path at this steering.
+
+    frame: uint8 (160, 320, 3), RGB; returns uint8 (298, 640, 3), RGB.
+    """
     from cloning.pilot.attention import overlay  # imports torch, which only films need
 
-    shown = overlay(frame, steering)
-    cv2.putText(shown, caption, (10, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
+    shown = overlay(frame, steering)[: 2 * FIRST_BONNET_ROW]
+    shown = cv2.copyMakeBorder(shown, CAPTION_ROWS, 0, 0, 0, cv2.BORDER_CONSTANT)
+    cv2.putText(shown, caption, (10, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return shown

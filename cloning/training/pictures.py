@@ -28,9 +28,13 @@ def panel(frame: np.ndarray, title: str, steering: float) -> Image.Image:
     draw.text((10, 4), title, "black", font)
     draw.text((width - 10, 4), f"steering {steering + 0:+.3f}", "black", font, anchor="ra")  # + 0 turns -0 into 0
     heading = np.radians(FULL_LOCK * steering)
-    start, end = (width / 2, height + 10), (width / 2 + 150 * np.sin(heading), height + 10 - 150 * np.cos(heading))
-    draw.line([start, end], "black", 9)
-    draw.line([start, end], "yellow", 5)
+    length, start = (
+        min(150, height - 40),
+        np.array([width / 2, height + 10]),
+    )  # within the image, which begins in row 40
+    end = start + length * np.array([np.sin(heading), -np.cos(heading)])
+    for colour, thickness in (("black", 9), ("yellow", 5)):
+        draw.line([*start, *end], colour, thickness)
     return picture
 
 
@@ -76,14 +80,9 @@ def loss_picture(history: list[EpochMetrics]) -> bytes:
     axes = figure.add_subplot()
     epochs, best = [row["epoch"] for row in history], min(history, key=lambda row: row["val_loss"])
     axes.plot(epochs, [row["loss"] for row in history], "o-", label="training (augmented, with dropout)")
-    axes.plot(epochs, [row["val_loss"] for row in history], "o-", label="validation")
-    axes.annotate(
-        f"best {best['val_loss']:.4f}",
-        (best["epoch"], best["val_loss"]),
-        (0, 10),
-        ha="center",
-        textcoords="offset points",
-    )
+    name = f"validation (best: {best['val_loss']:.4f} in epoch {best['epoch']:.0f})"
+    (line,) = axes.plot(epochs, [row["val_loss"] for row in history], "o-", label=name)
+    axes.plot(best["epoch"], best["val_loss"], "o", color=line.get_color(), markersize=13, fillstyle="none")
     axes.margins(x=0.08)
     axes.set(title="Mean squared error of the steering", xlabel="epoch", ylabel="mean squared error", ylim=(0, None))
     axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True))

@@ -3,12 +3,14 @@
 import csv
 import io
 import itertools
+import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from cloning.compute import threads
 from cloning.errors import RecordingError
@@ -16,10 +18,12 @@ from cloning.files import write
 from cloning.pilot.network import Network, layer_table
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
-from cloning.training.checkpoint import EpochMetrics
-from cloning.training.distributed import world
+from cloning.training.checkpoint import EpochMetrics, Progress
+from cloning.training.distributed import rank, world
+from cloning.training.options import Arguments
 
 MIN_CORRELATION = 0.3  # with the labels; below it, the model has hardly learned anything
+TIMED_BATCHES, TIMED_SECONDS = 10, 5.0  # at least, before the time of the whole run is told
 
 
 class Counts(NamedTuple):
@@ -90,12 +94,50 @@ def run_header(network: Network, device: torch.device, precision: torch.dtype) -
     return f"{layer_table(network)}\n\n{device}, {name}, {threads()} threads{processes}"
 
 
-def epoch_line(row: EpochMetrics, samples_per_epoch: int) -> str:
+def epoch_line(row: EpochMetrics) -> str:
     """Return the line for a finished epoch, in the format of the report's log."""
     return (
-        f"{row['images']}/{samples_per_epoch} [{'=' * 30}] - {row['seconds']:.0f}s - "
+        f"{row['images']} images [{'=' * 30}] - {row['seconds']:.0f}s - "
         f"loss: {row['loss']:.4f} - val_loss: {row['val_loss']:.4f}"
     )
+
+
+class Pace:
+    """Measures how fast this process trains, and tells how long the rest of the run will take on this machine."""
+
+    def __init__(self, arguments: Arguments):
+        """arguments: of the run."""
+        self.epochs, self.samples = arguments.epochs, arguments.samples_per_epoch
+        self.batches = self.images = 0  # timed so far
+        self.started: float | None = None  # time.monotonic() at the end of the first batch, which is slower
+        self.told, self.rest = False, ""
+
+    def after_batch(self, images: int, progress: Progress) -> str:
+        """Return the mean loss of the epoch and the time left for the whole run, for a progress bar.
+
+        Call it after each batch; images: number in it. Once, it prints how long the run will take.
+        """
+        loss = f"loss: {progress.loss / progress.images:.4f}"
+        if self.started is None:
+            self.started = time.monotonic()
+            self.rest = "the rest of " if progress.history or progress.images > images else ""  # of a resumed run
+            return loss
+        self.batches, self.images = self.batches + 1, self.images + images
+        seconds = time.monotonic() - self.started
+        done = len(progress.history) * self.samples + progress.images
+        left = max(0, self.epochs * self.samples - done) * seconds / self.images
+        if not self.told and rank() == 0 and self.batches >= TIMED_BATCHES and seconds >= TIMED_SECONDS:
+            self.told = True
+            epochs = "1 epoch" if self.epochs == 1 else f"{self.epochs} epochs"
+            tqdm.write(f"about {duration(seconds + left)} for {self.rest}{epochs} on this machine")
+        return f"{loss}, {duration(left)} left in all"
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in words, as exact as an estimate is."""
+    if seconds < 90:
+        return f"{seconds:.0f} seconds"
+    return f"{seconds / 60:.0f} minutes" if seconds < 90 * 60 else f"{seconds / 3600:.1f} hours"
 
 
 def error_table(
@@ -115,11 +157,19 @@ def error_table(
             errors = "".join(f"{np.mean((guess - labels)[rows] ** 2):15.4f}" for guess in predictions.values())
             lines.append(f"{f'steering of {low:g} to {high:g}':32} {rows.sum():6,}{errors}")
     correlations = {name: correlation(guess, labels) for name, guess in predictions.items()}
-    values = "".join(f"{value:15.2f}" for value in correlations.values())
+    values = "".join(f"{'-' if np.isnan(value) else f'{value:.2f}':>15}" for value in correlations.values())
     lines.append(f"{f'correlation with the {label_source}':39}{values}")
+    lines.append("\nsteer 0 and steer mean, constant steering, are for comparison; they have no correlation (-).")
     last = next(iter(models))
+    worse = np.mean((models[last] - labels) ** 2) > np.mean(labels**2)
     if not correlations[last] > MIN_CORRELATION:
         lines.append(f"{last} hardly follows the {label_source}: train longer, or record more turns.")
+    elif worse:
+        lines.append(
+            f"{last} has a larger error than steer 0, because on straights, most of the rows, 0 is nearly right.\n"
+            f"It follows the {label_source} nevertheless. How well it drives, a replay tells:\n"
+            f"python -m simulator replay RECORDING --model {last}"
+        )
     return "\n".join(lines)
 
 
