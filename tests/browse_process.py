@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from conftest import HERE
 
-from cloning.browse.looks import LANE, Result, stamp, write_result
+from cloning.browse.analyses import LANE, Result, stamp, write_result
 from cloning.recordings.log import read_recording
 from cloning.road.track import Track
 
@@ -61,7 +61,7 @@ def browsing(*arguments):
 
 
 def placed(folder: Path, offset: np.ndarray) -> None:
-    """As if the lane had been looked at already, which takes seconds; offset: float (n,), m."""
+    """As if the lane had been analysed already, which takes seconds; offset: float (n,), m."""
     recording, track = read_recording(folder), Track("lake")
     points = track.points[100 : 100 + len(recording), :2].astype(np.float32)
     columns = {"offset": offset.astype(np.float32), "x": points[:, 0], "y": points[:, 1], "road": np.zeros(len(offset))}

@@ -74,7 +74,7 @@ def main() -> int:
     try:
         connections.serve_until_stopped(listener, refuse_other_sites(create_app(library)))
     finally:
-        library.looks.close()
+        library.analyses.close()
     return program.DONE
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cloning.browse import summary
-from cloning.browse.looks import LANE, Looks, Result, file_stamp, read_result, stamp
+from cloning.browse.analyses import LANE, Analyses, Result, file_stamp, read_result, stamp
 from cloning.errors import RecordingError, UserError, message_of
 from cloning.recordings.excluded import Cut, add_cut, cut_rows, delete_cut, one_line, read_cuts
 from cloning.recordings.format import CAMERAS, DRIVING_LOG, FRAME
@@ -17,8 +17,8 @@ from cloning.recordings.images import jpeg_size, read_jpeg
 from cloning.recordings.log import Recording, read_uncut
 
 OPEN = 2  # recordings that are kept in memory: 100,000 rows take 20 MB
-COLUMNS = ("steering", "throttle", "speed", "seconds")  # of the log; the looks add to them
-OFFSET, MODEL = "offset", "model-"  # the looks' columns: m, right positive; model-0 and so on: steering, -1..1
+COLUMNS = ("steering", "throttle", "speed", "seconds")  # of the log; the analyses add to them
+OFFSET, MODEL = "offset", "model-"  # the analyses' columns: m, right positive; model-0 and so on: steering, -1..1
 
 
 class UnknownError(UserError):
@@ -34,7 +34,7 @@ class Library:
             hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=6).hexdigest(): folder for folder in folders
         }
         self.models = [str(model) for model in models]
-        self.looks = Looks()
+        self.analyses = Analyses()
 
     def folder(self, identifier: str) -> Path:
         """Return a recording's folder. Raises UnknownError."""
@@ -64,7 +64,7 @@ class Library:
         try:
             cuts = tuple(read_cuts(folder))
             shown |= _figures(folder, self.version(identifier), cuts)
-            shown["lane"] = self.looks.state(folder, LANE)
+            shown["lane"] = self.analyses.state(folder, LANE)
             if shown["lane"]["state"] == "ready":
                 shown |= _road(folder, self.version(identifier), stamp(folder, LANE))
         except (UserError, OSError) as error:
@@ -75,9 +75,9 @@ class Library:
         """Return what the page shows of one recording besides its columns. Raises RecordingError."""
         folder, recording = self.folder(identifier), self.recording(identifier)
         cuts = read_cuts(folder)
-        self.looks.hurry(folder)
-        models = [{"name": Path(model).name, **self.looks.state(folder, model)} for model in self.models]
-        lane = {"lane": self.looks.state(folder, LANE)}
+        self.analyses.hurry(folder)
+        models = [{"name": Path(model).name, **self.analyses.state(folder, model)} for model in self.models]
+        lane = {"lane": self.analyses.state(folder, LANE)}
         shown = self.overview(identifier) | lane | {"version": self.version(identifier), "models": models, "cuts": []}
         is_cut = np.zeros(len(recording), bool)
         for cut, rows in zip(cuts, cut_rows(folder, cuts, recording.names, recording.images[:, 0]), strict=True):
@@ -103,13 +103,13 @@ class Library:
             return getattr(recording, name)
         number = name.removeprefix(MODEL)
         if name == OFFSET:
-            look, part = LANE, OFFSET
+            analysis, part = LANE, OFFSET
         elif name.startswith(MODEL) and number.isascii() and number.isdigit() and int(number) < len(self.models):
-            look, part = self.models[int(number)], "steering"
+            analysis, part = self.models[int(number)], "steering"
         else:
             raise UnknownError(f"no column {name[:40]}")
         folder = self.folder(identifier)
-        return _result(folder, look, stamp(folder, look)).column(part, recording.images[:, 0])
+        return _result(folder, analysis, stamp(folder, analysis)).column(part, recording.images[:, 0])
 
     def row(self, identifier: str, row: int, version: str | None = None) -> dict[str, Any]:
         """Return a row's line in the log and the names of its images. Raises UnknownError, RecordingError."""
@@ -161,10 +161,10 @@ def _read(folder: Path, version: str) -> Recording:
 
 
 @functools.lru_cache(maxsize=2 * OPEN)
-def _result(folder: Path, look: str, of: str) -> Result:
-    result = read_result(folder, look)
+def _result(folder: Path, analysis: str, of: str) -> Result:
+    result = read_result(folder, analysis)
     if result is None:
-        raise UnknownError(f"{folder}: this column is still being estimated")
+        raise UnknownError(f"{folder}: this column is still being analysed")
     return result
 
 

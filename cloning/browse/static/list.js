@@ -1,7 +1,7 @@
 // All recordings at a glance.
 import {ask, element, make, many, notice} from "./common.js";
 
-const AGAIN = 3000; // ms until a recording whose lane is being estimated is asked for again
+const AGAIN = 3000; // ms until a recording whose lane is being analysed is asked for again
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
 let shown = 0; // counted up when the list is left, so that answers that come later are dropped
 const known = new Map(); // card -> its recording's overview
@@ -67,7 +67,7 @@ function draw(overview, card) {
 
 export function road({lane, roads}) {
   if (lane.state == "waiting") return "not known yet: waits for its turn";
-  if (lane.state == "running") return `not known yet: ${(100 * lane.progress).toFixed(0)} % of the frames looked at`;
+  if (lane.state == "running") return `not known yet: ${(100 * lane.progress).toFixed(0)} % of the frames analysed`;
   if (lane.state == "failed") return `not known: ${lane.message}`;
   if (!roads.length) return "other";
   return roads.map(([name, direction]) => `${name}, ${DIRECTIONS[direction]}`).join("; ");

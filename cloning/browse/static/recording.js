@@ -4,7 +4,7 @@ import {Frames} from "./frames.js";
 import {Plots} from "./plots.js";
 
 const SECOND = 15; // rows, of the larger step
-const PENDING = 2000, IDLE = 5000; // ms between two questions for news, while something is being estimated and else
+const PENDING = 2000, IDLE = 5000; // ms between two questions for news, while something is being analysed and else
 export const KEYS = [
   ["Space", "play and pause, at the recording's own rate"],
   ["← →", "one frame back, on"],
@@ -77,15 +77,15 @@ async function update(details) {
     return;
   }
   now.details = details;
-  const looks = [["offset", details.lane], ...details.models.map((model, number) => [`model-${number}`, model])];
-  const ready = looks.filter(([name, look]) => look.state == "ready" && !now.columns[name]);
+  const analyses = [["offset", details.lane], ...details.models.map((model, number) => [`model-${number}`, model])];
+  const ready = analyses.filter(([name, analysis]) => analysis.state == "ready" && !now.columns[name]);
   for (const [name] of ready) now.columns[name] = await column(now.id, details.version, name);
   if (open != now) return;
   if (ready.length) now.plots.build();
   showCuts();
   showFindings();
   buttons();
-  const pending = looks.some(([, {state}]) => ["waiting", "running"].includes(state));
+  const pending = analyses.some(([, {state}]) => ["waiting", "running"].includes(state));
   now.timer = setTimeout(() => refresh(now), pending ? PENDING : IDLE);
 }
 
@@ -135,10 +135,10 @@ function showFindings() {
   };
   listed(details.rejected, details.first_rejected);
   if (details.unusable) listed(details.unusable, details.first_unusable);
-  for (const look of [{name: "lateral offset", ...details.lane}, ...details.models]) {
-    if (look.state == "waiting") found.push(`${look.name}: waits for its turn`);
-    if (look.state == "running") found.push(`${look.name}: ${(100 * look.progress).toFixed(0)} % estimated`);
-    if (look.state == "failed") found.push(`${look.name}: ${look.message}`);
+  for (const analysis of [{name: "lateral offset", ...details.lane}, ...details.models]) {
+    if (analysis.state == "waiting") found.push(`${analysis.name}: waits for its turn`);
+    if (analysis.state == "running") found.push(`${analysis.name}: ${(100 * analysis.progress).toFixed(0)} % analysed`);
+    if (analysis.state == "failed") found.push(`${analysis.name}: ${analysis.message}`);
   }
   if (!found.length) found.push("Every row could be read as it is.");
   element("findings").replaceChildren(...found.map(text => make("li", text)));

@@ -1,7 +1,7 @@
-"""Slow looks at recordings: where the car is on the road, and how models steer; each in a process of its own.
+"""Slow analyses of recordings: where the car is on the road, and how models steer; each in a process of its own.
 
 A process takes its memory along when it ends, and leaves its result in the user's cache folder, where it stays until
-the recording changes. `estimate.py` is what runs in it.
+the recording changes. `analyse.py` is what runs in it.
 """
 
 import contextlib
@@ -23,14 +23,14 @@ from cloning.recordings.check import cache_file
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
 
 RULES = 1  # of what a result contains: counted up when they change
-LANE = "lane"  # the look for the position in the lane; every other look is the path of a model file
-COMMAND = (sys.executable, "-m", "cloning.browse.estimate")
+LANE = "lane"  # the analysis of the position in the lane; every other one is the path of a model file
+COMMAND = (sys.executable, "-m", "cloning.browse.analyse")
 PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a look has found.
+    """What an analysis has found.
 
     images  int32 (k,): the centre images, as in `Recording.images`, that the columns belong to
     columns float32 (k,), by name
@@ -42,7 +42,7 @@ class Result:
     about: dict[str, Any]
 
     def column(self, name: str, centres: np.ndarray) -> np.ndarray:
-        """Return a column in the rows of a recording: float32 (n,), nan in those not looked at.
+        """Return a column in the rows of a recording: float32 (n,), nan in those not analysed.
 
         centres: int32 (n,), the rows' centre images.
         """
@@ -51,12 +51,12 @@ class Result:
         return values[centres]
 
 
-def stamp(folder: Path, look: str) -> str:
+def stamp(folder: Path, analysis: str) -> str:
     """Return what tells whether a result is still of the same files: their sizes and times of change.
 
     Raises RecordingError if the log, the images or the model is gone.
     """
-    paths = [folder / DRIVING_LOG, folder / IMAGE_FOLDER, *([] if look == LANE else [Path(look)])]
+    paths = [folder / DRIVING_LOG, folder / IMAGE_FOLDER, *([] if analysis == LANE else [Path(analysis)])]
     return f"{RULES} {[file_stamp(path) for path in paths]}"
 
 
@@ -69,15 +69,17 @@ def file_stamp(path: Path) -> tuple[int, int]:
     return status.st_size, status.st_mtime_ns
 
 
-def result_file(folder: Path, look: str) -> Path:
-    """Return the file in the user's cache folder for a look's result."""
-    model = "" if look == LANE else "-" + hashlib.blake2b(os.fsencode(Path(look).resolve()), digest_size=6).hexdigest()
-    return cache_file(folder, f"-{LANE if look == LANE else 'steering'}{model}")
+def result_file(folder: Path, analysis: str) -> Path:
+    """Return the file in the user's cache folder for the result of an analysis."""
+    if analysis == LANE:
+        return cache_file(folder, f"-{LANE}")
+    model = hashlib.blake2b(os.fsencode(Path(analysis).resolve()), digest_size=6).hexdigest()
+    return cache_file(folder, f"-steering-{model}")
 
 
-def write_result(folder: Path, look: str, of: str, result: Result) -> None:
-    """Write a look's result; of: the `stamp` from before the look. Raises OSError."""
-    file = result_file(folder, look)
+def write_result(folder: Path, analysis: str, of: str, result: Result) -> None:
+    """Write the result of an analysis; of: the `stamp` from before the analysis. Raises OSError."""
+    file = result_file(folder, analysis)
     file.parent.mkdir(parents=True, exist_ok=True)
     names, columns = list(result.columns), np.array(list(result.columns.values()), np.float32)
     about = np.frombuffer(json.dumps({"stamp": of, "columns": names, **result.about}).encode(), np.uint8)
@@ -85,27 +87,27 @@ def write_result(folder: Path, look: str, of: str, result: Result) -> None:
         np.savez(opened, about=about, images=result.images, columns=columns)
 
 
-def read_result(folder: Path, look: str) -> Result | None:
-    """Return a look's result, None if there is none of these files yet. Raises RecordingError as `stamp` does."""
-    wanted = stamp(folder, look)
+def read_result(folder: Path, analysis: str) -> Result | None:
+    """Return the result of an analysis, None if these files have none yet. Raises RecordingError as `stamp` does."""
+    wanted = stamp(folder, analysis)
     try:
-        with np.load(result_file(folder, look)) as file:
+        with np.load(result_file(folder, analysis)) as file:
             about, images, columns = json.loads(file["about"].tobytes()), file["images"], file["columns"]
         named = dict(zip(about["columns"], columns, strict=True))
-    except Exception:  # there is no file yet, or a damaged one, of whatever kind: the look replaces it
+    except Exception:  # there is no file yet, or a damaged one, of whatever kind: the analysis replaces it
         return None
     return Result(images, named, about) if about["stamp"] == wanted else None
 
 
-class Looks:
-    """Runs the looks that are asked for, one after the other, the smallest recording first."""
+class Analyses:
+    """Runs the analyses that are asked for, one after the other, the smallest recording first."""
 
     def __init__(self) -> None:
         """Begin with nothing to do."""
-        self.waiting: dict[tuple[Path, str], int] = {}  # folder, look -> size of the log, bytes
-        self.urgent: Path | None = None  # the folder whose looks go before all others
-        self.failed: dict[tuple[Path, str, str], str] = {}  # folder, look, stamp -> message
-        self.ready: set[tuple[Path, str, str]] = set()  # folder, look, stamp
+        self.waiting: dict[tuple[Path, str], int] = {}  # folder, analysis -> size of the log, bytes
+        self.urgent: Path | None = None  # the folder whose analyses go before all others
+        self.failed: dict[tuple[Path, str, str], str] = {}  # folder, analysis, stamp -> message
+        self.ready: set[tuple[Path, str, str]] = set()  # folder, analysis, stamp
         self.running: tuple[Path, str] | None = None
         self.progress = 0.0
         self.process: subprocess.Popen[str] | None = None
@@ -113,33 +115,33 @@ class Looks:
         self.closed = False
         self.thread = threading.Thread(target=self._run, daemon=True)
 
-    def state(self, folder: Path, look: str) -> dict[str, Any]:
-        """Return how far a look is, for the page; begin it if it is not done: {"state", "progress" or "message"}.
+    def state(self, folder: Path, analysis: str) -> dict[str, Any]:
+        """Return how far an analysis is, for the page; begin it if it is not done: {"state", "progress" or "message"}.
 
         Raises RecordingError as `stamp` does.
         """
-        now = folder, look, stamp(folder, look)
+        now = folder, analysis, stamp(folder, analysis)
         with self.changed:
             if now in self.failed:
                 return {"state": "failed", "message": self.failed[now]}
-            if (now in self.ready and result_file(folder, look).exists()) or read_result(folder, look):
+            if (now in self.ready and result_file(folder, analysis).exists()) or read_result(folder, analysis):
                 self.ready.add(now)
                 return {"state": "ready"}
-            if self.running == (folder, look):
+            if self.running == (folder, analysis):
                 return {"state": "running", "progress": self.progress}
-            if (folder, look) not in self.waiting:
-                self.waiting[folder, look] = file_stamp(folder / DRIVING_LOG)[0]
+            if (folder, analysis) not in self.waiting:
+                self.waiting[folder, analysis] = file_stamp(folder / DRIVING_LOG)[0]
                 if not self.thread.is_alive():
                     self.thread.start()
                 self.changed.notify()
         return {"state": "waiting"}
 
     def hurry(self, folder: Path) -> None:
-        """Put a recording's looks before all others that wait."""
+        """Put a recording's analyses before all others that wait."""
         self.urgent = folder
 
     def close(self) -> None:
-        """End the look that runs, if one does."""
+        """End the analysis that runs, if one does."""
         with self.changed:
             self.closed = True
             self.changed.notify()
@@ -158,14 +160,14 @@ class Looks:
                 self.running = min(self.waiting, key=lambda each: (each[0] != self.urgent, self.waiting[each]))
                 self.progress = 0.0
                 del self.waiting[self.running]
-                folder, look = self.running
-                command, pipe = [*COMMAND, str(folder), look], subprocess.PIPE
+                folder, analysis = self.running
+                command, pipe = [*COMMAND, str(folder), analysis], subprocess.PIPE
                 self.process = subprocess.Popen(
                     command, stdout=pipe, stderr=subprocess.STDOUT, text=True, errors="replace"
                 )
             before, message = "", "was ended"
             with contextlib.suppress(RecordingError):
-                before = stamp(folder, look)
+                before = stamp(folder, analysis)
             with self.process:
                 assert self.process.stdout
                 for line in self.process.stdout:
@@ -175,5 +177,5 @@ class Looks:
                         message = line.strip()
             with self.changed:
                 if self.process.returncode and not self.closed:
-                    self.failed[folder, look, before] = message
+                    self.failed[folder, analysis, before] = message
                 self.process = self.running = None

@@ -1,7 +1,7 @@
-"""Estimate where the car is on the road in each row of a recording, or how a model steers; see `looks.py`.
+"""Estimate where the car is on the road in each row of a recording, or how a model steers; see `analyses.py`.
 
-python -m cloning.browse.estimate RECORDING lane        # lateral offset, and the place on a known track
-python -m cloning.browse.estimate RECORDING model.pt    # the model's steering
+python -m cloning.browse.analyse RECORDING lane        # lateral offset, and the place on a known track
+python -m cloning.browse.analyse RECORDING model.pt    # the model's steering
 """
 
 import argparse
@@ -14,12 +14,12 @@ from pathlib import Path
 from cloning import program
 
 if __name__ == "__main__":
-    program.end_on_interrupt("estimate")
+    program.end_on_interrupt("analyse")
 
 import numpy as np
 import torch
 
-from cloning.browse.looks import LANE, PROGRESS, Result, stamp, write_result
+from cloning.browse.analyses import LANE, PROGRESS, Result, stamp, write_result
 from cloning.compute import one_thread
 from cloning.cores import threads
 from cloning.errors import ModelError, UserError
@@ -31,28 +31,28 @@ from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_uncut
 from cloning.road.motion import stretches
 
-PART_ROWS = 256  # that are looked at at once: with their strips, 12 MB
+PART_ROWS = 256  # that are analysed at once: with their strips, 12 MB
 SHOWN_REJECTED = 5  # rows with unusable images that the page lists
 
 
 def main() -> int:
-    """Look at a recording and write the result; return the exit status."""
+    """Analyse a recording and write the result; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path, help="folder with a driving_log.csv")
-    parser.add_argument("look", help=f"{LANE}, or a model file")
+    parser.add_argument("analysis", help=f"{LANE}, or a model file")
     arguments = parser.parse_args()
     if hasattr(os, "nice"):
         os.nice(10)  # the page, and whatever else the user does, goes first
     try:
-        folder, look = arguments.recording, arguments.look
-        before = stamp(folder, look)
+        folder, analysis = arguments.recording, arguments.analysis
+        before = stamp(folder, analysis)
         recording = read_uncut(folder)
         check_images(recording, threads(), show_progress=False)
         recording.drop_copies()
-        result = lane(recording) if look == LANE else steering(recording, look)
-        write_result(folder, look, before, result)
+        result = lane(recording) if analysis == LANE else steering(recording, analysis)
+        write_result(folder, analysis, before, result)
     except (UserError, OSError) as error:
-        return program.failed("estimate", error)
+        return program.failed("analyse", error)
     return program.DONE
 
 
