@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cloning.browse import analyse, analyses, summary
-from cloning.browse.analyses import LANE, Result, read_result, stamp, write_result
+from cloning.browse.analyses import LANE, Analysis, Result, read_result, stamp, write_result
 from cloning.browse.library import Library
 from cloning.errors import RecordingError
 from cloning.lane.place import Localisation
@@ -115,7 +115,7 @@ def test_a_result_is_kept_until_the_recording_changes(linked):
         read_result(linked, LANE)
 
 
-def ended(library: Library, folder: Path, analysis: str) -> list[dict]:
+def ended(library: Library, folder: Path, analysis: Analysis) -> list[dict]:
     """The states of an analysis until it is done or has failed, without repetitions."""
     states, end = [library.analyses.state(folder, analysis)], time.monotonic() + 60
     while states[-1]["state"] in ("waiting", "running"):

@@ -51,6 +51,11 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
     return steering, whole_frame
 
 
+def opacity(mask: np.ndarray) -> np.ndarray:
+    """Return how strongly MAGENTA covers a frame, 0..1, where the network looks at it; mask: of `visual_backprop`."""
+    return np.sqrt(mask) * 0.7  # the square root makes weak attention visible
+
+
 def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> np.ndarray:
     """Return a frame at twice its size, uint8 (320, 640, 3), RGB, with the path ahead at this steering in green.
 
@@ -58,7 +63,7 @@ def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) 
     """
     picture = frame.astype(np.float32)
     if mask is not None:
-        strength = np.sqrt(mask)[..., None] * 0.7  # the square root makes weak attention visible
+        strength = opacity(mask)[..., None]
         picture = picture * (1 - strength) + np.asarray(MAGENTA, np.float32) * strength
     enlarged = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides the nearer part

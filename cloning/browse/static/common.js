@@ -1,11 +1,13 @@
 // What all parts of the page use.
 export const element = id => document.getElementById(id);
 
-// A request's JSON, or bytes if `binary`. An error shows the server's message and is thrown on.
-export async function ask(path, {binary = false, ...options} = {}) {
+// A request's JSON, or bytes if `binary`. What is thrown has the server's message.
+export const ask = (path, options) => request(`/recordings${path}`, options);
+
+export async function request(path, {binary = false, ...options} = {}) {
   let answer;
   try {
-    answer = await fetch(`/recordings${path}`, options);
+    answer = await fetch(path, options);
   } catch (error) {
     throw new Error("The program that shows the recordings does not answer: start it again.");
   }
@@ -28,6 +30,14 @@ export function make(name, text = "", attributes = {}, ...children) {
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
   made.append(...children);
   return made;
+}
+
+// Have a button do something; after a click with the mouse, Space is again for playing.
+export function onClick(button, action) {
+  button.onclick = event => {
+    action(event);
+    if (event.detail) button.blur();
+  };
 }
 
 export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;

@@ -1,5 +1,6 @@
 // All recordings at a glance.
-import {ask, element, make, many, notice} from "./common.js";
+import {ask, element, make, many, notice, request} from "./common.js";
+import {stateOf} from "./run.js";
 
 const AGAIN = 3000; // ms until a recording whose lane is being analysed is asked for again
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
@@ -17,9 +18,23 @@ export function leaveList() {
 export async function showList() {
   const now = shown, recordings = await ask("");
   if (now != shown) return;
+  showRuns(now);
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);
   await Promise.all(recordings.map((recording, at) => fill(recording.id, cards[at], now)));
+}
+
+async function showRuns(now) {
+  try {
+    const runs = await request("/runs");
+    if (now != shown) return;
+    element("runs").replaceChildren(...runs.map(run => make("article", "", {},
+      make("h2", "", {}, make("a", `Training run in ${run.folder}`, {href: `#/run/${run.id}`})),
+      run.message ? make("p", run.message, {class: "bad"}) : make("p", stateOf(run)))));
+  } catch (error) {
+    if (now == shown) notice(error.message);
+  }
+  if (now == shown) setTimeout(() => now == shown && showRuns(now), AGAIN);
 }
 
 // What is drawn on a canvas does not follow the system's colours by itself.
