@@ -67,10 +67,10 @@ def overview(files: RunFiles) -> dict[str, Any]:
     images and loss so far in this epoch, age in s of that state; rate in images/s and left in s, None if unknown;
     pictures: numbers of observations, ascending. Raises RunError, OSError.
     """
-    options, progress = _json(files.arguments, OPTIONS), {}
+    options, progress = _json(files.arguments, OPTIONS, 1), {}
     history = _history(files.log)
     if files.progress.exists():
-        progress = _json(files.progress, PROGRESS)
+        progress = _json(files.progress, PROGRESS, 0)
         history = history[: progress["finished"]]  # else those are an earlier run's, or the state comes in a moment
     epochs, samples = options["epochs"], options["samples_per_epoch"]
     finished, images, seconds = len(history), progress.get("images", 0), progress.get("seconds", 0.0)
@@ -108,15 +108,15 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _json(path: Path, kinds: dict[str, Any]) -> dict[str, Any]:
-    """Return a JSON object with values of these types, positive where they are numbers. Raises RunError, OSError."""
+def _json(path: Path, kinds: dict[str, Any], least: int) -> dict[str, Any]:
+    """Return a JSON object with values of these types, numbers from `least` on. Raises RunError, OSError."""
     try:
         found = json.loads(path.read_bytes())
     except ValueError as error:
         raise RunError(f"{path}: not JSON ({error}); `python model.py` writes it anew") from None
     for name, kind in kinds.items():
         value = found.get(name) if isinstance(found, dict) else None
-        if isinstance(value, bool) or not isinstance(value, kind) or (value is not None and not 0 <= value < 1e12):
+        if isinstance(value, bool) or not isinstance(value, kind) or (value is not None and not least <= value < 1e12):
             raise RunError(f"{path}: {name} is {str(value)[:40]}; `python model.py` writes it anew")
     return found
 
