@@ -63,9 +63,10 @@ class Runs:
 def overview(files: RunFiles) -> dict[str, Any]:
     """Return what the page shows of a run.
 
-    state: running, finished or stopped; history: a dict of METRICS for each finished epoch; epochs, samples_per_epoch;
-    images and loss so far in this epoch, age in s of that state; rate in images/s and left in s, None if unknown;
-    pictures: numbers of observations, ascending. Raises RunError, OSError.
+    run: its identifier, or None; state: running, finished or stopped; history: a dict of METRICS for each finished
+    epoch; epochs, samples_per_epoch; images and loss so far in this epoch, with their age in s; rate in images/s, and
+    left, s of training from there on, None if unknown; pictures: numbers of observations, ascending. Raises RunError,
+    OSError.
     """
     options, progress = _json(files.arguments, OPTIONS, 1), {}
     history = _history(files.log)
@@ -85,10 +86,11 @@ def overview(files: RunFiles) -> dict[str, Any]:
     left = None
     if state == "running" and (rate or history):
         whole = history[-1]["seconds"] if history else samples / rate if rate else math.nan  # with its validation
-        left = max(0.0, (epochs - finished) * whole - whole * min(1.0, images / samples) - age)
+        left = whole * max(0.0, epochs - finished - min(1.0, images / samples))
     if not rate and history and history[-1]["seconds"]:
         rate = history[-1]["images"] / history[-1]["seconds"]
     return {
+        "run": progress.get("run"),
         "state": state,
         "robust": options.get("robust") is True,
         "recordings": [str(each) for each in options.get("recordings", [])],

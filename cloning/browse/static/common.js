@@ -23,6 +23,14 @@ export function notice(message) {
   element("notice").hidden = !message;
 }
 
+// Give an element new children, unless they would show the same as before: a focus in them stays. build: makes them.
+export function renew(place, content, build) {
+  const now = JSON.stringify(content);
+  if (place.shown == now) return;
+  place.shown = now;
+  place.replaceChildren(...build());
+}
+
 // An element with a text and children.
 export function make(name, text = "", attributes = {}, ...children) {
   const made = document.createElement(name);

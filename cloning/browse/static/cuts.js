@@ -1,5 +1,5 @@
 // Cutting stretches from a recording, and undoing it.
-import {ask, clock, element, make, many, notice} from "./common.js";
+import {ask, clock, element, make, many, notice, renew} from "./common.js";
 import {seek, stop} from "./moving.js";
 import {page, say} from "./state.js";
 
@@ -13,7 +13,7 @@ export function showCuts() {
     class: colour == "--mark" ? "mark" : "",
     style: `left: ${100 * first / count}%; width: ${100 * (end - first) / count}%`,
   })));
-  element("cuts").replaceChildren(...details.cuts.map(cut => {
+  renew(element("cuts"), [now.id, details.version, details.cuts], () => details.cuts.length ? details.cuts.map(cut => {
     const begin = cut.stretches[0]?.[0] ?? 0, row = make("li", "", {});
     const go = make("button", clock(now.columns.seconds[begin])), remove = make("button", "Delete");
     go.onclick = () => seek(begin);
@@ -21,8 +21,7 @@ export function showCuts() {
     remove.onclick = () => change("DELETE", cut, "deleted the cut");
     row.append(go, ` ${many(cut.frames, "frame")}: ${cut.reason || "no reason given"} `, remove);
     return row;
-  }));
-  if (!details.cuts.length) element("cuts").replaceChildren(make("p", "None. Mark a stretch with I and O, then press X.", {class: "quiet"}));
+  }) : [make("p", "None. Mark a stretch with I and O, then press X.", {class: "quiet"})]);
 }
 
 export async function mark(name) {

@@ -4,6 +4,7 @@ import {element} from "./common.js";
 const KEPT = 60; // rows whose pictures stay decoded: 200 kB for each layer of each picture
 const AHEAD = 4; // rows that are loaded ahead while playing
 const AT_ONCE = 3; // rows that are loaded at the same time; of those asked for meanwhile, only the last one is
+const PATIENCE = 100; // ms that a row's frames wait for what the models look at
 
 export class Frames {
   // pictures: {canvas, caption(row), path, looks, has?(row)}; looks: numbers of the models whose attention lies over it
@@ -39,28 +40,32 @@ export class Frames {
     while (this.wanted != undefined && !this.closed) {
       const row = this.wanted, number = ++this.asked, {pictures} = this;
       this.wanted = undefined;
-      const loaded = await this.load(row);
+      const {frames, whole} = this.load(row);
+      const loaded = await Promise.race([whole, frames.then(pause)]);
       if (this.closed || number < this.drawn || pictures != this.pictures) continue;
       this.drawn = number;
       pictures.forEach((picture, at) => paint(picture, row, loaded[at]));
+      whole.then(all => { // the attention may take long: it is laid over the frames when it comes
+        if (all == loaded || this.closed || number != this.drawn || pictures != this.pictures) return;
+        pictures.forEach((picture, at) => paint(picture, row, all[at]));
+      });
     }
     this.loading -= 1;
   }
 
+  // Promises of a row's pictures, {layers, message?} each: the frames alone, and with what the models look at.
   load(row) {
     if (!this.loaded.has(row)) {
-      this.loaded.set(row, Promise.all(this.pictures.map(picture => this.fetch(row, picture))));
+      const parts = this.pictures.map(({path, looks, has}) => has && !has(row)
+        ? [Promise.resolve({message: "not replayed here"})]
+        : [`${path}.jpg`, ...looks.map(model => `${path}/${model}.png`)].map(path => this.layer(row, path)));
+      this.loaded.set(row, {
+        frames: Promise.all(parts.map(async ([frame]) => together([await frame]))),
+        whole: Promise.all(parts.map(async layers => together(await Promise.all(layers)))),
+      });
       if (this.loaded.size > KEPT) this.loaded.delete(this.loaded.keys().next().value);
     }
     return this.loaded.get(row);
-  }
-
-  // The layers of a picture, the lowest first, and a message if one is missing.
-  async fetch(row, {path, looks, has}) {
-    if (has && !has(row)) return {layers: [], message: "not replayed here"};
-    const paths = [`${path}.jpg`, ...looks.map(model => `${path}/${model}.png`)];
-    const parts = await Promise.all(paths.map(path => this.layer(row, path)));
-    return {layers: parts.map(({layer}) => layer).filter(Boolean), message: parts.find(({message}) => message)?.message};
   }
 
   async layer(row, path) {
@@ -74,6 +79,13 @@ export class Frames {
     }
   }
 }
+
+const pause = value => new Promise(resolve => setTimeout(resolve, PATIENCE, value));
+
+const together = parts => ({
+  layers: parts.map(({layer}) => layer).filter(Boolean), // the lowest first
+  message: parts.find(({message}) => message)?.message,
+});
 
 function paint({canvas, caption}, row, {layers, message}) {
   const place = element(canvas), context = place.getContext("2d"), below = place.parentNode.lastElementChild;

@@ -1,5 +1,5 @@
 // All recordings at a glance.
-import {ask, element, make, many, notice, request} from "./common.js";
+import {ask, element, make, many, notice, renew, request} from "./common.js";
 import {stateOf} from "./run.js";
 
 const AGAIN = 3000; // ms until a recording whose lane is being analysed is asked for again
@@ -28,9 +28,13 @@ async function showRuns(now) {
   try {
     const runs = await request("/runs");
     if (now != shown) return;
-    element("runs").replaceChildren(...runs.map(run => make("article", "", {},
-      make("h2", "", {}, make("a", `Training run in ${run.folder}`, {href: `#/run/${run.id}`})),
-      run.message ? make("p", run.message, {class: "bad"}) : make("p", stateOf(run)))));
+    renew(element("runs"), runs.map(({id, folder}) => [id, folder]), () => runs.map(({id, folder}) => make("article", "", {},
+      make("h2", "", {}, make("a", `Training run in ${folder}`, {href: `#/run/${id}`})), make("p"))));
+    runs.forEach((run, at) => {
+      const state = element("runs").children[at].lastElementChild;
+      state.textContent = run.message ?? stateOf(run);
+      state.className = run.message ? "bad" : "";
+    });
   } catch (error) {
     if (now == shown) notice(error.message);
   }

@@ -1,5 +1,5 @@
 // Replays of the recording with each model as the driver, and what a model looks at.
-import {ask, clock, element, make, many, notice, onClick} from "./common.js";
+import {ask, clock, element, make, many, notice, onClick, renew} from "./common.js";
 import {seek} from "./moving.js";
 import {MODEL_COLOURS} from "./plots.js";
 import {page, say} from "./state.js";
@@ -47,14 +47,15 @@ export async function showReplays() {
   for (const button of document.querySelectorAll("[data-limit]")) {
     button.setAttribute("aria-pressed", button.dataset.limit == now.limit);
   }
-  element("attention").replaceChildren(...details.models.map(({name}, number) => {
-    const button = make("button", name, {"aria-pressed": now.attention == number});
-    onClick(button, () => watch(now.attention == number ? null : number));
+  renew(element("attention"), details.models.map(({name}) => name), () => details.models.map(({name}, number) => {
+    const button = make("button", name);
+    onClick(button, () => watch(page.open.attention == number ? null : number));
     return button;
   }));
+  [...element("attention").children].forEach((button, number) => button.setAttribute("aria-pressed", now.attention == number));
   element("replays").hidden = !now.limit;
   if (now.limit && details.limit == now.limit) {
-    element("replay-list").replaceChildren(...details.replays.map((replay, number) => section(replay, number)));
+    renew(element("replay-list"), [now.id, details.version, details.limit, details.replays], () => details.replays.map(section));
   }
 }
 
@@ -83,8 +84,8 @@ function section(replay, number) {
   if (waiting) return make("section", "", {}, heading, make("p", "", {}, ...waiting));
   const lines = Object.entries({
     autonomy: `${replay.autonomy_percent.toFixed(1)} %`,
-    "distance from the lane's centre": `mean ${replay.distance_mean_m.toFixed(2)} m, 95 % below ${replay.distance_p95_m.toFixed(2)} m`,
-    "the human's": `mean ${replay.human_mean_m.toFixed(2)} m`,
+    distance: `mean ${replay.distance_mean_m.toFixed(2)} m, 95 % below ${replay.distance_p95_m.toFixed(2)} m`,
+    "human's distance": `mean ${replay.human_mean_m.toFixed(2)} m`,
     driven: many(replay.driven, "frame") + (replay.by_lane < replay.driven
       ? `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known` : ""),
     interventions: replay.interventions.toLocaleString("en"),

@@ -92,7 +92,7 @@ function draw() {
   open.plot = new uPlot({
     width: Math.max(200, place.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
     scales: {x: {time: false, range: [0, Math.max(1, run.epochs)]}, y: {range: (_, low, high) => [0, (high || 0.1) * 1.08]}},
-    axes: [{...axis, label: "epoch", labelSize: 20, incrs: [1, 2, 5, 10, 20, 50, 100], stroke: colour("--quiet")}, {...axis, size: 56}],
+    axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font, incrs: [1, 2, 5, 10, 20, 50, 100]}, {...axis, size: 56}],
     series: [{label: "epoch", value: (_, at) => at == null ? "–" : at.toFixed(Number.isInteger(at) ? 0 : 2)},
       {...curve("training", colour("--line")), value: (_, value) => value?.toFixed(4) ?? "–"},
       {...curve("validation", "#d55e00"), value: (_, value) => value?.toFixed(4) ?? "–"},
@@ -110,7 +110,7 @@ function showPictures() {
   element("run-pictures").hidden = shown == undefined;
   KINDS.forEach((kind, number) => {
     const [picture, caption] = element("run-pictures").children[number].children;
-    const address = `/runs/${id}/training_generator_${kind}${shown}.png`;
+    const address = `/runs/${id}/training_generator_${kind}${shown}.png?of=${run.run}`; // another run's is another one
     if (shown != undefined && picture.getAttribute("src") != address) Object.assign(picture, {src: address, alt: caption.textContent});
   });
 }
