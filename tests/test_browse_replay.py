@@ -220,7 +220,7 @@ def test_runs_over_the_socket(tmp_path):
         assert server.recordings() == {}
         [found] = server.get("/runs")
         assert found["id"] == 1 and found["state"] == "finished" and "pictures" not in found
-        assert server.get("/runs/1")["pictures"] == [0, 1200, 6400]
+        assert server.get("/runs/1")["pictures"] == [0, 1200]
         status, data, headers = server.ask("/runs/1/training_generator_LRC_0.png")
         assert (status, data, headers["Content-Type"]) == (200, b"png", "image/png")
         for path in ("/runs/2", "/runs/1/..%2f..%2fsecret.png", "/runs/1/../../secret.png", "/runs/1/training_log.csv",
