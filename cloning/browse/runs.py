@@ -82,18 +82,16 @@ def overview(files: RunFiles) -> dict[str, Any]:
         state = "running"
     else:
         state = "finished" if finished >= epochs else "stopped"
-    rate = images / seconds if seconds and images else None
-    left = None
-    if state == "running" and (rate or history):
-        whole = history[-1]["seconds"] if history else samples / rate if rate else math.nan  # with its validation
-        left = whole * max(0.0, epochs - finished - min(1.0, images / samples))
-    if not rate and history and history[-1]["seconds"]:
-        rate = history[-1]["images"] / history[-1]["seconds"]
+    last = history[-1]["seconds"] if history else 0.0  # with its validation
+    rate = images / seconds if images and seconds else history[-1]["images"] / last if last else None
+    epoch = last or (samples / rate if rate else None)
+    left = epoch * max(0.0, epochs - finished - min(1.0, images / samples)) if epoch and state == "running" else None
+    recordings = options.get("recordings")
     return {
         "run": progress.get("run"),
         "state": state,
         "robust": options.get("robust") is True,
-        "recordings": [str(each) for each in options.get("recordings", [])],
+        "recordings": [str(each) for each in recordings] if isinstance(recordings, list) else [],
         "epochs": epochs,
         "samples_per_epoch": samples,
         "history": [{key: _finite(value) for key, value in row.items()} for row in history],
