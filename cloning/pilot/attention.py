@@ -51,11 +51,6 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
     return steering, whole_frame
 
 
-def opacity(mask: np.ndarray) -> np.ndarray:
-    """Return how strongly MAGENTA covers a frame, 0..1, where the network looks at it; mask: of `visual_backprop`."""
-    return np.sqrt(mask) * 0.7  # the square root makes weak attention visible
-
-
 def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> np.ndarray:
     """Return a frame at twice its size, uint8 (320, 640, 3), RGB, with the path ahead at this steering in green.
 
@@ -70,3 +65,8 @@ def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) 
     points = project_ground(curvature(steering) * ahead**2 / 2, ahead) * 2
     cv2.polylines(enlarged, [np.round(points).astype(np.int32)], False, GREEN, 3, cv2.LINE_AA)
     return enlarged
+
+
+def opacity(mask: np.ndarray) -> np.ndarray:
+    """Return how strongly MAGENTA covers a frame, 0..1, where the network looks at it; mask: of `visual_backprop`."""
+    return np.sqrt(mask) * 0.7  # the square root makes weak attention visible

@@ -23,14 +23,6 @@ export function notice(message) {
   element("notice").hidden = !message;
 }
 
-// Give an element new children, unless they would show the same as before: a focus in them stays. build: makes them.
-export function renew(place, content, build) {
-  const now = JSON.stringify(content);
-  if (place.shown == now) return;
-  place.shown = now;
-  place.replaceChildren(...build());
-}
-
 // An element with a text and children.
 export function make(name, text = "", attributes = {}, ...children) {
   const made = document.createElement(name);
@@ -40,6 +32,9 @@ export function make(name, text = "", attributes = {}, ...children) {
   return made;
 }
 
+export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;
+export const many = (count, word) => `${count.toLocaleString("en")} ${word}${count == 1 ? "" : "s"}`;
+
 // Have a button do something; after a click with the mouse, Space is again for playing.
 export function onClick(button, action) {
   button.onclick = event => {
@@ -48,5 +43,10 @@ export function onClick(button, action) {
   };
 }
 
-export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;
-export const many = (count, word) => `${count.toLocaleString("en")} ${word}${count == 1 ? "" : "s"}`;
+// Give an element new children, unless they would show the same as before: a focus in them stays. build: makes them.
+export function renew(place, content, build) {
+  const now = JSON.stringify(content);
+  if (place.shown == now) return;
+  place.shown = now;
+  place.replaceChildren(...build());
+}
