@@ -23,7 +23,7 @@ lint: .venv/installed
 	$(BIN)/lint-imports --no-logo
 
 # The stamp is written last, so that an interrupted installation is repeated.
-.venv/installed: requirements.txt requirements-dev.txt
+.venv/installed: requirements.txt requirements-export.txt requirements-dev.txt
 	@$(PYTHON) -c "import ensurepip" 2>/dev/null || $(APT) python3-venv
 	@[ "$$(uname)" != Linux ] || PATH="$$PATH:/sbin" ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
 	$(PYTHON) -m venv .venv

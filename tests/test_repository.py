@@ -90,13 +90,16 @@ def test_requirements_are_what_the_code_imports():
     foreign = imported - own - set(sys.stdlib_module_names) - OPTIONAL
     distributions = packages_distributions()
     used = {distributions[name][0].lower() for name in foreign}
-    required = {line.split("==")[0] for line in (ROOT / "requirements.txt").read_text(encoding="utf-8").split()}
+    lines = [
+        line for name in ("", "-export") for line in (ROOT / f"requirements{name}.txt").read_text("utf-8").split("\n")
+    ]
+    required = {line.split("==")[0] for line in lines if "==" in line}
     assert used == required
 
 
 def test_the_readme_lists_every_requirement():
     table = (ROOT / "README.md").read_text(encoding="utf-8").split("## Dependencies")[1]
-    for file in ("requirements.txt", "requirements-dev.txt"):
+    for file in ("requirements.txt", "requirements-export.txt", "requirements-dev.txt"):
         for line in (ROOT / file).read_text(encoding="utf-8").splitlines():
             name = line.split("==")[0]
             if "==" in line and not re.match("pandas-stubs|types-", name):

@@ -118,13 +118,22 @@ class CroppedView:
         rows: uint8 (90, 320, 3), `SOURCE_ROWS` of a frame; matrices: float64 (2, 3, 3), of `homographies`; mirrored:
         whether they are for the mirrored world.
         """
-        ground, sky, size = *matrices, (self.columns, self.rows)
-        view = cv2.warpPerspective(rows, ground, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        ground, sky = matrices
+        view = self.warp_ground(rows, ground)
         seen = cv2.warpPerspective(
-            road_mask()[SOURCE_ROWS], ground, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+            road_mask()[SOURCE_ROWS],
+            ground,
+            (self.columns, self.rows),
+            flags=cv2.INTER_NEAREST,
+            borderMode=cv2.BORDER_CONSTANT,
         )
         size = self.columns, self.sky_rows
         far = cv2.warpPerspective(rows, sky, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         cv2.copyTo(far, self.sky[mirrored], view[: self.sky_rows])
         np.bitwise_or(seen[: self.sky_rows], self.sky[mirrored], out=seen[: self.sky_rows])
         return view, seen
+
+    def warp_ground(self, rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """Return a view, uint8 (75, 320, 3), as if all of it were ground; matrix: that for the ground, (3, 3)."""
+        size = self.columns, self.rows
+        return cv2.warpPerspective(rows, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -177,8 +177,8 @@ class Poses:
         """
         camera, mirrored = int(self.camera[at]), bool(self.mirrored[at])
         image, seen = VIEW.warp(read(camera, False), self.warps[at, 0], mirrored)
-        if not seen.all():
-            earlier, _ = VIEW.warp(read(camera, True), self.warps[at, 1], mirrored)
+        if not seen.all():  # only ground can be missing
+            earlier = VIEW.warp_ground(read(camera, True), self.warps[at, 1, 0])
             cv2.copyTo(earlier, cv2.bitwise_not(seen), image)
         return light.relight(image, self.colours[at], int(self.shade[at]))
 
