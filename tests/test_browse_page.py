@@ -98,8 +98,9 @@ def test_a_replay_is_watched_with_the_keyboard_alone(linked, page, model_file):
     replayed(linked, other, 1.0, -offset, [[40, -1.3]])
     with browsing(linked, "--model", model_file, other) as server:
         page.look(1280, 800)
+        page.open("about:blank")
         page.open(f"{server.base}{server.recordings()['lake'].replace('recordings/', '#/').lstrip('/')}/0")
-        page.wait("document.querySelector('#where').textContent.endsWith('frame 1 of 60')")
+        page.wait("document.querySelector('#where')?.textContent.endsWith('frame 1 of 60')")
         page.press("l")
         page.wait("document.querySelectorAll('#replay-list .where').length == 2")
         for words in ("model.pt at 1 m", "other.pt at 1 m", "90.0 %", "mean 0.25 m", "1.20 m to the right"):
@@ -137,7 +138,7 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.look(390, 844)
         page.open("about:blank")
         page.open(server.base)
-        page.wait("document.querySelector('#runs').textContent.includes('stopped or killed in epoch 2 of 4')")
+        page.wait("document.querySelector('#runs')?.textContent.includes('stopped or killed in epoch 2 of 4')")
         page.run("document.querySelector('#runs a').click()")
         page.wait("document.querySelector('#losses .uplot')")
         assert page.run("document.documentElement.scrollWidth <= innerWidth")
