@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from browse_process import browsing, placed, replayed, written_run
-from conftest import HERE
+from conftest import HERE, run_here
 from test_excluded import center
 
 from cloning.browse import analyse, analyses, attend, runs
@@ -228,3 +229,15 @@ def test_runs_over_the_socket(tmp_path):
             assert server.ask(path)[0] == 404, path
         assert server.ask("/runs/1/training_generator_LRC_5.png")[0] == 409
         assert server.ask("/runs", Host="evil.example")[0] == 403
+
+
+def test_a_run_that_was_killed_before_it_told_of_its_end_tells_when_it_is_resumed(finished, tmp_path):
+    shutil.copytree(finished[1], tmp_path / "run")
+    files = RunFiles(str(tmp_path / "run" / "model.pt"))
+    told = json.loads(files.progress.read_bytes())
+    assert told["finished"] == 2
+    files.progress.write_text(json.dumps(told | {"finished": 1}), encoding="utf-8")
+    assert runs.overview(files)["state"] == "stopped"
+    done = run_here("--resume", "--output", files.last)
+    assert done.returncode == 0, done.stderr
+    assert runs.overview(files)["state"] == "finished" and json.loads(files.progress.read_bytes()) == told

@@ -190,6 +190,7 @@ class Checkpoint:
         settings = {**asdict(self.arguments), "precision": str(precision), "versions": versions()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if resumed:
+            self._tell(progress)  # a killed run may not have come so far
             print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
 
     def save(self, progress: Progress, *models: Path) -> None:
@@ -214,7 +215,9 @@ class Checkpoint:
                 "fingerprint": self.fingerprint,
             },
         )
-        # Last, so that it never tells of more than --resume continues with.
+        self._tell(progress)  # last, so that it never tells of more than --resume continues with
+
+    def _tell(self, progress: Progress) -> None:
         write(self.files.progress, json.dumps(progress.told()).encode())
 
     def restore(self, saved: dict[str, Any]) -> Progress:
