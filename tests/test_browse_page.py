@@ -50,6 +50,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         def at(row: int) -> None:
             page.wait(f"document.querySelector('#where').textContent.endsWith('frame {row + 1} of 60')")
 
+        assert page.run("getComputedStyle(document.querySelector('#replaying')).display") == "none", "without a model"
         for key, shift, row in (("ArrowRight", False, 1), ("ArrowRight", True, 16), ("ArrowLeft", True, 1),
                                 ("End", False, 59), ("f", False, 44), ("Home", False, 0), ("PageDown", False, 59),
                                 ("PageUp", False, 0), ("F", True, 44)):  # fmt: skip
