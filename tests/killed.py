@@ -70,6 +70,8 @@ def value(path: Path) -> object:
         return [line.split(",")[:2] + line.split(",")[3:] for line in path.read_text(encoding="utf-8").splitlines()]
     if path.name == "training_arguments.json":
         return json.loads(path.read_bytes()) | {"resume": None}
+    if path.name == "training_progress.json":
+        return json.loads(path.read_bytes()) | {"run": None, "seconds": None}
     if path.name == "drive.json":
         return {
             name: value

@@ -1,4 +1,4 @@
-"""What the browser of recordings shows: figures, places, and the slow looks at lane and models."""
+"""What the browser of recordings shows: figures, places, and the slow analyses of lane and models."""
 
 import shutil
 import sys
@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloning.browse import estimate, looks, summary
+from cloning.browse import analyse, analyses, summary
+from cloning.browse.analyses import LANE, Analysis, Result, read_result, stamp, write_result
 from cloning.browse.library import Library
-from cloning.browse.looks import LANE, Result, read_result, stamp, write_result
 from cloning.errors import RecordingError
 from cloning.lane.place import Localisation
 from cloning.pilot.network import load_model, steer
@@ -76,8 +76,8 @@ def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
     s = np.linspace(100, 120, 40)
     placed = Localisation(track, np.stack([s, np.full(40, 1.5), np.zeros(40)], axis=1), 0.0)
     monkeypatch.setattr("cloning.lane.place.localise_all", lambda *_: [(slice(10, 50), placed)])
-    monkeypatch.setattr(estimate, "detect_centres", lambda part, _: np.zeros((len(part), 3, 5), np.float32))
-    result = estimate.lane(recording)
+    monkeypatch.setattr(analyse, "detect_centres", lambda part, _: np.zeros((len(part), 3, 5), np.float32))
+    result = analyse.lane(recording)
     x, y = (result.column(name, recording.images[:, 0]) for name in "xy")
     for row, at in ((10, 100.0), (49, 120.0)):
         found = track.locate(float(x[row]), float(y[row]))
@@ -89,12 +89,12 @@ def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Looks
+# Analyses
 
 
 def test_a_models_steering_is_that_of_drive_py(sample_recording, model_file):
     recording = read_recording(sample_recording)
-    result = estimate.steering(recording, str(model_file))
+    result = analyse.steering(recording, str(model_file))
     network = load_model(model_file)
     wanted = [float(steer(network, read_frame(recording.path(row)))) for row in (0, 31, 59)]
     np.testing.assert_allclose(result.column("steering", recording.images[:, 0])[[0, 31, 59]], wanted, atol=1e-6)
@@ -115,13 +115,13 @@ def test_a_result_is_kept_until_the_recording_changes(linked):
         read_result(linked, LANE)
 
 
-def ended(library: Library, folder: Path, look: str) -> list[dict]:
-    """The states of a look until it is done or has failed, without repetitions."""
-    states, end = [library.looks.state(folder, look)], time.monotonic() + 60
+def ended(library: Library, folder: Path, analysis: Analysis) -> list[dict]:
+    """The states of an analysis until it is done or has failed, without repetitions."""
+    states, end = [library.analyses.state(folder, analysis)], time.monotonic() + 60
     while states[-1]["state"] in ("waiting", "running"):
         assert time.monotonic() < end, states
         time.sleep(0.005)
-        if (state := library.looks.state(folder, look)) != states[-1]:
+        if (state := library.analyses.state(folder, analysis)) != states[-1]:
             states.append(state)
     return states
 
@@ -134,34 +134,34 @@ def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, t
         (tmp_path / name / "driving_log.csv").write_text(text * copies, encoding="utf-8")
         folders.append(tmp_path / name)
     code = f"import sys; open({str(tmp_path / 'order')!r}, 'a').write(sys.argv[1] + '\\n'); sys.exit('no')"
-    monkeypatch.setattr(looks, "COMMAND", (sys.executable, "-c", code))
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
     library = Library(folders, [])
     try:
-        with library.looks.changed:  # until all of them wait
+        with library.analyses.changed:  # until all of them wait
             for folder in folders:
-                library.looks.state(folder, LANE)
-            library.looks.hurry(folders[3])
+                library.analyses.state(folder, LANE)
+            library.analyses.hurry(folders[3])
         for folder in folders:
             assert ended(library, folder, LANE)[-1]["state"] == "failed"
     finally:
-        library.looks.close()
+        library.analyses.close()
     order = [Path(line).name for line in (tmp_path / "order").read_text(encoding="utf-8").splitlines()]
     assert order == ["open", "small", "middle", "large"]
 
 
-def test_a_look_tells_how_far_it_is_and_why_it_failed(linked, monkeypatch):
+def test_an_analysis_tells_how_far_it_is_and_why_it_failed(linked, monkeypatch):
     code = (
-        "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nestimate: no model')"
+        "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nanalyse: no model')"
     )
-    monkeypatch.setattr(looks, "COMMAND", (sys.executable, "-c", code))
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
     library = Library([linked], [])
     try:
         states = ended(library, linked, LANE)
         assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
-        assert states[-1] == {"state": "failed", "message": "estimate: no model"}
+        assert states[-1] == {"state": "failed", "message": "analyse: no model"}
         time.sleep(0.02)  # longer than a tick of the file system's clock
         (linked / "driving_log.csv").touch()
-        assert library.looks.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
+        assert library.analyses.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
     finally:
-        library.looks.close()
-    assert library.looks.process is None
+        library.analyses.close()
+    assert library.analyses.process is None

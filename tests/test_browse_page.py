@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from browse_process import browsing, placed
+from browse_process import browsing, placed, replayed, written_run
 from browser import CHROMIUM, chromium
 from test_excluded import center
 
@@ -50,6 +50,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         def at(row: int) -> None:
             page.wait(f"document.querySelector('#where').textContent.endsWith('frame {row + 1} of 60')")
 
+        assert page.run("getComputedStyle(document.querySelector('#replaying')).display") == "none", "without a model"
         for key, shift, row in (("ArrowRight", False, 1), ("ArrowRight", True, 16), ("ArrowLeft", True, 1),
                                 ("End", False, 59), ("f", False, 44), ("Home", False, 0), ("PageDown", False, 59),
                                 ("PageUp", False, 0), ("F", True, 44)):  # fmt: skip
@@ -85,6 +86,74 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         page.wait("document.querySelector('#notice').textContent.includes('driving_log.csv: No such file')")
         assert [entry for entry in page.complaints() if "409" not in entry] == []
         assert all(address.startswith((server.base, "data:")) for address in page.addresses()[1:]), "no outside host"
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+def test_a_replay_is_watched_with_the_keyboard_alone(linked, page, model_file):
+    """Two models beside the human: what their cars see, where they were set back, and what one looks at."""
+    placed(linked, np.zeros(60))
+    other = model_file.with_name("other.pt")
+    other.write_bytes(model_file.read_bytes())
+    offset = np.linspace(-0.5, 0.5, 60)
+    replayed(linked, model_file, 1.0, offset, [[30, 1.2], [50, -1.1]])
+    replayed(linked, other, 1.0, -offset, [[40, -1.3]])
+    with browsing(linked, "--model", model_file, other) as server:
+        page.look(1280, 800)
+        page.open("about:blank")
+        page.open(f"{server.base}{server.recordings()['lake'].replace('recordings/', '#/').lstrip('/')}/0")
+        page.wait("document.querySelector('#where')?.textContent.endsWith('frame 1 of 60')")
+        page.press("l")
+        page.wait("document.querySelectorAll('#replay-list .where').length == 2")
+        for words in ("model.pt at 1 m", "other.pt at 1 m", "90.0 %", "mean 0.25 m", "1.20 m to the right"):
+            assert words in page.text()
+        for key, row in (("n", 30), ("n", 40), ("n", 50), ("N", 40)):
+            page.press(key, key == "N")
+            page.wait(f"document.querySelector('#where').textContent.endsWith('frame {row + 1} of 60')")
+        captions = "[...document.querySelectorAll('.replayed figcaption')].map(each => each.textContent).join()"
+        page.wait(f"{captions} == 'model.pt at 1 m: 0.18 m to the right,other.pt at 1 m: 0.18 m to the left'")
+        seen = server.ask(f"{server.recordings()['lake']}/rows/40/replay-0-1.jpg")[1]
+        view = model_file.with_name("view.jpg")
+        view.write_bytes(seen)
+        page.until(lambda: difference(page, "view-0", view) < 3)
+        centre = read_recording(linked).path(40)
+        page.until(lambda: difference(page, "center", centre) < 3)
+        page.press("a")
+        page.until(lambda: difference(page, "center", centre) > 3)
+        page.press("a")
+        page.press("a")
+        page.until(lambda: difference(page, "center", centre) < 3)
+        page.press("l")
+        page.wait("document.querySelector('#replay-list').textContent.includes('at 2.5 m')")
+        page.press("l")
+        page.wait("document.querySelector('#replays').hidden && !document.querySelector('.replayed')")
+        assert page.complaints() == []
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+def test_a_training_run_refreshes_itself(tmp_path, page):
+    files = written_run(tmp_path, finished=1, images=500)
+    picture = cv2.imencode(".png", np.zeros((40, 60, 3), np.uint8))[1].tobytes()
+    for path in files.pictures.iterdir():
+        path.write_bytes(picture)
+    with browsing("--run", tmp_path) as server:
+        page.look(390, 844)
+        page.open("about:blank")
+        page.open(server.base)
+        page.wait("document.querySelector('#runs')?.textContent.includes('stopped or killed in epoch 2 of 4')")
+        page.run("document.querySelector('#runs a').click()")
+        page.wait("document.querySelector('#losses .uplot')")
+        assert page.run("document.documentElement.scrollWidth <= innerWidth")
+        which = "document.querySelector('#run-which').textContent"
+        page.wait(f"{which}.startsWith('after 1,200 observations')")
+        page.press("ArrowLeft")
+        page.wait(f"{which}.startsWith('after 0 observations')")
+        page.wait("document.querySelector('#run-pictures img').naturalWidth == 60")
+        files.progress.write_text(
+            files.progress.read_text(encoding="utf-8").replace('"finished": 1', '"finished": 4'), encoding="utf-8"
+        )
+        page.wait("document.querySelector('#run-figures').textContent.includes('finished: 4 epochs')")
+        assert page.run("document.querySelector('#run-bar').value") == 1
+        assert page.complaints() == []
 
 
 def difference(page, camera: str, path: Path) -> float:

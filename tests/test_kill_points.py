@@ -323,8 +323,8 @@ def test_a_cut_killed_anywhere(warm, lake, tmp_path):
         assert sorted(path.name for path in (place.folder / "lake").iterdir()) == sorted(os.listdir(recorded))
 
 
-def test_an_estimate_of_the_lane_killed_anywhere(warm, lake, tmp_path):
-    command = ["cloning.browse.estimate", lake, "lane"]
+def test_an_analysis_of_the_lane_killed_anywhere(warm, lake, tmp_path):
+    command = ["cloning.browse.analyse", lake, "lane"]
     Place(warm, tmp_path / "place", command, command).killed_everywhere(1)
 
 

@@ -92,6 +92,7 @@ def test_what_a_run_leaves(finished):
         "training_loss.png",
         "training_log.csv",
         "training_arguments.json",
+        "training_progress.json",
         "diagnostic_images",
     }
     rows = log(folder)

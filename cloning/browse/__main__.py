@@ -1,8 +1,9 @@
 """Show recordings in a browser, play them, and cut stretches from them; training and replays leave these out.
 
-    python -m cloning.browse                                 # the recordings below data/
+    python -m cloning.browse                                 # the recordings below data/, and the run in this folder
     python -m cloning.browse data/lake-ccw data/jungle       # these recordings
-    python -m cloning.browse data --model model.pt           # also show how a model would steer
+    python -m cloning.browse data --model model.pt           # also show how a model would steer, and let it drive
+    python -m cloning.browse --run runs/a runs/b             # only the training runs that write to these folders
 
 A cut is a line in excluded.csv beside the recording's driving_log.csv, which is never changed.
 """
@@ -18,11 +19,12 @@ if __name__ == "__main__":
 
 from cloning.arguments import MAX_PORT, number
 from cloning.browse.library import Library
-from cloning.browse.page import create_app
+from cloning.browse.runs import Runs
 from cloning.errors import UserError
 from cloning.recordings.log import find_folders
 
 try:
+    from cloning.browse.page import create_app
     from cloning.wire import connections
     from cloning.wire.server import refuse_other_sites
 except UserError as error:  # wrong versions of the socket libraries
@@ -46,6 +48,13 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         "--model", nargs="+", type=Path, default=[], metavar="model.pt", help="show the steering of these models"
     )
     parser.add_argument(
+        "--run",
+        nargs="+",
+        type=Path,
+        metavar="FOLDER",
+        help="folders into which model.py writes (default: the current one); alone, without recordings",
+    )
+    parser.add_argument(
         "--port",
         type=number(int, 0, MAX_PORT),
         default=PORT,
@@ -58,23 +67,26 @@ def main() -> int:
     """Serve the page until Ctrl-C; return the exit status."""
     arguments = parse_arguments()
     try:
-        folders = find_folders(arguments.recordings or ["data"])
+        folders = find_folders(arguments.recordings or ["data"]) if arguments.recordings or not arguments.run else []
         for model in arguments.model:
             if not model.is_file():
                 raise UserError(f"{model}: no such model file; `python model.py` trains one")
+        for folder in arguments.run or []:
+            if not folder.is_dir():
+                raise UserError(f"{folder}: no such folder; name one that `python model.py` writes to")
         listener = connections.claim_port(HOST, arguments.port)
     except (UserError, OSError) as error:
         return program.failed("browse", error)
-    library = Library(folders, arguments.model)
+    library, runs = Library(folders, arguments.model), Runs(arguments.run or [Path()])
     print(
         f"{len(folders)} recording{'s' * (len(folders) != 1)}. "
         f"Open http://{HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.",
         flush=True,
     )
     try:
-        connections.serve_until_stopped(listener, refuse_other_sites(create_app(library)))
+        connections.serve_until_stopped(listener, refuse_other_sites(create_app(library, runs)))
     finally:
-        library.looks.close()
+        library.close()
     return program.DONE
 
 

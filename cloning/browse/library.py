@@ -8,17 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from cloning.browse import summary
-from cloning.browse.looks import LANE, Looks, Result, file_stamp, read_result, stamp
+from cloning.browse import replays, summary
+from cloning.browse.analyses import LANE, Analyses, Analysis, Result, file_stamp, read_result, stamp
+from cloning.browse.attention import Attention
 from cloning.errors import RecordingError, UserError, message_of
 from cloning.recordings.excluded import Cut, add_cut, cut_rows, delete_cut, one_line, read_cuts
 from cloning.recordings.format import CAMERAS, DRIVING_LOG, FRAME
 from cloning.recordings.images import jpeg_size, read_jpeg
 from cloning.recordings.log import Recording, read_uncut
+from cloning.replay.autonomy import LIMITS
 
 OPEN = 2  # recordings that are kept in memory: 100,000 rows take 20 MB
-COLUMNS = ("steering", "throttle", "speed", "seconds")  # of the log; the looks add to them
-OFFSET, MODEL = "offset", "model-"  # the looks' columns: m, right positive; model-0 and so on: steering, -1..1
+COLUMNS = ("steering", "throttle", "speed", "seconds")  # of the log; the analyses add to them
+OFFSET, MODEL = "offset", "model-"  # the analyses' columns: m, right positive; model-0 and so on: steering, -1..1
+REPLAY = "replay-"  # replay-0-2.5 and so on: the lateral offset with model 0 as the driver, at a limit of 2.5 m
 
 
 class UnknownError(UserError):
@@ -34,7 +37,17 @@ class Library:
             hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=6).hexdigest(): folder for folder in folders
         }
         self.models = [str(model) for model in models]
-        self.looks = Looks()
+        self.analyses, self.attention = Analyses(), Attention()
+        self.analysed = {OFFSET: (LANE, "offset")}  # column -> the analysis that has it, and its name there
+        for number, model in enumerate(self.models):
+            self.analysed[f"{MODEL}{number}"] = Analysis("steering", model), "steering"
+            for limit in LIMITS:
+                self.analysed[f"{REPLAY}{number}-{limit:g}"] = Analysis("replay", model, limit), "offset"
+
+    def close(self) -> None:
+        """End the processes that were started for the page."""
+        self.analyses.close()
+        self.attention.close()
 
     def folder(self, identifier: str) -> Path:
         """Return a recording's folder. Raises UnknownError."""
@@ -64,20 +77,24 @@ class Library:
         try:
             cuts = tuple(read_cuts(folder))
             shown |= _figures(folder, self.version(identifier), cuts)
-            shown["lane"] = self.looks.state(folder, LANE)
+            shown["lane"] = self.analyses.state(folder, LANE)
             if shown["lane"]["state"] == "ready":
                 shown |= _road(folder, self.version(identifier), stamp(folder, LANE))
         except (UserError, OSError) as error:
             shown["message"] = message_of(error)
         return shown
 
-    def details(self, identifier: str) -> dict[str, Any]:
-        """Return what the page shows of one recording besides its columns. Raises RecordingError."""
+    def details(self, identifier: str, limit: str | None = None) -> dict[str, Any]:
+        """Return what the page shows of one recording besides its columns; limit: of the replays to tell of, or None.
+
+        Raises RecordingError, UnknownError.
+        """
         folder, recording = self.folder(identifier), self.recording(identifier)
         cuts = read_cuts(folder)
-        self.looks.hurry(folder)
-        models = [{"name": Path(model).name, **self.looks.state(folder, model)} for model in self.models]
-        lane = {"lane": self.looks.state(folder, LANE)}
+        self.analyses.hurry(folder)
+        steering = [self.analysed[f"{MODEL}{number}"][0] for number in range(len(self.models))]
+        models = [{"name": Path(each.model).name, **self.analyses.state(folder, each)} for each in steering]
+        lane = {"lane": self.analyses.state(folder, LANE)}
         shown = self.overview(identifier) | lane | {"version": self.version(identifier), "models": models, "cuts": []}
         is_cut = np.zeros(len(recording), bool)
         for cut, rows in zip(cuts, cut_rows(folder, cuts, recording.names, recording.images[:, 0]), strict=True):
@@ -88,8 +105,32 @@ class Library:
         ready += [f"{MODEL}{number}" for number, model in enumerate(models) if model["state"] == "ready"]
         columns = {name: self.column(identifier, name) for name in ready}
         return shown | {
-            "places": summary.places(recording.steering, columns.pop(OFFSET, None), [*columns.values()], is_cut)
+            "places": summary.places(recording.steering, columns.pop(OFFSET, None), [*columns.values()], is_cut),
+            "limit": limit,
+            "replays": [self._replay(folder, recording, each) for each in self._replays(limit)] if limit else [],
         }
+
+    def _replays(self, limit: str) -> list[Analysis]:
+        """Return the replays at a limit, one a model. Raises UnknownError."""
+        if limit not in (f"{each:g}" for each in LIMITS):
+            raise UnknownError(f"no limit {limit[:40]}; there are {' and '.join(f'{each:g}' for each in LIMITS)} m")
+        return [self.analysed[f"{REPLAY}{number}-{limit}"][0] for number in range(len(self.models))]
+
+    def _replay(self, folder: Path, recording: Recording, replay: Analysis) -> dict[str, Any]:
+        shown = self.analyses.state(folder, replay, begin=False)
+        if shown["state"] == "ready":
+            of = stamp(folder, replay)
+            shown |= {**replays.figures(_result(folder, replay, of), recording.images[:, 0]), "stamp": of}
+        return shown
+
+    def replay(self, identifier: str, limit: str, begin: bool) -> None:
+        """Begin the replays of a recording at a limit, or end those that are not done. Raises UnknownError."""
+        folder = self.folder(identifier)
+        for replay in self._replays(limit):
+            if begin:
+                self.analyses.state(folder, replay)
+            else:
+                self.analyses.stop(folder, replay)
 
     def column(self, identifier: str, name: str, version: str | None = None) -> np.ndarray:
         """Return a column of a recording: float32 (n,), nan where nothing is known.
@@ -101,15 +142,11 @@ class Library:
             return summary.driven_seconds(recording.time).astype(np.float32)
         if name in COLUMNS:
             return getattr(recording, name)
-        number = name.removeprefix(MODEL)
-        if name == OFFSET:
-            look, part = LANE, OFFSET
-        elif name.startswith(MODEL) and number.isascii() and number.isdigit() and int(number) < len(self.models):
-            look, part = self.models[int(number)], "steering"
-        else:
+        if name not in self.analysed:
             raise UnknownError(f"no column {name[:40]}")
+        analysis, part = self.analysed[name]
         folder = self.folder(identifier)
-        return _result(folder, look, stamp(folder, look)).column(part, recording.images[:, 0])
+        return _result(folder, analysis, stamp(folder, analysis)).column(part, recording.images[:, 0])
 
     def row(self, identifier: str, row: int, version: str | None = None) -> dict[str, Any]:
         """Return a row's line in the log and the names of its images. Raises UnknownError, RecordingError."""
@@ -117,12 +154,22 @@ class Library:
         names = [recording.name(row, camera) for camera in range(len(CAMERAS))]
         return {"line": int(recording.lines[row]), "images": names}
 
-    def jpeg(self, identifier: str, row: int, camera: str, version: str | None = None) -> bytes:
-        """Return the JPEG of a frame; camera: one of CAMERAS. Raises UnknownError, and RecordingError if unusable."""
+    def jpeg(self, identifier: str, row: int, picture: str, version: str | None = None) -> bytes:
+        """Return the JPEG of a frame; picture: one of CAMERAS, or a replay's column: what its car sees there.
+
+        Raises UnknownError, NotReplayedError, and RecordingError if a frame is unusable.
+        """
         recording = self._with_row(identifier, row, version)
-        if camera not in CAMERAS:
-            raise UnknownError(f"no camera {camera[:40]}")
-        path = recording.path(row, CAMERAS.index(camera))
+        if picture.startswith(REPLAY) and picture in self.analysed:
+            folder, replay = self.folder(identifier), self.analysed[picture][0]
+            of = stamp(folder, replay)
+            result = _result(folder, replay, of)
+            place = replays.place_of(result, int(recording.images[row, 0]))
+            line = int(result.columns["line"][place])
+            return _line_views(folder, self.version(identifier), replay, of, line).jpeg(place)
+        if picture not in CAMERAS:
+            raise UnknownError(f"no picture {picture[:40]}")
+        path = recording.path(row, CAMERAS.index(picture))
         try:
             jpeg = read_jpeg(path)
             if jpeg_size(jpeg) != FRAME[:2]:
@@ -130,6 +177,12 @@ class Library:
         except ValueError as error:
             raise RecordingError(f"{path}: {error}") from None
         return jpeg
+
+    def model(self, number: int) -> str:
+        """Return a model's file. Raises UnknownError."""
+        if number >= len(self.models):
+            raise UnknownError(f"no model {number}")
+        return self.models[number]
 
     def _with_row(self, identifier: str, row: int, version: str | None) -> Recording:
         recording = self.recording(identifier, version)
@@ -160,12 +213,17 @@ def _read(folder: Path, version: str) -> Recording:
     return read_uncut(folder)
 
 
-@functools.lru_cache(maxsize=2 * OPEN)
-def _result(folder: Path, look: str, of: str) -> Result:
-    result = read_result(folder, look)
+@functools.lru_cache(maxsize=6 * OPEN)  # 100,000 rows take 3 MB
+def _result(folder: Path, analysis: Analysis, of: str) -> Result:
+    result = read_result(folder, analysis)
     if result is None:
-        raise UnknownError(f"{folder}: this column is still being estimated")
+        raise UnknownError(f"{folder}: this column is still being analysed")
     return result
+
+
+@functools.lru_cache(maxsize=2 * OPEN)
+def _line_views(folder: Path, version: str, replay: Analysis, of: str, line: int) -> replays.LineViews:
+    return replays.LineViews(_read(folder, version), _result(folder, replay, of), line)
 
 
 @functools.lru_cache(maxsize=1000)

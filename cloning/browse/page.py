@@ -6,19 +6,26 @@ import flask
 import numpy as np
 
 from cloning.browse.library import Library, UnknownError
+from cloning.browse.replays import NotReplayedError
+from cloning.browse.runs import Runs
 from cloning.errors import UserError, message_of
 from cloning.pilot import site
+from cloning.replay.autonomy import LIMITS
+from cloning.wire.libraries import eventlet
 
 KEPT = 600  # s for which a browser does not ask again for a frame
 
 
-def create_app(library: Library) -> flask.Flask:
+def create_app(library: Library, runs: Runs) -> flask.Flask:
     """Return the web application.
 
     `/` is the page; `/recordings` lists identifiers. Below `/recordings/ID`: `overview` and `details`, JSON;
-    `columns/NAME`, little-endian float32 (n,); `rows/N`, JSON, and `rows/N/CAMERA.jpg`; `cuts`, to which POST adds and
-    DELETE deletes one, {"first", "last", "reason"}; they answer with the details, and with the cut as "changed". What
-    depends on the log takes `?version=`, and is refused with 409 when it has changed since. An error is {"message"}.
+    `columns/NAME`, little-endian float32 (n,); `rows/N`, JSON, `rows/N/PICTURE.jpg`, and what a model looks at on it,
+    `rows/N/PICTURE/MODEL.png`; `cuts`, to which POST adds and DELETE deletes one, {"first", "last", "reason"}; they
+    answer with the details, and with the cut as "changed". `replays/LIMIT`: POST begins a recording's replays, DELETE
+    ends them; `details?limit=` tells how far they are. What depends on the log takes `?version=`, and is refused with
+    409 when it has changed since. `/runs` and `/runs/N` tell of training runs, and `/runs/N/NAME` is a picture of one.
+    An error is {"message"}.
     """
     app = flask.Flask(__name__)
     site.prepare(app, "script-src 'self'", "img-src 'self' data:")
@@ -26,7 +33,7 @@ def create_app(library: Library) -> flask.Flask:
     @app.errorhandler(UserError)
     @app.errorhandler(OSError)
     def explain(error: UserError | OSError) -> tuple[dict[str, str], int]:
-        return {"message": message_of(error)}, 404 if isinstance(error, UnknownError) else 409
+        return {"message": message_of(error)}, 404 if isinstance(error, UnknownError | NotReplayedError) else 409
 
     @app.after_request
     def keep(response: flask.Response) -> flask.Response:
@@ -36,7 +43,7 @@ def create_app(library: Library) -> flask.Flask:
 
     @app.get("/")
     def index() -> str:
-        return flask.render_template("browse.html")
+        return flask.render_template("browse.html", limits=[f"{limit:g}" for limit in LIMITS])
 
     @app.get("/recordings")
     def recordings() -> list[dict[str, str]]:
@@ -48,7 +55,17 @@ def create_app(library: Library) -> flask.Flask:
 
     @app.get("/recordings/<identifier>/details")
     def details(identifier: str) -> dict[str, Any]:
-        return library.details(identifier)
+        return library.details(identifier, limit_asked())
+
+    @app.post("/recordings/<identifier>/replays/<limit>")
+    def replay(identifier: str, limit: str) -> dict[str, Any]:
+        library.replay(identifier, limit, begin=True)
+        return library.details(identifier, limit)
+
+    @app.delete("/recordings/<identifier>/replays/<limit>")
+    def stop_replay(identifier: str, limit: str) -> dict[str, Any]:
+        library.replay(identifier, limit, begin=False)
+        return library.details(identifier, limit)
 
     @app.get("/recordings/<identifier>/columns/<name>")
     def column(identifier: str, name: str) -> flask.Response:
@@ -59,30 +76,58 @@ def create_app(library: Library) -> flask.Flask:
     def row(identifier: str, row: int) -> dict[str, Any]:
         return library.row(identifier, row, version())
 
-    @app.get("/recordings/<identifier>/rows/<int:row>/<camera>.jpg")
-    def frame(identifier: str, row: int, camera: str) -> flask.Response:
-        response = flask.Response(library.jpeg(identifier, row, camera, version()), mimetype="image/jpeg")
-        response.headers["Cache-Control"] = f"private, max-age={KEPT}"
-        response.add_etag()
-        response.make_conditional(flask.request)
-        return response
+    @app.get("/recordings/<identifier>/rows/<int:row>/<picture>.jpg")
+    def frame(identifier: str, row: int, picture: str) -> flask.Response:
+        return kept(library.jpeg(identifier, row, picture, version()), "image/jpeg")
+
+    @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/<int:model>.png")
+    def attention(identifier: str, row: int, picture: str, model: int) -> flask.Response:
+        jpeg = library.jpeg(identifier, row, picture, version())
+        # In a thread, so that others are answered meanwhile.
+        return kept(eventlet.tpool.execute(library.attention.png, jpeg, library.model(model)), "image/png")
 
     @app.post("/recordings/<identifier>/cuts")
     def cut(identifier: str) -> dict[str, Any]:
         changed = library.cut(identifier, **stretch())
-        return library.details(identifier) | {"changed": changed}
+        return library.details(identifier, limit_asked()) | {"changed": changed}
 
     @app.delete("/recordings/<identifier>/cuts")
     def restore(identifier: str) -> dict[str, Any]:
         changed = library.restore(identifier, **stretch())
-        return library.details(identifier) | {"changed": changed}
+        return library.details(identifier, limit_asked()) | {"changed": changed}
+
+    @app.get("/runs")
+    def found() -> list[dict[str, Any]]:
+        return runs.found()
+
+    @app.get("/runs/<int:number>")
+    def run(number: int) -> dict[str, Any]:
+        return runs.run(number)
+
+    @app.get("/runs/<int:number>/<name>")
+    def run_picture(number: int, name: str) -> flask.Response:
+        return kept(runs.picture(number, name), "image/png")
 
     return app
+
+
+def kept(picture: bytes, kind: str) -> flask.Response:
+    """Return an answer that a browser keeps for KEPT seconds; kind: its MIME type."""
+    response = flask.Response(picture, mimetype=kind)
+    response.headers["Cache-Control"] = f"private, max-age={KEPT}"
+    response.add_etag()
+    response.make_conditional(flask.request)
+    return response
 
 
 def version() -> str | None:
     """Return the version of the log that the request is about."""
     return flask.request.args.get("version")
+
+
+def limit_asked() -> str | None:
+    """Return the limit of the replays that the request is about."""
+    return flask.request.args.get("limit")
 
 
 def stretch() -> dict[str, str]:

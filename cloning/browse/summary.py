@@ -1,10 +1,10 @@
-"""What the page shows of a whole recording: its figures at a glance, and the places worth a look."""
+"""What the page shows of a whole recording: its figures at a glance, and the places worth watching."""
 
 from typing import Any
 
 import numpy as np
 
-from cloning.browse.looks import Result
+from cloning.browse.analyses import Result
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import SHOWN_PER_KIND, Recording
 from cloning.road.motion import MAX_GAP
@@ -87,7 +87,7 @@ def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
 def road_of(result: Result, centres: np.ndarray) -> dict[str, Any]:
     """Return on which roads and in which directions a recording was driven, and its path on the most driven one.
 
-    result: of the look for the lane; centres: int32 (n,), the rows' centre images. The path is a list of strokes,
+    result: of the analysis of the lane; centres: int32 (n,), the rows' centre images. The path is a list of strokes,
     lists of [x, y] in m, east and north.
     """
     about = result.about

@@ -58,10 +58,15 @@ def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) 
     """
     picture = frame.astype(np.float32)
     if mask is not None:
-        strength = np.sqrt(mask)[..., None] * 0.7  # the square root makes weak attention visible
+        strength = opacity(mask)[..., None]
         picture = picture * (1 - strength) + np.asarray(MAGENTA, np.float32) * strength
     enlarged = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
     ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides the nearer part
     points = project_ground(curvature(steering) * ahead**2 / 2, ahead) * 2
     cv2.polylines(enlarged, [np.round(points).astype(np.int32)], False, GREEN, 3, cv2.LINE_AA)
     return enlarged
+
+
+def opacity(mask: np.ndarray) -> np.ndarray:
+    """Return how strongly MAGENTA covers a frame, 0..1, where the network looks at it; mask: of `visual_backprop`."""
+    return np.sqrt(mask) * 0.7  # the square root makes weak attention visible

@@ -105,7 +105,8 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
     """Return the reference lines of the stretches to replay.
 
     by_lane: use the lane centre in stretches in which its estimate is trusted, and leave out the parts in which the
-    human driver is off the road; in other stretches, and if not by_lane, use the human driver's path.
+    human driver is off the road; in other stretches, and if not by_lane, use the human driver's path. Raises
+    RecordingError if there is no stretch to replay.
     """
     lines, driven = [], stretches(recording)
     if by_lane:
@@ -133,6 +134,8 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
                 if b - a < len(stretch):
                     part = Stretch.of(recording, slice(rows.start + a, rows.start + b))
                 lines.append(ReferenceLine(part, offsets[a:b], yaws[a:b], True, ahead.take(slice(a, b))))
+    if not lines:
+        raise RecordingError(f"{recording.folder}: no two seconds of driving without a break to replay")
     return lines
 
 

@@ -10,32 +10,25 @@ by the run's identifier in them: a killed run that is resumed never takes its ow
 copy that was made before the kill is not made again.
 """
 
-import contextlib
 import hashlib
 import itertools
 import json
 import math
-import os
 import uuid
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from cloning.errors import ModelError, OutputError
+from cloning.errors import ModelError
 from cloning.files import write
-from cloning.outputs import check_folders
 from cloning.pilot.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
 from cloning.tensors import matching, shown
 from cloning.training.adam import Adam, zeros
-from cloning.training.distributed import from_first_rank
 from cloning.training.observations import Observations
 from cloning.training.options import Arguments, option
-
-if os.name != "nt":
-    import fcntl
+from cloning.training.run_files import RunFiles
 
 EpochMetrics = dict[str, float]  # a row of training_log.csv: epoch, images, seconds, loss, val_loss
 NEW_RUN = "start a new run without --resume"
@@ -44,65 +37,6 @@ METRICS = ("epoch", "images", "seconds", "loss", "val_loss")  # of EpochMetrics
 COUNTS = {"number", "images", "epoch"}
 NEVER_RESUMED = {"output", "device", "strict", "resume"}  # they belong to one process, not to the run
 MAY_CHANGE = NEVER_RESUMED | {"recordings", "epochs"}  # with --resume; a fingerprint checks the recordings' contents
-
-
-class RunFiles:
-    """The paths of the files that a run writes: the model's, and all others in the same folder."""
-
-    def __init__(self, output: str):
-        """output: the model's file, such as model.pt; its folder need not exist."""
-        self.last = Path(output)
-        self.best = self.last.with_stem(f"{self.last.stem}-best")
-        self.resume = self.last.with_stem(f"{self.last.stem}-resume")
-        self.log = self.last.with_name("training_log.csv")
-        self.losses = self.last.with_name("training_loss.png")
-        self.arguments = self.last.with_name("training_arguments.json")
-        self.rejected = self.last.with_name("rejected_rows.csv")
-        self.pictures = self.last.with_name("diagnostic_images")
-        self._state_at_start = self._state()
-
-    @contextlib.contextmanager
-    def claimed(self) -> Iterator[None]:
-        """Make the folders and keep other runs out of them until the block ends, or this process.
-
-        On Windows, and on a file system without locks, other runs are not kept out. Raises OutputError, OSError.
-        """
-        with contextlib.ExitStack() as stack:
-
-            def claim() -> None:
-                self.pictures.mkdir(parents=True, exist_ok=True)
-                check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
-                if os.name == "nt":
-                    return
-                folder = os.open(self.last.parent, os.O_RDONLY)
-                stack.callback(os.close, folder)
-                try:
-                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    raise OutputError(
-                        f"{self.last}: another run is writing to this folder; wait for its end, or give an --output in "
-                        "another folder"
-                    ) from None
-                except OSError as error:  # a network's file system, for example
-                    print(f"{self.last.parent}: cannot be locked ({error.strerror}); start no other run in it")
-
-            from_first_rank(claim)
-            yield
-
-    def next_step(self, resumed: bool) -> str:
-        """Return what the user can do after an error; resumed: whether --resume was given.
-
-        Until a new run has saved a state, --resume would continue an earlier run.
-        """
-        begun = resumed or self._state() != self._state_at_start
-        return "continue with --resume" if begun else "start the run again"
-
-    def _state(self) -> tuple[int, int] | None:
-        """Return what tells whether model-resume.pt was replaced."""
-        if not os.path.exists(self.resume):
-            return None
-        now = self.resume.stat()
-        return now.st_ino, now.st_mtime_ns
 
 
 @dataclass
@@ -121,6 +55,21 @@ class Progress:
     seconds: float = 0.0
     history: list[EpochMetrics] = field(default_factory=list)
     run: str | None = field(default_factory=lambda: uuid.uuid4().hex)
+
+    def told(self) -> dict[str, Any]:
+        """Return what training_progress.json tells: the run, finished epochs, and the place in the next one.
+
+        loss is the mean squared error so far in this epoch, None before its first batch.
+        """
+        loss = self.loss / self.images if self.images else None
+        return {
+            "run": self.run,
+            "finished": len(self.history),
+            "batches": self.number,
+            "images": self.images,
+            "seconds": round(self.seconds, 3),
+            "loss": loss if loss is None or math.isfinite(loss) else None,
+        }
 
     def finish_epoch(self, val_loss: float) -> bool:
         """Add the epoch to the history and begin the next one; return whether val_loss is the lowest so far.
@@ -261,12 +210,16 @@ class Checkpoint:
         settings = {**asdict(self.arguments), "precision": str(precision), "versions": versions()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if self.resumed:
+            self._tell(progress)  # a killed run may not have come so far
             print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
         elif self.arguments.from_:
             print(f"begins with the weights of {self.arguments.from_}")
 
     def save(self, progress: Progress, *models: Path) -> None:
-        """Write the network to these files, then model-resume.pt with all that --resume needs. Raises OSError."""
+        """Write the network to these files, then model-resume.pt with all that --resume needs, then how far it is.
+
+        Raises OSError.
+        """
         more = {"arguments": asdict(self.arguments), "history": progress.history, "run": progress.run}
         if models and len(progress.history) == 1:
             for path in (self.files.last, self.files.best):
@@ -284,6 +237,10 @@ class Checkpoint:
                 "fingerprint": self.fingerprint,
             },
         )
+        self._tell(progress)  # last, so that it never tells of more than --resume continues with
+
+    def _tell(self, progress: Progress) -> None:
+        write(self.files.progress, json.dumps(progress.told()).encode())
 
     def restore(self, saved: dict[str, Any]) -> Progress:
         """Load a checkpoint of `resumed_arguments` into network and optimizer, and return its progress.

@@ -13,6 +13,7 @@ with warnings.catch_warnings():
     import engineio.async_drivers.eventlet
     import engineio.socket
     import eventlet
+    import eventlet.tpool
     import eventlet.websocket
     import eventlet.wsgi
     import socketio

@@ -1,11 +1,13 @@
 // What all parts of the page use.
 export const element = id => document.getElementById(id);
 
-// A request's JSON, or bytes if `binary`. An error shows the server's message and is thrown on.
-export async function ask(path, {binary = false, ...options} = {}) {
+// A request's JSON, or bytes if `binary`. What is thrown has the server's message.
+export const ask = (path, options) => request(`/recordings${path}`, options);
+
+export async function request(path, {binary = false, ...options} = {}) {
   let answer;
   try {
-    answer = await fetch(`/recordings${path}`, options);
+    answer = await fetch(path, options);
   } catch (error) {
     throw new Error("The program that shows the recordings does not answer: start it again.");
   }
@@ -32,3 +34,19 @@ export function make(name, text = "", attributes = {}, ...children) {
 
 export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;
 export const many = (count, word) => `${count.toLocaleString("en")} ${word}${count == 1 ? "" : "s"}`;
+
+// Have a button do something; after a click with the mouse, Space is again for playing.
+export function onClick(button, action) {
+  button.onclick = event => {
+    action(event);
+    if (event.detail) button.blur();
+  };
+}
+
+// Give an element new children, unless they would show the same as before: a focus in them stays. build: makes them.
+export function renew(place, content, build) {
+  const now = JSON.stringify(content);
+  if (place.shown == now) return;
+  place.shown = now;
+  place.replaceChildren(...build());
+}

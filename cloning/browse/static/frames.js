@@ -1,14 +1,15 @@
-// The three cameras: a row that is asked for is drawn as soon as it is there, unless a later one was drawn before.
+// The pictures of a row: it is drawn as soon as they are there, unless a later one was drawn before.
 import {element} from "./common.js";
 
-const CAMERAS = ["left", "center", "right"], NAMES = {left: "Left", center: "Centre", right: "Right"};
-const KEPT = 60; // rows whose pictures stay decoded: 600 kB each
+const KEPT = 60; // rows whose pictures stay decoded: 200 kB for each layer of each picture
 const AHEAD = 4; // rows that are loaded ahead while playing
 const AT_ONCE = 3; // rows that are loaded at the same time; of those asked for meanwhile, only the last one is
+const PATIENCE = 100; // ms that a row's frames wait for what the models look at
 
 export class Frames {
-  constructor(id, version, count) {
-    Object.assign(this, {id, version, count, closed: false});
+  // pictures: {canvas, caption(row), path, looks, has?(row)}; looks: numbers of the models whose attention lies over it
+  constructor(id, version, count, pictures) {
+    Object.assign(this, {id, version, count, pictures, closed: false, row: 0});
     this.wanted = undefined; // the row to load next
     this.asked = this.drawn = this.loading = 0; // numbers of the last question and of the one drawn, and how many load
     this.loaded = new Map(); // row -> promise of its pictures, the oldest first
@@ -16,12 +17,18 @@ export class Frames {
 
   // Show a row; step: the rows to load ahead are so far apart, 0 for none.
   show(row, step = 0) {
-    this.wanted = row;
+    this.row = this.wanted = row;
     if (this.loading < AT_ONCE) this.draw();
     for (let ahead = 1; step && ahead <= AHEAD; ahead++) {
       const next = row + ahead * step;
       if (next >= 0 && next < this.count) this.load(next);
     }
+  }
+
+  setPictures(pictures) {
+    this.pictures = pictures;
+    this.loaded.clear();
+    this.show(this.row);
   }
 
   close() {
@@ -31,29 +38,41 @@ export class Frames {
   async draw() {
     this.loading += 1;
     while (this.wanted != undefined && !this.closed) {
-      const row = this.wanted, number = ++this.asked;
+      const row = this.wanted, number = ++this.asked, {pictures} = this;
       this.wanted = undefined;
-      const pictures = await this.load(row);
-      if (this.closed || number < this.drawn) continue;
+      const {frames, whole} = this.load(row);
+      const loaded = await Promise.race([whole, frames.then(pause)]);
+      if (this.closed || number < this.drawn || pictures != this.pictures) continue;
       this.drawn = number;
-      CAMERAS.forEach((camera, at) => paint(camera, pictures[at]));
+      pictures.forEach((picture, at) => paint(picture, row, loaded[at]));
+      whole.then(all => { // the attention may take long: it is laid over the frames when it comes
+        if (all == loaded || this.closed || number != this.drawn || pictures != this.pictures) return;
+        pictures.forEach((picture, at) => paint(picture, row, all[at]));
+      });
     }
     this.loading -= 1;
   }
 
+  // Promises of a row's pictures, {layers, message?} each: the frames alone, and with what the models look at.
   load(row) {
     if (!this.loaded.has(row)) {
-      this.loaded.set(row, Promise.all(CAMERAS.map(camera => this.fetch(row, camera))));
+      const parts = this.pictures.map(({path, looks, has}) => has && !has(row)
+        ? [Promise.resolve({message: "not replayed here"})]
+        : [`${path}.jpg`, ...looks.map(model => `${path}/${model}.png`)].map(path => this.layer(row, path)));
+      this.loaded.set(row, {
+        frames: Promise.all(parts.map(async ([frame]) => together([await frame]))),
+        whole: Promise.all(parts.map(async layers => together(await Promise.all(layers)))),
+      });
       if (this.loaded.size > KEPT) this.loaded.delete(this.loaded.keys().next().value);
     }
     return this.loaded.get(row);
   }
 
-  async fetch(row, camera) {
+  async layer(row, path) {
     try {
-      const answer = await fetch(`/recordings/${this.id}/rows/${row}/${camera}.jpg?version=${this.version}`);
-      if (!answer.ok) return {status: answer.status, message: (await answer.json()).message};
-      return {picture: await createImageBitmap(await answer.blob())};
+      const answer = await fetch(`/recordings/${this.id}/rows/${row}/${path}?version=${this.version}`);
+      if (!answer.ok) return {message: (await answer.json()).message};
+      return {layer: await createImageBitmap(await answer.blob())};
     } catch (error) {
       this.loaded.delete(row);
       return {message: "The program that shows the recordings does not answer."};
@@ -61,10 +80,17 @@ export class Frames {
   }
 }
 
-function paint(camera, {picture, message}) {
-  const canvas = element(camera), context = canvas.getContext("2d");
-  if (picture) context.drawImage(picture, 0, 0);
-  else context.clearRect(0, 0, canvas.width, canvas.height);
-  canvas.parentNode.lastElementChild.textContent = message?.split(/[\\/]IMG[\\/]/).at(-1) ?? NAMES[camera]; // no folder
-  canvas.parentNode.lastElementChild.className = message ? "bad" : "";
+const pause = value => new Promise(resolve => setTimeout(resolve, PATIENCE, value));
+
+const together = parts => ({
+  layers: parts.map(({layer}) => layer).filter(Boolean), // the lowest first
+  message: parts.find(({message}) => message)?.message,
+});
+
+function paint({canvas, caption}, row, {layers, message}) {
+  const place = element(canvas), context = place.getContext("2d"), below = place.parentNode.lastElementChild;
+  context.clearRect(0, 0, place.width, place.height);
+  for (const layer of layers) context.drawImage(layer, 0, 0);
+  below.textContent = message?.split(/[\\/]IMG[\\/]/).at(-1) ?? caption(row); // no folder
+  below.className = message ? "bad" : "";
 }

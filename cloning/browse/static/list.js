@@ -1,7 +1,8 @@
 // All recordings at a glance.
-import {ask, element, make, many, notice} from "./common.js";
+import {ask, element, make, many, notice, renew, request} from "./common.js";
+import {stateOf} from "./run.js";
 
-const AGAIN = 3000; // ms until a recording whose lane is being estimated is asked for again
+const AGAIN = 3000; // ms until a recording whose lane is being analysed is asked for again
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
 let shown = 0; // counted up when the list is left, so that answers that come later are dropped
 const known = new Map(); // card -> its recording's overview
@@ -17,9 +18,27 @@ export function leaveList() {
 export async function showList() {
   const now = shown, recordings = await ask("");
   if (now != shown) return;
+  showRuns(now);
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);
   await Promise.all(recordings.map((recording, at) => fill(recording.id, cards[at], now)));
+}
+
+async function showRuns(now) {
+  try {
+    const runs = await request("/runs");
+    if (now != shown) return;
+    renew(element("runs"), runs.map(({id, folder}) => [id, folder]), () => runs.map(({id, folder}) => make("article", "", {},
+      make("h2", "", {}, make("a", `Training run in ${folder}`, {href: `#/run/${id}`})), make("p"))));
+    runs.forEach((run, at) => {
+      const state = element("runs").children[at].lastElementChild;
+      state.textContent = run.message ?? stateOf(run);
+      state.className = run.message ? "bad" : "";
+    });
+  } catch (error) {
+    if (now == shown) notice(error.message);
+  }
+  if (now == shown) setTimeout(() => now == shown && showRuns(now), AGAIN);
 }
 
 // What is drawn on a canvas does not follow the system's colours by itself.
@@ -67,7 +86,7 @@ function draw(overview, card) {
 
 export function road({lane, roads}) {
   if (lane.state == "waiting") return "not known yet: waits for its turn";
-  if (lane.state == "running") return `not known yet: ${(100 * lane.progress).toFixed(0)} % of the frames looked at`;
+  if (lane.state == "running") return `not known yet: ${(100 * lane.progress).toFixed(0)} % of the frames analysed`;
   if (lane.state == "failed") return `not known: ${lane.message}`;
   if (!roads.length) return "other";
   return roads.map(([name, direction]) => `${name}, ${DIRECTIONS[direction]}`).join("; ");

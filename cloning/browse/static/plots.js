@@ -1,7 +1,7 @@
 // The curves of a recording, one above the other, over its rows; drawn by uPlot.
 import {element, make} from "./common.js";
 
-const MODEL_COLOURS = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]; // told apart by the colour-blind too
+export const MODEL_COLOURS = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]; // told apart by the colour-blind too
 const LEFT = 56, RIGHT = 12; // px; browse.css has them for the bar
 const HEIGHT = 84, TIMES = 20; // px of a plot, and of the times below the last one
 const STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 1800, 3600], TIME_SPACE = 70; // s between two times; px
@@ -9,7 +9,7 @@ const STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 1800, 3600], TIME_SPACE =
 export class Plots {
   // columns: arrays by name; models: their names; seek: called with the row that was clicked
   constructor(columns, models, seek) {
-    Object.assign(this, {columns, models, seek, stretches: [], row: 0, zoom: null});
+    Object.assign(this, {columns, models, seek, stretches: [], replays: [], row: 0, zoom: null});
     this.count = columns.seconds.length;
     this.rows = Array.from({length: this.count}, (_, row) => row);
     this.resizing = new ResizeObserver(() =>
@@ -36,15 +36,19 @@ export class Plots {
   build() {
     this.plots?.forEach(plot => plot.destroy());
     element("plots").replaceChildren();
-    const {steering, throttle, speed, offset} = this.columns, models = this.models.map((name, number) =>
+    const {steering, throttle, speed, offset} = this.columns;
+    const models = this.models.map((name, number) =>
       ({name, values: this.columns[`model-${number}`], colour: MODEL_COLOURS[number % MODEL_COLOURS.length]}));
+    const replays = this.replays.map((replay, number) => replay && ({...models[number], values: replay.offset,
+      marks: replay.where.map(([row]) => row)})).filter(Boolean);
     const kinds = [
       {title: "Steering", unit: "", digits: 3, range: [-1, 1],
         curves: [{name: models.length ? "human" : "", values: steering}, ...models]},
       {title: "Throttle", unit: "", digits: 2, range: [Math.min(0, least(throttle)), 1], curves: [{name: "", values: throttle}]},
       {title: "Speed", unit: " mph", digits: 1, range: [0, Math.max(31, -least(speed.map(value => -value)))],
         curves: [{name: "", values: speed}]},
-      {title: "Lateral offset, right positive", unit: " m", digits: 2, curves: [{name: "", values: offset}]},
+      {title: "Lateral offset, right positive", unit: " m", digits: 2,
+        curves: [{name: replays.length ? "human" : "", values: offset}, ...replays]},
     ];
     this.shown = [];
     this.plots = kinds.map((kind, at) => this.plot(kind, at == kinds.length - 1));
@@ -78,7 +82,7 @@ export class Plots {
       series: [{}, ...curves.map(curve => ({stroke: curve.colour, width: 1, points: {show: false}, spanGaps: false}))],
       hooks: {
         ready: [plot => this.listen(plot, here)],
-        drawClear: [plot => this.shade(plot)],
+        drawClear: [plot => this.shade(plot, curves)],
         draw: [plot => this.move(plot, here)],
         setSelect: [plot => {
           const from = plot.posToVal(plot.select.left, "x"), width = plot.select.width;
@@ -119,7 +123,8 @@ export class Plots {
   }
 
   // The stretches behind the curves: [first row, row after the last, custom property of the colour].
-  shade(plot) {
+  // The interventions of the curves are lines in their colours.
+  shade(plot, curves) {
     const {ctx, bbox} = plot, colours = getComputedStyle(document.body);
     ctx.save();
     ctx.globalAlpha = 0.25;
@@ -129,7 +134,21 @@ export class Plots {
       ctx.fillStyle = colours.getPropertyValue(colour);
       if (right > left) ctx.fillRect(left, bbox.top, Math.max(1, right - left), bbox.height);
     }
+    ctx.globalAlpha = 0.7;
+    for (const {marks = [], colour} of curves) {
+      ctx.fillStyle = colour;
+      for (const row of marks) {
+        const at = plot.valToPos(row, "x", true);
+        if (at >= bbox.left && at <= bbox.left + bbox.width) ctx.fillRect(at - 1, bbox.top, 2, bbox.height);
+      }
+    }
     ctx.restore();
+  }
+
+  // Replays by the number of their model: {offset, where}, or undefined.
+  setReplays(replays) {
+    this.replays = replays;
+    this.build();
   }
 
   setStretches(stretches) {

@@ -1,7 +1,8 @@
-"""Estimate where the car is on the road in each row of a recording, or how a model steers; see `looks.py`.
+"""Analyse each row of a recording: where the car is on the road, or how a model steers or drives; see `analyses.py`.
 
-python -m cloning.browse.estimate RECORDING lane        # lateral offset, and the place on a known track
-python -m cloning.browse.estimate RECORDING model.pt    # the model's steering
+python -m cloning.browse.analyse RECORDING lane                 # lateral offset, and the place on a known track
+python -m cloning.browse.analyse RECORDING steering model.pt    # the model's steering
+python -m cloning.browse.analyse RECORDING replay model.pt 1    # a drive with the model as the driver, at 1 m
 """
 
 import argparse
@@ -14,12 +15,12 @@ from pathlib import Path
 from cloning import program
 
 if __name__ == "__main__":
-    program.end_on_interrupt("estimate")
+    program.end_on_interrupt("analyse")
 
 import numpy as np
 import torch
 
-from cloning.browse.looks import LANE, PROGRESS, Result, stamp, write_result
+from cloning.browse.analyses import PROGRESS, Analysis, Result, stamp, write_result
 from cloning.compute import one_thread
 from cloning.cores import threads
 from cloning.errors import ModelError, UserError
@@ -29,30 +30,38 @@ from cloning.pilot.network import load_model, steer
 from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_uncut
+from cloning.replay.drivers import ModelDriver
+from cloning.replay.replay import Drive, ReplayFrame, drive, load_recording, reference_lines
+from cloning.replay.score import driving_metrics
 from cloning.road.motion import stretches
 
-PART_ROWS = 256  # that are looked at at once: with their strips, 12 MB
+PART_ROWS = 256  # that are analysed at once: with their strips, 12 MB
 SHOWN_REJECTED = 5  # rows with unusable images that the page lists
 
 
 def main() -> int:
-    """Look at a recording and write the result; return the exit status."""
+    """Analyse a recording and write the result; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path, help="folder with a driving_log.csv")
-    parser.add_argument("look", help=f"{LANE}, or a model file")
+    parser.add_argument("kind", choices=("lane", "steering", "replay"))
+    parser.add_argument("model", nargs="?", default="", help="its file, for steering and replay")
+    parser.add_argument("limit", nargs="?", type=float, default=0.0, help="m from the reference line, for replay")
     arguments = parser.parse_args()
     if hasattr(os, "nice"):
         os.nice(10)  # the page, and whatever else the user does, goes first
     try:
-        folder, look = arguments.recording, arguments.look
-        before = stamp(folder, look)
-        recording = read_uncut(folder)
-        check_images(recording, threads(), show_progress=False)
-        recording.drop_copies()
-        result = lane(recording) if look == LANE else steering(recording, look)
-        write_result(folder, look, before, result)
+        folder, analysis = arguments.recording, Analysis(arguments.kind, arguments.model, arguments.limit)
+        before = stamp(folder, analysis)
+        if analysis.kind == "replay":
+            result = replayed(load_recording(folder), analysis)
+        else:
+            recording = read_uncut(folder)
+            check_images(recording, threads(), show_progress=False)
+            recording.drop_copies()
+            result = lane(recording) if analysis.kind == "lane" else steering(recording, analysis.model)
+        write_result(folder, analysis, before, result)
     except (UserError, OSError) as error:
-        return program.failed("estimate", error)
+        return program.failed("analyse", error)
     return program.DONE
 
 
@@ -99,6 +108,41 @@ def steering(recording: Recording, model: str) -> Result:
     except ArithmeticError as error:
         raise ModelError(f"{model}: {error}; train the model again") from None
     return Result(recording.images[:, 0], {"steering": np.array(values, np.float32)}, rejected(recording))
+
+
+def replayed(recording: Recording, analysis: Analysis) -> Result:
+    """Return how a model drives; see `cloning.replay.replay` and `Drive`. Raises UserError.
+
+    The columns are offset and human, the cars' lateral offset in m from the reference line, right positive; right and
+    yaw, the pose of `ReplayedCar`; line, the number of the reference line. about has the metrics, and the interventions
+    as [place in the columns, offset in m].
+    """
+    lines = reference_lines(recording)
+    total = sum(len(line.stretch) for line in lines)
+    poses: list[tuple[float, float]] = []
+
+    def watch(frame: ReplayFrame, done: Drive) -> None:
+        if len(poses) % PART_ROWS == 0:
+            print(f"{PROGRESS}{len(poses) / total:.3f}", flush=True)
+        poses.append(frame.pose)
+
+    done = drive(recording, lines, analysis.limit, ModelDriver(analysis.model), watch)
+    offset = np.array(done.offset)
+    right, yaw = np.array(poses).T
+    columns = {
+        "offset": offset,
+        "human": offset - done.offset_from_human,
+        "right": right,
+        "yaw": yaw,
+        "line": np.repeat(np.arange(len(lines)), [len(line.stretch) for line in lines]),
+    }
+    about = {
+        **driving_metrics(done),
+        "human_mean_m": round(float(np.abs(columns["human"]).mean()), 3),
+        "where": [[at, round(metres, 2)] for at, metres in done.interventions.items()],
+        "by_lane": sum(len(line.stretch) for line in lines if line.is_lane_centre),
+    }
+    return Result(recording.images[done.row, 0], columns, about)
 
 
 def parts(recording: Recording) -> Iterator[Recording]:

@@ -1,0 +1,223 @@
+"""Slow analyses of recordings: the place on the road, and how models steer and drive; each in a process of its own.
+
+A process takes its memory along when it ends, and leaves its result in the user's cache folder, where it stays until
+the recording changes. `analyse.py` is what runs in it.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cloning.errors import RecordingError
+from cloning.files import written_whole
+from cloning.recordings.check import cache_file
+from cloning.recordings.excluded import read_cuts
+from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
+
+RULES = 1  # of what a result contains: counted up when they change
+COMMAND = (sys.executable, "-m", "cloning.browse.analyse")
+PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What can be analysed in a recording.
+
+    kind   "lane": where the car is; "steering": a model's in each frame; "replay": a drive with a model as the driver
+    model  its file, unless the lane is analysed
+    limit  m from the reference line at which a replay counts an intervention
+    """
+
+    kind: str
+    model: str = ""
+    limit: float = 0.0
+
+    def arguments(self) -> list[str]:
+        """Return the arguments for COMMAND, after the recording."""
+        return [self.kind, *[self.model] * bool(self.model), *[f"{self.limit:g}"] * bool(self.limit)]
+
+
+LANE = Analysis("lane")
+
+
+@dataclass(frozen=True)
+class Result:
+    """What an analysis has found.
+
+    images  int32 (k,): the centre images, as in `Recording.images`, that the columns belong to
+    columns float32 (k,), by name
+    about   everything else, in JSON's types
+    """
+
+    images: np.ndarray
+    columns: dict[str, np.ndarray]
+    about: dict[str, Any]
+
+    def column(self, name: str, centres: np.ndarray) -> np.ndarray:
+        """Return a column in the rows of a recording: float32 (n,), nan in those not analysed.
+
+        centres: int32 (n,), the rows' centre images.
+        """
+        values = np.full(max(centres.max(initial=0), self.images.max(initial=0)) + 1, np.nan, np.float32)
+        values[self.images] = self.columns[name]
+        return values[centres]
+
+
+def stamp(folder: Path, analysis: Analysis) -> str:
+    """Return what tells whether a result is still of the same files: their sizes and times of change, and the cuts.
+
+    Only a replay leaves out what is cut. Raises RecordingError if the log, the images or the model is gone, and if a
+    replay cannot read the cuts.
+    """
+    paths = [folder / DRIVING_LOG, folder / IMAGE_FOLDER, *[Path(analysis.model)] * bool(analysis.model)]
+    cuts = f" {[(cut.first, cut.last) for cut in read_cuts(folder)]}" if analysis.kind == "replay" else ""
+    return f"{RULES} {[file_stamp(path) for path in paths]}{cuts}"
+
+
+def file_stamp(path: Path) -> tuple[int, int]:
+    """Return size and time of change in ns of a file or folder. Raises RecordingError if it is gone."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}; put it back, or leave the recording out") from None
+    return status.st_size, status.st_mtime_ns
+
+
+def result_file(folder: Path, analysis: Analysis) -> Path:
+    """Return the file in the user's cache folder for the result of an analysis."""
+    name = f"-{analysis.kind}" + f"-{analysis.limit:g}" * bool(analysis.limit)
+    if analysis.model:
+        name += "-" + hashlib.blake2b(os.fsencode(Path(analysis.model).resolve()), digest_size=6).hexdigest()
+    return cache_file(folder, name)
+
+
+def write_result(folder: Path, analysis: Analysis, of: str, result: Result) -> None:
+    """Write the result of an analysis; of: the `stamp` from before the analysis. Raises OSError."""
+    file = result_file(folder, analysis)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    names, columns = list(result.columns), np.array(list(result.columns.values()), np.float32)
+    about = np.frombuffer(json.dumps({"stamp": of, "columns": names, **result.about}).encode(), np.uint8)
+    with written_whole(file) as temporary, open(temporary, "wb") as opened:
+        np.savez(opened, about=about, images=result.images, columns=columns)
+
+
+def read_result(folder: Path, analysis: Analysis) -> Result | None:
+    """Return the result of an analysis, None if these files have none yet. Raises RecordingError as `stamp` does."""
+    wanted = stamp(folder, analysis)
+    try:
+        with np.load(result_file(folder, analysis)) as file:
+            about, images, columns = json.loads(file["about"].tobytes()), file["images"], file["columns"]
+        named = dict(zip(about["columns"], columns, strict=True))
+    except Exception:  # there is no file yet, or a damaged one, of whatever kind: the analysis replaces it
+        return None
+    return Result(images, named, about) if about["stamp"] == wanted else None
+
+
+class Analyses:
+    """Runs the analyses that are asked for, one after the other, the smallest recording first, and replays last."""
+
+    def __init__(self) -> None:
+        """Begin with nothing to do."""
+        self.waiting: dict[tuple[Path, Analysis], int] = {}  # -> size of the log, bytes
+        self.urgent: Path | None = None  # the folder whose analyses go before all others
+        self.failed: dict[tuple[Path, Analysis, str], str] = {}  # folder, analysis, stamp -> message
+        self.ready: set[tuple[Path, Analysis, str]] = set()  # folder, analysis, stamp
+        self.running: tuple[Path, Analysis] | None = None
+        self.progress = 0.0
+        self.process: subprocess.Popen[str] | None = None
+        self.changed = threading.Condition()
+        self.ended = False  # the process, before it was done, by `stop` or `close`
+        self.closed = False
+        self.thread = threading.Thread(target=self._run, daemon=True)
+
+    def state(self, folder: Path, analysis: Analysis, begin: bool = True) -> dict[str, Any]:
+        """Return how far an analysis is, for the page: {"state", "progress" or "message"}.
+
+        The states are ready, running, waiting, failed and, if it is not to begin now and nobody asked for it, none.
+        Raises RecordingError as `stamp` does.
+        """
+        now = folder, analysis, stamp(folder, analysis)
+        with self.changed:
+            if now in self.failed:
+                return {"state": "failed", "message": self.failed[now]}
+            if (now in self.ready and result_file(folder, analysis).exists()) or read_result(folder, analysis):
+                self.ready.add(now)
+                return {"state": "ready"}
+            if self.running == (folder, analysis):
+                return {"state": "running", "progress": self.progress}
+            if (folder, analysis) not in self.waiting:
+                if not begin:
+                    return {"state": "none"}
+                self.waiting[folder, analysis] = file_stamp(folder / DRIVING_LOG)[0]
+                if not self.thread.is_alive():
+                    self.thread.start()
+                self.changed.notify()
+        return {"state": "waiting"}
+
+    def stop(self, folder: Path, analysis: Analysis) -> None:
+        """End an analysis that runs or waits; what is done already stays."""
+        with self.changed:
+            self.waiting.pop((folder, analysis), None)
+            if self.running == (folder, analysis):
+                self._end()
+
+    def hurry(self, folder: Path) -> None:
+        """Put a recording's analyses before all others that wait."""
+        self.urgent = folder
+
+    def close(self) -> None:
+        """End the analysis that runs, if one does."""
+        with self.changed:
+            self.closed = True
+            self.changed.notify()
+            self._end()
+        if self.thread.is_alive():
+            self.thread.join()
+
+    def _end(self) -> None:
+        self.ended = True
+        if self.process:
+            self.process.kill()  # its result is whole or not there
+
+    def _order(self, waiting: tuple[Path, Analysis]) -> tuple[bool, bool, int]:
+        """Return what is least for the analysis to run next."""
+        folder, analysis = waiting
+        return folder != self.urgent, analysis.kind == "replay", self.waiting[waiting]
+
+    def _run(self) -> None:
+        while True:
+            with self.changed:
+                while not (self.waiting or self.closed):
+                    self.changed.wait()
+                if self.closed:
+                    return
+                self.running = folder, analysis = min(self.waiting, key=self._order)
+                self.progress, self.ended = 0.0, False
+                del self.waiting[self.running]
+                command, pipe = [*COMMAND, str(folder), *analysis.arguments()], subprocess.PIPE
+                self.process = subprocess.Popen(
+                    command, stdout=pipe, stderr=subprocess.STDOUT, text=True, errors="replace"
+                )
+            before, message = "", "was ended"
+            with contextlib.suppress(RecordingError):
+                before = stamp(folder, analysis)
+            with self.process:
+                assert self.process.stdout
+                for line in self.process.stdout:
+                    if line.startswith(PROGRESS):
+                        self.progress = float(line.removeprefix(PROGRESS))
+                    elif line.strip():
+                        message = line.strip()
+            with self.changed:
+                if self.process.returncode and not self.ended:
+                    self.failed[folder, analysis, before] = message
+                self.process = self.running = None

@@ -1,0 +1,65 @@
+"""Replays for the page: their figures, and what the replayed car sees in each row."""
+
+import copy
+from typing import Any
+
+import numpy as np
+
+from cloning.browse.analyses import Result
+from cloning.errors import UserError
+from cloning.recordings.images import encode
+from cloning.recordings.log import Recording
+from cloning.replay.views import StretchViews
+from cloning.road.camera import VIEW_JPEG_QUALITY
+from cloning.road.motion import Stretch
+
+
+class NotReplayedError(UserError):
+    """A row that a replay left out: it is cut, has an unusable image, or is no part of two seconds of driving."""
+
+
+def rows_driven(result: Result, centres: np.ndarray) -> np.ndarray:
+    """Return the recording's row of each place in the result's columns: int64 (k,).
+
+    centres: int32 (n,), the rows' centre images. Of rows with the same one, which are copies, it is the first.
+    """
+    first = np.full(max(centres.max(initial=0), result.images.max(initial=0)) + 1, -1)
+    first[centres[::-1]] = np.arange(len(centres))[::-1]
+    return first[result.images]
+
+
+def figures(result: Result, centres: np.ndarray) -> dict[str, Any]:
+    """Return a replay's metrics, and its interventions as [row, offset in m]; centres: as in `rows_driven`."""
+    rows = rows_driven(result, centres)
+    where = [[int(rows[at]), metres] for at, metres in result.about["where"]]
+    return {**result.about, "where": where, "driven": len(rows)}
+
+
+class LineViews:
+    """The views from the replayed car along one reference line, as the model saw them."""
+
+    def __init__(self, recording: Recording, result: Result, line: int):
+        """line: its number in the result."""
+        places = np.flatnonzero(result.columns["line"] == line)
+        part = copy.copy(recording)
+        part.keep(rows_driven(result, recording.images[:, 0])[places])
+        self.views = StretchViews(part, Stretch.of(part, slice(0, len(part))))
+        self.right, self.yaw = result.columns["right"][places], result.columns["yaw"][places]
+        self.first = int(places[0])
+
+    def jpeg(self, place: int) -> bytes:
+        """Return the view at a place in the result's columns; at the human driver's pose, the recorded file itself.
+
+        Raises RecordingError if an image became unusable.
+        """
+        at = place - self.first
+        pose = float(self.right[at]), float(self.yaw[at])
+        return encode(self.views.view_from(at, *pose), VIEW_JPEG_QUALITY) if any(pose) else self.views.jpeg(at)
+
+
+def place_of(result: Result, image: int) -> int:
+    """Return the place of a centre image in the result's columns. Raises NotReplayedError."""
+    places = np.flatnonzero(result.images == image)
+    if not len(places):
+        raise NotReplayedError("not replayed here: cut, an unusable image, off the road, or standing")
+    return int(places[-1])

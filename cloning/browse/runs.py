@@ -1,0 +1,145 @@
+"""Training runs for the page: how far each is, its losses and its pictures, read from what model.py writes."""
+
+import csv
+import json
+import math
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+from cloning.browse.library import UnknownError
+from cloning.errors import UserError, message_of
+from cloning.training.run_files import RunFiles
+
+PICTURE = re.compile(r"training_generator_(LRC_|augmented-)([0-9]{1,12})\.png")
+ALIVE = 120.0  # s since a run's last state, saved every 30 s, in which it counts as running where there are no locks
+METRICS = {"epoch": int, "images": int, "seconds": float, "loss": float, "val_loss": float}  # of training_log.csv
+PROGRESS = {"finished": int, "batches": int, "images": int, "seconds": (int, float), "loss": (int, float, type(None))}
+OPTIONS = {"epochs": int, "samples_per_epoch": int, "batch_size": int}
+
+
+class RunError(UserError):
+    """A file of a run that cannot be read."""
+
+
+class Runs:
+    """The runs in the given folders, by their number."""
+
+    def __init__(self, folders: list[Path]):
+        """folders: into which model.py writes, or may later."""
+        self.files = [RunFiles(str(folder / "model.pt")) for folder in folders]
+
+    def found(self) -> list[dict[str, Any]]:
+        """Return what the list shows of each run that has begun; {"message"} instead of figures if it can't be read."""
+        shown = []
+        for number, files in enumerate(self.files):
+            if files.arguments.exists():
+                name: dict[str, Any] = {"id": number, "folder": str(files.last.parent.resolve())}
+                try:
+                    shown.append(name | {key: value for key, value in overview(files).items() if key != "pictures"})
+                except (UserError, OSError) as error:
+                    shown.append(name | {"message": message_of(error)})
+        return shown
+
+    def run(self, number: int) -> dict[str, Any]:
+        """Return what the page shows of a run. Raises UnknownError, RunError, OSError."""
+        files = self._files(number)
+        return {"id": number, "folder": str(files.last.parent.resolve()), **overview(files)}
+
+    def picture(self, number: int, name: str) -> bytes:
+        """Return a diagnostic picture, a PNG. Raises UnknownError, OSError."""
+        files = self._files(number)
+        if not PICTURE.fullmatch(name):
+            raise UnknownError(f"no picture {name[:60]}")
+        return (files.pictures / name).read_bytes()
+
+    def _files(self, number: int) -> RunFiles:
+        if number >= len(self.files):
+            raise UnknownError(f"no run {number} here; go back to the list")
+        return self.files[number]
+
+
+def overview(files: RunFiles) -> dict[str, Any]:
+    """Return what the page shows of a run.
+
+    run: its identifier, or None; state: running, finished or stopped; history: a dict of METRICS for each finished
+    epoch; epochs, samples_per_epoch; images and loss so far in this epoch, with their age in s; rate in images/s, and
+    left, s of training from there on, None if unknown; pictures: numbers of observations, ascending. Raises RunError,
+    OSError.
+    """
+    options, progress = _json(files.arguments, OPTIONS, 1), {}
+    history = _history(files.log)
+    if files.progress.exists():
+        progress = _json(files.progress, PROGRESS, 0)
+        history = history[: progress["finished"]]  # else those are an earlier run's, or the state comes in a moment
+    epochs, samples = options["epochs"], options["samples_per_epoch"]
+    finished, images, seconds = len(history), progress.get("images", 0), progress.get("seconds", 0.0)
+    latest = max((file.stat().st_mtime for file in (files.progress, files.arguments) if file.exists()), default=0)
+    age = max(0.0, time.time() - latest)
+    claimed = files.is_claimed()
+    if claimed or (claimed is None and age < ALIVE and finished < epochs):
+        state = "running"
+    else:
+        state = "finished" if finished >= epochs else "stopped"
+    last = history[-1]["seconds"] if history else 0.0  # with its validation
+    rate = images / seconds if images and seconds else history[-1]["images"] / last if last else None
+    epoch = last or (samples / rate if rate else None)
+    left = epoch * max(0.0, epochs - finished - min(1.0, images / samples)) if epoch and state == "running" else None
+    recordings = options.get("recordings")
+    return {
+        "run": progress.get("run"),
+        "state": state,
+        "robust": options.get("robust") is True,
+        "recordings": [str(each) for each in recordings] if isinstance(recordings, list) else [],
+        "epochs": epochs,
+        "samples_per_epoch": samples,
+        "history": [{key: _finite(value) for key, value in row.items()} for row in history],
+        "images": images,
+        "loss": progress.get("loss"),
+        "age": age,
+        "rate": rate,
+        "left": left,
+        "pictures": _pictures(files, progress["batches"] * options["batch_size"] if progress else math.inf),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _json(path: Path, kinds: dict[str, Any], least: int) -> dict[str, Any]:
+    """Return a JSON object with values of these types, numbers from `least` on. Raises RunError, OSError."""
+    try:
+        found = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise RunError(f"{path}: not JSON ({error}); `python model.py` writes it anew") from None
+    for name, kind in kinds.items():
+        value = found.get(name) if isinstance(found, dict) else None
+        if isinstance(value, bool) or not isinstance(value, kind) or (value is not None and not least <= value < 1e12):
+            raise RunError(f"{path}: {name} is {str(value)[:40]}; `python model.py` writes it anew")
+    return found
+
+
+def _history(path: Path) -> list[dict[str, float]]:
+    """Return the finished epochs' metrics in training_log.csv, none if there is no file. Raises RunError, OSError."""
+    if not path.exists():
+        return []
+    rows = list(csv.DictReader(path.read_text(encoding="utf-8", errors="replace").splitlines()))
+    try:
+        return [{name: kind(row[name]) for name, kind in METRICS.items()} for row in rows]
+    except (KeyError, TypeError, ValueError):
+        raise RunError(f"{path}: not a log of epochs; `python model.py` writes it anew") from None
+
+
+def _pictures(files: RunFiles, observations: float) -> list[int]:
+    """Return after how many observations there are pictures, ascending, without an earlier run's later ones."""
+    numbers: dict[int, int] = {}
+    try:
+        names = [path.name for path in files.pictures.iterdir()]
+    except OSError:  # none yet
+        return []
+    for name in names:
+        if (match := PICTURE.fullmatch(name)) and int(match[2]) <= observations:
+            numbers[int(match[2])] = numbers.get(int(match[2]), 0) + 1
+    return sorted(number for number, kinds in numbers.items() if kinds == 2)

@@ -1,0 +1,154 @@
+// Replays of the recording with each model as the driver, and what a model looks at.
+import {ask, clock, element, make, many, notice, onClick, renew} from "./common.js";
+import {seek} from "./moving.js";
+import {MODEL_COLOURS} from "./plots.js";
+import {page, say} from "./state.js";
+
+const LIMITS = [...document.querySelectorAll("[data-limit]")].map(button => button.dataset.limit);
+
+// The pictures to show: the cameras, or the centre camera beside what each replayed car sees.
+export function cameras() {
+  const {details, replays, attention} = page.open, isReplayed = replays.some(Boolean);
+  element("cameras").className = isReplayed ? "replaying" : "";
+  document.querySelectorAll("#cameras .replayed").forEach(figure => figure.remove());
+  const recorded = (canvas, caption, looks = []) => ({canvas, caption: () => caption, path: canvas, looks});
+  const centre = recorded("center", "Centre", attention == null ? [] : [attention]);
+  if (!isReplayed) return [recorded("left", "Left"), centre, recorded("right", "Right")];
+  const views = replays.map((replay, number) => replay && {
+    canvas: `view-${number}`,
+    caption: row => `${details.models[number].name} at ${replay.limit} m: ${metres(replay.offset[row])}`,
+    has: row => !Number.isNaN(replay.offset[row]),
+    path: `replay-${number}-${replay.limit}`,
+    looks: attention == number ? [number] : [],
+  }).filter(Boolean);
+  for (const {canvas} of views) {
+    element("cameras").append(make("figure", "", {class: "replayed"},
+      make("canvas", "", {id: canvas, role: "img", width: 320, height: 160, "aria-label": "What the replayed car sees"}),
+      make("figcaption")));
+  }
+  return [centre, ...views];
+}
+
+// Show the replays at the chosen limit as far as they are: curves, pictures, figures, interventions.
+export async function showReplays() {
+  const now = page.open, {details} = now;
+  element("replaying").hidden = element("watching").hidden = !details.models.length;
+  if (details.limit == now.limit) {
+    const replays = await Promise.all(details.replays.map((replay, number) => load(now, replay, number)));
+    if (page.open != now || details.limit != now.limit) return;
+    const stamps = all => JSON.stringify(all.map(replay => replay && [replay.limit, replay.stamp]));
+    const changed = stamps(replays) != stamps(now.replays);
+    now.replays = replays;
+    if (changed) {
+      now.plots.setReplays(replays);
+      now.frames.setPictures(cameras());
+    }
+  }
+  for (const button of document.querySelectorAll("[data-limit]")) {
+    button.setAttribute("aria-pressed", button.dataset.limit == now.limit);
+  }
+  renew(element("attention"), details.models.map(({name}) => name), () => details.models.map(({name}, number) => {
+    const button = make("button", name);
+    onClick(button, () => watch(page.open.attention == number ? null : number));
+    return button;
+  }));
+  [...element("attention").children].forEach((button, number) => button.setAttribute("aria-pressed", now.attention == number));
+  element("replays").hidden = !now.limit;
+  if (now.limit && details.limit == now.limit) {
+    renew(element("replay-list"), [now.id, details.version, details.limit, details.replays], () => details.replays.map(section));
+  }
+}
+
+// A replay with its column, if it is there; the one that is shown already, if it is still the same.
+async function load(now, replay, number) {
+  if (replay.state != "ready") return undefined;
+  const limit = now.details.limit, before = now.replays[number];
+  if (before?.limit == limit && before.stamp == replay.stamp) return before;
+  return {...replay, limit, offset: await now.column(`replay-${number}-${limit}`)};
+}
+
+function section(replay, number) {
+  const {details, limit} = page.open, {name} = details.models[number];
+  const heading = make("h3", `${name} at ${limit} m`, {style: `border-color: ${MODEL_COLOURS[number % MODEL_COLOURS.length]}`});
+  const button = (text, method) => {
+    const made = make("button", text);
+    onClick(made, () => drive(method));
+    return made;
+  };
+  const waiting = {
+    none: ["Not replayed with these files and cuts. ", button("Replay", "POST")],
+    waiting: ["Waits for its turn. ", button("Stop", "DELETE")],
+    running: [`Replaying: ${(100 * replay.progress).toFixed(0)} % driven. `, button("Stop", "DELETE")],
+    failed: [`Failed: ${replay.message}`],
+  }[replay.state];
+  if (waiting) return make("section", "", {}, heading, make("p", "", {}, ...waiting));
+  const lines = Object.entries({
+    autonomy: `${replay.autonomy_percent.toFixed(1)} %`,
+    distance: `mean ${replay.distance_mean_m.toFixed(2)} m, 95 % below ${replay.distance_p95_m.toFixed(2)} m`,
+    "human's distance": `mean ${replay.human_mean_m.toFixed(2)} m`,
+    driven: many(replay.driven, "frame") + (replay.by_lane < replay.driven
+      ? `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known` : ""),
+    interventions: replay.interventions.toLocaleString("en"),
+  });
+  const made = make("section", "", {}, heading,
+    make("dl", "", {}, ...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)])));
+  if (replay.where.length) {
+    made.append(make("ol", "", {class: "where"}, ...replay.where.map(([row, offset]) => {
+      const time = clock(page.open.columns.seconds[row]), go = make("button", time, {"aria-label": `Go to the intervention at ${time}`});
+      onClick(go, () => seek(row));
+      return make("li", "", {}, go, ` ${metres(offset)}`);
+    })));
+  }
+  return made;
+}
+
+const metres = offset => `${Math.abs(offset).toFixed(2)} m to the ${offset > 0 ? "right" : "left"}`;
+
+// ---------------------------------------------------------------------------------------------------------------------
+// What to show
+
+// Show the replays at a limit, and begin those that are not there; limit: null for none.
+async function choose(limit) {
+  const now = page.open;
+  now.limit = limit;
+  say(limit ? `Replays at a limit of ${limit} m.` : "No replays.");
+  if (limit) return drive("POST");
+  now.replays = [];
+  now.plots.setReplays([]);
+  now.frames.setPictures(cameras());
+  await now.update({...now.details, limit: null, replays: []});
+}
+
+// Begin (POST) or stop (DELETE) the replays at the limit that is shown.
+async function drive(method) {
+  const now = page.open;
+  try {
+    const details = await ask(`/${now.id}/replays/${now.limit}`, {method});
+    if (page.open == now) await now.update(details);
+  } catch (error) {
+    notice(error.message);
+  }
+}
+
+export function nextLimit() {
+  if (page.open.details.models.length) choose(LIMITS[LIMITS.indexOf(page.open.limit) + 1] ?? null);
+  else say("No model to replay with: start with --model.");
+}
+
+function watch(number) {
+  const now = page.open;
+  now.attention = number;
+  say(number == null ? "" : `In magenta, what ${now.details.models[number].name} looks at.`);
+  now.frames.setPictures(cameras());
+  showReplays();
+}
+
+export function nextAttention() {
+  const {details, attention} = page.open, next = (attention ?? -1) + 1;
+  if (details.models.length) watch(next < details.models.length ? next : null);
+  else say("No model whose attention could be shown: start with --model.");
+}
+
+for (const button of document.querySelectorAll("[data-limit]")) {
+  onClick(button, () => choose(button.dataset.limit == page.open.limit ? null : button.dataset.limit));
+}

@@ -1,0 +1,95 @@
+"""The files of a run, and whether one is writing them; without PyTorch, so that a page can show them."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from cloning.errors import OutputError
+from cloning.outputs import check_folders
+
+if os.name != "nt":
+    import fcntl
+
+
+class RunFiles:
+    """The paths of the files that a run writes: the model's, and all others in the same folder."""
+
+    def __init__(self, output: str):
+        """output: the model's file, such as model.pt; its folder need not exist."""
+        self.last = Path(output)
+        self.best = self.last.with_stem(f"{self.last.stem}-best")
+        self.resume = self.last.with_stem(f"{self.last.stem}-resume")
+        self.log = self.last.with_name("training_log.csv")
+        self.losses = self.last.with_name("training_loss.png")
+        self.arguments = self.last.with_name("training_arguments.json")
+        self.progress = self.last.with_name("training_progress.json")
+        self.rejected = self.last.with_name("rejected_rows.csv")
+        self.pictures = self.last.with_name("diagnostic_images")
+        self._state_at_start = self._state()
+
+    @contextlib.contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Make the folders and keep other runs out of them until the block ends, or this process.
+
+        On Windows, and on a file system without locks, other runs are not kept out. Raises OutputError, OSError.
+        """
+        from cloning.training.distributed import from_first_rank  # imports torch
+
+        with contextlib.ExitStack() as stack:
+
+            def claim() -> None:
+                self.pictures.mkdir(parents=True, exist_ok=True)
+                check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
+                if os.name == "nt":
+                    return
+                folder = os.open(self.last.parent, os.O_RDONLY)
+                stack.callback(os.close, folder)
+                try:
+                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise OutputError(
+                        f"{self.last}: another run is writing to this folder; wait for its end, or give an --output in "
+                        "another folder"
+                    ) from None
+                except OSError as error:  # a network's file system, for example
+                    print(f"{self.last.parent}: cannot be locked ({error.strerror}); start no other run in it")
+
+            from_first_rank(claim)
+            yield
+
+    def is_claimed(self) -> bool | None:
+        """Return whether a run is writing the files; None if that cannot be told, as where there are no locks.
+
+        It looks for a moment as if this were a run, too: one that starts in the same microseconds is refused.
+        """
+        if os.name == "nt":
+            return None
+        try:
+            folder = os.open(self.last.parent, os.O_RDONLY)
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return None
+        finally:
+            os.close(folder)
+        return False
+
+    def next_step(self, resumed: bool) -> str:
+        """Return what the user can do after an error; resumed: whether --resume was given.
+
+        Until a new run has saved a state, --resume would continue an earlier run.
+        """
+        begun = resumed or self._state() != self._state_at_start
+        return "continue with --resume" if begun else "start the run again"
+
+    def _state(self) -> tuple[int, int] | None:
+        """Return what tells whether model-resume.pt was replaced."""
+        if not os.path.exists(self.resume):
+            return None
+        now = self.resume.stat()
+        return now.st_ino, now.st_mtime_ns

@@ -1,0 +1,243 @@
+"""Replays and attention in the browser of recordings, and the training runs that it shows."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+from browse_process import browsing, placed, replayed, written_run
+from conftest import HERE, run_here
+from test_excluded import center
+
+from cloning.browse import analyse, analyses, attend, runs
+from cloning.browse.analyses import Analysis, stamp, write_result
+from cloning.browse.attention import Attention
+from cloning.browse.library import Library
+from cloning.browse.replays import NotReplayedError
+from cloning.errors import ModelError
+from cloning.pilot.attention import MAGENTA, overlay, visual_backprop
+from cloning.pilot.network import load_model
+from cloning.recordings.excluded import Cut, add_cut
+from cloning.recordings.images import decode, read_frame
+from cloning.recordings.log import read_recording
+from cloning.replay import command, replay
+from cloning.replay.drivers import ModelDriver
+from cloning.training.run_files import RunFiles
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Replays
+
+
+def test_a_replay_on_the_page_is_that_of_the_command(linked, model_file, tmp_path, monkeypatch):
+    """Its figures are those of the command's report, its pictures those that the model was given."""
+    add_cut(linked, Cut(center(linked, 0), center(linked, 4), "standing"))
+    given = []
+
+    class Watched(ModelDriver):
+        def __call__(self, frame):
+            given.append((frame.row, frame.jpeg()))
+            return super().__call__(frame)
+
+    monkeypatch.setattr(analyse, "ModelDriver", Watched)
+    wanted = Analysis("replay", str(model_file), 1.0)
+    write_result(linked, wanted, stamp(linked, wanted), analyse.replayed(replay.load_recording(linked), wanted))
+    report = tmp_path / "replay.json"
+    command.run(command.Options([str(linked)], str(model_file), "", 0, 0, [1.0], "lane", str(report), None, None))
+    expected = json.loads(report.read_bytes())[0]["limits"]["1"]
+    library = Library([linked], [model_file])
+    [name] = library.folders
+    try:
+        shown = library.details(name, "1")["replays"][0]
+        assert shown["state"] == "ready" and shown["driven"] == 55
+        for key in ("autonomy_percent", "interventions", "distance_mean_m", "distance_p95_m"):
+            assert shown[key] == expected[key]
+        images = [library.row(name, row)["images"][0] for row, _ in shown["where"]]
+        assert images == [each["image"] for each in expected["where"]] and len(images) > 0
+        column = library.column(name, "replay-0-1")
+        assert np.isnan(column[:5]).all() and not np.isnan(column[5:]).any()
+        for row, jpeg in given[::9]:
+            seen = decode(library.jpeg(name, row + 5, "replay-0-1"))  # the replay does not have the five rows
+            assert np.abs(seen.astype(int) - decode(jpeg)).mean() < 0.5
+        with pytest.raises(NotReplayedError):
+            library.jpeg(name, 4, "replay-0-1")
+        add_cut(linked, Cut(center(linked, 50), center(linked, 59), "crash"))
+        assert library.details(name, "1")["replays"] == [{"state": "none"}], "of other cuts"
+    finally:
+        library.close()
+
+
+def test_a_replay_begins_only_when_asked_for_and_can_be_stopped(linked, model_file, monkeypatch):
+    code = "import sys, time; print('progress 0.25', flush=True); time.sleep('replay' in sys.argv and 600)"
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
+    placed(linked, np.zeros(60))
+    library = Library([linked], [model_file])
+    [name] = library.folders
+
+    def state(limit: str = "2.5") -> dict:
+        return library.details(name, limit)["replays"][0]
+
+    try:
+        assert state() == {"state": "none"}
+        library.replay(name, "2.5", begin=True)
+        end = time.monotonic() + 60
+        while state() != {"state": "running", "progress": 0.25}:
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        library.replay(name, "1", begin=True)
+        assert state("1") == {"state": "waiting"}
+        for limit in ("1", "2.5"):
+            library.replay(name, limit, begin=False)
+        while state()["state"] == "running":
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        assert state() == state("1") == {"state": "none"}
+    finally:
+        library.close()
+
+
+def test_replays_over_the_socket(linked, model_file):
+    placed(linked, np.zeros(60))
+    replayed(linked, model_file, 1.0, np.linspace(-0.5, 0.5, 60), [[30, 1.2]])
+    with browsing(linked, "--model", model_file) as server:
+        here = server.recordings()["lake"]
+        shown = server.get(f"{here}/details?limit=1")["replays"][0]
+        assert shown["where"] == [[30, 1.2]] and shown["autonomy_percent"] == 90
+        status, data, _ = server.ask(f"{here}/columns/replay-0-1")
+        assert status == 200 and np.frombuffer(data, "<f4")[-1] == 0.5
+        status, data, headers = server.ask(f"{here}/rows/59/replay-0-1.jpg")
+        recorded = read_frame(read_recording(linked).path(59))
+        assert status == 200 and headers["Content-Type"] == "image/jpeg"
+        assert np.abs(decode(data).astype(int) - recorded).mean() > 1, "moved half a metre to the right"
+        for path in ("details?limit=1.7", "columns/replay-1-1", "columns/replay-0-7", "rows/0/replay-0-x.jpg",
+                     "rows/0/center/1.png", "rows/0/secret/0.png"):  # fmt: skip
+            assert server.ask(f"{here}/{path}")[0] == 404, path
+        assert server.ask(f"{here}/replays/3", "POST")[0] == 404
+        assert server.ask(f"{here}/replays/2.5", "POST", Origin="http://evil.example")[0] == 403
+        assert server.get(f"{here}/details?limit=2.5")["replays"][0]["state"] == "none"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What a model looks at
+
+
+def test_the_attention_laid_over_a_frame_is_that_of_the_films(sample_recording, model_file):
+    path = read_recording(sample_recording).path(20)
+    png = cv2.imdecode(np.frombuffer(attend.picture(path.read_bytes(), str(model_file)), np.uint8), -1)
+    frame = read_frame(path)
+    alpha = png[..., 3:].astype(float) / 255
+    laid = frame * (1 - alpha) + np.array(MAGENTA) * alpha
+    steering, mask = visual_backprop(load_model(model_file), frame)
+    film = cv2.resize(overlay(frame, steering, mask), (320, 160), interpolation=cv2.INTER_AREA)[:60]
+    assert mask[60:].any() and np.abs(laid[:60] - film).mean() < 2
+    assert alpha.max() == pytest.approx(0.7, abs=0.01)
+
+
+def test_attention_comes_from_a_process_that_is_started_again_when_it_has_ended(sample_recording, model_file, tmp_path):
+    jpeg = read_recording(sample_recording).path(20).read_bytes()
+    attention = Attention()
+    try:
+        png = attention.png(jpeg, str(model_file))
+        assert png == attend.picture(jpeg, str(model_file))
+        attention.process.kill()
+        attention.process.wait()
+        assert attention.png(jpeg, str(model_file)) == png
+        (tmp_path / "spoilt.pt").write_bytes(b"no model")
+        with pytest.raises(ModelError, match=r"spoilt\.pt: "):
+            attention.png(jpeg, str(tmp_path / "spoilt.pt"))
+        process = attention.process
+    finally:
+        attention.close()
+    assert process.poll() is not None
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Training runs
+
+HELD = """
+import sys
+from cloning.training.run_files import RunFiles
+with RunFiles(sys.argv[1]).claimed():
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_run_is_running_while_its_folder_is_claimed_and_then_stopped(tmp_path):
+    files = written_run(tmp_path, finished=1, images=500)
+    holding = [sys.executable, "-c", HELD, str(files.last)]
+    pipe = subprocess.PIPE
+    holder = subprocess.Popen(holding, stdin=pipe, stdout=pipe, text=True, env={**os.environ, **HERE})
+    assert holder.stdout.readline() == "held\n"
+    found = runs.overview(files)
+    assert found["state"] == "running" and found["robust"] and found["rate"] == 100 and found["loss"] == 0.25
+    # 12.5 s an epoch, with its validation: half of this one and two others are left.
+    assert found["left"] == 2.5 * 12.5
+    assert [row["loss"] for row in found["history"]] == [0.5], "the other rows are an earlier run's"
+    assert found["pictures"] == [0, 1200], "those from 6,400 observations on are an earlier run's"
+    holder.kill()
+    holder.communicate()
+    found = runs.overview(files)
+    assert found["state"] == "stopped" and found["left"] is None
+
+
+def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
+    found = runs.overview(RunFiles(str(finished[1] / "model.pt")))
+    assert (found["state"], found["epochs"], len(found["history"]), found["pictures"]) == ("finished", 2, 2, [0])
+    files = written_run(tmp_path / "old", finished=4, images=0, losses=(0.5, float("nan"), 0.3))
+    files.progress.unlink()
+    found = runs.overview(files)
+    assert found["state"] == "stopped" and [row["loss"] for row in found["history"]] == [0.5, None, 0.3]
+    assert found["pictures"] == [0, 1200, 6400]
+
+
+@pytest.mark.parametrize(
+    "name, contents, words",
+    [
+        ("training_arguments.json", "{", "training_arguments.json: not JSON"),
+        ("training_arguments.json", '{"epochs": "4"}', "training_arguments.json: epochs is 4"),
+        ("training_arguments.json", '{"epochs": 4, "samples_per_epoch": 0}', "samples_per_epoch is 0"),
+        ("training_progress.json", "[]", "training_progress.json: finished is None"),
+        ("training_progress.json", '{"finished": -1}', "finished is -1"),
+        ("training_log.csv", "epoch,images\n1,2\n", "training_log.csv: not a log of epochs"),
+    ],
+)
+def test_spoilt_files_of_a_run_are_named(tmp_path, name, contents, words):
+    written_run(tmp_path, finished=1, images=500)
+    (tmp_path / name).write_text(contents, encoding="utf-8")
+    [found] = runs.Runs([tmp_path]).found()
+    assert words in found["message"] and "state" not in found
+
+
+def test_runs_over_the_socket(tmp_path):
+    written_run(tmp_path / "a", finished=4, images=0)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    with browsing("--run", tmp_path / "empty", tmp_path / "a") as server:
+        assert server.recordings() == {}
+        [found] = server.get("/runs")
+        assert found["id"] == 1 and found["state"] == "finished" and "pictures" not in found
+        assert server.get("/runs/1")["pictures"] == [0, 1200]
+        status, data, headers = server.ask("/runs/1/training_generator_LRC_0.png")
+        assert (status, data, headers["Content-Type"]) == (200, b"png", "image/png")
+        for path in ("/runs/2", "/runs/1/..%2f..%2fsecret.png", "/runs/1/../../secret.png", "/runs/1/training_log.csv",
+                     "/runs/1/training_generator_LRC_x.png"):  # fmt: skip
+            assert server.ask(path)[0] == 404, path
+        assert server.ask("/runs/1/training_generator_LRC_5.png")[0] == 409
+        assert server.ask("/runs", Host="evil.example")[0] == 403
+
+
+def test_a_run_that_was_killed_before_it_told_of_its_end_tells_when_it_is_resumed(finished, tmp_path):
+    shutil.copytree(finished[1], tmp_path / "run")
+    files = RunFiles(str(tmp_path / "run" / "model.pt"))
+    told = json.loads(files.progress.read_bytes())
+    assert told["finished"] == 2
+    files.progress.write_text(json.dumps(told | {"finished": 1}), encoding="utf-8")
+    assert runs.overview(files)["state"] == "stopped"
+    done = run_here("--resume", "--output", files.last)
+    assert done.returncode == 0, done.stderr
+    assert runs.overview(files)["state"] == "finished" and json.loads(files.progress.read_bytes()) == told
