@@ -21,7 +21,7 @@ def create_app(library: Library) -> flask.Flask:
     depends on the log takes `?version=`, and is refused with 409 when it has changed since. An error is {"message"}.
     """
     app = flask.Flask(__name__)
-    site.prepare(app, "script-src 'self'", "img-src 'self' data:")
+    site.prepare(app, "img-src 'self' data:")
 
     @app.errorhandler(UserError)
     @app.errorhandler(OSError)
