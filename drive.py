@@ -84,6 +84,9 @@ class Session:
         self.steering = np.float32(0)  # of the last answer, -1..1
         self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
         self.driven = self.unusable = 0  # frames
+        self.reason = ""  # why the last unusable one was
+        self.heard = 0.0  # time of the last telemetry, in seconds since 1970
+        self.manual = self.ended = False  # whether a person drove then; whether the connection has ended
         self.history: deque[page.DrivenFrame] = deque(maxlen=page.HISTORY_FRAMES)
         self.started = time.perf_counter()
         self.warned: set[str] = set()  # kinds of warnings logged: see OncePerKind
@@ -91,7 +94,7 @@ class Session:
     def answer(self, message: object) -> dict[str, str]:
         """Return the answer to a telemetry message: steering and throttle, -1..1, as strings. Never raises."""
         arrived = self.arrival_time()
-        throttle = 0.0
+        self.heard, self.manual, throttle = time.time(), False, 0.0
         try:
             self.separator = decimal_separator(message, self.separator)
             telemetry = parse_telemetry(message)
@@ -99,9 +102,9 @@ class Session:
             throttle = self.controller.throttle(telemetry.speed)
         except Exception as error:  # whatever it is: without an answer the car would stand still
             self.unusable += 1
-            reason = str(error) if isinstance(error, UnusableTelemetry) else f"{type(error).__name__}: {error}"
+            self.reason = str(error) if isinstance(error, UnusableTelemetry) else f"{type(error).__name__}: {error}"
             log.warning(
-                f"a frame can't be used: {reason}; the answer repeats the last steering with throttle 0",
+                f"a frame can't be used: {self.reason}; the answer repeats the last steering with throttle 0",
                 extra={"warned": self.warned},
             )
         else:
@@ -111,7 +114,8 @@ class Session:
                 self.folder = self.folder or self.server.saver.start_session()
                 self.folder.save(telemetry.jpeg)
             latency = (time.perf_counter() - arrived) * 1000
-            self.history.append(page.DrivenFrame(time.time(), float(self.steering), telemetry.speed, throttle, latency))
+            shown = (time.time(), float(self.steering), telemetry.speed, throttle, latency, telemetry.cte)
+            self.history.append(page.DrivenFrame(*shown))
         return {
             "steering_angle": format_number(self.steering, self.separator),
             "throttle": format_number(throttle, self.separator),
@@ -135,12 +139,12 @@ class Session:
 class DriveServer:
     """Serves steering to up to MAX_CLIENTS simulators, and the page to browsers."""
 
-    def __init__(
-        self, network: Network, set_speed: float = SET_SPEED_MPH, saver: saved_frames.FrameSaver | None = None
-    ):
-        """set_speed: mph; saver: saves the frames, or None."""
-        self.network, self.set_speed, self.saver = network, set_speed, saver
+    def __init__(self, network: Network, set_speed: float = SET_SPEED_MPH, model: str = ""):
+        """set_speed: mph; model: the network's name on the page."""
+        self.network, self.set_speed, self.model = network, set_speed, model
+        self.saver: saved_frames.FrameSaver | None = None  # saves the frames
         self.sessions: dict[str, Session] = {}
+        self.last_ended: Session | None = None
         self.socket = wire.Server()
         self.socket.on("connect", self.connect)
         self.socket.on("telemetry", self.telemetry)
@@ -164,6 +168,7 @@ class DriveServer:
         """Answer each telemetry exactly once: with `steer`, or with `manual` if the human driver steers."""
         session = self.session(sid)
         if message is None:
+            session.heard, session.manual = time.time(), True
             self.socket.emit("manual", {}, room=sid)
         else:
             self.socket.emit("steer", session.answer(message), room=sid)
@@ -171,6 +176,8 @@ class DriveServer:
     def disconnect(self, sid: str, *_: object) -> None:
         """Forget a session and log its summary."""
         session = self.sessions.pop(sid, None)
+        if session and session.heard:
+            session.ended, session.environ, self.last_ended = True, {}, session
         if session and session.driven + session.unusable:
             if session.folder:
                 session.folder.when_written(lambda: log.info(session.summary()))
@@ -183,8 +190,18 @@ class DriveServer:
             self.disconnect(sid)
 
     def watched_session(self) -> Session | None:
-        """Return the session for the page and the status line: the newest one with driven frames, or None."""
-        return next((session for session in reversed(self.sessions.values()) if session.driven), None)
+        """Return the session for the page and the status line, or None before the first telemetry.
+
+        This is the newest connected one with driven frames, else one without, else the last one that has ended.
+        """
+        heard = [session for session in self.sessions.values() if session.heard]
+        return max(heard, key=lambda session: (session.driven > 0, session.started), default=self.last_ended)
+
+    def change_set_speed(self, set_speed: float) -> None:
+        """Drive all simulators at another set speed, in mph, from the next frame on."""
+        self.set_speed = set_speed
+        for session in self.sessions.values():
+            session.controller.set_speed = set_speed  # its sum stays: it is what holds the speed on this slope
 
 
 class StatusLine:
@@ -203,7 +220,7 @@ class StatusLine:
         if now < self.time + self.period:
             return
         session = self.server.watched_session()
-        if session:
+        if session and session.driven and not session.ended:
             start, end = ("\r", "\033[K") if self.terminal else ("", "\n")
             print(start + self.text(session, now), end=end, file=sys.stderr, flush=True)
             self.frames = session.driven
@@ -293,7 +310,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--speed",
-        type=number(float, 0.1, 1000),
+        type=page.speed_argument,
         default=SET_SPEED_MPH,
         help=f"set speed in mph; the car does at most {TOP_SPEED_MPH} (default %(default)g)",
     )
@@ -341,7 +358,8 @@ def main() -> int:
         network = load_model(model, args.device)
         if args.folder:
             saved_frames.check_folder(args.folder)
-        server = DriveServer(network, args.speed)
+        origin = "the model that comes with the project" if model == SHIPPED_MODEL else ""
+        server = DriveServer(network, args.speed, origin or str(model))
         listener = connections.claim_port(args.host, args.port)
         if args.folder:
             server.saver = saver = saved_frames.FrameSaver(args.folder)  # last, because it empties the folder
@@ -350,7 +368,7 @@ def main() -> int:
     port = listener.getsockname()[1]
     watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(args.host, args.host)
     print(
-        f"Driving with {model}{' (the model that comes with the project)' if model == SHIPPED_MODEL else ''}.\n"
+        f"Driving with {model}{origin and f' ({origin})'}.\n"
         f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
         f"Watch at http://{f'[{watched}]' if ':' in watched else watched}:{port}/ . Ctrl-C ends.",
         file=sys.stderr,

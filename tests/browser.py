@@ -10,6 +10,7 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+AXE = Path(__file__).with_name("axe.min.js")  # axe-core 4.14.1 by Deque Systems, MPL-2.0: see axe.LICENSE
 CHROMIUM = shutil.which("chromium")
 OPTIONS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
@@ -123,6 +124,17 @@ class Page:
             elif event.get("method") == "Log.entryAdded" and parameters["entry"]["level"] == "error":
                 found.append(f"{parameters['entry']['text']} {parameters['entry'].get('url', '')}")
         return found
+
+    def barriers(self) -> list[str]:
+        """What axe-core finds on the page that is a serious or critical barrier to people."""
+        self.run(AXE.read_text(encoding="utf-8") + ";0")
+        found = self.run("axe.run({resultTypes: ['violations']}).then(({violations}) => violations)")
+        return [
+            f"{each['id']}: {node['html']}: {node['failureSummary']}"
+            for each in found
+            if each["impact"] in ("serious", "critical")
+            for node in each["nodes"]
+        ]
 
     def addresses(self) -> list[str]:
         """What the page has asked for."""

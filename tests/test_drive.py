@@ -334,8 +334,8 @@ def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
 # What the network looks at
 
 
-def test_attention_is_where_the_network_can_see_anything():
-    """A network whose every layer passes on where the image is bright looks at the bright spot, and nowhere else."""
+def looking_at_what_is_bright() -> Network:
+    """A network whose every layer passes on where the image is bright."""
     network = Network().eval()
     with torch.no_grad():
         for parameter in network.parameters():
@@ -343,6 +343,20 @@ def test_attention_is_where_the_network_can_see_anything():
         for layer in network.convolutions:
             layer.weight.fill_(1 / layer.weight[0].numel())
         network.convolutions[0].bias.fill_(0.9)  # black is -1: it falls below 0 and out of the positive part
+    return network
+
+
+def test_attention_to_an_even_image_has_no_grid():
+    _, mask = attention.visual_backprop(looking_at_what_is_bright(), np.full((160, 320, 3), 255, np.uint8))
+    middle = mask[60:135, 120:200]
+    assert np.ptp(middle, axis=1).max() < 1e-4, "far from its sides, one column is like the other"
+    rising = np.sign(np.diff(middle[:, 0][middle[:, 0] > 1e-4]))
+    assert np.count_nonzero(np.diff(rising)) == 1, "from top to bottom it rises to one maximum, and falls"
+
+
+def test_attention_is_where_the_network_can_see_anything():
+    """A network that looks at what is bright looks at the bright spot, and nowhere else."""
+    network = looking_at_what_is_bright()
     frame = np.zeros((160, 320, 3), np.uint8)
     frame[90:106, 200:216] = 255
     steering, mask = attention.visual_backprop(network, frame)

@@ -287,7 +287,7 @@ def test_it_listens_on_loopback_alone(server):
 
 def test_the_page_and_its_events(server, jpegs):
     page = urllib.request.urlopen(f"http://127.0.0.1:{server.port}/", timeout=10).read().decode()
-    assert "http" not in re.sub(r"<script>.*?</script>", "", page, flags=re.S), "no outside host"
+    assert "http" not in page, "no outside host"
     with Simulator(server.port) as simulator:
         simulator.open()
         simulator.drive(telemetry(jpegs[0], speed="8.5000"))
@@ -295,7 +295,7 @@ def test_the_page_and_its_events(server, jpegs):
             with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/live{query}", timeout=10) as events:
                 event = next(line for line in events if line.startswith(b"data: "))
             live = json.loads(event[6:])
-            time_stamp, _, speed, throttle, latency = live["rows"][-1]
+            time_stamp, _, speed, throttle, latency, _ = live["rows"][-1]
             assert abs(time_stamp - time.time()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
             assert live["image"].startswith("data:image/jpeg;base64,/9j/")
 
@@ -312,7 +312,7 @@ def test_the_page_in_a_real_browser(server, jpegs, tmp_path):
     with Simulator(server.port) as simulator, chromium(tmp_path / "profile") as page:
         simulator.open()
         simulator.drive(telemetry(jpegs[0], speed="8.5000"))
-        page.look(1000, 800)
+        page.look(800, 800)  # where the image is as wide as its pixels
         page.open(f"http://127.0.0.1:{server.port}/")
         page.wait(f"location.port == '{server.port}' && document.readyState == 'complete'")
         page.until(shows_the_sky)

@@ -28,7 +28,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     An error is {"message"}.
     """
     app = flask.Flask(__name__)
-    site.prepare(app, "script-src 'self'", "img-src 'self' data:")
+    site.prepare(app, "img-src 'self' data:")
 
     @app.errorhandler(UserError)
     @app.errorhandler(OSError)

@@ -1,5 +1,7 @@
 """Visualise what the network looks at, by VisualBackProp (arXiv 1611.05418), and its steering, for page and films."""
 
+import math
+
 import cv2
 import numpy as np
 import torch
@@ -17,8 +19,10 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
     """Return steering, -1..1, and attention mask, float32 (160, 320), 0..1, for a frame, uint8 (160, 320, 3), RGB.
 
     VisualBackProp: the feature maps of each layer are averaged; from the last layer to the first, the average is
-    scaled up to the layer below (a transposed convolution with ones) and multiplied with that layer's average.
-    Raises ArithmeticError if the network's output is not finite.
+    scaled up to the layer below and multiplied with that layer's average. The paper scales up by a transposed
+    convolution with ones, of which more overlap at some pixels than at their neighbours: that shows as a grid. Here
+    the kernels are binomial coefficients, whose sum is the same everywhere at a stride of 1 or 2. Raises
+    ArithmeticError if the network's output is not finite.
     """
     maps: list[torch.Tensor] = []
 
@@ -40,15 +44,19 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
         mask = torch.ones_like(maps[-1])
         for layer, average, size in reversed(list(zip(layers, maps, sizes, strict=True))):
             mask = mask * average
-            kernel, stride = layer.kernel_size, layer.stride
-            ones = torch.ones(1, 1, *kernel, device=mask.device)
-            covered = [(n - 1) * s + k for n, s, k in zip(mask.shape[2:], stride, kernel, strict=True)]
+            covered = [(n - 1) * s + k for n, s, k in zip(mask.shape[2:], layer.stride, layer.kernel_size, strict=True)]
             padding = [whole - part for whole, part in zip(size, covered, strict=True)]
-            mask = nn.functional.conv_transpose2d(mask, ones, stride=stride, output_padding=padding)
+            kernel = torch.outer(*map(_binomial, layer.kernel_size))[None, None].to(mask.device)
+            mask = nn.functional.conv_transpose2d(mask, kernel, stride=layer.stride, output_padding=padding)
             mask = mask / mask.max().clamp(min=1e-12)
     whole_frame = np.zeros(FRAME[:2], np.float32)
     whole_frame[top : FRAME[0] - bottom] = mask[0, 0].cpu().numpy()
     return steering, whole_frame
+
+
+def _binomial(size: int) -> torch.Tensor:
+    """Return so many binomial coefficients: 1 4 6 4 1."""
+    return torch.tensor([float(math.comb(size - 1, at)) for at in range(size)])
 
 
 def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> np.ndarray:

@@ -1,5 +1,6 @@
-"""The web page that shows the car driving, made with Flask."""
+"""The web page that shows the car driving and changes its set speed, made with Flask."""
 
+import argparse
 import base64
 import itertools
 import json
@@ -7,14 +8,17 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import flask
 import numpy as np
 
+from cloning.arguments import number
 from cloning.pilot import attention, site
 from cloning.pilot.network import Network
 from cloning.recordings.images import encode
+from cloning.recordings.saved_frames import FrameSaver, SessionFolder
+from cloning.road.motion import TOP_SPEED_MPH
 from cloning.wire.libraries import eventlet
 from cloning.wire.turns import STRANGERS, TURNS
 
@@ -22,9 +26,14 @@ SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
 SHOWN_FRAMES = 1200  # at most, in one event: as many as a graph has pixels; a new page gets the whole minute
 UPDATE_INTERVAL = 0.1  # s between two pictures
-QUIET_INTERVALS = 10  # without driving, after which a page gets a sign that the server is there
+QUIET_INTERVALS = 10  # without driving, after which a page gets an event nevertheless
+RATE_SECONDS = 2  # over which frames/s are counted
+SILENCE = 2.0  # s without a telemetry, or without a usable one, after which the page says so
 MAX_PAGES = 64  # open at once
+MAX_BODY = 200  # bytes of a request; more could be JSON that is nested too deeply to read
 JPEG_QUALITY = 80  # of the pictures
+LEAST_SPEED, LARGEST_SPEED = 0.1, 1000  # mph: the range of the set speed
+speed_argument = number(float, LEAST_SPEED, LARGEST_SPEED)
 
 
 class DrivenFrame(NamedTuple):
@@ -35,34 +44,59 @@ class DrivenFrame(NamedTuple):
     speed: float  # mph
     throttle: float  # -1..1
     latency: float  # ms in drive.py, from reading the telemetry's first fragment to its finished answer
+    cte: float | None = None  # m from the lane's centre, if the simulator tells; the sign is the simulator's own
 
 
 class Session(Protocol):
-    """What the page shows of a connected simulator."""
+    """What the page shows of a simulator that is, or was, connected."""
 
+    started: float  # tells sessions apart
+    heard: float  # time of the last telemetry, in seconds since 1970
+    manual: bool  # whether a person drove then
+    ended: bool  # whether the connection has ended
     history: deque[DrivenFrame]
     frame: np.ndarray | None  # the last driven one: uint8 (160, 320, 3), RGB; None before the first
+    driven: int  # frames
+    unusable: int  # frames
+    reason: str  # why the last unusable one was; "" if there was none
+    folder: SessionFolder | None  # of its saved frames
 
 
 class Server(Protocol):
     """What the page needs of the server that drives."""
 
     network: Network
+    model: str  # the network's name, for people
     set_speed: float  # mph
+    saver: FrameSaver | None
 
     def watched_session(self) -> Session | None:
         """Return the session to show, or None."""
 
+    def change_set_speed(self, set_speed: float) -> None:
+        """Drive at another set speed, in mph, from now on."""
+
 
 def create_app(server: Server) -> flask.Flask:
-    """Return the web application: `/` is the page, `/live` its figures and pictures as server-sent events."""
-    app = flask.Flask(__name__)
-    site.prepare(app, "script-src 'self' 'unsafe-inline'", "img-src data:")
+    """Return the web application.
+
+    `/` is the page, `/live` its figures and pictures as server-sent events. POST to `/set-speed` changes the set speed:
+    {"set_speed": text, mph}; the answer is {"set_speed": number}, or {"message"} with 400.
+    """
+    app = flask.Flask(__name__, static_folder=None)
+    app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
+    site.prepare(app, "img-src data:")
     pages = {False: Pages(server, with_attention=False), True: Pages(server, with_attention=True)}
 
     @app.get("/")
     def index() -> str:
-        return flask.render_template("index.html", set_speed=server.set_speed, seconds=SHOWN_SECONDS)
+        return flask.render_template(
+            "drive.html",
+            model=server.model,
+            seconds=SHOWN_SECONDS,
+            top_speed=TOP_SPEED_MPH,
+            speeds=(LEAST_SPEED, LARGEST_SPEED),
+        )
 
     @app.get("/live")
     def live() -> flask.Response:
@@ -73,6 +107,18 @@ def create_app(server: Server) -> flask.Flask:
             mimetype="text/event-stream",
             headers={"Cache-Control": "no-store"},
         )
+
+    @app.post("/set-speed")
+    def change_set_speed() -> tuple[dict[str, Any], int]:
+        # JSON, which a browser does not send to another site without asking, whatever else keeps other sites out.
+        body = flask.request.get_json()
+        if not isinstance(body, dict) or set(body) != {"set_speed"} or type(body["set_speed"]) is not str:
+            flask.abort(400, "A set speed is a JSON object with the text set_speed.")
+        try:
+            server.change_set_speed(speed_argument(body["set_speed"]))
+        except argparse.ArgumentTypeError as error:
+            return {"message": f"{error} (mph)"}, 400
+        return {"set_speed": server.set_speed}, 200
 
     return app
 
@@ -90,30 +136,30 @@ class Pages:
         self.open = 0  # number of pages
         self.interval = -1
         self.session: Session | None = None  # shown in this interval
+        self.now = 0.0  # the time at which the graphs end, in seconds since 1970
+        self.state = ""
         self.until = 0.0  # time of its last frame shown, in seconds since 1970
         self.picture = ""  # data URL, or "" if it is not drawn yet
         self.texts: dict[float, str] = {}  # of this interval's events, by the time of the first frame shown
 
     def events(self) -> Iterator[str]:
-        """Yield the figures and the picture as server-sent events, whenever frames have been driven.
+        """Yield server-sent events: when frames have been driven, when the state changes, and else once a second.
 
-        Their JSON is {"session", "rows": [[time, steering, speed, throttle, latency], …], "image"}.
+        Writing one fails once the page is closed, which ends this loop. Their JSON is that of `figures`, and with new
+        frames also {"rows": [[time, steering, speed, throttle, latency, cte], …], "image": data URL}.
         """
         self.open += 1
         try:
-            shown, last, quiet = None, 0.0, QUIET_INTERVALS - 1  # so that a page hears at once
+            shown, state, last, quiet = None, "", 0.0, 0
             while True:
                 TURNS.take(STRANGERS)
                 self._begin_interval()
                 last = last if self.session is shown else 0.0
-                if self.session and self.until > last:
-                    event = self._event(self.session, last)
-                    shown, last, quiet = self.session, self.until, 0
+                quiet += 1
+                if self.until > last or self.state != state or quiet >= QUIET_INTERVALS:
+                    event = self._event(last)
+                    shown, state, last, quiet = self.session, self.state, self.until, 0
                     yield event
-                else:
-                    quiet += 1
-                    if quiet % QUIET_INTERVALS == 0:
-                        yield ":\n\n"  # a comment: writing it fails once the page is closed, which ends this loop
                 eventlet.sleep(UPDATE_INTERVAL)
         finally:
             self.open -= 1
@@ -123,24 +169,54 @@ class Pages:
         interval = int(time.monotonic() / UPDATE_INTERVAL)
         if interval > self.interval:
             self.interval, self.session = interval, self.server.watched_session()
-            self.until = self.session.history[-1].time if self.session else 0.0
+            self.now = self.session.heard if self.session and self.session.ended else time.time()
+            self.state = state_of(self.session, self.now)
+            self.until = self.session.history[-1].time if self.session and self.session.history else 0.0
             self.picture, self.texts = "", {}
 
-    def _event(self, session: Session, last: float) -> str:
+    def _event(self, last: float) -> str:
         """Return an event with the frames later than `last`, in seconds since 1970."""
-        if not self.picture:
-            self.picture = image(self.server, session, self.with_attention)
         if last not in self.texts:
-            rows = [frame for frame in frames_since(session.history, last) if frame.time <= self.until]
-            thinned = rows[:: -math.ceil(len(rows) / SHOWN_FRAMES)][::-1]  # with the last one
-            event = {"session": id(session), "rows": thinned, "image": self.picture}
+            event = {"state": self.state, **figures(self.server, self.session, self.now)}
+            if self.session and self.until > last:
+                self.picture = self.picture or image(self.server, self.session, self.with_attention)
+                rows = frames_since(self.session.history, max(last, self.now - SHOWN_SECONDS))
+                rows = [frame for frame in rows if frame.time <= self.until]
+                event |= {"rows": rows[:: -math.ceil(len(rows) / SHOWN_FRAMES)][::-1] if rows else []}  # with the last
+                event |= {"image": self.picture}
             self.texts[last] = f"data: {json.dumps(event)}\n\n"
         return self.texts[last]
 
 
-def frames_since(history: deque[DrivenFrame], last: float) -> list[DrivenFrame]:
-    """Return the frames of the last SHOWN_SECONDS that are later than `last`, in seconds since 1970."""
-    first = max(last, time.time() - SHOWN_SECONDS)
+def state_of(session: Session | None, now: float) -> str:
+    """Return what a session does, by a name for which drive.js has the words; now: seconds since 1970."""
+    if session is None:
+        return "waiting"
+    if session.ended:
+        return "gone"
+    if session.heard < now - SILENCE:
+        return "silent"
+    if session.manual:
+        return "manual"
+    if not session.history or session.history[-1].time < now - SILENCE:
+        return "unusable"
+    return "driving"
+
+
+def figures(server: Server, session: Session | None, now: float) -> dict[str, Any]:
+    """Return what the page tells besides the state and the graphs, for JSON; now: seconds since 1970."""
+    folder = session.folder if session else None
+    shown = {"set_speed": server.set_speed, "saving": folder.progress() if folder else "", "saver": bool(server.saver)}
+    if session:
+        recent = frames_since(session.history, now - RATE_SECONDS)
+        rate = (len(recent) - 1) / max(now - recent[0].time, 1e-3) if recent else 0.0
+        shown |= {"session": session.started, "now": now, "rate": rate, "frames": session.driven}
+        shown |= {"unusable": session.unusable, "reason": session.reason}
+    return shown
+
+
+def frames_since(history: deque[DrivenFrame], first: float) -> list[DrivenFrame]:
+    """Return the frames that are later than `first`, in seconds since 1970."""
     return list(itertools.takewhile(lambda frame: frame.time > first, reversed(history)))[::-1]
 
 

@@ -1,19 +1,21 @@
-"""What every page has in common: its style, and what a browser may do with it."""
-
-from pathlib import Path
+"""What every page has in common: its style, the library that draws its curves, and what a browser may do with it."""
 
 import flask
 
-STYLE = Path(__file__).with_name("style.css").read_text(encoding="utf-8")
-
 
 def prepare(app: flask.Flask, *sources: str) -> None:
-    """Give an application's templates the common `style`, and its answers the headers that keep other sites out.
+    """Serve `cloning/pilot/static/` at /site/, and give all answers the headers that keep other sites out.
 
-    sources: of the Content-Security-Policy, besides scripts and answers of the same address, and styles in the page.
+    sources: of the Content-Security-Policy, besides scripts, styles and answers of the same address.
     """
-    app.jinja_env.globals["style"] = STYLE
-    policy = ["default-src 'none'", "style-src 'self' 'unsafe-inline'", "connect-src 'self'", "frame-ancestors 'none'"]
+    app.register_blueprint(flask.Blueprint("site", __name__, static_folder="static", static_url_path="/site"))
+    policy = [
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self' 'unsafe-inline'",
+        "connect-src 'self'",
+        "frame-ancestors 'none'",
+    ]
 
     @app.after_request
     def restrict(response: flask.Response) -> flask.Response:

@@ -34,20 +34,22 @@ class UnusableTelemetry(ValueError):
 
 @dataclass(frozen=True)
 class Telemetry:
-    """The part of a telemetry message that driving needs.
+    """The part of a telemetry message that driving and its page need.
 
     jpeg   the image as received
     image  the image decoded: uint8 (160, 320, 3), RGB
     speed  mph
+    cte    m from the lane's centre, which some simulators tell, in their own sign; None without a usable number
     """
 
     jpeg: bytes
     image: np.ndarray
     speed: float
+    cte: float | None
 
 
 def parse_telemetry(message: object) -> Telemetry:
-    """Read the image and the speed out of a telemetry message.
+    """Read the image, the speed and the distance from the centre out of a telemetry message.
 
     message: the decoded JSON, or UNREADABLE. Other fields are ignored. Raises UnusableTelemetry.
     """
@@ -63,11 +65,15 @@ def parse_telemetry(message: object) -> Telemetry:
     except ValueError as error:
         raise UnusableTelemetry("speed is not a number") from error
     try:
+        cte, _ = parse_number(message.get("cte"))
+    except ValueError:
+        cte = None
+    try:
         jpeg = base64.b64decode(message["image"], validate=True)
     except (TypeError, ValueError) as error:
         raise UnusableTelemetry("the image is not base64") from error
     try:
-        return Telemetry(jpeg, decode(jpeg), speed)
+        return Telemetry(jpeg, decode(jpeg), speed, cte)
     except ValueError as error:
         raise UnusableTelemetry(f"the image is unusable: {error}") from error
 

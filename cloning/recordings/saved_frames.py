@@ -127,11 +127,14 @@ class SessionFolder:
         """Have the thread call `report` when all frames that were queued are written or lost."""
         self._queue.put(report)
 
+    def progress(self) -> str:
+        """Return how many frames are saved and lost so far, and where."""
+        lost = f", {self.lost} LOST ({self.error})" if self.lost else ""
+        return f"{self.saved} frames saved in {self.path}{lost}"
+
     def summary(self) -> str:
         """Return where the frames are, and how many are lost so far."""
-        if self.lost:
-            return f"{self.saved} frames saved in {self.path}, {self.lost} LOST ({self.error})"
-        return f"driven frames saved in {self.path}"
+        return self.progress() if self.lost else f"driven frames saved in {self.path}"
 
     def _write(self, path: Path, jpeg: bytes) -> None:
         try:

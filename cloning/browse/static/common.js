@@ -1,5 +1,6 @@
 // What all parts of the page use.
-export const element = id => document.getElementById(id);
+import {element, make} from "/site/site.js";
+export {element, make};
 
 // A request's JSON, or bytes if `binary`. What is thrown has the server's message.
 export const ask = (path, options) => request(`/recordings${path}`, options);
@@ -21,15 +22,6 @@ export async function request(path, {binary = false, ...options} = {}) {
 export function notice(message) {
   element("notice").textContent = message ?? "";
   element("notice").hidden = !message;
-}
-
-// An element with a text and children.
-export function make(name, text = "", attributes = {}, ...children) {
-  const made = document.createElement(name);
-  made.textContent = text;
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
 }
 
 export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;

@@ -1,5 +1,6 @@
 // The curves of a recording, one above the other, over its rows; drawn by uPlot.
 import {element, make} from "./common.js";
+import {rounded} from "/site/site.js";
 
 export const MODEL_COLOURS = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]; // told apart by the colour-blind too
 const LEFT = 56, RIGHT = 12; // px; browse.css has them for the bar
@@ -190,7 +191,6 @@ export class Plots {
   }
 }
 
-const rounded = (number, digits) => number.toFixed(digits).replace(/^-(0[.0]*)$/, "$1"); // no -0.00
 const least = values => values.reduce((low, value) => Math.min(low, value), Infinity);
 const largest = values => values.reduce((high, value) => Math.max(high, Math.abs(value) || 0), 0);
 // uPlot leaves gaps at nulls, which typed arrays do not have.
