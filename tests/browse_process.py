@@ -94,5 +94,5 @@ def written_run(folder, finished: int, images: int, epochs: int = 4, losses=(0.5
     files.progress.write_text(json.dumps(told), encoding="utf-8")
     for number in (0, 1200, 6400):
         for kind in ("LRC_", "augmented-"):
-            (files.pictures / f"training_generator_{kind}{number}.png").write_bytes(b"png")
+            (files.pictures / f"training_generator_{kind}{number}.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     return files

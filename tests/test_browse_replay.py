@@ -223,11 +223,13 @@ def test_runs_over_the_socket(tmp_path):
         assert found["id"] == 1 and found["state"] == "finished" and "pictures" not in found
         assert server.get("/runs/1")["pictures"] == [0, 1200]
         status, data, headers = server.ask("/runs/1/training_generator_LRC_0.png")
-        assert (status, data, headers["Content-Type"]) == (200, b"png", "image/png")
+        assert (status, data, headers["Content-Type"]) == (200, b"\x89PNG\r\n\x1a\n", "image/png")
         for path in ("/runs/2", "/runs/1/..%2f..%2fsecret.png", "/runs/1/../../secret.png", "/runs/1/training_log.csv",
-                     "/runs/1/training_generator_LRC_x.png"):  # fmt: skip
+                     "/runs/1/training_generator_LRC_x.png", "/runs/1/training_generator_LRC_6.png"):  # fmt: skip
             assert server.ask(path)[0] == 404, path
-        assert server.ask("/runs/1/training_generator_LRC_5.png")[0] == 409
+        (tmp_path / "a" / "diagnostic_images" / "training_generator_LRC_5.png").symlink_to("/etc/passwd")
+        status, data, _ = server.ask("/runs/1/training_generator_LRC_5.png")
+        assert status == 409 and "not a PNG" in json.loads(data)["message"]
         assert server.ask("/runs", Host="evil.example")[0] == 403
 
 

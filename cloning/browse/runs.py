@@ -13,6 +13,7 @@ from cloning.errors import UserError, message_of
 from cloning.training.run_files import RunFiles
 
 PICTURE = re.compile(r"training_generator_(LRC_|augmented-)([0-9]{1,12})\.png")
+SIGNATURE = b"\x89PNG\r\n\x1a\n"  # begins every PNG
 ALIVE = 120.0  # s since a run's last state, saved every 30 s, in which it counts as running where there are no locks
 METRICS = {"epoch": int, "images": int, "seconds": float, "loss": float, "val_loss": float}  # of training_log.csv
 PROGRESS = {"finished": int, "batches": int, "images": int, "seconds": (int, float), "loss": (int, float, type(None))}
@@ -48,11 +49,15 @@ class Runs:
         return {"id": number, "folder": str(files.last.parent.resolve()), **overview(files)}
 
     def picture(self, number: int, name: str) -> bytes:
-        """Return a diagnostic picture, a PNG. Raises UnknownError, OSError."""
+        """Return a diagnostic picture, a PNG. Raises UnknownError, RunError, OSError."""
         files = self._files(number)
-        if not PICTURE.fullmatch(name):
+        path = files.pictures / name
+        if not (PICTURE.fullmatch(name) and path.is_file()):
             raise UnknownError(f"no picture {name[:60]}")
-        return (files.pictures / name).read_bytes()
+        png = path.read_bytes()
+        if not png.startswith(SIGNATURE):  # a link to something else
+            raise RunError(f"{path}: not a PNG")
+        return png
 
     def _files(self, number: int) -> RunFiles:
         if number >= len(self.files):
