@@ -123,7 +123,7 @@ function showCuts() {
     row.append(go, ` ${many(cut.frames, "frame")}: ${cut.reason || "no reason given"} `, remove);
     return row;
   }));
-  if (!details.cuts.length) element("cuts").replaceChildren(make("p", "None. Mark a stretch with I and O, then press X.", {class: "quiet"}));
+  if (!details.cuts.length) element("cuts").replaceChildren(make("li", "None. Mark a stretch with I and O, then press X.", {class: "quiet"}));
 }
 
 function showFindings() {
