@@ -21,7 +21,7 @@ export function showCuts() {
     remove.onclick = () => change("DELETE", cut, "deleted the cut");
     row.append(go, ` ${many(cut.frames, "frame")}: ${cut.reason || "no reason given"} `, remove);
     return row;
-  }) : [make("p", "None. Mark a stretch with I and O, then press X.", {class: "quiet"})]);
+  }) : [make("li", "None. Mark a stretch with I and O, then press X.", {class: "quiet"})]);
 }
 
 export async function mark(name) {
