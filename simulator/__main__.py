@@ -292,12 +292,14 @@ def run_window(args: argparse.Namespace) -> int:
     """Open the window in which a person drives or watches."""
     from datetime import datetime
 
+    from simulator.controls import HELP
     from simulator.window import Window
 
     kind = PROBLEM_AREAS[-1] if args.autonomous else ""
     folder = args.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}{kind}"
     server = (args.host, args.port) if args.autonomous else None
     opened = Window(Track(args.track, args.direction), folder, args.look, server)
+    print(HELP, flush=True)
     try:
         opened.run()
     finally:

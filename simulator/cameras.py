@@ -31,7 +31,8 @@ SUPERSAMPLING = 2  # rows rendered for each row of a frame; with 1, the road far
 # frames before it.
 load_prc_file_data(
     "",
-    "window-type none\naudio-library-name null\nsync-video false\nnotify-level-display error\n"
+    "window-type none\naudio-library-name null\nsync-video false\nprint-pipe-types false\n"
+    "notify-level-display error\nnotify-level-device fatal\n"
     "load-display p3tinydisplay\nuniquify-transforms false\ntransform-cache false\n",
 )
 

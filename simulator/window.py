@@ -93,6 +93,7 @@ class Window(ShowBase):
         self.controls, self.gamepad = Controls(), Gamepad()
         self.remote: RemoteDriver | None = None
         self.by_hand = not server  # whether the person drove before the last frame
+        self.started = bool(server)  # until somebody drives, the car stands still, also on a slope
         if server:
             host, port = server
             self.remote = RemoteDriver(host, port, Cameras(self.scene, ("center",)))
@@ -107,7 +108,7 @@ class Window(ShowBase):
             pos=(-1.7, 0.9),
             scale=0.06,
             fg=(1, 1, 1, 1),
-            shadow=(0, 0, 0, 1),
+            bg=(0, 0, 0, 0.5),
             align=TextNode.A_left,
             mayChange=True,
         )
@@ -147,6 +148,10 @@ class Window(ShowBase):
         now = time.monotonic()
         held, mouse, pad = self.held(), self.mouse(), self.gamepad.read()
         by_hand = not self.remote or self.controls.pedals(held) != 0
+        if not self.started:
+            self.simulated_until = now
+            self.controls.step(held, mouse, pad)
+            self.started = self.controls.throttle != 0
         if self.remote:
             self.remote.poll(by_hand, self.simulation)
         if by_hand and not self.by_hand:
@@ -221,11 +226,13 @@ class Window(ShowBase):
             self.camera.reparent_to(self.scene.car)
             self.camera.set_pos_hpr(*CAMERA_POSITIONS["center"], -CAMERA_YAW, -MOUNT_PITCH, 0)
         lines = [
-            f"{run.speed_mph:4.1f} mph   set speed {self.controls.set_speed}   steering {run.steering:+.2f}",
+            f"{run.speed_mph:4.1f} mph   steering {run.steering:+.2f}",
             f"lap {run.laps + 1}   {run.time:.0f} s   departures {len(run.departures)}",
         ]
-        if self.controls.cruise:
-            lines[0] += "   cruise"
+        if by_hand:  # drive.py has a set speed of its own
+            lines[0] += f"   at most {self.controls.set_speed} mph" + "   cruise" * self.controls.cruise
+        if not self.started:
+            lines.append("W or the up arrow: drive")
         if self.remote:
             lines.append(f"drive.py: {self.remote.state}" + ("   you drive" if by_hand else ""))
         if self.recording:

@@ -37,6 +37,7 @@ from simulator.scenery.shapes import Mesh, merge
 GRAVITY = 9.81  # m/s²
 GROUND_HALF_WIDTH = 8.0  # m of ground on each side of a road with climbs; the car is set back before it gets so far
 CELL = 120.0  # m: meshes are divided into square cells, so that the engine can skip those that are out of view
+UNDER_CAR = 0.5  # share of the light that the ground under the car lacks in a scene without shadows
 INSIDE, OUTSIDE = BitMask32.bit(0), BitMask32.bit(1)  # cameras in the car, which see its bonnet; others, its body
 HAZE_STEP, SHEEN_STEP = 25.0, 2.0  # m of camera movement after which haze and sheen are computed again
 SHADE = InternalName.get_texcoord_name("shade")  # texture coordinates in the pictures of the shadows on the road
@@ -212,13 +213,13 @@ class Scene:
         self.car.set_bin("fixed", len(self.groups))
         MeshGroup(scenery.bonnet, self.car).root.hide(OUTSIDE)
         MeshGroup(scenery.body, self.car).root.hide(INSIDE)
-        self.car_shadow = self.root.attach_new_node("car's shadow")
-        if shade:
-            MeshGroup(car_shadow(float(1 - shade.factor.mean())), self.car_shadow).root.set_transparency(
-                TransparencyAttrib.M_alpha
-            )
-            self.car_shadow.set_bin("fixed", len(self.groups))
-            self.car_shadow.set_depth_write(False)
+        self.car_shadow = (self.root if shade else self.car).attach_new_node("car's shadow")
+        darkness = float(1 - shade.factor.mean()) if shade else UNDER_CAR
+        MeshGroup(car_shadow(darkness), self.car_shadow).root.set_transparency(TransparencyAttrib.M_alpha)
+        self.car_shadow.set_bin("fixed", len(self.groups))
+        self.car_shadow.set_depth_write(False)
+        if not shade:  # the real simulator's lower qualities have none, but a car seen from outside seems to float
+            self.car_shadow.hide(INSIDE)
         # Step -> the grid point for which colours were computed last.
         self.viewpoints: dict[float, tuple[int, int]] = {}
 

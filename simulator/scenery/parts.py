@@ -1,4 +1,4 @@
-"""The parts that both sceneries share: sky, haze, and the car's own bonnet and body."""
+"""The parts that all sceneries share: sky, haze, and the car's own bonnet."""
 
 from dataclasses import dataclass
 
@@ -6,9 +6,10 @@ import numpy as np
 
 from cloning.road.camera import height_at_rows
 from simulator.scenery import textures
+from simulator.scenery.body import body
 from simulator.scenery.looks import Look
 from simulator.scenery.shade import Shade
-from simulator.scenery.shapes import Colour, Light, Mesh, box, grid, illuminate, merge
+from simulator.scenery.shapes import Colour, Light, Mesh, grid, illuminate
 
 
 @dataclass(frozen=True)
@@ -89,16 +90,3 @@ def bonnet(colour: Colour, light: Light) -> Mesh:
         textures.plain(),
     )
     return illuminate(mesh, light, face_up=True)
-
-
-def body(colour: Colour, light: Light) -> Mesh:
-    """Return the car as seen from outside, in the coordinates of the bonnet."""
-    plain, dark = textures.plain(), (0.08, 0.08, 0.09)
-    boxes = [
-        box((0, -0.15, 0.35), (1.75, 4.3, 0.45), 0.0, colour, plain),
-        box((0, -0.45, 0.80), (1.45, 2.1, 0.50), 0.0, dark, plain),
-        box((0, -0.45, 1.26), (1.30, 1.8, 0.06), 0.0, colour, plain),
-        box((0, -2.35, 0.65), (1.5, 0.08, 0.12), 0.0, (0.75, 0.10, 0.08), plain),
-    ]
-    boxes += [box((x, y, 0.0), (0.25, 0.68, 0.68), 0.0, dark, plain) for x in (-0.88, 0.88) for y in (1.27, -1.60)]
-    return illuminate(merge(boxes), light)

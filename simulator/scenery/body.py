@@ -1,0 +1,110 @@
+"""The car as seen from outside, for films and the window; the cameras in the car see only its bonnet."""
+
+import numpy as np
+
+from simulator.scenery import textures
+from simulator.scenery.shapes import Colour, Light, Mesh, box, grid, illuminate, merge
+
+GLASS, TYRE, RIM, RED, WHITE = (0.07, 0.08, 0.10), (0.05, 0.05, 0.05), (0.45, 0.46, 0.48), (0.7, 0.06, 0.05), (0.9,) * 3
+# m, from the rear to the front: y, half the width, height of the upper edge.
+SHELL = [
+    (-2.30, 0.70, 0.66),
+    (-2.22, 0.82, 0.82),
+    (-1.80, 0.88, 0.88),
+    (-0.60, 0.90, 0.86),
+    (0.70, 0.90, 0.82),
+    (1.40, 0.87, 0.74),
+    (1.90, 0.80, 0.62),
+    (2.05, 0.68, 0.48),
+]
+# y, half the width at the foot and at the roof, height of the roof.
+CABIN = [
+    (-1.95, 0.66, 0.62, 0.88),
+    (-1.15, 0.76, 0.58, 1.24),
+    (-0.45, 0.78, 0.58, 1.31),
+    (0.05, 0.78, 0.58, 1.27),
+    (0.95, 0.70, 0.64, 0.80),
+]
+WHEELS = [(x, y) for x in (-0.80, 0.80) for y in (1.27, -1.40)]  # m: the middles of their axles
+RADIUS, TREAD, SPOKES = 0.34, 0.24, 24
+
+
+def body(colour: Colour, light: Light) -> Mesh:
+    """Return the car's body, in the coordinates of the bonnet: x right, y forward, z up, in metres."""
+    parts = [shell(colour), cabin(colour), *(wheel(x, y) for x, y in WHEELS)]
+    lamps = [(-2.27, RED, 0.62), (2.00, WHITE, 0.44)]  # behind and in front: y, colour, height
+    for y, lamp, height in lamps:
+        parts += [box((x, y, height), (0.30, 0.12, 0.10), 0.0, lamp, textures.plain()) for x in (-0.55, 0.55)]
+    parts.append(box((0, -2.28, 0.40), (0.50, 0.10, 0.12), 0.0, WHITE, textures.plain()))  # number plate
+    return illuminate(merge(parts), light)
+
+
+def loft(sections: np.ndarray, colours: np.ndarray) -> Mesh:
+    """Return a surface through cross-sections, closed at both ends.
+
+    sections: (n, k, 3), from the rear to the front, each clockwise as seen from behind; colours: (n, k, 3).
+    """
+    ends = [np.broadcast_to(end.mean(axis=0), end.shape) for end in (sections[0], sections[-1])]
+    points = np.concatenate([ends[:1], sections, ends[1:]])
+    shades = np.concatenate([colours[:1], colours, colours[-1:]])
+    rows, columns = points.shape[:2]
+    uv = np.zeros((rows * columns, 2))
+    return Mesh(points.reshape(-1, 3), shades.reshape(-1, 3), uv, grid(rows, columns), textures.plain())
+
+
+def shell(colour: Colour) -> Mesh:
+    """Return the body below the windows."""
+    sections = []
+    for y, width, top in SHELL:
+        left = [(width * 0.96, 0.20), (width, 0.42), (width * 0.98, top - 0.08), (width * 0.86, top)]
+        right = [(x, z) for x, z in reversed(left)]
+        across = [(0.0, 0.20), *((-x, z) for x, z in left), (0.0, top + 0.03), *right, (0.0, 0.20)]
+        sections.append([(x, y, z) for x, z in across])
+    colours = np.broadcast_to(np.array(colour, float), (len(SHELL), 11, 3)).copy()
+    colours[:, [0, 1, -2, -1]] *= 0.35  # the floor and the sills
+    return loft(np.array(sections), colours)
+
+
+def cabin(colour: Colour) -> Mesh:
+    """Return windows and roof."""
+    sections, colours = [], []
+    for number, (y, foot, roof, top) in enumerate(CABIN):
+        across = [(-foot, 0.78), (-roof, top - 0.05), (-roof * 0.86, top), (0.0, top + 0.02)]
+        across += [(-x, z) for x, z in reversed(across[:3])]
+        sections.append([(x, y, z) for x, z in across])
+        is_roof = 0 < number < len(CABIN) - 1
+        colours.append([colour if is_roof and 1 < column < 5 else GLASS for column in range(7)])
+    return loft(np.array(sections), np.array(colours, float))
+
+
+def wheel(x: float, y: float) -> Mesh:
+    """Return a wheel with its axle at this place."""
+    angle = np.linspace(0, 2 * np.pi, SPOKES + 1)
+    # From the left hub over the tread to the right hub: x from the wheel's middle, and radius.
+    profile = [(-0.40, 0.62), (-0.48, 0.66), (-0.50, 1.0), (0.50, 1.0), (0.48, 0.66), (0.40, 0.62)]
+    colours = np.array([RIM, TYRE, TYRE, TYRE, TYRE, RIM], float)
+    sections = [
+        [(x + TREAD * side, y - RADIUS * r * np.cos(a), RADIUS + RADIUS * r * np.sin(a)) for side, r in profile]
+        for a in angle
+    ]
+    shades = np.broadcast_to(colours, (len(angle), *colours.shape))
+    rows, columns = len(angle), len(profile)
+    points = np.array(sections).reshape(-1, 3)
+    tread = Mesh(
+        points, shades.reshape(-1, 3).copy(), np.zeros((len(points), 2)), grid(rows, columns), textures.plain()
+    )
+    return merge([tread, *(hub(x + TREAD * side, y, side > 0) for side in (-0.40, 0.40))])
+
+
+def hub(x: float, y: float, outwards_right: bool) -> Mesh:
+    """Return the disc in a wheel."""
+    angle = np.linspace(0, 2 * np.pi, SPOKES + 1)[:-1]
+    rim = np.stack([np.full(SPOKES, x), y - 0.62 * RADIUS * np.cos(angle), RADIUS * (1 + 0.62 * np.sin(angle))], axis=1)
+    points = np.vstack([[(x, y, RADIUS)], rim])
+    here = np.arange(SPOKES) + 1
+    faces = np.stack([np.zeros(SPOKES, int), here, here % SPOKES + 1], axis=1)
+    colours = np.tile(np.array(RIM, float), (len(points), 1))
+    colours[1::3] *= 0.5  # spokes
+    return Mesh(
+        points, colours, np.zeros((len(points), 2)), faces[:, ::-1] if outwards_right else faces, textures.plain()
+    )
