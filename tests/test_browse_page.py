@@ -117,8 +117,10 @@ def test_a_replay_is_watched_with_the_keyboard_alone(linked, page, model_file):
         page.until(lambda: difference(page, "view-0", view) < 3)
         centre = read_recording(linked).path(40)
         page.until(lambda: difference(page, "center", centre) < 3)
+        here = server.recordings()["lake"]
         page.press("a")
-        page.until(lambda: difference(page, "center", centre) > 3)
+        assert page.run(f"fetch('{here}/rows/40/center/0.png').then(answer => answer.status)") == 200
+        page.until(lambda: difference(page, "center", centre) > 6)
         page.press("a")
         page.press("a")
         page.until(lambda: difference(page, "center", centre) < 3)
