@@ -206,5 +206,5 @@ def mark_start(axes: "Axes", track: Track) -> None:
     axes.plot(start.x, start.y, "o", color="black", markersize=6)
     arrow = {"arrowstyle": "-|>", "linewidth": 1.5, "color": "black"}
     axes.annotate("", (beside.x + east, beside.y + north), (beside.x, beside.y), arrowprops=arrow)
-    name = {"ha": "center", "va": "center", "textcoords": "offset points"}
-    axes.annotate("start", (beside.x, beside.y), (-0.35 * east, -0.35 * north), **name)
+    behind = -0.35 * east, -0.35 * north  # points
+    axes.annotate("start", (beside.x, beside.y), behind, ha="center", va="center", textcoords="offset points")
