@@ -202,8 +202,9 @@ def mark_start(axes: "Axes", track: Track) -> None:
     """Plot where the autonomous mode starts, and an arrow beside the road in the direction of driving."""
     start = track.at(track.starts["autonomous"])
     beside = track.at(track.starts["autonomous"], ARROW_OFFSET)
-    ahead = ARROW_LENGTH * np.array([math.cos(start.heading), math.sin(start.heading)])
+    east, north = ARROW_LENGTH * math.cos(start.heading), ARROW_LENGTH * math.sin(start.heading)
     axes.plot(start.x, start.y, "o", color="black", markersize=6)
     arrow = {"arrowstyle": "-|>", "linewidth": 1.5, "color": "black"}
-    axes.annotate("", (beside.x + ahead[0], beside.y + ahead[1]), (beside.x, beside.y), arrowprops=arrow)
-    axes.annotate("start", (beside.x, beside.y), -0.35 * ahead, ha="center", va="center", textcoords="offset points")
+    axes.annotate("", (beside.x + east, beside.y + north), (beside.x, beside.y), arrowprops=arrow)
+    behind = -0.35 * east, -0.35 * north  # points
+    axes.annotate("start", (beside.x, beside.y), behind, ha="center", va="center", textcoords="offset points")

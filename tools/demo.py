@@ -93,7 +93,7 @@ def train() -> None:
     """Train a network on the recorded laps, or continue to. Raises SimulatorError."""
     if MODEL.exists():  # written at the end of the only epoch
         return
-    options = ["--robust", "--epochs", "1", "--samples-per-epoch", str(IMAGES), "--output", MODEL]
+    options = ["--robust", "--epochs", "1", "--samples-per-epoch", str(IMAGES), "--output", str(MODEL)]
     if MODEL.with_stem(f"{MODEL.stem}-resume").exists():
         options.append("--resume")
     done = subprocess.run([sys.executable, ROOT / "model.py", FOLDER / "recorded", *options])
@@ -108,7 +108,7 @@ def drive(lap: Drive) -> None:
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir()
         files = [unfinished / f"lap.{suffix}" for suffix in ("json", "png", "mp4")]
-        outputs = ("--report", files[0], "--picture", files[1], "--film", files[2])
+        outputs = [str(word) for pair in zip(("--report", "--picture", "--film"), files, strict=True) for word in pair]
         server, port = start_server([ROOT / "drive.py", lap.model, "--speed", str(lap.speed), "--port", "0"])
         road = ("--track", lap.track, "--direction", lap.direction, "--port", str(port))
         command = [sys.executable, "-m", "simulator", "drive", *road, *outputs]
