@@ -88,7 +88,7 @@ def render(folder: Path, chosen: list[Lap]) -> None:
 def repeat(folder: Path, recordings: list[Path]) -> None:
     """Make folders of the real recordings that training repeats as it does problem areas: their names say so."""
     for recording, copy in itertools.product(recordings, range(1, COPIES + 1)):
-        twin = folder / f"{recording.resolve().name}-{copy}-repetitive"
+        twin = folder / f"{recording.resolve().name}{copy}-repetitive"
         twin.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(recording / DRIVING_LOG, twin / DRIVING_LOG)
         (twin / EXCLUDED).unlink(missing_ok=True)
