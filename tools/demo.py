@@ -154,7 +154,7 @@ def page() -> str:
     ]
     steps = [f"<dt><code>{html.escape(command)}</code><dd>{html.escape(text)}" for command, text in NEXT]
     return string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        style=STYLE,
+        style=STYLE.read_text(encoding="utf-8"),
         films="\n".join(figures),
         maps="\n".join(maps),
         steps="\n".join(steps),
