@@ -75,7 +75,7 @@ class Measurement:
 
     def __init__(self, args: argparse.Namespace):
         """Read the earlier results. Raises UserError if the folder was begun with other options, OSError."""
-        self.args, self.folder = args, args.folder
+        self.args, self.folder = args, args.folder.resolve()  # the simulator runs in another folder
         self.track, self.results = Track(args.track), []
         self.table = self.folder / "departures.csv"
         options = {name: value for name, value in vars(args).items() if name not in ("folder", "rounds", "seeds")}
