@@ -84,6 +84,10 @@ class Page:
             raise AssertionError(f"{code}: {error}; the page shows: {self.run('document.body.innerText')}") from None
 
     def open(self, address: str) -> None:
+        """Load a page anew; what an earlier one asked for and said is forgotten."""
+        self.send("Page.navigate", url="about:blank")
+        self.wait("location.href == 'about:blank' && document.readyState == 'complete'")
+        self.events.clear()
         self.send("Page.navigate", url=address)
 
     def text(self) -> str:

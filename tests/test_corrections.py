@@ -141,7 +141,7 @@ class Seat(Window):
         self.simulation, self.controls = Run(Track("lake"), "autonomous"), Controls()
         self.gamepad = SimpleNamespace(read=lambda: None)
         self.remote = SimpleNamespace(steering=0.0, throttle=1.0, poll=lambda by_hand, run: None, close=lambda: None)
-        self.by_hand, self.cameras, self.keys = False, None, set()
+        self.by_hand, self.started, self.cameras, self.keys = False, True, None, set()
         self.folder, self.recording, self.recording_on = folder, None, False
         self.simulated_until = 0.0
 

@@ -192,7 +192,7 @@ def tables(folder):
 
 
 KINDS = ("model", "model-best", "model-resume")
-CHANGES = 10  # of files by a new run of one epoch until it is saved
+CHANGES = 12  # of files by a new run of one epoch until it is saved
 
 
 @pytest.mark.parametrize("kill_at", range(1, CHANGES + 1))
@@ -200,8 +200,9 @@ CHANGES = 10  # of files by a new run of one epoch until it is saved
 def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, kill_at, then):
     """At each point --resume continues the run that model-resume.pt is of, and each earlier run's model is kept once.
 
-    Changes: 1 copy of model-resume.pt, 2 model-resume.pt, 3 arguments, 4 log, 5 picture, 6 and 7 copies of the models,
-    8 model.pt, 9 model-best.pt, 10 model-resume.pt. Diagnostic pictures and the cache are not counted.
+    Changes: 1 copy of model-resume.pt, 2 model-resume.pt, 3 progress, 4 arguments, 5 log, 6 picture, 7 and 8 copies of
+    the models, 9 model.pt, 10 model-best.pt, 11 model-resume.pt, 12 progress. Diagnostic pictures and the cache are not
+    counted.
     """
     changes, replace = 0, os.replace
 
@@ -236,7 +237,7 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
             assert found.pop(f"{kind}-previous.pt") == seed
     # What else is kept: the models of seed 1 that a kill after they were written left; a copy of the resumed run's
     # state that was made for the new run.
-    kept = {f"{kind}-previous-2.pt": 1 for kind, point in (("model", 8), ("model-best", 9)) if kill_at > point}
+    kept = {f"{kind}-previous-2.pt": 1 for kind, point in zip(KINDS, (9, 10, 11), strict=True) if kill_at > point}
     copied = {"model-resume-previous.pt": 0} if kill_at == 2 else {}
     assert found == (copied if then == "resume" else kept)
 
