@@ -219,7 +219,7 @@ def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording)
         assert (folder / "diagnostic_images" / name).exists()
     arguments = torch.load(folder / "model.pt", weights_only=True)["arguments"]
     assert arguments["robust"]
-    assert (arguments["batch_size"], arguments["learning_rate"]) == (8, 3e-4)  # as given, and as --robust sets it
+    assert (arguments["batch_size"], arguments["learning_rate"]) == (8, 1e-3)  # as given, and as --robust sets it
 
 
 def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_recording, tmp_path):
@@ -241,7 +241,7 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_r
         assert all(torch.equal(a[key], b[key]) for key in a)
 
 
-@pytest.mark.parametrize("options, begins", [([], 1e-4), (["--robust"], 3e-4)])
+@pytest.mark.parametrize("options, begins", [([], 1e-4), (["--robust"], 1e-3)])
 def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
     sample_recording, tmp_path, monkeypatch, options, begins
 ):

@@ -32,10 +32,10 @@ from cloning.recordings.log import Recording, find_folders
 from cloning.replay.autonomy import autonomy
 from cloning.replay.drivers import ModelDriver
 from cloning.replay.replay import ReferenceLine, drive, load_recording, reference_lines
+from cloning.training.options import ROBUST_DEFAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
-# What is enough for one lap of the lake; the ledger in writeup_report.md has what each choice gained.
-IMAGES, BATCH_SIZE, LEARNING_RATE = 8000, 16, 1e-3
+IMAGES = 15_000  # enough for one lap of the lake, nearly always; writeup_report.md has what was tried
 
 
 class Result(NamedTuple):
@@ -98,10 +98,16 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--images", type=number(int, 1), default=IMAGES, help="to train on (default %(default)s)")
     parser.add_argument(
-        "--batch-size", type=number(int, 1), default=BATCH_SIZE, help="observations (default %(default)s)"
+        "--batch-size",
+        type=number(int, 1),
+        default=ROBUST_DEFAULTS["batch_size"],
+        help="observations (default %(default)s)",
     )
     parser.add_argument(
-        "--learning-rate", type=number(float, 1e-9), default=LEARNING_RATE, help="at first (default %(default)s)"
+        "--learning-rate",
+        type=number(float, 1e-9),
+        default=ROBUST_DEFAULTS["learning_rate"],
+        help="at first (default %(default)s)",
     )
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
