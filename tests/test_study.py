@@ -1,0 +1,209 @@
+"""tools.study: its plan, what alters the training, its measures against oracles, and the command on tiny recordings."""
+
+import csv
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from conftest import ROOT, render_recording
+from test_generator import loaded, observations
+
+import model
+from cloning.replay.replay import load_recording, reference_lines
+from cloning.training import light, robust
+from cloning.training.options import Arguments, parse
+from tools.study import figures
+from tools.study.measures import PIECE_SECONDS, Simulator, cut, offline, short_replay
+from tools.study.networks import ALTERATIONS, TRACKS, plan
+
+
+def test_the_plan_has_many_networks_none_of_which_is_trained_on_what_is_held_out():
+    variants = plan()
+    assert len({variant.name for variant in variants}) == len(variants) >= 40
+    for variant in variants:
+        parse([*variant.options, "data"])  # exits if model.py does not take these options
+        assert TRACKS[variant.track].held_out not in variant.recordings
+        assert variant.alteration in {"", *ALTERATIONS}
+    assert {variant.alteration for variant in variants} == {"", *ALTERATIONS}, "each is used"
+    recovering = [variant for variant in variants if variant.recovers]
+    assert {variant.kind: 5 for variant in recovering} == {
+        kind: sum(variant.kind == kind for variant in recovering) for kind in {variant.kind for variant in recovering}
+    }
+
+
+@pytest.fixture
+def restored(monkeypatch):
+    """What the alterations change is as before after the test."""
+    for place, name in (
+        (model, "FLIP"),
+        (model, "SHADOW"),
+        (model, "KEEP_STRAIGHT"),
+        (model, "TURN"),
+        (model.ReportObservations, "sample_views"),
+        (light, "TINTED_SHARE"),
+        (light, "SHADED_SHARE"),
+        (robust, "YAW_DEVIATION"),
+    ):
+        monkeypatch.setattr(place, name, getattr(place, name))
+
+
+@pytest.mark.parametrize(("alteration", "kind"), [("no flip", 1), ("no shadow", 3)])
+def test_a_kind_of_image_is_left_out(restored, sample_recording, alteration, kind):
+    with ThreadPoolExecutor(1) as pool:
+        generator = model.Generator(loaded(sample_recording), Arguments(batch_size=64), pool, ahead=1)
+        made = (generator.sample(0).places >= 0).any(axis=0)
+        assert made.all()
+        ALTERATIONS[alteration]()
+        assert (generator.sample(0).places >= 0).any(axis=0).tolist() == [other != kind for other in range(4)]
+
+
+def test_without_resampling_each_observation_counts_once(restored):
+    steering = np.float32([0, 0.01, 0.3, -0.4, 1] * 20)
+    assert len(observations(steering).resample(seed=0)) != len(steering)
+    ALTERATIONS["no resampling"]()
+    assert sorted(observations(steering).resample(seed=0).steering) == sorted(steering)
+
+
+def test_the_centre_camera_alone(restored, sample_recording):
+    found = loaded(sample_recording)
+    ALTERATIONS["centre camera"]()
+    views = found.sample_views(np.arange(3), np.array([0, 1, 2]), 0.2, np.random.default_rng(0))
+    assert views.labels[:, 0].tolist() == found.steering[:3].tolist()
+    frame = found.read_cropped(2, 0)
+    assert np.array_equal(views.images(np.array([2]))[0][0], frame)
+
+
+def test_shifts_neither_turn_the_car_nor_change_the_light(restored):
+    lanes = robust.Lanes.unknown(200)
+    ALTERATIONS["shifts, rotations"]()
+    poses = lanes.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
+    assert (poses.colours == np.eye(3)).all()
+    assert (poses.shade == -1).all()
+    straight = lanes.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
+    ALTERATIONS["shifts"]()
+    shifted = lanes.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
+    assert not np.allclose(straight.steering, shifted.steering)
+    offsets = np.random.default_rng(0).uniform(-robust.MAX_POSE_OFFSET, robust.MAX_POSE_OFFSET, 200)
+    assert np.allclose(shifted.steering, lanes.steering(offsets, np.zeros(200)))
+
+
+def test_correlation_is_of_ranks_and_signed():
+    values = np.arange(10.0)
+    assert figures.correlated(np.exp(values), values, 1)[0] == pytest.approx(1)
+    value, low, high = figures.correlated(-(values**3), values, 1)
+    assert (value, low, high) == pytest.approx((-1, -1, -1))
+    shuffled = np.array([2, 1, 4, 3, 6, 5, 8, 7, 10, 9.0])
+    value, low, high = figures.correlated(shuffled, values, -1)
+    assert value == pytest.approx(-(1 - 6 * 10 / (10 * 99)))  # Spearman's own formula: ten differences of 1
+    assert -1 <= low < value < high < 0
+    assert np.isnan(figures.correlated(np.zeros(10), values, 1)).all()
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return load_recording(render_recording(tmp_path_factory.mktemp("study") / "lake-cw", rows=100))
+
+
+def test_short_replays_are_whole_pieces_that_begin_at_the_drivers_pose(recording):
+    [line] = reference_lines(recording, by_lane=False)
+    pieces = cut(recording, line)
+    assert [piece.rows.stop - piece.rows.start for piece in pieces] == [15 * PIECE_SECONDS] * 3
+    assert all(before.rows.stop == after.rows.start for before, after in pairwise(pieces))
+    assert short_replay(recording, lambda frame: frame.human_steering) == pytest.approx(0, abs=1e-6)
+    assert short_replay(recording, lambda frame: frame.human_steering + 0.1) > 0.1
+
+
+class Constant:
+    """A network that always steers alike, or one that repeats the recorded steering plus something."""
+
+    def __init__(self, values):
+        self.values = np.float32(values)
+
+    def __call__(self, frames):
+        import torch
+
+        now, self.values = self.values[: len(frames)], self.values[len(frames) :]
+        return torch.from_numpy(now)
+
+
+def test_errors_on_recorded_frames(recording):
+    found = offline(Constant(recording.steering + np.tile([0.1, 0.3], 50)), recording)
+    assert found["mse"] == pytest.approx(0.05, rel=1e-4)
+    assert found["mae"] == pytest.approx(0.2, rel=1e-4)
+    assert found["large_errors"] == 0.5
+    assert 0.8 < found["correlation"] < 1
+    still = offline(Constant(np.full(100, 0.2)), recording)
+    assert (still["whiteness"], still["correlation"]) == (0, 0)
+
+
+@pytest.mark.parametrize(("steering", "departures"), [(None, False), (0.3, True)])
+def test_laps_and_recovery_in_the_simulator(monkeypatch, steering, departures):
+    """Steered by the known position, the car stays and comes back; steered to one side, it leaves the road."""
+    simulator = Simulator(None, "lake", "ccw", 15)
+    monkeypatch.setattr(
+        simulator, "steering", lambda run: follow(run) if steering is None else steering
+    )  # without rendering
+    found = simulator.lap(0.05)
+    assert (found["departures"] > 0) == departures
+    assert (found["offset_max"] < 1) == (not departures)
+    assert found["metres"] >= 0.05 * simulator.track.length * (not departures)
+    assert simulator.recovery(6) == (0 if departures else 1)
+
+
+def follow(run):
+    """Steer for a point 8 m ahead on the centre line."""
+    goal = run.track.at(run.s + 8)
+    position = run.car.node.get_pos()
+    bearing = np.arctan2(goal.y - position.y, goal.x - position.x) - run.car.heading
+    return float(np.clip(-3 * ((bearing + np.pi) % (2 * np.pi) - np.pi), -1, 1))
+
+
+def test_the_command_measures_and_goes_on(tmp_path):
+    data, folder = tmp_path / "data", tmp_path / "study"
+    for seed, name in enumerate(["jungle", "jungle-shadows", "lake-ccw", "lake-cw"]):
+        render_recording(data / name, seed=seed)
+
+    def study(*more):
+        command = [sys.executable, "-m", "tools.study", str(data), "--folder", str(folder), "--jobs", "1", *more]
+        trial = ["--images", "30", "--laps", "0.01", "--starts", "1"]
+        return subprocess.run([*command, *trial], cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+    done = study("--networks", "1")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "lake-centre-camera-seed-0 is measured" in done.stdout
+    with open(folder / "study.csv", encoding="utf-8", newline="") as file:
+        [row] = csv.DictReader(file)
+    assert (row["kind"], row["recordings"]) == ("centre camera", "lake-ccw")
+    assert {measure.name for measure in figures.MEASURES} | set(figures.DRIVING) <= set(row)
+    assert float(row["recovered"]) in (0, 1)
+    again = study("--networks", "1")
+    assert (again.returncode, "is measured" in again.stdout) == (0, False), "it was measured before"
+    (data / "lake-cw" / "driving_log.csv").rename(data / "lake-cw" / "log.csv")
+    missing = study("--networks", "1")
+    assert missing.returncode == 2
+    assert (
+        "lake-cw: the study needs recordings by the names jungle, jungle-shadows, lake-ccw, lake-cw" in missing.stderr
+    )
+    assert "Traceback" not in missing.stderr
+
+
+def test_the_report_and_the_pictures_show_all_networks():
+    rng = np.random.default_rng(0)
+    names = {measure.name for measure in figures.MEASURES} | set(figures.DRIVING)
+    rows = [
+        figures.row(variant, {**dict.fromkeys(names, 0.0), **{name: rng.random() for name in names}})
+        for variant in plan()
+    ]
+    for row in rows[:25]:
+        row["recovered"] = 0.25
+    text = figures.report(rows)
+    assert text.count("\n| lake, ") == sum(variant.track == "lake" for variant in plan())
+    assert f"lake, {text.count(chr(10) + '| lake, ')} networks" in text
+    assert "| robust | 25 %, 25 %, 25 %, 25 %, 25 % | 25 % |" in text
+    for draw in (figures.correlation_picture, figures.scatter_picture, figures.recovery_picture):
+        pixels = cv2.imdecode(np.frombuffer(draw(rows), np.uint8), cv2.IMREAD_COLOR)
+        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20

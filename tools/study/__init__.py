@@ -1,0 +1,1 @@
+"""The study of whether the loss tells how a network drives."""

@@ -1,0 +1,211 @@
+"""What the study found: rank correlations of each measure with driving, tables and pictures."""
+
+import io
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.stats import rankdata
+
+from cloning.road.motion import MPH
+from tools.study.measures import RECOVERY_SECONDS, RECOVERY_SPEED
+from tools.study.networks import TRACKS, Variant, recovering
+
+Row = dict[str, float | str]  # a network: the columns of `row`
+
+RESAMPLES = 2000  # of the bootstrap
+INTERVAL = 2.5, 97.5  # percentiles: 95 %
+DPI = 150
+
+
+class Measure(NamedTuple):
+    """A measure that might tell how a network drives.
+
+    name   column of study.csv
+    title  in words
+    sign   1 if more is worse, -1 if more is better
+    group  "loss" of errors on recorded frames, "replay"
+    """
+
+    name: str
+    title: str
+    sign: int
+    group: str
+
+
+MEASURES = (
+    Measure("own_val_loss", "its own validation loss", 1, "loss"),
+    Measure("mse", "mean squared error", 1, "loss"),
+    Measure("mae", "mean absolute error", 1, "loss"),
+    Measure("correlation", "correlation with the driver", -1, "loss"),
+    Measure("large_errors", "share of errors above 0.2", 1, "loss"),
+    Measure("whiteness", "whiteness of the steering", 1, "loss"),
+    Measure("short_replay", "replay of 2 s, from the driver's path", 1, "replay"),
+    Measure("autonomy_1", "replay: autonomy at 1 m", -1, "replay"),
+    Measure("autonomy_2.5", "replay: autonomy at 2.5 m", -1, "replay"),
+    Measure("metres_per_intervention_1", "replay: m per intervention at 1 m", -1, "replay"),
+    Measure("replay_distance_2.5", "replay: mean distance", 1, "replay"),
+)
+DRIVING = {"offset_mean": "mean distance from the lane's centre", "departures_per_km": "departures per km"}
+COLOURS = {"loss": "tab:orange", "replay": "tab:blue"}
+
+
+def row(variant: Variant, found: dict[str, float]) -> Row:
+    """Return a network's row of study.csv; found: its measures."""
+    about: Row = {"track": variant.track, "kind": variant.kind, "seed": variant.seed}
+    about |= {"recordings": " ".join(variant.recordings), "options": " ".join(variant.options)}
+    return {**about, "recovered": "", **found}
+
+
+def column(rows: Sequence[Row], name: str) -> np.ndarray:
+    """Return a column of numbers: float64 (n,)."""
+    return np.array([float(each[name]) for each in rows])
+
+
+def correlated(measure: np.ndarray, driving: np.ndarray, sign: int) -> tuple[float, float, float]:
+    """Return Spearman's rank correlation of a measure with driving, and the ends of its 95 % interval.
+
+    measure, driving: float64 (n,); sign: see Measure; more driving is worse. The interval is that of a bootstrap over
+    the networks. nan if either has the same value everywhere.
+    """
+    rng, n = np.random.default_rng(0), len(measure)
+    draws = np.vstack([np.arange(n), rng.integers(n, size=(RESAMPLES, n))])
+    ranks = [rankdata(values[draws], axis=1) - (n + 1) / 2 for values in (measure, driving)]  # centred: n ranks
+    products, squares = (ranks[0] * ranks[1]).sum(axis=1), [(rank**2).sum(axis=1) for rank in ranks]
+    with np.errstate(invalid="ignore"):
+        values = sign * products / np.sqrt(squares[0] * squares[1])
+    if np.isnan(values[0]):
+        return (float("nan"),) * 3
+    low, high = np.nanpercentile(values[1:], INTERVAL)
+    return float(values[0]), float(low), float(high)
+
+
+def on_track(rows: Sequence[Row], track: str) -> list[Row]:
+    """Return the networks that were measured on a track."""
+    return [each for each in rows if each["track"] == track]
+
+
+def correlations(rows: Sequence[Row], driving: str) -> dict[tuple[str, str], tuple[float, float, float]]:
+    """Return (track, name of the measure) -> correlation with driving and its interval; driving: key of DRIVING."""
+    return {
+        (track, measure.name): correlated(column(part, measure.name), column(part, driving), measure.sign)
+        for track in TRACKS
+        if len(part := on_track(rows, track)) > 2
+        for measure in MEASURES
+    }
+
+
+def report(rows: Sequence[Row]) -> str:
+    """Return study.md: the correlations on each track, the recovery, and all networks."""
+    lines = ["# Does the loss tell how a network drives?", "", "Made by `python -m tools.study`."]
+    for name, title in DRIVING.items():
+        found = correlations(rows, name)
+        tracks = [track for track in TRACKS if (track, MEASURES[0].name) in found]
+        lines += ["", f"## Rank correlation with {title} in the stand-in simulator", ""]
+        heads = [f"{track}, {len(on_track(rows, track))} networks" for track in tracks]
+        lines += [f"| {' | '.join(['measure', *heads])} |", "|---" * (1 + len(tracks)) + "|"]
+        for measure in MEASURES:
+            cells = ["{:.2f} ({:.2f} to {:.2f})".format(*found[track, measure.name]) for track in tracks]
+            lines.append(f"| {' | '.join([measure.title, *cells])} |")
+        lines += ["", "Spearman's, signed so that 1 is perfect foresight; in brackets, 95 % of a bootstrap's draws."]
+    seconds, metres = RECOVERY_SECONDS, RECOVERY_SPEED * MPH
+    lines += ["", f"## Back in the lane within {seconds:g} s, at {metres:.0f} m/s", ""]
+    lines += ["| trained with | of its starts, by seed | mean |", "|---|---|---|"]
+    for kind, shares in recovery(rows).items():
+        by_seed = ", ".join(f"{100 * share:.0f} %" for share in shares)
+        lines.append(f"| {kind} | {by_seed} | {100 * np.mean(shares):.0f} % |")
+    lines += ["", "## All networks", "", "| network | mse | autonomy at 1 m | mean distance | departures per km |"]
+    lines.append("|---|---|---|---|---|")
+    for each in rows:
+        network = f"{each['track']}, {each['kind']}, seed {each['seed']}"
+        figures = (
+            f"{float(each['mse']):.4f} | {100 * float(each['autonomy_1']):.0f} % | {float(each['offset_mean']):.2f} m"
+        )
+        lines.append(f"| {network} | {figures} | {float(each['departures_per_km']):.1f} |")
+    return "\n".join(lines) + "\n"
+
+
+def recovery(rows: Sequence[Row]) -> dict[str, list[float]]:
+    """Return the shares recovered by kind of network, in the order of the plan."""
+    kinds = list(dict.fromkeys(variant.kind for variant in recovering()))
+    found = {
+        kind: [float(r["recovered"]) for r in rows if r["kind"] == kind and r["recovered"] != ""] for kind in kinds
+    }
+    return {kind: shares for kind, shares in found.items() if shares}
+
+
+def png(draw: Callable[[Figure], None], width: float, height: float) -> bytes:
+    """Return a picture as PNG; width, height: inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    draw(figure)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=DPI)
+    return file.getvalue()
+
+
+def correlation_picture(rows: Sequence[Row]) -> bytes:
+    """Return bars of each measure's correlation with the mean distance, on each track, with their intervals."""
+    found = correlations(rows, "offset_mean")
+
+    def draw(figure: Figure) -> None:
+        for axes, track in zip(figure.subplots(1, len(TRACKS), sharey=True), TRACKS, strict=True):
+            for place, measure in enumerate(MEASURES):
+                value, low, high = found.get((track, measure.name), (np.nan,) * 3)
+                colour = COLOURS[measure.group]
+                axes.barh(place, value, color=colour, alpha=0.8, height=0.7)
+                axes.plot([low, high], [place, place], color="black", linewidth=1.2)
+            axes.axvline(0, color="black", linewidth=0.8)
+            axes.set(
+                yticks=range(len(MEASURES)),
+                yticklabels=[measure.title for measure in MEASURES],
+                xlim=(-1, 1),
+                xlabel="rank correlation with driving",
+                title=f"{track}, {len(on_track(rows, track))} networks",
+            )
+            axes.grid(axis="x", alpha=0.3)
+        axes.invert_yaxis()
+
+    return png(draw, 10, 4.6)
+
+
+def scatter_picture(rows: Sequence[Row]) -> bytes:
+    """Return, for each track, the networks by loss and by replay, against how they drive."""
+    shown = [next(measure for measure in MEASURES if measure.name == name) for name in ("mse", "replay_distance_2.5")]
+
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(len(TRACKS), len(shown), squeeze=False)
+        for line, track in zip(grid, TRACKS, strict=True):
+            part = on_track(rows, track)
+            for axes, measure in zip(line, shown, strict=True):
+                for group, colour in (("recipe", "tab:orange"), ("robust", "tab:blue")):
+                    some = [each for each in part if ("--robust" in str(each["options"])) == (group == "robust")]
+                    if some:
+                        where = column(some, measure.name), column(some, "offset_mean")
+                        axes.scatter(*where, s=18, color=colour, alpha=0.8, label=group)
+                axes.set(title=track, xlabel=measure.title, ylabel="m from the centre, in laps")
+                axes.set_xlim(left=0)
+                axes.set_ylim(bottom=0)
+                axes.grid(alpha=0.3)
+        if rows:
+            grid[0, 0].legend()
+
+    return png(draw, 9, 7)
+
+
+def recovery_picture(rows: Sequence[Row]) -> bytes:
+    """Return the share of starts from which each kind of network comes back: bars for means, dots for seeds."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for place, shares in enumerate(recovery(rows).values()):
+            axes.bar(place, 100 * np.mean(shares), color="tab:blue", alpha=0.5)
+            axes.plot([place] * len(shares), 100 * np.array(shares), "o", color="black", markersize=4)
+        kinds = list(recovery(rows))
+        axes.set(xticks=range(len(kinds)), xticklabels=kinds, ylim=(0, 105), ylabel="% of starts")
+        axes.set_title(f"back in the lane within {RECOVERY_SECONDS:g} s")
+        axes.grid(axis="y", alpha=0.3)
+
+    return png(draw, 7, 4)

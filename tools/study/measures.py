@@ -1,0 +1,177 @@
+"""What the study measures of a network: its errors on a recording, its replays, its laps, and how it recovers."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from cloning.pilot.network import Network, steer
+from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.images import read_image
+from cloning.recordings.log import Recording
+from cloning.recordings.writer import SampleClock
+from cloning.replay.autonomy import LIMITS
+from cloning.replay.drivers import ModelDriver
+from cloning.replay.replay import ReferenceLine, drive, reference_lines
+from cloning.road.motion import MPH, Stretch, wrap_angle
+from cloning.road.track import Track
+from simulator import scenery
+from simulator.cameras import Cameras
+from simulator.run import Run
+from simulator.world import Scene
+
+BATCH = 32  # frames
+LARGE_ERROR = 0.2  # of steering: the "thresholded relative error" of Codevilla et al. (1809.04843) has another unit
+PIECE_SECONDS = 2  # of a short replay: as long as the blocks of a recording that model.py validates with
+TIME_OUT = 1.5  # times the time of a lap at the set speed; a car that leaves the road over and over gets no further
+RECOVERY_SPEED, RECOVERY_SECONDS = 20.0, 3.0  # mph; the time is ChauffeurNet's (1812.03079)
+RECOVERY_OFFSETS, RECOVERY_TURNS = (0.5, 2.0), (2.0, 20.0)  # m from the lane's centre, degrees to its direction
+RECOVERED = 0.5, 5.0  # m and degrees: nearer than both is back in the lane
+
+
+def offline(network: Network, recording: Recording) -> dict[str, float]:
+    """Return a network's errors at the recorded poses, with the human driver's steering as label.
+
+    whiteness: root mean square of the steering's change per second (University of Tartu's measure), here of the
+    steering on the recorded frames.
+    """
+    guesses = []
+    for start in range(0, len(recording), BATCH):
+        rows = range(start, min(start + BATCH, len(recording)))
+        frames = np.stack([read_image(recording.path(row, 0))[1] for row in rows])
+        with torch.inference_mode():
+            guesses.append(network(torch.from_numpy(frames)).numpy())
+    guess = np.concatenate(guesses).clip(-1, 1)
+    error = guess - recording.steering
+    seconds = np.diff(recording.time)
+    change = np.diff(guess)[seconds > 0] / seconds[seconds > 0]
+    return {
+        "mse": float(np.mean(error**2)),
+        "mae": float(np.abs(error).mean()),
+        "correlation": float(np.corrcoef(guess, recording.steering)[0, 1]) if np.ptp(guess) else 0.0,
+        "large_errors": float((np.abs(error) > LARGE_ERROR).mean()),
+        "whiteness": float(np.sqrt(np.mean(change**2))),
+    }
+
+
+def replayed(recording: Recording, lines: list[ReferenceLine], driver: ModelDriver) -> dict[str, float]:
+    """Return what replays of a recording measure: NVIDIA's autonomy at both limits, distances, and short replays."""
+    found: dict[str, float] = {}
+    for limit in LIMITS:
+        done = drive(recording, lines, limit, driver)
+        metres = float(np.sum(np.abs(recording.speed[done.row]) * MPH * done.seconds))
+        found[f"autonomy_{limit:g}"] = done.autonomy()
+        found[f"replay_distance_{limit:g}"] = float(np.abs(done.offset).mean())
+        found[f"metres_per_intervention_{limit:g}"] = metres / max(1, len(done.interventions))
+    found["short_replay"] = short_replay(recording, driver)
+    return found
+
+
+def short_replay(recording: Recording, driver: ModelDriver) -> float:
+    """Return how far the car is from the human driver's path after PIECE_SECONDS from there: m, mean over all pieces.
+
+    This needs no lane, so that a training run could measure it on the blocks that it validates with.
+    """
+    pieces = [part for line in reference_lines(recording, by_lane=False) for part in cut(recording, line)]
+    done = drive(recording, pieces, math.inf, driver)
+    ends = np.cumsum([len(piece.stretch) for piece in pieces]) - 1
+    return float(np.abs(np.array(done.offset_from_human)[ends]).mean())
+
+
+def cut(recording: Recording, line: ReferenceLine) -> list[ReferenceLine]:
+    """Return the whole pieces of PIECE_SECONDS of a line that is the human driver's path."""
+    rows, n = line.rows, PIECE_SECONDS * SAMPLE_RATE
+    pieces = []
+    for start in range(0, len(line.stretch) - n + 1, n):
+        stretch = Stretch.of(recording, slice(rows.start + start, rows.start + start + n))
+        zeros = np.zeros(n)
+        ahead = line.ahead.take(slice(start, start + n))
+        pieces.append(ReferenceLine(stretch, zeros, zeros, is_lane_centre=False, ahead=ahead))
+    return pieces
+
+
+class Simulator:
+    """The stand-in simulator's car with its centre camera, steered by a network in this process."""
+
+    def __init__(self, network: Network, track: str, direction: str, speed: float):
+        """speed: set speed, mph, which the car holds where the road allows it."""
+        self.network, self.track, self.speed = network, Track(track, direction), speed
+        self.cameras = Cameras(Scene(scenery.build(track)), ("center",))
+
+    def start(self) -> Run:
+        """Return a new run, whose car stands on the road."""
+        run = Run(self.track, "autonomous")
+        run.car.speed_limit = self.speed * MPH
+        return run
+
+    def steering(self, run: Run) -> float:
+        """Return the network's steering for what the car sees now."""
+        return float(steer(self.network, self.cameras.frames(run.car.node.get_transform())[0]))
+
+    def lap(self, laps: float) -> dict[str, float]:
+        """Drive; after a departure the car is set back and goes on, until the laps' end or TIME_OUT."""
+        run, clock = self.start(), SampleClock(1 / SAMPLE_RATE)
+        metres = laps * self.track.length
+        steering, commands = self.steering(run), []
+        while run.travelled < metres and run.time < TIME_OUT * metres / (self.speed * MPH):
+            run.step(steering, 1.0)
+            if clock.due(run.time):
+                steering = self.steering(run)
+                commands.append(steering)
+        offset = np.abs(run.trajectory.offset)
+        return {
+            "metres": run.distance,
+            "departures": len(run.departures),
+            "offset_mean": float(offset.mean()),
+            "offset_max": float(offset.max()),
+            "lap_whiteness": float(np.sqrt(np.mean((np.diff(commands) * SAMPLE_RATE) ** 2))),
+        }
+
+    def recovery(self, starts: int) -> float:
+        """Return the share of starts next to the lane's centre, and turned, from which the car comes back in time.
+
+        The starts are the same for every network: all around the track, offsets and turns to all sides.
+        """
+        rng = np.random.default_rng(0)
+        sides = np.where(rng.random((starts, 2)) < 0.5, -1, 1)
+        offsets = sides[:, 0] * rng.uniform(*RECOVERY_OFFSETS, starts)
+        turns = sides[:, 1] * np.radians(rng.uniform(*RECOVERY_TURNS, starts))
+        places = (np.arange(starts) + rng.random(starts)) / starts * self.track.length
+        run = self.start()
+        return float(np.mean([self.comes_back(run, *start) for start in zip(places, offsets, turns, strict=True)]))
+
+    def comes_back(self, run: Run, s: float, offset: float, turn: float) -> bool:
+        """Return whether the car is back in the lane in time, without leaving the road before.
+
+        s: m along the track; offset: m, right positive; turn: radians to the right.
+        """
+        place = self.track.at(s, offset)
+        run.car.place(replace(place, heading=place.heading - turn))  # headings grow to the left
+        run.car.settle()
+        run.car.body.set_linear_velocity(run.car.node.get_quat().get_forward() * (RECOVERY_SPEED * MPH))
+        run.s, run.offset, until = s, offset, run.time + RECOVERY_SECONDS
+        clock, steering = SampleClock(run.time + 1 / SAMPLE_RATE), self.steering(run)
+        while run.time < until:
+            if not run.advance(steering, 1.0):
+                return False
+            yaw = abs(wrap_angle(run.car.heading - self.track.at(run.s).heading))
+            if abs(run.offset) < RECOVERED[0] and math.degrees(yaw) < RECOVERED[1]:
+                return True
+            if clock.due(run.time):
+                steering = self.steering(run)
+        return False
+
+
+def laps(simulators: list[Simulator], share: float) -> dict[str, float]:
+    """Return the measures of a network's laps, one in each simulator; share: of a lap, such as 1.
+
+    departures_per_km, offset_mean, offset_max: m, lap_whiteness: over all laps together.
+    """
+    driven = [simulator.lap(share) for simulator in simulators]
+    return {
+        "departures_per_km": sum(lap["departures"] for lap in driven) / sum(lap["metres"] for lap in driven) * 1000,
+        "offset_mean": float(np.mean([lap["offset_mean"] for lap in driven])),
+        "offset_max": max(lap["offset_max"] for lap in driven),
+        "lap_whiteness": float(np.mean([lap["lap_whiteness"] for lap in driven])),
+    }
