@@ -8,12 +8,13 @@
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes that share every batch
 
 "The report" is the writeup of the Behavioral Cloning project that is reproduced here; this file follows it from top to
-bottom. A run writes model.pt (the last epoch's model, as in the report), model-best.pt (lowest validation loss),
+bottom. A run writes model.pt (the last epoch's model, as in the report), model-best.pt (the epoch that drives best),
 model-resume.pt, training_loss.png, training_log.csv, training_arguments.json and pictures in diagnostic_images/.
 """
 
 import functools
 import itertools
+import math
 import sys
 import time
 from collections import deque
@@ -41,6 +42,7 @@ from cloning.pilot.network import CROP, UNITS, Network, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS, FRAME
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
+from cloning.replay.drift import drifts, pieces, still_drifts
 from cloning.training import summary
 from cloning.training.adam import Adam
 from cloning.training.checkpoint import Checkpoint, Progress, RunFiles, fingerprint, resumed_arguments
@@ -100,6 +102,7 @@ class ReportObservations(Observations):
     label_source: ClassVar[str] = "driver"
     too_few: ClassVar[str] = "--throttle-threshold drops most of them"
     dropout: ClassVar[bool] = True
+    best_by: ClassVar[str] = "val_drift"
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:
@@ -252,9 +255,7 @@ class Generator:
         """pool: makes the images; ahead: number of batches that are made at the same time."""
         self.observations, self.arguments, self.pool, self.ahead = observations, arguments, pool, ahead
         seed = arguments.seed
-        self.shuffled = functools.lru_cache(2)(
-            lambda number: observations.shuffle(np.random.default_rng([seed, 2, number]))
-        )
+        self.shuffled = functools.lru_cache(2)(lambda n: observations.shuffle(np.random.default_rng([seed, 2, n])))
 
     def sample(self, number: int) -> Choices:
         """Return the random choices for batch `number`, counted from 0."""
@@ -338,8 +339,7 @@ class TrainingRun:
         self.precision = choose_precision(self.device)
         self.files = RunFiles(arguments.output)
         torch.manual_seed(arguments.seed)
-        self.network = Network()
-        self.network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in stubs
+        self.network = Network().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         repeatable(self.device)
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
@@ -352,6 +352,7 @@ class TrainingRun:
         data = fingerprint(training, validation)
         self.checkpoint = Checkpoint(self.files, arguments, self.network, self.optimizer, data)
         self.validation_sets = validation.validation_sets(arguments.seed)
+        self.pieces = pieces(validation.recordings, validation.recording, validation.row)[rank() :: world()]
         self.progress = self.checkpoint.restore(resumed) if resumed else Progress()
         self.pace, self.stop, self.saved_at = summary.Pace(arguments), StopSignals(), time.monotonic()
 
@@ -361,9 +362,9 @@ class TrainingRun:
         while len(progress.history) < self.arguments.epochs:
             self.epoch(batches)
             started = time.monotonic()
-            loss = self.validate()
+            loss, drift = self.validate()
             progress.seconds += time.monotonic() - started
-            is_best, history = progress.finish_epoch(loss), progress.history
+            is_best, history = progress.finish_epoch(loss, drift, self.validation.best_by), progress.history
             if rank() == 0:  # first: a run killed before `save` repeats this
                 write(self.files.log, summary.history_csv(history))
                 write(self.files.losses, loss_picture(history))
@@ -402,16 +403,17 @@ class TrainingRun:
                 if time.monotonic() - self.saved_at > SAVE_SECONDS:
                     self.save()
 
-    def validate(self) -> float:
-        """Return the mean squared error on 0.2 x samples_per_epoch observations, or all, of each validation set."""
+    def validate(self) -> tuple[float, float]:
+        """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m."""
         count = min(len(self.validation), self.arguments.samples_per_epoch // 5)
         chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[: max(count, 1)]
         mine = chosen[rank() :: world()]
-        errors = torch.zeros(())
+        error = 0.0
         for images, labels in self.validation_sets:
-            predicted = self.predict(self.network, images, mine)
-            errors += float(((predicted - labels[mine]) ** 2).sum())
-        return float(summed(errors / len(self.validation_sets), self.device)) / len(chosen)
+            error += float(((self.predict(self.network, images, mine) - labels[mine]) ** 2).sum())
+        far = drifts(self.pieces, self.network, self.pool)
+        error, metres, n = summed(torch.tensor([error, far.sum(), len(far)], dtype=torch.float64), self.device).tolist()
+        return error / len(self.validation_sets) / len(chosen), metres / n if n else math.nan
 
     def save(self, *models: Path) -> None:
         """Write the network to these files, and the state that --resume needs."""
@@ -428,12 +430,13 @@ class TrainingRun:
             write(self.files.pictures / name.format(now // PICTURE_EVERY * PICTURE_EVERY), png)
 
     def summary(self) -> str:
-        """Return a table of the errors of the last and the best epoch's models and of constant steering."""
+        """Return a table of the errors of the last and the best epoch's models, and in words how they will drive."""
         labels, mean, models = self.validation.steering, self.training.steering.mean(), {}
         for path in (self.files.last, self.files.best):
             network = load_model(path, self.device)
             models[path.name] = self.predict(network, self.validation.center, np.arange(len(labels)))
-        return summary.error_table(labels, mean, models, (0, STRAIGHT, *TURN, 1), self.validation.label_source)
+        table = summary.error_table(labels, mean, models, (0, STRAIGHT, *TURN, 1), self.validation.label_source)
+        return table + summary.driving(self.progress.history, self.validation.best_by, still_drifts(self.pieces))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

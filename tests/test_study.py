@@ -4,7 +4,6 @@ import csv
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -13,11 +12,11 @@ from conftest import ROOT, render_recording
 from test_generator import loaded, observations
 
 import model
-from cloning.replay.replay import load_recording, reference_lines
+from cloning.replay.replay import load_recording
 from cloning.training import light, robust
 from cloning.training.options import Arguments, parse
 from tools.study import figures
-from tools.study.measures import PIECE_SECONDS, Simulator, cut, offline, short_replay
+from tools.study.measures import Simulator, offline
 from tools.study.networks import ALTERATIONS, TRACKS, plan
 
 
@@ -106,15 +105,6 @@ def test_correlation_is_of_ranks_and_signed():
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     return load_recording(render_recording(tmp_path_factory.mktemp("study") / "lake-cw", rows=100))
-
-
-def test_short_replays_are_whole_pieces_that_begin_at_the_drivers_pose(recording):
-    [line] = reference_lines(recording, by_lane=False)
-    pieces = cut(recording, line)
-    assert [piece.rows.stop - piece.rows.start for piece in pieces] == [15 * PIECE_SECONDS] * 3
-    assert all(before.rows.stop == after.rows.start for before, after in pairwise(pieces))
-    assert short_replay(recording, lambda frame: frame.human_steering) == pytest.approx(0, abs=1e-6)
-    assert short_replay(recording, lambda frame: frame.human_steering + 0.1) > 0.1
 
 
 class Constant:

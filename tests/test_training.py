@@ -229,7 +229,7 @@ def test_the_first_epoch_is_the_best_so_far_even_if_it_diverged():
     progress, is_best = Progress(), []
     for val_loss in (math.nan, 0.5, math.nan, 0.6, 0.4):
         progress.images = 1
-        is_best.append(progress.finish_epoch(val_loss))
+        is_best.append(progress.finish_epoch(val_loss, math.nan))
     assert is_best == [True, True, False, False, True]
 
 

@@ -1,10 +1,15 @@
 """The drivers of a replay: drive.py over the wire, or a model in this process."""
 
+from typing import TYPE_CHECKING
+
 from cloning.errors import SimulatorError
 from cloning.recordings.images import decode
 from cloning.replay.replay import ReplayFrame
 from cloning.wire.client import ConnectionLost, telemetry_packet
 from cloning.wire.session import ClientSession
+
+if TYPE_CHECKING:
+    from cloning.pilot.network import Network
 
 
 class ServerDriver(ClientSession):
@@ -37,14 +42,14 @@ class ServerDriver(ClientSession):
 class ModelDriver:
     """Steers by a model in this process, with the same arithmetic as drive.py."""
 
-    def __init__(self, model: str):
-        """Load the model. Raises ModelError."""
+    def __init__(self, model: "str | Network"):
+        """Load the model; model: its file, or the network itself. Raises ModelError."""
         import torch  # slow to import, and not needed to drive over the wire
 
         from cloning.pilot.network import load_model, steer
 
         torch.set_num_threads(1)  # the drives at several limits run in a thread each
-        self.network = load_model(model)
+        self.network = load_model(model) if isinstance(model, str) else model
         self.steer = steer
 
     def __call__(self, frame: ReplayFrame) -> float:

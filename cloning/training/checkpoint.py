@@ -30,10 +30,10 @@ from cloning.training.observations import Observations
 from cloning.training.options import Arguments, option
 from cloning.training.run_files import RunFiles
 
-EpochMetrics = dict[str, float]  # a row of training_log.csv: epoch, images, seconds, loss, val_loss
+EpochMetrics = dict[str, float]  # a row of training_log.csv: epoch, images, seconds, loss, val_loss, val_drift
 NEW_RUN = "start a new run without --resume"
 PLACE = ("number", "images", "loss", "seconds")  # of Progress
-METRICS = ("epoch", "images", "seconds", "loss", "val_loss")  # of EpochMetrics
+METRICS = ("epoch", "images", "seconds", "loss", "val_loss", "val_drift")  # of EpochMetrics
 COUNTS = {"number", "images", "epoch"}
 NEVER_RESUMED = {"output", "device", "strict", "resume"}  # they belong to one process, not to the run
 MAY_CHANGE = NEVER_RESUMED | {"recordings", "epochs"}  # with --resume; a fingerprint checks the recordings' contents
@@ -71,22 +71,25 @@ class Progress:
             "loss": loss if loss is None or math.isfinite(loss) else None,
         }
 
-    def finish_epoch(self, val_loss: float) -> bool:
-        """Add the epoch to the history and begin the next one; return whether val_loss is the lowest so far.
+    def finish_epoch(self, val_loss: float, val_drift: float, by: str = "val_loss") -> bool:
+        """Add the epoch to the history and begin the next one; return whether its model is the best so far.
 
+        val_drift: m, nan if unknown; by: the metric whose lowest value is the best: val_loss where val_drift is unknown.
         The first epoch always is, so that there is a best model even if the losses are not numbers.
         """
-        earlier = [row["val_loss"] for row in self.history if not math.isnan(row["val_loss"])]
-        is_best = not self.history or val_loss < min(earlier, default=math.inf)
-        self.history.append(
-            {
-                "epoch": len(self.history) + 1,
-                "images": self.images,
-                "seconds": round(self.seconds, 3),
-                "loss": self.loss / self.images,
-                "val_loss": val_loss,
-            }
-        )
+        if math.isnan(val_drift):
+            by = "val_loss"
+        row = {
+            "epoch": len(self.history) + 1,
+            "images": self.images,
+            "seconds": round(self.seconds, 3),
+            "loss": self.loss / self.images,
+            "val_loss": val_loss,
+            "val_drift": val_drift,
+        }
+        earlier = [before[by] for before in self.history if not math.isnan(before[by])]
+        is_best = not self.history or row[by] < min(earlier, default=math.inf)
+        self.history.append(row)
         self.images, self.loss, self.seconds = 0, 0.0, 0.0
         return is_best
 
@@ -163,6 +166,8 @@ def _progress(saved: dict[str, Any]) -> Progress:
         raise ValueError("it has no state, history or identifier of its run")
     values = [(name, state.get(name)) for name in PLACE]
     for row in history:
+        if isinstance(row, dict) and tuple(row) == METRICS[:-1]:
+            row["val_drift"] = math.nan  # an earlier version did not measure it
         if not isinstance(row, dict) or tuple(row) != METRICS:
             raise ValueError(f"its history has {shown(row)}, not {', '.join(METRICS)}")
         values += row.items()

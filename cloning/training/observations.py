@@ -132,6 +132,7 @@ class Observations(ABC):
     label_source: ClassVar[str]  # whose steering the label is, as the summary calls it
     too_few: ClassVar[str]  # the reason to print if `select` leaves too few rows
     dropout: ClassVar[bool]  # whether the network is trained with it
+    best_by: ClassVar[str]  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
 
     def __post_init__(self) -> None:
         self.cache = ImageCache(self.cached_rows.stop - self.cached_rows.start)

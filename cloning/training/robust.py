@@ -201,6 +201,7 @@ class RobustObservations(Observations):
     too_few: ClassVar[str] = "the drives are too short"
     # As in NVIDIA's paper. No image is seen twice; with dropout val_loss was higher after the same number of images.
     dropout: ClassVar[bool] = False
+    best_by: ClassVar[str] = "val_loss"  # which is that of steering back, too; the driver's path is not aimed at
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:

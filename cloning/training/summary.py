@@ -3,6 +3,7 @@
 import csv
 import io
 import itertools
+import math
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -23,6 +24,12 @@ from cloning.training.distributed import rank, world
 from cloning.training.options import Arguments
 
 MIN_CORRELATION = 0.3  # with the labels; below it, the model has hardly learned anything
+# By val_drift in m, how networks drove in the stand-in simulator: see the study in writeup_report.md.
+VERDICTS = (
+    (0.8, "Networks like this one stay on the road."),
+    (1.6, "Networks like this one leave the road now and then."),
+    (math.inf, "Networks like this one leave the road often: train longer, record more, or use --robust."),
+)
 TIMED_BATCHES, TIMED_SECONDS = 10, 5.0  # at least, before the time of the whole run is told
 
 
@@ -83,8 +90,8 @@ def csv_bytes(header: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes:
 
 
 def history_csv(history: list[EpochMetrics]) -> bytes:
-    """Return the contents of training_log.csv: a line for each finished epoch."""
-    return csv_bytes(history[0], [row.values() for row in history])
+    """Return the contents of training_log.csv: a line for each finished epoch; a figure that is unknown is empty."""
+    return csv_bytes(history[0], [["" if math.isnan(value) else value for value in row.values()] for row in history])
 
 
 def run_header(network: Network, device: torch.device, precision: torch.dtype) -> str:
@@ -96,9 +103,10 @@ def run_header(network: Network, device: torch.device, precision: torch.dtype) -
 
 def epoch_line(row: EpochMetrics) -> str:
     """Return the line for a finished epoch, in the format of the report's log."""
+    drift = "" if math.isnan(row["val_drift"]) else f" - val_drift: {row['val_drift']:.2f} m"
     return (
         f"{row['images']} images [{'=' * 30}] - {row['seconds']:.0f}s - "
-        f"loss: {row['loss']:.4f} - val_loss: {row['val_loss']:.4f}"
+        f"loss: {row['loss']:.4f} - val_loss: {row['val_loss']:.4f}{drift}"
     )
 
 
@@ -171,6 +179,26 @@ def error_table(
             f"python -m simulator replay RECORDING --model {last}"
         )
     return "\n".join(lines)
+
+
+def driving(history: list[EpochMetrics], by: str, still: np.ndarray) -> str:
+    """Return in words how the last and the best epoch's models will drive, "" if no piece of a drive is held out.
+
+    by: the metric by which the best epoch was chosen; still: float64 (n,), m, of `drift.still_drifts`.
+    """
+    last, best = history[-1], min(history, key=lambda row: row[by] if not math.isnan(row[by]) else math.inf)
+    drift = last["val_drift"]
+    if math.isnan(drift) or not len(still):
+        return ""
+    verdict = next(words for limit, words in VERDICTS if drift <= limit)
+    others = f"with the wheels straight ahead it would be {still.mean():.2f} m"
+    if best is not last and not math.isnan(best["val_drift"]):
+        others = f"with model-best.pt, of epoch {best['epoch']:.0f}, {best['val_drift']:.2f} m; {others}"
+    return (
+        f"\n\nSteered by model.pt, a car that starts where the driver was is {drift:.2f} m away after two seconds\n"
+        f"({len(still)} times on held-out stretches, mean; {others}).\n"
+        f"{verdict}"
+    )
 
 
 def correlation(predicted: np.ndarray, labels: np.ndarray) -> float:

@@ -42,7 +42,7 @@ MEASURES = (
     Measure("correlation", "correlation with the driver", -1, "loss"),
     Measure("large_errors", "share of errors above 0.2", 1, "loss"),
     Measure("whiteness", "whiteness of the steering", 1, "loss"),
-    Measure("short_replay", "replay of 2 s, from the driver's path", 1, "replay"),
+    Measure("drift", "replay of 2 s: drift from the driver", 1, "replay"),
     Measure("autonomy_1", "replay: autonomy at 1 m", -1, "replay"),
     Measure("autonomy_2.5", "replay: autonomy at 2.5 m", -1, "replay"),
     Measure("metres_per_intervention_1", "replay: m per intervention at 1 m", -1, "replay"),

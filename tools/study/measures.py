@@ -1,6 +1,7 @@
 """What the study measures of a network: its errors on a recording, its replays, its laps, and how it recovers."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,10 @@ from cloning.recordings.images import read_image
 from cloning.recordings.log import Recording
 from cloning.recordings.writer import SampleClock
 from cloning.replay.autonomy import LIMITS
+from cloning.replay.drift import drifts, pieces
 from cloning.replay.drivers import ModelDriver
-from cloning.replay.replay import ReferenceLine, drive, reference_lines
-from cloning.road.motion import MPH, Stretch, wrap_angle
+from cloning.replay.replay import ReferenceLine, drive
+from cloning.road.motion import MPH, wrap_angle
 from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras
@@ -23,7 +25,6 @@ from simulator.world import Scene
 
 BATCH = 32  # frames
 LARGE_ERROR = 0.2  # of steering: the "thresholded relative error" of Codevilla et al. (1809.04843) has another unit
-PIECE_SECONDS = 2  # of a short replay: as long as the blocks of a recording that model.py validates with
 TIME_OUT = 1.5  # times the time of a lap at the set speed; a car that leaves the road over and over gets no further
 RECOVERY_SPEED, RECOVERY_SECONDS = 20.0, 3.0  # mph; the time is ChauffeurNet's (1812.03079)
 RECOVERY_OFFSETS, RECOVERY_TURNS = (0.5, 2.0), (2.0, 20.0)  # m from the lane's centre, degrees to its direction
@@ -56,7 +57,7 @@ def offline(network: Network, recording: Recording) -> dict[str, float]:
 
 
 def replayed(recording: Recording, lines: list[ReferenceLine], driver: ModelDriver) -> dict[str, float]:
-    """Return what replays of a recording measure: NVIDIA's autonomy at both limits, distances, and short replays."""
+    """Return what replays of a recording measure: NVIDIA's autonomy at both limits, distances, and drift."""
     found: dict[str, float] = {}
     for limit in LIMITS:
         done = drive(recording, lines, limit, driver)
@@ -64,31 +65,10 @@ def replayed(recording: Recording, lines: list[ReferenceLine], driver: ModelDriv
         found[f"autonomy_{limit:g}"] = done.autonomy()
         found[f"replay_distance_{limit:g}"] = float(np.abs(done.offset).mean())
         found[f"metres_per_intervention_{limit:g}"] = metres / max(1, len(done.interventions))
-    found["short_replay"] = short_replay(recording, driver)
+    every = pieces([recording], np.zeros(len(recording), int), np.arange(len(recording)))
+    with ThreadPoolExecutor(1) as pool:
+        found["drift"] = float(drifts(every, driver.network, pool).mean())
     return found
-
-
-def short_replay(recording: Recording, driver: ModelDriver) -> float:
-    """Return how far the car is from the human driver's path after PIECE_SECONDS from there: m, mean over all pieces.
-
-    This needs no lane, so that a training run could measure it on the blocks that it validates with.
-    """
-    pieces = [part for line in reference_lines(recording, by_lane=False) for part in cut(recording, line)]
-    done = drive(recording, pieces, math.inf, driver)
-    ends = np.cumsum([len(piece.stretch) for piece in pieces]) - 1
-    return float(np.abs(np.array(done.offset_from_human)[ends]).mean())
-
-
-def cut(recording: Recording, line: ReferenceLine) -> list[ReferenceLine]:
-    """Return the whole pieces of PIECE_SECONDS of a line that is the human driver's path."""
-    rows, n = line.rows, PIECE_SECONDS * SAMPLE_RATE
-    pieces = []
-    for start in range(0, len(line.stretch) - n + 1, n):
-        stretch = Stretch.of(recording, slice(rows.start + start, rows.start + start + n))
-        zeros = np.zeros(n)
-        ahead = line.ahead.take(slice(start, start + n))
-        pieces.append(ReferenceLine(stretch, zeros, zeros, is_lane_centre=False, ahead=ahead))
-    return pieces
 
 
 class Simulator:

@@ -1,0 +1,123 @@
+"""The quick replay by which a training run tells how its network drives: which pieces, how far, and what is chosen."""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from conftest import render_recording
+from test_generator import recording as without_images
+
+from cloning.errors import SimulatorError
+from cloning.pilot.network import Network
+from cloning.replay import drift
+from cloning.replay.drift import MOST_PIECES, ROWS, drifts, pieces, still_drifts
+from cloning.replay.replay import load_recording
+from cloning.road.motion import Stretch, curvature
+from cloning.training.checkpoint import Progress
+from cloning.training.summary import driving
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    return load_recording(render_recording(tmp_path_factory.mktemp("drift") / "lake", rows=100))
+
+
+def moving(n, name="lake"):
+    found = without_images(n, name, seconds=1 / 15)
+    found.speed[:] = 20
+    return found
+
+
+def rows_of(found):
+    return [(line.rows.start, line.rows.stop) for _, line in found]
+
+
+def test_pieces_are_those_of_the_held_out_stretches_with_the_rows_in_between():
+    held_out = np.r_[0:30, 150:165, 170:180, 300:310]  # five rows of the second are filtered out, the third is short
+    found = pieces([moving(400)], np.zeros(len(held_out), int), held_out)
+    assert rows_of(found) == [(0, 30), (150, 180)]
+    two = pieces([moving(60), moving(60, "b")], np.repeat([1, 0], 30), np.r_[10:40, 20:50])
+    assert [(each.folder.name, rows) for (each, _), rows in zip(two, rows_of(two), strict=True)] == [
+        ("lake", (20, 50)),
+        ("b", (10, 40)),
+    ]
+    every = pieces([moving(10_000)], np.zeros(10_000, int), np.arange(10_000))
+    assert len(every) == MOST_PIECES
+    assert rows_of(every)[0] == (0, ROWS)
+    assert rows_of(every)[-1][1] > 9_900, "from the first to the last"
+    assert pieces([without_images(400)], np.zeros(400, int), np.arange(400)) == [], "the car stands still"
+    assert pieces([moving(400)], np.array([], int), np.array([], int)) == []
+
+
+def test_drift_is_the_distance_between_the_two_cars(recording, monkeypatch):
+    """The oracle is the recorded car's trajectory, integrated with the other steering instead of its own."""
+    found = pieces([recording], np.zeros(100, int), np.arange(100))
+    assert rows_of(found) == [(0, 30), (30, 60), (60, 90)]
+
+    class Driver:
+        def __init__(self, more):
+            self.more = more
+
+        def __call__(self, frame):
+            return frame.human_steering + self.more
+
+    monkeypatch.setattr(drift, "ModelDriver", Driver)
+    with ThreadPoolExecutor(2) as pool:
+        assert drifts(found, 0.0, pool) == pytest.approx(np.zeros(3), abs=1e-6)
+        [first, *_] = drifts(found, 0.1, pool)
+    line = found[0][1]
+    other = load_recording(recording.folder)
+    other.steering = other.steering + np.float32(0.1)
+    path = Stretch.of(other, line.rows)
+    apart = np.hypot(path.right[-1] - line.stretch.right[-1], path.forward[-1] - line.stretch.forward[-1])
+    assert first == pytest.approx(apart, rel=0.15)
+
+
+def test_straight_ahead_the_car_drifts_by_the_bends_that_the_driver_takes():
+    recording = moving(30)
+    recording.steering[:] = 0.1
+    [far] = still_drifts(pieces([recording], np.zeros(30, int), np.arange(30)))
+    metres = 20 * 0.44704 * 29 / 15
+    assert far == pytest.approx(float(curvature(0.1)) * metres**2 / 2, rel=0.25)  # a parabola; the lag takes some
+
+
+def test_a_network_that_diverged_drives_nowhere(recording):
+    network = Network()
+    torch.nn.init.constant_(network.dense[-1].bias, math.nan)
+    with ThreadPoolExecutor(1) as pool:
+        assert np.isnan(drifts(pieces([recording], np.zeros(100, int), np.arange(100)), network, pool)).all()
+    with pytest.raises(SimulatorError, match="train the model again"):
+        drift.ModelDriver(network)(type("Frame", (), {"jpeg": lambda self: recording_jpeg(recording)})())
+
+
+def recording_jpeg(recording):
+    return recording.path(0, 0).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("by", "best"), [("val_drift", [True, True, False, True, False]), ("val_loss", [True, False, True, False, False])]
+)
+def test_the_best_epoch_is_chosen_by_one_metric(by, best):
+    progress, found = Progress(), []
+    for loss, far in ((0.3, 2.0), (0.4, 1.5), (0.2, 1.7), (0.5, 1.0), (0.4, math.nan)):
+        progress.images = 1
+        found.append(progress.finish_epoch(loss, far, by))
+    assert found == best
+
+
+def epoch(number, loss, far):
+    return {"epoch": number, "images": 1, "seconds": 1.0, "loss": 0.1, "val_loss": loss, "val_drift": far}
+
+
+def test_the_last_lines_say_in_words_how_the_network_will_drive():
+    still = np.array([2.0, 3.0])
+    text = driving([epoch(1, 0.1, 0.4), epoch(2, 0.2, 1.0)], "val_drift", still)
+    assert "1.00 m away after two seconds" in text
+    assert "with model-best.pt, of epoch 1, 0.40 m; with the wheels straight ahead it would be 2.50 m" in text
+    assert text.endswith("leave the road now and then.")
+    assert driving([epoch(1, 0.1, 0.4)], "val_drift", still).endswith("stay on the road.")
+    assert "--robust" in driving([epoch(1, 0.1, 4.0)], "val_drift", still)
+    assert "model-best" not in driving([epoch(1, 0.2, 1.0), epoch(2, 0.1, 1.2)], "val_loss", still)
+    assert driving([epoch(1, 0.1, math.nan)], "val_loss", still) == ""
