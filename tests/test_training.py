@@ -47,7 +47,7 @@ def test_a_run_tells_once_how_long_it_will_take_and_then_what_is_left(monkeypatc
         now, progress.images, progress.loss = now + 1, progress.images + 100, progress.loss + 10
         shown.append(pace.after_batch(100, progress))
     assert shown[0] == "loss: 0.1000" and shown[9] == "loss: 0.1000, 80 seconds left in all"
-    progress.finish_epoch(0.1)
+    progress.finish_epoch(0.1, math.nan)
     now, progress.images, progress.loss = now + 61, 6000, 600
     assert pace.after_batch(6000, progress) == "loss: 0.1000, 0 seconds left in all"
     assert capsys.readouterr().out == "about 89 seconds for 3 epochs on this machine\n"

@@ -74,7 +74,7 @@ class Progress:
     def finish_epoch(self, val_loss: float, val_drift: float, by: str = "val_loss") -> bool:
         """Add the epoch to the history and begin the next one; return whether its model is the best so far.
 
-        val_drift: m, nan if unknown; by: the metric whose lowest value is the best: val_loss where val_drift is unknown.
+        val_drift: m, nan if unknown; by: the metric whose lowest value is the best, or val_loss if val_drift is nan.
         The first epoch always is, so that there is a best model even if the losses are not numbers.
         """
         if math.isnan(val_drift):
