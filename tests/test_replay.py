@@ -22,11 +22,12 @@ from drive_process import serving
 from cloning.errors import SimulatorError, UserError
 from cloning.lane.reader import LanePosition
 from cloning.lane.recovery import LaneAhead
-from cloning.pilot.network import Network, load_model, save_model, steer
-from cloning.recordings.images import decode
+from cloning.pilot.network import CROP, Network, load_model, save_model, steer
+from cloning.recordings.images import compress, compressed_rows, decode, encode
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
 from cloning.replay.autonomy import LIMITS
+from cloning.replay.drivers import ModelDriver
 from cloning.replay.score import ReplayFilm, driving_metrics, steering_metrics
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
 
@@ -268,16 +269,53 @@ def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):
     assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == ["2"]
 
 
-def test_the_same_answer_in_process_as_by_the_network(recording, model):
-    network, answers = load_model(model), []
-    recording.keep(np.arange(45))
+@pytest.mark.parametrize("crop", [(60, 25), (0, 85), (85, 0)])
+def test_in_process_the_network_sees_exactly_what_a_server_receives(recording, tmp_path, crop):
+    torch.manual_seed(0)
+    save_model(tmp_path / "model.pt", Network(crop))
+    network, driver = load_model(tmp_path / "model.pt"), ModelDriver(str(tmp_path / "model.pt"))
+    recording.keep(np.arange(90) if crop == CROP else np.arange(45))
+    poses = []
+
+    def compared(frame):
+        received = decode(frame.jpeg())
+        assert np.array_equal(frame.received(driver.rows), received[driver.rows])
+        steering = float(steer(network, received))
+        assert driver(frame) == steering, "to the bit"
+        poses.append(frame.pose)
+        return np.clip(steering + 0.4 * np.sin(frame.row / 9), -1, 1)  # far to both sides, so that all cameras are used
+
+    replay.drive(recording, human(recording), 2.5, compared)
+    right, yaw = np.array(poses).T
+    assert right.min() < -0.8 and right.max() > 0.8 and np.abs(yaw).max() > 0.1
+
+
+@pytest.mark.parametrize("first", range(0, 64, 7))
+def test_rows_compressed_alone_are_those_of_the_whole_frame(first):
+    """Noise, so that every pixel depends on all that the compression lets it depend on."""
+    frame = np.random.default_rng(0).integers(0, 256, (160, 320, 3), np.uint8)
+    rows = slice(first, first + 75)
+    made = compressed_rows(rows)
+    alone = compress(frame[made], 95)[rows.start - made.start : rows.stop - made.start]
+    assert np.array_equal(alone, decode(encode(frame, 95))[rows])
+    assert made.stop - made.start <= 75 + 2 * 16
+
+
+def test_drives_at_several_limits_ask_the_model_once_until_they_part(recording):
+    """They are the same as one after the other."""
 
     def driver(frame):
-        answers.append(float(steer(network, decode(frame.jpeg()))))
-        return answers[-1]
+        asked.append((frame.row, frame.pose))
+        return float(np.clip(frame.human_steering + 0.03 * (frame.row > 100), -1, 1))
 
-    done = replay.drive(recording, human(recording), 2.5, driver)
-    assert done.steering == answers
+    limits, lines, asked = (1.0, 2.0, 2.5), human(recording), []
+    expected = [replay.drive(recording, lines, limit, driver) for limit in limits]
+    views, asked = set(asked), []
+    done = command.drive_at_limits(recording, lines, driver, dict.fromkeys(limits), parallel=True)
+    assert done == expected
+    parted = min(expected[0].interventions)
+    assert parted > 100 and sorted(asked) == sorted(views)
+    assert [row for row, _ in sorted(asked)[: parted + 2]] == [*range(parted), parted, parted], "two from there on"
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,7 @@ def restore_weights(network: Network, saved: dict[str, Any]) -> None:
 def steer(network: Network, frame: np.ndarray) -> np.float32:
     """Return the steering for a frame, uint8 (160, 320, 3), RGB, clipped to -1..1: the number that is sent and shown.
 
-    Raises ArithmeticError if the network's output is not finite.
+    The frame may already be cropped: uint8 (75, 320, 3). Raises ArithmeticError if the network's output is not finite.
     """
     with torch.inference_mode():
         steering = network(torch.from_numpy(frame)[None].to(next(network.parameters()).device)).cpu().numpy()[0]

@@ -17,6 +17,7 @@ MAX_BYTES = 1 << 20  # of a frame's JPEG; noise at quality 100 takes a fifth of 
 MAX_SEGMENTS = 100  # a camera's JPEG has 10
 MAX_SCANS = 20  # a progressive JPEG usually has 10; each one may take as long as the whole frame
 
+BLOCK_ROWS = 16  # of a frame that `encode` compresses together: colour has half the resolution, in blocks of 8 x 8
 NONBLOCKING = getattr(os, "O_NONBLOCK", 0)  # opening a named pipe without a writer would block; Windows has none
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; all with Huffman codes
 SCAN_HEADER = 0xDA
@@ -78,19 +79,45 @@ def decode(jpeg: bytes) -> np.ndarray:
     rows, columns = jpeg_size(jpeg)
     if (rows, columns) != FRAME[:2]:
         raise ValueError(f"{columns}x{rows} pixels where {FRAME[1]}x{FRAME[0]} are expected")
-    try:
-        frame = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise ValueError("damaged") from error
-    if frame is None or frame.shape != FRAME or frame.dtype != np.uint8:
+    frame = _pixels(jpeg)
+    if frame.shape != FRAME or frame.dtype != np.uint8:
         raise ValueError("damaged")
     return frame
+
+
+def _pixels(jpeg: bytes) -> np.ndarray:
+    """Return the pixels of a JPEG of any size: uint8 (rows, columns, 3), RGB. Raises ValueError if it is damaged."""
+    try:
+        pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise ValueError("damaged") from error
+    if pixels is None:
+        raise ValueError("damaged")
+    return pixels
 
 
 def encode(frame: np.ndarray, quality: int) -> bytes:
     """Encode a frame, uint8 (rows, columns, 3), RGB, as JPEG; quality: 0..100."""
     bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+def compressed_rows(rows: slice) -> slice:
+    """Return the rows of a frame on whose compression these rows of it depend: theirs, and whole blocks around them.
+
+    A decoder interpolates colours between a row and its neighbours, so these count as well.
+    """
+    first, end = max(rows.start - 1, 0), min(rows.stop + 1, FRAME[0])
+    return slice(first - first % BLOCK_ROWS, end + -end % BLOCK_ROWS)
+
+
+def compress(rows: np.ndarray, quality: int) -> np.ndarray:
+    """Return rows of a frame as they are after `encode` and `decode` of the whole frame, but sooner.
+
+    rows: `compressed_rows` of a frame, uint8 (k, 320, 3), RGB; quality: 0..100. Returns the same shape. Only the rows
+    of which they are the `compressed_rows` are those of the whole frame.
+    """
+    return _pixels(encode(rows, quality))
 
 
 def read_jpeg(path: Path) -> bytes:

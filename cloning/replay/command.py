@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +12,19 @@ from cloning.errors import SimulatorError
 from cloning.outputs import check_folders, run_all, write_json
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.drivers import ModelDriver, ServerDriver
-from cloning.replay.replay import Drive, ReferenceLine, ReplayFrame, Watcher, drive, load_recording, reference_lines
+from cloning.replay.replay import (
+    Drive,
+    Driver,
+    ReferenceLine,
+    ReplayFrame,
+    Watcher,
+    drive,
+    load_recording,
+    reference_lines,
+)
 from cloning.replay.score import ReplayFilm, ReplayReport, replay_report, report_text, write_plot
+
+KEPT_ANSWERS = 1000  # views: drives at the same pose are few rows apart
 
 
 @dataclass(frozen=True)
@@ -79,20 +90,49 @@ def run(options: Options) -> None:
     run_all(*steps)
 
 
+class AskedOnce:
+    """A driver of several drives of a recording, which asks another driver only once about each view.
+
+    Until the first intervention in a stretch, the drives at all limits are the same.
+    """
+
+    def __init__(self, driver: Driver):
+        """driver: it must answer a view always alike."""
+        self.driver, self.lock = driver, threading.Lock()
+        self.answers: dict[tuple[int, float, float], Future[float]] = {}
+
+    def __call__(self, frame: ReplayFrame) -> float:
+        """Return the driver's steering, or raise its error; wait if another thread has asked and it computes still."""
+        view = frame.row, *frame.pose
+        with self.lock:
+            is_new = view not in self.answers
+            answer = self.answers.setdefault(view, Future())
+            if len(self.answers) > KEPT_ANSWERS:
+                del self.answers[next(iter(self.answers))]
+        if is_new:
+            try:
+                answer.set_result(self.driver(frame))
+            except BaseException as error:
+                answer.set_exception(error)
+        return answer.result()
+
+
 def drive_at_limits(
     recording: Recording,
     lines: list[ReferenceLine],
-    driver: ModelDriver | ServerDriver,
+    driver: Driver,
     watchers: dict[float, Watcher | None],
     parallel: bool,
 ) -> list[Drive]:
     """Return the drives of a recording at each limit, in the order of `watchers`.
 
-    parallel: drive in a thread per limit. If one drive fails, or on Ctrl-C, the others stop at their next row.
-    Otherwise drive in this thread, which Ctrl-C interrupts also while it waits for a server.
+    parallel: drive in a thread per limit, by a driver that answers a view always alike. If one drive fails, or on
+    Ctrl-C, the others stop at their next row. Otherwise drive in this thread, which Ctrl-C interrupts also while it
+    waits for a server.
     """
     rows = sum(len(line.stretch) for line in lines)
     stopped = threading.Event()
+    driver = AskedOnce(driver) if parallel else driver
 
     def drive_at(limit: float) -> Drive:
         film = watchers[limit]

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from cloning.errors import SimulatorError
-from cloning.recordings.images import decode
+from cloning.recordings.format import FRAME
 from cloning.replay.replay import ReplayFrame
 from cloning.wire.client import ConnectionLost, telemetry_packet
 from cloning.wire.session import ClientSession
@@ -50,12 +50,14 @@ class ModelDriver:
 
         torch.set_num_threads(1)  # the drives at several limits run in a thread each
         self.network = load_model(model) if isinstance(model, str) else model
+        top, bottom = self.network.crop
+        self.rows = slice(top, FRAME[0] - bottom)  # of a frame, which the network sees
         self.steer = steer
 
     def __call__(self, frame: ReplayFrame) -> float:
         """Return the steering, -1..1. Raises SimulatorError if the network computes no finite number."""
         try:
-            return float(self.steer(self.network, decode(frame.jpeg())))
+            return float(self.steer(self.network, frame.received(self.rows)))
         except ArithmeticError as error:
             raise SimulatorError(f"{error}: train the model again") from None
 

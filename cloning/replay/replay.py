@@ -16,7 +16,7 @@ from cloning.errors import RecordingError
 from cloning.lane.recovery import LaneAhead
 from cloning.recordings.check import check_images
 from cloning.recordings.format import DRIVING_LOG
-from cloning.recordings.images import encode
+from cloning.recordings.images import compress, compressed_rows, encode
 from cloning.recordings.log import Recording, print_findings, read_recording
 from cloning.replay.autonomy import autonomy
 from cloning.replay.views import StretchViews
@@ -193,8 +193,7 @@ class ReplayFrame:
 
     def __init__(self, recording: Recording, views: StretchViews, car: ReplayedCar, at: int):
         self.views, self.at, self.pose = views, at, (car.right, car.yaw)
-        self.ahead = car.line.ahead.take(slice(at, at + 1))
-        self.row = car.line.rows.start + at
+        self.line, self.row = car.line, car.line.rows.start + at
         self.speed = float(recording.speed[self.row])  # mph
         self.human_steering = float(car.human_steering[at])  # -1..1
 
@@ -214,14 +213,26 @@ class ReplayFrame:
             return self.views.jpeg(self.at)
         return encode(self.view, VIEW_JPEG_QUALITY)
 
+    def received(self, rows: slice) -> np.ndarray:
+        """Return rows of `decode(self.jpeg())`, which a server receives: uint8 (k, 320, 3), RGB; only these are made.
+
+        rows: of the frame.
+        """
+        if not any(self.pose):
+            return self.recorded[rows]
+        made = compressed_rows(rows)
+        view = compress(self.views.view_from(self.at, *self.pose, made), VIEW_JPEG_QUALITY)
+        return view[rows.start - made.start : rows.stop - made.start]
+
     def recovery_steering(self) -> float:
         """Return the recovery steering from the car's pose, -1..1: the label of `model.py --robust`.
 
         The lane ahead is that of the reference line, so the human driver's path where that is the reference.
         """
         right, yaw = self.pose
-        human_yaw = float(self.ahead.yaw[0])
-        return float(self.ahead.steering(self.ahead.offset[0] + right * np.cos(human_yaw), human_yaw + yaw)[0])
+        ahead = self.line.ahead.take(slice(self.at, self.at + 1))
+        human_yaw = float(ahead.yaw[0])
+        return float(ahead.steering(ahead.offset[0] + right * np.cos(human_yaw), human_yaw + yaw)[0])
 
 
 Driver = Callable[[ReplayFrame], float]  # returns steering, -1..1

@@ -4,11 +4,14 @@ import functools
 
 import numpy as np
 
+from cloning.recordings.format import FRAME
 from cloning.recordings.images import read_image
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, FIRST_BONNET_ROW, camera_position
 from cloning.road.motion import AXLE_TO_CAMERA, Stretch, components, forward_vector, right_of
 from cloning.road.warp import warp
+
+WHOLE = slice(0, FRAME[0])  # rows of a frame
 
 
 class StretchViews:
@@ -37,28 +40,28 @@ class StretchViews:
         """Return the bytes of the centre camera's file. Raises RecordingError if it became unusable."""
         return self._image(at, 0)[0]
 
-    def view_from(self, at: int, right: float, yaw: float) -> np.ndarray:
-        """Return what the centre camera would see from another pose than the recorded one: uint8 (160, 320, 3), RGB.
+    def view_from(self, at: int, right: float, yaw: float, rows: slice = WHOLE) -> np.ndarray:
+        """Return what the centre camera would see from another pose than the recorded one: uint8 (k, 320, 3), RGB.
 
-        right: m from the recorded position of the rear axle to the right; yaw: radians to the recorded heading.
+        right: m from the recorded position of the rear axle to the right; yaw: radians to the recorded heading;
+        rows: of the frame, which are the same whichever others are asked for.
         """
         heading = self.stretch.heading[at] + yaw
         axle = self._axle(at) + right * right_of(forward_vector(self.stretch.heading[at]))
         position = camera_position(axle, forward_vector(heading))
         offset = right + AXLE_TO_CAMERA * np.sin(yaw)
         camera = int(np.argmin([abs(offset - mounted) for mounted in CAMERA_OFFSETS.values()]))
-        view, seen = self._warp(at, camera, position, heading)
+        # From the first row on, whichever are asked for: OpenCV rounds the sky of another box differently.
+        view, seen = self._warp(at, camera, position, heading, (0, FIRST_BONNET_ROW, 0, FRAME[1]))
         driven = self.stretch.driven
         earlier = int(np.searchsorted(driven, driven[at] - EARLIER_FRAME, "right")) - 1
-        rows, columns = (~seen[:FIRST_BONNET_ROW]).nonzero()
-        if earlier >= 0 and len(rows):
-            top, bottom = int(rows.min()), int(rows.max()) + 1
-            left, right_end = int(columns.min()), int(columns.max()) + 1
-            earlier_view, _ = self._warp(earlier, camera, position, heading, (top, bottom, left, right_end))
+        unseen = ~seen
+        if earlier >= 0 and unseen.any():
+            (top, bottom), (left, right_end) = (np.flatnonzero(unseen.any(axis))[[0, -1]] + (0, 1) for axis in (1, 0))
             box = np.s_[top:bottom, left:right_end]
-            np.copyto(view[box], earlier_view, where=~seen[box][..., None])
-        view[FIRST_BONNET_ROW:] = self.frame(at, 0)[FIRST_BONNET_ROW:]
-        return view
+            earlier_view, _ = self._warp(earlier, camera, position, heading, (top, bottom, left, right_end))
+            np.copyto(view[box], earlier_view, where=unseen[box][..., None])
+        return np.concatenate([view[rows], self.frame(at, 0)[FIRST_BONNET_ROW : rows.stop]])
 
     def _axle(self, at: int) -> np.ndarray:
         """Return the middle of the rear axle, float64 (2,): m, right and forward in the stretch's frame."""
@@ -70,11 +73,11 @@ class StretchViews:
         camera: int,
         position: np.ndarray,
         heading: float,
-        box: tuple[int, int, int, int] | None = None,
+        box: tuple[int, int, int, int],
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return a camera's frame warped to another position, (2,), and heading; see `warp`."""
         forward = forward_vector(self.stretch.heading[at])
         mounted = list(CAMERA_OFFSETS.values())[camera]
         moved = components(position - camera_position(self._axle(at), forward, mounted), forward)
         pose = float(moved[0]), float(moved[1]), float(heading - self.stretch.heading[at])
-        return warp(self.frame(at, camera), *pose, box) if box else warp(self.frame(at, camera), *pose)
+        return warp(self.frame(at, camera), *pose, box)
