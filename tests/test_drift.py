@@ -11,6 +11,7 @@ from test_generator import recording as without_images
 
 from cloning.errors import SimulatorError
 from cloning.pilot.network import Network
+from cloning.recordings.images import read_frame
 from cloning.replay import drift
 from cloning.replay.drift import MOST_PIECES, ROWS, drifts, pieces, still_drifts
 from cloning.replay.replay import load_recording
@@ -89,11 +90,13 @@ def test_a_network_that_diverged_drives_nowhere(recording):
     with ThreadPoolExecutor(1) as pool:
         assert np.isnan(drifts(pieces([recording], np.zeros(100, int), np.arange(100)), network, pool)).all()
     with pytest.raises(SimulatorError, match="train the model again"):
-        drift.ModelDriver(network)(type("Frame", (), {"jpeg": lambda self: recording_jpeg(recording)})())
+        drift.ModelDriver(network)(
+            type("Frame", (), {"received": lambda self, rows: recording_frame(recording)[rows]})()
+        )
 
 
-def recording_jpeg(recording):
-    return recording.path(0, 0).read_bytes()
+def recording_frame(recording):
+    return read_frame(recording.path(0, 0))
 
 
 @pytest.mark.parametrize(
