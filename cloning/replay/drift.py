@@ -22,7 +22,7 @@ from cloning.road.motion import Stretch, stretches
 
 SECONDS = 2.0  # as long as the stretches that model.py validates with
 ROWS, LEAST_ROWS = round(SECONDS * SAMPLE_RATE), round(0.75 * SECONDS * SAMPLE_RATE)  # of a piece
-MOST_PIECES = 64  # two minutes of driving
+MOST_PIECES = 32  # a minute of driving
 
 Piece = tuple[Recording, ReferenceLine]
 
