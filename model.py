@@ -42,7 +42,7 @@ from cloning.pilot.network import CROP, UNITS, Network, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS, FRAME
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
-from cloning.replay.drift import drifts, pieces, still_drifts
+from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import summary
 from cloning.training.adam import Adam
 from cloning.training.checkpoint import Checkpoint, Progress, RunFiles, fingerprint, resumed_arguments
@@ -103,6 +103,7 @@ class ReportObservations(Observations):
     too_few: ClassVar[str] = "--throttle-threshold drops most of them"
     dropout: ClassVar[bool] = True
     best_by: ClassVar[str] = "val_drift"
+    aimed_at: ClassVar[str] = "the driver's path"
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:
@@ -352,7 +353,7 @@ class TrainingRun:
         data = fingerprint(training, validation)
         self.checkpoint = Checkpoint(self.files, arguments, self.network, self.optimizer, data)
         self.validation_sets = validation.validation_sets(arguments.seed)
-        self.pieces = pieces(validation.recordings, validation.recording, validation.row)[rank() :: world()]
+        self.held_out = held_out(validation.recordings, validation.recording, validation.row, validation.aim())
         self.progress = self.checkpoint.restore(resumed) if resumed else Progress()
         self.pace, self.stop, self.saved_at = summary.Pace(arguments), StopSignals(), time.monotonic()
 
@@ -411,7 +412,7 @@ class TrainingRun:
         error = 0.0
         for images, labels in self.validation_sets:
             error += float(((self.predict(self.network, images, mine) - labels[mine]) ** 2).sum())
-        far = drifts(self.pieces, self.network, self.pool)
+        far = drifts(self.held_out[rank() :: world()], self.network, self.pool)
         error, metres, n = summed(torch.tensor([error, far.sum(), len(far)], dtype=torch.float64), self.device).tolist()
         return error / len(self.validation_sets) / len(chosen), metres / n if n else math.nan
 
@@ -436,7 +437,7 @@ class TrainingRun:
             network = load_model(path, self.device)
             models[path.name] = self.predict(network, self.validation.center, np.arange(len(labels)))
         table = summary.error_table(labels, mean, models, (0, STRAIGHT, *TURN, 1), self.validation.label_source)
-        return table + summary.driving(self.progress.history, self.validation.best_by, still_drifts(self.pieces))
+        return table + summary.driving(self.progress.history, type(self.validation), still_drifts(self.held_out))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -9,11 +9,12 @@ import torch
 from conftest import render_recording
 from test_generator import recording as without_images
 
+import model
 from cloning.errors import SimulatorError
 from cloning.pilot.network import Network
 from cloning.recordings.images import read_frame
 from cloning.replay import drift
-from cloning.replay.drift import MOST_PIECES, ROWS, drifts, pieces, still_drifts
+from cloning.replay.drift import MOST_PIECES, ROWS, drifts, held_out, still_drifts
 from cloning.replay.replay import load_recording
 from cloning.road.motion import Stretch, curvature
 from cloning.training.checkpoint import Progress
@@ -32,29 +33,32 @@ def moving(n, name="lake"):
 
 
 def rows_of(found):
-    return [(line.rows.start, line.rows.stop) for _, line in found]
+    return [(piece.line.rows.start, piece.line.rows.stop) for piece in found]
+
+
+def driven(recordings, which, rows):
+    """The pieces of a network that should follow the driver's path."""
+    return held_out(recordings, which, rows, np.zeros(len(rows)))
 
 
 def test_pieces_are_those_of_the_held_out_stretches_with_the_rows_in_between():
-    held_out = np.r_[0:30, 150:165, 170:180, 300:310]  # five rows of the second are filtered out, the third is short
-    found = pieces([moving(400)], np.zeros(len(held_out), int), held_out)
+    chosen = np.r_[0:30, 150:165, 170:180, 300:310]  # five rows of the second are filtered out, the third is short
+    found = driven([moving(400)], np.zeros(len(chosen), int), chosen)
     assert rows_of(found) == [(0, 30), (150, 180)]
-    two = pieces([moving(60), moving(60, "b")], np.repeat([1, 0], 30), np.r_[10:40, 20:50])
-    assert [(each.folder.name, rows) for (each, _), rows in zip(two, rows_of(two), strict=True)] == [
-        ("lake", (20, 50)),
-        ("b", (10, 40)),
-    ]
-    every = pieces([moving(10_000)], np.zeros(10_000, int), np.arange(10_000))
+    two = driven([moving(60), moving(60, "b")], np.repeat([1, 0], 30), np.r_[10:40, 20:50])
+    assert [piece.recording.folder.name for piece in two] == ["lake", "b"]
+    assert rows_of(two) == [(20, 50), (10, 40)]
+    every = driven([moving(10_000)], np.zeros(10_000, int), np.arange(10_000))
     assert len(every) == MOST_PIECES
     assert rows_of(every)[0] == (0, ROWS)
     assert rows_of(every)[-1][1] > 9_900, "from the first to the last"
-    assert pieces([without_images(400)], np.zeros(400, int), np.arange(400)) == [], "the car stands still"
-    assert pieces([moving(400)], np.array([], int), np.array([], int)) == []
+    assert driven([without_images(400)], np.zeros(400, int), np.arange(400)) == [], "the car stands still"
+    assert driven([moving(400)], np.array([], int), np.array([], int)) == []
 
 
 def test_drift_is_the_distance_between_the_two_cars(recording, monkeypatch):
     """The oracle is the recorded car's trajectory, integrated with the other steering instead of its own."""
-    found = pieces([recording], np.zeros(100, int), np.arange(100))
+    found = driven([recording], np.zeros(100, int), np.arange(100))
     assert rows_of(found) == [(0, 30), (30, 60), (60, 90)]
 
     class Driver:
@@ -68,7 +72,7 @@ def test_drift_is_the_distance_between_the_two_cars(recording, monkeypatch):
     with ThreadPoolExecutor(2) as pool:
         assert drifts(found, 0.0, pool) == pytest.approx(np.zeros(3), abs=1e-6)
         [first, *_] = drifts(found, 0.1, pool)
-    line = found[0][1]
+    line = found[0].line
     other = load_recording(recording.folder)
     other.steering = other.steering + np.float32(0.1)
     path = Stretch.of(other, line.rows)
@@ -76,10 +80,17 @@ def test_drift_is_the_distance_between_the_two_cars(recording, monkeypatch):
     assert first == pytest.approx(apart, rel=0.15)
 
 
+def test_the_aim_is_that_of_the_pieces_last_row():
+    rows = np.r_[0:30, 150:175, 176:179]
+    found = held_out([moving(400)], np.zeros(len(rows), int), rows, rows / 10)
+    assert [piece.aim for piece in found] == [2.9, 17.8]
+    assert still_drifts(found) == pytest.approx([2.9, 17.8]), "the driver goes straight ahead"
+
+
 def test_straight_ahead_the_car_drifts_by_the_bends_that_the_driver_takes():
     recording = moving(30)
     recording.steering[:] = 0.1
-    [far] = still_drifts(pieces([recording], np.zeros(30, int), np.arange(30)))
+    [far] = still_drifts(driven([recording], np.zeros(30, int), np.arange(30)))
     metres = 20 * 0.44704 * 29 / 15
     assert far == pytest.approx(float(curvature(0.1)) * metres**2 / 2, rel=0.25)  # a parabola; the lag takes some
 
@@ -88,7 +99,7 @@ def test_a_network_that_diverged_drives_nowhere(recording):
     network = Network()
     torch.nn.init.constant_(network.dense[-1].bias, math.nan)
     with ThreadPoolExecutor(1) as pool:
-        assert np.isnan(drifts(pieces([recording], np.zeros(100, int), np.arange(100)), network, pool)).all()
+        assert np.isnan(drifts(driven([recording], np.zeros(100, int), np.arange(100)), network, pool)).all()
     with pytest.raises(SimulatorError, match="train the model again"):
         drift.ModelDriver(network)(
             type("Frame", (), {"received": lambda self, rows: recording_frame(recording)[rows]})()
@@ -115,12 +126,13 @@ def epoch(number, loss, far):
 
 
 def test_the_last_lines_say_in_words_how_the_network_will_drive():
-    still = np.array([2.0, 3.0])
-    text = driving([epoch(1, 0.1, 0.4), epoch(2, 0.2, 1.0)], "val_drift", still)
-    assert "1.00 m away after two seconds" in text
-    assert "with model-best.pt, of epoch 1, 0.40 m; with the wheels straight ahead it would be 2.50 m" in text
+    still, report, robust = np.array([2.0, 3.0]), model.ReportObservations, model.RobustObservations
+    text = driving([epoch(1, 0.1, 0.4), epoch(2, 0.2, 1.0)], report, still)
+    assert "from where the driver was, a car is 1.00 m from the driver's path" in text
+    assert "2 held-out stretches; 0.40 m by model-best.pt of epoch 1, 2.50 m with the wheels straight ahead" in text
     assert text.endswith("leave the road now and then.")
-    assert driving([epoch(1, 0.1, 0.4)], "val_drift", still).endswith("stay on the road.")
-    assert "--robust" in driving([epoch(1, 0.1, 4.0)], "val_drift", still)
-    assert "model-best" not in driving([epoch(1, 0.2, 1.0), epoch(2, 0.1, 1.2)], "val_loss", still)
-    assert driving([epoch(1, 0.1, math.nan)], "val_loss", still) == ""
+    assert driving([epoch(1, 0.1, 0.4)], report, still).endswith("stay on the road.")
+    assert "--robust" in driving([epoch(1, 0.1, 4.0)], report, still)
+    text = driving([epoch(1, 0.2, 1.0), epoch(2, 0.1, 1.2)], robust, still)
+    assert "1.20 m from the lane's centre" in text and "model-best" not in text
+    assert driving([epoch(1, 0.1, math.nan)], robust, still) == ""

@@ -133,6 +133,7 @@ class Observations(ABC):
     too_few: ClassVar[str]  # the reason to print if `select` leaves too few rows
     dropout: ClassVar[bool]  # whether the network is trained with it
     best_by: ClassVar[str]  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
+    aimed_at: ClassVar[str]  # where the car should be, in words
 
     def __post_init__(self) -> None:
         self.cache = ImageCache(self.cached_rows.stop - self.cached_rows.start)
@@ -178,6 +179,10 @@ class Observations(ABC):
     def learning_rate(arguments: Arguments, progress: float) -> float:
         """Return the learning rate of the next step, a constant; progress: the finished share of the run, 0..1."""
         return arguments.learning_rate
+
+    def aim(self) -> np.ndarray:
+        """Return how far right of the recorded car a well steered one should be: float (n,), m; on the same path: 0."""
+        return np.zeros(len(self))
 
     # ---- columns
 

@@ -21,6 +21,7 @@ from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
 from cloning.training.checkpoint import EpochMetrics, Progress
 from cloning.training.distributed import rank, world
+from cloning.training.observations import Observations
 from cloning.training.options import Arguments
 
 MIN_CORRELATION = 0.3  # with the labels; below it, the model has hardly learned anything
@@ -181,23 +182,22 @@ def error_table(
     return "\n".join(lines)
 
 
-def driving(history: list[EpochMetrics], by: str, still: np.ndarray) -> str:
+def driving(history: list[EpochMetrics], kind: type[Observations], still: np.ndarray) -> str:
     """Return in words how the last and the best epoch's models will drive, "" if no piece of a drive is held out.
 
-    by: the metric by which the best epoch was chosen; still: float64 (n,), m, of `drift.still_drifts`.
+    kind: of the observations; still: float64 (n,), m, of `drift.still_drifts`.
     """
-    last, best = history[-1], min(history, key=lambda row: row[by] if not math.isnan(row[by]) else math.inf)
-    drift = last["val_drift"]
-    if math.isnan(drift) or not len(still):
+    last, by = history[-1], kind.best_by
+    best = min(history, key=lambda row: math.inf if math.isnan(row[by]) else row[by])
+    if math.isnan(last["val_drift"]) or not len(still):
         return ""
-    verdict = next(words for limit, words in VERDICTS if drift <= limit)
-    others = f"with the wheels straight ahead it would be {still.mean():.2f} m"
+    verdict = next(words for limit, words in VERDICTS if last["val_drift"] <= limit)
+    others = f"{still.mean():.2f} m with the wheels straight ahead"
     if best is not last and not math.isnan(best["val_drift"]):
-        others = f"with model-best.pt, of epoch {best['epoch']:.0f}, {best['val_drift']:.2f} m; {others}"
+        others = f"{best['val_drift']:.2f} m by model-best.pt of epoch {best['epoch']:.0f}, {others}"
     return (
-        f"\n\nSteered by model.pt, a car that starts where the driver was is {drift:.2f} m away after two seconds\n"
-        f"({len(still)} times on held-out stretches, mean; {others}).\n"
-        f"{verdict}"
+        f"\n\nSteered by model.pt for two seconds, from where the driver was, a car is {last['val_drift']:.2f} m "
+        f"from {kind.aimed_at}\n(mean of {len(still)} held-out stretches; {others}).\n{verdict}"
     )
 
 

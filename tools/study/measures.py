@@ -13,7 +13,7 @@ from cloning.recordings.images import read_image
 from cloning.recordings.log import Recording
 from cloning.recordings.writer import SampleClock
 from cloning.replay.autonomy import LIMITS
-from cloning.replay.drift import drifts, pieces
+from cloning.replay.drift import drifts, held_out
 from cloning.replay.drivers import ModelDriver
 from cloning.replay.replay import ReferenceLine, drive
 from cloning.road.motion import MPH, wrap_angle
@@ -65,7 +65,8 @@ def replayed(recording: Recording, lines: list[ReferenceLine], driver: ModelDriv
         found[f"autonomy_{limit:g}"] = done.autonomy()
         found[f"replay_distance_{limit:g}"] = float(np.abs(done.offset).mean())
         found[f"metres_per_intervention_{limit:g}"] = metres / max(1, len(done.interventions))
-    every = pieces([recording], np.zeros(len(recording), int), np.arange(len(recording)))
+    n = len(recording)
+    every = held_out([recording], np.zeros(n, int), np.arange(n), np.zeros(n))
     with ThreadPoolExecutor(1) as pool:
         found["drift"] = float(drifts(every, driver.network, pool).mean())
     return found
