@@ -185,8 +185,8 @@ class CameraViews(Views):
         """Return the batch's observation number i for the diagnostic pictures."""
         row, camera = self.rows[i], self.cameras[i]
         frames = [self.observations.read(row, number) for number in range(len(CAMERAS))]
-        labels, titles = self.observations.steering[row] + self.corrections, [f"{CAMERAS[camera]} camera", "flipped"]
-        return Example(frames, labels, kind_inputs(frames[camera][None]), 0, titles)
+        labels, name = self.observations.steering[row] + self.corrections, f"{CAMERAS[camera]} camera"
+        return Example(frames, labels, kind_inputs(frames[camera][None]), 0, [name, f"{name}, flipped", name, name])
 
 
 def kind_inputs(images: np.ndarray) -> list[np.ndarray]:
@@ -368,7 +368,7 @@ class TrainingRun:
             is_best, history = progress.finish_epoch(loss, drift, self.validation.best_by), progress.history
             if rank() == 0:  # first: a run killed before `save` repeats this
                 write(self.files.log, summary.history_csv(history))
-                write(self.files.losses, loss_picture(history))
+                write(self.files.losses, loss_picture(history, self.training.dropout))
             self.save(self.files.last, *[self.files.best] * is_best)
             if rank() == 0:
                 print(summary.epoch_line(history[-1]), flush=True)

@@ -13,7 +13,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from conftest import HERE, ROOT, SHORT, log, render_recording, run_here, run_model, same, weights
+from conftest import HERE, ROOT, SHORT, finished_run, log, render_recording, run_here, run_model, same, weights
+from matplotlib.figure import Figure
 from PIL import Image
 
 import model
@@ -21,6 +22,7 @@ from cloning.errors import RecordingError
 from cloning.training import options, pictures, summary
 from cloning.training.checkpoint import Progress
 from cloning.training.distributed import FirstRankFailed
+from cloning.training.robust import Lanes, Poses
 
 
 def test_what_a_run_prints(finished, sample_recording):
@@ -79,8 +81,32 @@ def test_the_line_of_a_diagnostic_picture_stays_within_its_image():
     for rows in (75, 160):
         for steering in (-1.0, 0.0, 1.0):
             picture = np.asarray(pictures.panel(np.zeros((rows, 320, 3), np.uint8), "", steering))
-            yellow = (picture == (255, 255, 0)).all(2).nonzero()[0]
-            assert 40 < yellow.min() < yellow.max() < len(picture)
+            yellow, caption = (picture == (255, 255, 0)).all(2).nonzero()[0], len(picture) - pictures.SCALE * rows
+            assert caption < yellow.min() < yellow.max() < len(picture)
+
+
+def test_a_diagnostic_picture_names_the_pose_that_its_image_shows():
+    """A car on a straight that is not turned steers away from the side on which it is, also in a mirrored image."""
+    offset, mirrored = np.array([0.8, 0.8, -1.1, -1.1]), np.array([False, True, False, True])
+    poses = Poses.of(Lanes.unknown(4), offset, np.zeros(4), np.zeros(4, int), mirrored)
+    titles = [poses.title(at) for at in range(4)]
+    assert [title.split(",")[0] for title in titles] == ["0.8 m right", "0.8 m left", "1.1 m left", "1.1 m right"]
+    assert [" m right," in title for title in titles] == [steering < 0 for steering in poses.steering]
+    turned = Poses.of(Lanes.unknown(2), np.zeros(2), np.radians([5, 5]), np.zeros(2, int), mirrored[:2])
+    assert [turned.title(at).split(", ")[1] for at in range(2)] == ["turned 5° right", "turned 5° left"]
+
+
+@pytest.mark.parametrize("options, dropout", [((), "with dropout"), (("--robust",), "without dropout")])
+def test_the_legend_of_the_losses_says_whether_training_uses_dropout(
+    sample_recording, tmp_path, monkeypatch, options, dropout
+):
+    legends = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: legends.append(figure.axes[0].get_legend()))
+    finished_run(sample_recording, tmp_path, *SHORT, "--epochs", 1, *options)
+    training, validation = (text.get_text() for text in legends[0].get_texts())
+    assert training == f"training (augmented, {dropout})" and re.fullmatch(
+        r"validation \(best: .* in epoch 1\)", validation
+    )
 
 
 def test_what_a_run_leaves(finished):

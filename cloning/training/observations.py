@@ -41,7 +41,7 @@ class Example(NamedTuple):
     camera_labels  float32 (3,): their labels
     images         uint8 (1, rows, 320, 3) each: the four kinds of image before brightening and shadowing
     first_row      the row of the full frame that is the first of `images`
-    titles         of the unaltered and the flipped image
+    titles         of these images
     """
 
     frames: list[np.ndarray]

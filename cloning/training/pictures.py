@@ -13,39 +13,42 @@ from cloning.training.observations import Augmented, Choices
 
 Augment = Callable[[Choices, np.ndarray, list[np.ndarray], int], list[Augmented]]
 
+SCALE = 3  # of a frame's pixels: three frames in a row are 25 cm wide at 300 dpi
+FONT, MARGIN = 44, 12  # pixels: of the captions, which stay legible at a third of the size; between panels
+DPI = 200  # of the curves, which are 8 inches wide
+
 
 def panel(frame: np.ndarray, title: str, steering: float) -> Image.Image:
-    """Return a frame at twice its size under a title, with the steering as a number and as the wheels' direction.
+    """Return an enlarged frame under a title, with the steering as a number and as the wheels' direction.
 
     frame: uint8 (rows, columns, 3), RGB; steering: -1..1.
     """
-    height, width = frame.shape[0] * 2, frame.shape[1] * 2
-    picture = Image.new("RGB", (width, height + 40), "white")
+    rows, columns = frame.shape[:2]
+    top, width, height = round(2.5 * FONT), columns * SCALE, rows * SCALE
+    picture = Image.new("RGB", (width, top + height), "white")
     image = Image.fromarray(np.ascontiguousarray(frame))
-    picture.paste(image.resize((width, height), Image.Resampling.BICUBIC), (0, 40))
+    # Every pixel as it is: that is what is trained on, and as a PNG it takes a third of an interpolated one.
+    picture.paste(image.resize((width, height), Image.Resampling.NEAREST), (0, top))
     draw = ImageDraw.Draw(picture)
-    font = ImageFont.load_default(26)
-    draw.text((10, 4), title, "black", font)
-    draw.text((width - 10, 4), f"steering {steering + 0:+.3f}", "black", font, anchor="ra")  # + 0 turns -0 into 0
+    font = ImageFont.load_default(FONT)
+    for line, text in enumerate((title, f"steering {steering + 0:+.3f}")):  # + 0 turns -0 into 0
+        draw.text((4, line * 1.2 * FONT), text, "black", font)
     heading = np.radians(FULL_LOCK * steering)
-    length, start = (
-        min(150, height - 40),
-        np.array([width / 2, height + 10]),
-    )  # within the image, which begins in row 40
+    start, length = np.array([width / 2, top + (rows - 15) * SCALE]), min(75, rows - 20) * SCALE  # within the frame
     end = start + length * np.array([np.sin(heading), -np.cos(heading)])
-    for colour, thickness in (("black", 9), ("yellow", 5)):
+    for colour, thickness in (("black", 13), ("yellow", 7)):
         draw.line([*start, *end], colour, thickness)
     return picture
 
 
-def side_by_side(panels: list[Image.Image]) -> bytes:
-    """Return a PNG of panels of equal size in a row, with margins."""
-    width, height = panels[0].size
-    whole = Image.new("RGB", (len(panels) * (width + 12) + 12, height + 24), "white")
+def grid(panels: list[Image.Image], columns: int) -> bytes:
+    """Return a PNG of panels of equal size, row by row, with margins."""
+    width, height = panels[0].width + MARGIN, panels[0].height + MARGIN
+    whole = Image.new("RGB", (columns * width + MARGIN, len(panels) // columns * height + MARGIN), "white")
     for i, picture in enumerate(panels):
-        whole.paste(picture, (12 + i * (width + 12), 12))
+        whole.paste(picture, (MARGIN + i % columns * width, MARGIN + i // columns * height))
     file = io.BytesIO()
-    whole.save(file, "PNG", compress_level=1)  # the default, 6, takes half a second and saves a tenth
+    whole.save(file, "PNG")
     return file.getvalue()
 
 
@@ -62,16 +65,17 @@ def batch_pictures(choices: Choices, augment: Augment) -> dict[str, bytes]:
         for frame, camera, label in zip(example.frames, CAMERAS, example.camera_labels, strict=True)
     )
     images = [kind.images[0] for kind in augment(choices, np.array([0]), example.images, example.first_row)]
-    titles = [*example.titles, f"brightness x {choices.brightness[0]:.2f}", f"shadow x {choices.darkness[0]:.2f}"]
+    changes = ["", "", f", brightness x {choices.brightness[0]:.2f}", f", shadow x {choices.darkness[0]:.2f}"]
+    titles = [title + change for title, change in zip(example.titles, changes, strict=True)]
     kinds = [panel(*column) for column in zip(images, titles, choices.views.labels[0], strict=True)]
     return {
-        "training_generator_LRC_{}.png": side_by_side([left, center, right]),
-        "training_generator_augmented-{}.png": side_by_side(kinds),
+        "training_generator_LRC_{}.png": grid([left, center, right], columns=3),
+        "training_generator_augmented-{}.png": grid(kinds, columns=2),
     }
 
 
-def loss_picture(history: list[EpochMetrics]) -> bytes:
-    """Return a PNG of both losses by epoch, with the lowest validation loss marked."""
+def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:
+    """Return a PNG of both losses by epoch, with the lowest validation loss marked; dropout: whether it trains so."""
     # matplotlib is large, and not needed before the first epoch is finished.
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -79,7 +83,8 @@ def loss_picture(history: list[EpochMetrics]) -> bytes:
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.add_subplot()
     epochs, best = [row["epoch"] for row in history], min(history, key=lambda row: row["val_loss"])
-    axes.plot(epochs, [row["loss"] for row in history], "o-", label="training (augmented, with dropout)")
+    name = f"training (augmented, with{'' if dropout else 'out'} dropout)"
+    axes.plot(epochs, [row["loss"] for row in history], "o-", label=name)
     name = f"validation (best: {best['val_loss']:.4f} in epoch {best['epoch']:.0f})"
     (line,) = axes.plot(epochs, [row["val_loss"] for row in history], "o-", label=name)
     axes.plot(best["epoch"], best["val_loss"], "o", color=line.get_color(), markersize=13, fillstyle="none")
@@ -89,5 +94,5 @@ def loss_picture(history: list[EpochMetrics]) -> bytes:
     axes.legend()
     axes.grid(alpha=0.3)
     file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=100)
+    figure.savefig(file, format="png", dpi=DPI)
     return file.getvalue()

@@ -134,6 +134,8 @@ class Lanes(LaneAhead):
 class Poses:
     """The poses from which n rows are seen, with everything that is needed to make their images.
 
+    offset    float (n,): lateral offset from the lane's centre, m; as the next, before the world is mirrored
+    yaw       float (n,): heading error, radians
     camera    int (n,): the camera whose frame is warped: 0 centre, 1 left, 2 right
     mirrored  bool (n,): whether the image shows the mirrored world, as seen by the same, slightly rolled camera
     warps     float64 (n, 2, 2, 3, 3): homographies from a frame's `SOURCE_ROWS` to what the network sees: from the
@@ -143,6 +145,8 @@ class Poses:
     shade     int16 (n,): shadows, see `light.sample_shades`
     """
 
+    offset: np.ndarray
+    yaw: np.ndarray
     camera: np.ndarray
     mirrored: np.ndarray
     warps: np.ndarray
@@ -164,7 +168,7 @@ class Poses:
         steering = lanes.steering(offset, yaw)
         labels = np.where(mirrored, -steering, steering)
         colours, shade = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1)), np.full(len(turn), -1, np.int16)
-        return Poses(camera, mirrored, np.stack(warps, axis=1), labels, colours, shade)
+        return Poses(offset, yaw, camera, mirrored, np.stack(warps, axis=1), labels, colours, shade)
 
     def take(self, rows: np.ndarray) -> "Poses":
         """Return these rows, in this order; rows: indices."""
@@ -182,6 +186,12 @@ class Poses:
             earlier = VIEW.warp_ground(read(camera, True), self.warps[at, 1, 0])
             cv2.copyTo(earlier, cv2.bitwise_not(seen), image)
         return light.relight(image, self.colours[at], int(self.shade[at]))
+
+    def title(self, at: int) -> str:
+        """Return the pose that an image shows in words, such as `0.8 m left, turned 5° right`; at: index of the row."""
+        seen = (-1 if self.mirrored[at] else 1) * np.array([self.offset[at], np.degrees(self.yaw[at])])
+        sides = ["left" if value < 0 else "right" for value in seen]
+        return f"{abs(seen[0]):.1f} m {sides[0]}, turned {abs(seen[1]):.0f}° {sides[1]}"
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -304,4 +314,4 @@ class PoseViews(Views):
         row = self.rows[i]
         frames = [self.observations.read(row, camera) for camera in range(len(CAMERAS))]
         labels = self.observations.lanes.camera_labels(row)
-        return Example(frames, labels, self.images(np.array([i])), CROP[0], ["from a pose", "from another"])
+        return Example(frames, labels, self.images(np.array([i])), CROP[0], [poses.title(i) for poses in self.poses])
