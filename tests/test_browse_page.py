@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from browse_process import browsing, placed, replayed, written_run
+from browse_process import browsing, placed, replayed, steered, written_run
 from browser import CHROMIUM, chromium
 from test_excluded import center
 
@@ -14,9 +14,17 @@ from cloning.recordings.log import read_recording
 
 
 @pytest.fixture(scope="module")
-def served(sample_recording):
+def served(sample_recording, model_file, tmp_path_factory):
+    """A recording, replayed by two models, and a training run."""
     placed(sample_recording, np.zeros(60))
-    with browsing(sample_recording) as server:
+    run = tmp_path_factory.mktemp("run")
+    models = [run / "one.pt", run / "two.pt"]
+    for model in models:
+        model.write_bytes(model_file.read_bytes())
+        steered(sample_recording, model)
+        replayed(sample_recording, model, 1.0, np.linspace(-0.5, 0.5, 60), [[30, 1.2], [50, -1.1]])
+    written_run(run, finished=1, images=500)
+    with browsing(sample_recording, "--model", *models, "--run", run) as server:
         yield server
 
 
@@ -99,7 +107,7 @@ def test_a_replay_is_watched_with_the_keyboard_alone(linked, page, model_file):
     replayed(linked, other, 1.0, -offset, [[40, -1.3]])
     with browsing(linked, "--model", model_file, other) as server:
         page.look(1280, 800)
-        page.open(f"{server.base}{server.recordings()['lake'].replace('recordings/', '#/').lstrip('/')}/0")
+        page.open(f"{server.base}{server.hash('lake')}/0")
         page.wait("document.querySelector('#where')?.textContent.endsWith('frame 1 of 60')")
         page.press("l")
         page.wait("document.querySelectorAll('#replay-list .where').length == 2")
@@ -165,17 +173,66 @@ def difference(page, camera: str, path: Path) -> float:
     return float(np.abs(shown.astype(int) - cv2.imread(str(path))[..., ::-1]).mean())
 
 
+LOOKS = [(width, dark) for width in (390, 1280, 2200) for dark in (False, True)]
+
+
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
-@pytest.mark.parametrize("width, height, dark", [(390, 844, True), (1280, 800, False), (1920, 1080, True)])
-def test_the_page_fits_every_screen(served, page, width, height, dark):
-    page.look(width, height, dark)
+@pytest.mark.parametrize("width, dark", LOOKS)
+def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
+    page.look(width, 900, dark)
     page.open(served.base)
     page.wait("document.querySelector('article dl')")
-    fits = "document.documentElement.scrollWidth <= innerWidth"
-    assert page.run(fits)
-    page.run(f"location.hash = '{served.recordings()['lake sample'].replace('recordings/', '#/').lstrip('/')}/5'")
-    page.wait("document.querySelector('#where').textContent.endsWith('frame 6 of 60')")
-    assert page.run(fits)
     ink, paper = page.run("[getComputedStyle(document.body).color, getComputedStyle(document.body).backgroundColor]")
     level = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
     assert (level[0] > level[1]) == dark and abs(level[0] - level[1]) > 400
+
+    def check() -> None:
+        assert page.run("document.documentElement.scrollWidth <= innerWidth")
+        assert page.barriers() == []
+
+    check()
+    page.run("location.hash = '#/run/0'")
+    page.wait("document.querySelector('#losses .uplot')")
+    check()
+    page.run(f"location.hash = '{served.hash('lake sample')}/5'")
+    page.wait("document.querySelector('#where').textContent.endsWith('frame 6 of 60')")
+    check()
+    page.press("l")
+    page.wait("document.querySelectorAll('.replayed').length == 2")
+    check()
+    page.press("?")
+    page.wait("document.querySelector('#help[open]')")
+    check()
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+def test_what_failed_is_tried_again(linked, page, tmp_path, model_file):
+    """The road on the list, a model's steering, its replay, and what it looks at."""
+    (tmp_path / "torch.py").write_text("raise ImportError('no PyTorch today')", encoding="utf-8")
+    with browsing(linked, "--model", model_file, modules=tmp_path) as server:
+        page.look(1280, 900)
+        page.open(server.base)
+        page.wait("document.querySelector('article button')")
+        assert "not known, the analysis failed: ImportError: no PyTorch today" in page.text()
+        placed(linked, np.zeros(60))
+        page.run("document.querySelector('article button').click()")
+        page.wait("document.querySelector('article dl').textContent.includes('lake, counter-clockwise')")
+        page.run(f"location.hash = '{server.hash('lake')}'")
+        page.wait("document.querySelector('#findings').textContent.includes('model.pt failed: ImportError')")
+        steered(linked, model_file)
+        page.run("document.querySelector('#findings button').focus()")
+        page.press("Enter")
+        page.wait("document.querySelector('#findings').textContent == 'Every row could be read as it is.'")
+        page.press("l")
+        page.wait("document.querySelector('#replay-list').textContent.includes('Failed: ImportError')")
+        replayed(linked, model_file, 1.0, np.zeros(60), [])
+        page.run("document.querySelector('#replay-list button').click()")
+        page.wait("document.querySelector('.replayed')")
+        page.press("a")
+        caption = "document.querySelector('#center').parentNode.lastElementChild.textContent"
+        page.wait(f"{caption}.includes('cannot show what it looks at')")
+        page.press("ArrowRight")
+        page.wait("document.querySelector('#where').textContent.endsWith('frame 2 of 60')")
+        page.press("ArrowLeft")
+        asked = f"{server.recordings()['lake']}/rows/0/center/0.png"
+        page.until(lambda: page.text() and sum(asked in address for address in page.addresses()) == 2)

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
-from browse_process import browsing, placed
 from browser import CHROMIUM, chromium
 from drive_process import serving
 from test_drive import Car
@@ -352,18 +351,4 @@ def test_the_page_fits_every_screen_and_bars_nobody(server, jpegs, page, width, 
         )
         level = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
         assert (level[0] > level[1]) == dark and abs(level[0] - level[1]) > 400
-        assert page.barriers() == []
-
-
-@needs_chromium
-@pytest.mark.parametrize("dark", [False, True])
-def test_the_pages_of_recordings_bar_nobody(sample_recording, page, dark):
-    placed(sample_recording, np.zeros(60))
-    with browsing(sample_recording) as server:
-        page.look(1280, 900, dark)
-        page.open(server.base)
-        page.wait("document.querySelector('article dl')")
-        assert page.barriers() == []
-        page.run(f"location.hash = '{server.recordings()['lake sample'].replace('recordings/', '#/').lstrip('/')}/5'")
-        page.wait("document.querySelector('#where').textContent.endsWith('frame 6 of 60')")
         assert page.barriers() == []

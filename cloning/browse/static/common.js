@@ -35,10 +35,13 @@ export function onClick(button, action) {
   };
 }
 
-// Give an element new children, unless they would show the same as before: a focus in them stays. build: makes them.
+// Give an element new children, unless they would show the same as before; build: makes them. A focus in them stays:
+// on the button at the same place.
 export function renew(place, content, build) {
   const now = JSON.stringify(content);
   if (place.shown == now) return;
   place.shown = now;
+  const focused = [...place.querySelectorAll("button")].indexOf(document.activeElement);
   place.replaceChildren(...build());
+  place.querySelectorAll("button")[focused]?.focus();
 }

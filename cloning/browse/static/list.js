@@ -1,5 +1,5 @@
 // All recordings at a glance.
-import {ask, element, make, many, notice, renew, request} from "./common.js";
+import {ask, element, make, many, notice, onClick, renew, request} from "./common.js";
 import {stateOf} from "./run.js";
 
 const AGAIN = 3000; // ms until a recording whose lane is being analysed is asked for again
@@ -80,14 +80,20 @@ function draw(overview, card) {
     make("div", "", {class: "pictures"}, map(overview), histogram),
     make("dl", "", {}, ...lines.flatMap(([name, value]) => [make("dt", name), make("dd", value)])),
   );
+  if (overview.lane.state == "failed") {
+    const retry = make("button", "Look for the road again"), now = shown;
+    onClick(retry, () => ask(`/${overview.id}/columns/offset`, {method: "POST"}).then(() => fill(overview.id, card, now))
+      .catch(error => notice(error.message)));
+    card.append(retry);
+  }
   histograms.get(card)?.destroy();
   histograms.set(card, bars(overview.histogram, histogram));
 }
 
-export function road({lane, roads}) {
+function road({lane, roads}) {
   if (lane.state == "waiting") return "not known yet: waits for its turn";
   if (lane.state == "running") return `not known yet: ${(100 * lane.progress).toFixed(0)} % of the frames analysed`;
-  if (lane.state == "failed") return `not known: ${lane.message}`;
+  if (lane.state == "failed") return `not known, the analysis failed: ${lane.message}`;
   if (!roads.length) return "other";
   return roads.map(([name, direction]) => `${name}, ${DIRECTIONS[direction]}`).join("; ");
 }

@@ -62,9 +62,9 @@ export class Plots {
     const figure = make("figure"), caption = make("figcaption", "", {}, make("span", title)), place = make("div");
     for (const curve of curves) {
       curve.colour ??= colour("--line");
-      const label = make("span", "", {}, make("span", curve.name ? `${curve.name} ` : "", {style: `color: ${curve.colour}`}), make("b"));
-      caption.append(label);
-      this.shown.push({value: label.lastChild, unit, digits, values: curve.values});
+      const named = curve.name ? [make("i", "", {style: `background: ${curve.colour}`}), `${curve.name} `] : [], value = make("b");
+      caption.append(make("span", "", {}, ...named, value));
+      this.shown.push({value, unit, digits, values: curve.values});
     }
     figure.append(caption, place);
     element("plots").append(figure);

@@ -1,11 +1,11 @@
 // One recording: its frames and curves, news of it from the server, and the keys.
-import {ask, element, make, many, notice, onClick} from "./common.js";
+import {ask, element, make, many, notice, onClick, renew} from "./common.js";
 import {askForReason, mark, showCuts, undo} from "./cuts.js";
 import {Frames} from "./frames.js";
 import {goTo, jump, play, PLACES, seek} from "./moving.js";
 import {Plots} from "./plots.js";
 import {cameras, nextAttention, nextLimit, showReplays} from "./replays.js";
-import {page, say} from "./state.js";
+import {orderButton, page, say} from "./state.js";
 
 const SECOND = 15; // rows, of the larger step
 const PENDING = 2000, IDLE = 5000; // ms between two questions for news, while something is being analysed and else
@@ -125,13 +125,17 @@ function showFindings() {
   };
   listed(details.rejected, details.first_rejected);
   if (details.unusable) listed(details.unusable, details.first_unusable);
-  for (const analysis of [{name: "lateral offset", ...details.lane}, ...details.models]) {
-    if (analysis.state == "waiting") found.push(`${analysis.name}: waits for its turn`);
-    if (analysis.state == "running") found.push(`${analysis.name}: ${(100 * analysis.progress).toFixed(0)} % analysed`);
-    if (analysis.state == "failed") found.push(`${analysis.name}: ${analysis.message}`);
-  }
+  const columns = ["offset", ...details.models.map((_, number) => `model-${number}`)];
+  [{name: "lateral offset", ...details.lane}, ...details.models].forEach(({name, state, progress, message}, at) => {
+    if (state == "waiting") found.push(`${name}: waits for its turn`);
+    if (state == "running") found.push(`${name}: ${(100 * progress).toFixed(0)} % analysed`);
+    if (state == "failed") found.push([`${name} failed: ${message}. `, columns[at]]);
+  });
   if (!found.length) found.push("Every row could be read as it is.");
-  element("findings").replaceChildren(...found.map(text => make("li", text)));
+  renew(element("findings"), [page.open.id, found], () => found.map(each => {
+    const [text, column] = [each].flat(), button = column ? [orderButton("Try again", "POST", `columns/${column}`)] : [];
+    return make("li", text, {}, ...button);
+  }));
 }
 
 function buttons() {
