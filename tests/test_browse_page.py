@@ -116,6 +116,10 @@ def test_a_replay_is_watched_with_the_keyboard_alone(linked, page, model_file):
         for key, row in (("n", 30), ("n", 40), ("n", 50), ("N", 40)):
             page.press(key, key == "N")
             page.wait(f"document.querySelector('#where').textContent.endsWith('frame {row + 1} of 60')")
+        page.run("document.querySelectorAll('#replay-list .where button')[1].click()")
+        page.wait("document.querySelector('#where').textContent.endsWith('frame 51 of 60')")
+        page.wait("document.querySelector('#said').textContent.includes('model.pt was 1.10 m to the left')")
+        page.press("N", shift=True)
         captions = "[...document.querySelectorAll('.replayed figcaption')].map(each => each.textContent).join()"
         page.wait(f"{captions} == 'model.pt at 1 m: 0.18 m to the right,other.pt at 1 m: 0.18 m to the left'")
         seen = server.ask(f"{server.recordings()['lake']}/rows/40/replay-0-1.jpg")[1]
@@ -236,3 +240,29 @@ def test_what_failed_is_tried_again(linked, page, tmp_path, model_file):
         page.press("ArrowLeft")
         asked = f"{server.recordings()['lake']}/rows/0/center/0.png"
         page.until(lambda: page.text() and sum(asked in address for address in page.addresses()) == 2)
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked, page):
+    placed(linked, np.zeros(60))
+    cuts, elsewhere = linked / "excluded.csv", linked.with_name("elsewhere")
+    cuts.write_text("spoilt\n", encoding="utf-8")
+    notice, where = "document.querySelector('#notice').textContent", "document.querySelector('#where').textContent"
+    with browsing(linked) as server:
+        page.look(1280, 900)
+        page.open(server.base)
+        page.wait("document.querySelector('article .bad')?.textContent.includes('excluded.csv: line 1')")
+        cuts.unlink()
+        page.wait("document.querySelector('article dl')")
+        cuts.write_text("spoilt\n", encoding="utf-8")
+        page.run(f"location.hash = '{server.hash('lake')}/7'")
+        page.wait(f"{notice}.includes('excluded.csv: line 1') && document.querySelector('#recording').hidden")
+        cuts.unlink()
+        page.wait(f"!{notice} && {where}.endsWith('frame 8 of 60')")
+        linked.rename(elsewhere)
+        page.wait(f"{notice}.includes('driving_log.csv: No such file')")
+        page.press("End")
+        caption = "document.querySelector('#center').parentNode.lastElementChild.textContent"
+        page.wait(f"{caption}.includes('driving_log.csv: No such file')")
+        elsewhere.rename(linked)
+        page.wait(f"!{notice} && {caption} == 'Centre' && {where}.endsWith('frame 60 of 60')")

@@ -19,8 +19,8 @@ export async function request(path, {binary = false, ...options} = {}) {
   return binary ? answer.arrayBuffer() : answer.json();
 }
 
-export function notice(message) {
-  element("notice").textContent = message ?? "";
+export function notice(message = "") {
+  if (element("notice").textContent != message) element("notice").textContent = message; // else it is read out again
   element("notice").hidden = !message;
 }
 

@@ -2,7 +2,7 @@
 import {ask, element, make, many, notice, onClick, renew, request} from "./common.js";
 import {stateOf} from "./run.js";
 
-const AGAIN = 3000; // ms until a recording whose lane is being analysed is asked for again
+const AGAIN = 3000; // ms until a recording that cannot be read, or whose lane is being analysed, is asked for again
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
 let shown = 0; // counted up when the list is left, so that answers that come later are dropped
 const known = new Map(); // card -> its recording's overview
@@ -18,6 +18,7 @@ export function leaveList() {
 export async function showList() {
   const now = shown, recordings = await ask("");
   if (now != shown) return;
+  element("list").hidden = false;
   showRuns(now);
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);
@@ -52,7 +53,7 @@ async function fill(id, card, now) {
   element("total").textContent = `${many(all.length, "recording")}, ${many(sum("frames"), "frame")}, ` +
     `${(sum("seconds") / 60).toFixed(1)} minutes, ${many(sum("cut_frames"), "frame")} cut`;
   draw(overview, card);
-  if (["waiting", "running"].includes(overview.lane?.state)) {
+  if (overview.message || ["waiting", "running"].includes(overview.lane?.state)) {
     setTimeout(() => now == shown && fill(id, card, now).catch(error => notice(error.message)), AGAIN);
   }
 }

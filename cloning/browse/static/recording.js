@@ -11,7 +11,7 @@ const SECOND = 15; // rows, of the larger step
 const PENDING = 2000, IDLE = 5000; // ms between two questions for news, while something is being analysed and else
 export const KEYS = [
   ["Space", "play and pause, at the recording's own rate"],
-  ["← →", "one frame back, on"],
+  ["← →", "one frame back, on; in a training run, earlier and later pictures"],
   ["Shift+← Shift+→", "one second back, on"],
   ["PageUp PageDown", "ten seconds back, on"],
   ["Home End", "to the beginning, the end"],
@@ -51,6 +51,7 @@ export async function showRecording(id, row) {
   if (mine != latest) return;
   names.forEach((name, at) => columns[name] = parts[at]);
   leaveRecording();
+  element("recording").hidden = false;
   // What this page has done stays undoable when it reads again, and it shows the same replays.
   const count = columns.seconds.length, marks = again?.details.version == details.version ? again.marks : {};
   const now = page.open = {
@@ -105,7 +106,10 @@ async function refresh(now) {
   try {
     const details = await ask(`/${now.id}/details${now.query()}`);
     if (page.open != now) return;
-    if (now.lost) notice();
+    if (now.lost) {
+      notice();
+      now.frames.show(now.row);
+    }
     now.lost = false;
     await update(details);
   } catch (error) {

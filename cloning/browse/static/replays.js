@@ -92,7 +92,10 @@ function section(replay, number) {
   if (replay.where.length) {
     made.append(make("ol", "", {class: "where"}, ...replay.where.map(([row, offset]) => {
       const time = clock(page.open.columns.seconds[row]), go = make("button", time, {"aria-label": `Go to the intervention at ${time}`});
-      onClick(go, () => seek(row));
+      onClick(go, () => {
+        seek(row);
+        say(`Here ${name} was ${metres(offset)}, and was set back.`);
+      });
       return make("li", "", {}, go, ` ${metres(offset)}`);
     })));
   }

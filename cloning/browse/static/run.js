@@ -17,7 +17,9 @@ export function leaveRun() {
 export async function showRun(id) {
   const now = open = {id, at: undefined};
   const run = await request(`/runs/${id}`);
-  if (open == now) update(run);
+  if (open != now) return;
+  element("run").hidden = false;
+  update(run);
 }
 
 export const stateOf = ({state, history, epochs, samples_per_epoch: samples, images, left}) => {
