@@ -11,10 +11,10 @@ from pathlib import Path
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which then ends this process
 
+import cv2
 import numpy as np
 import torch
 
-from cloning.browse.layers import layer
 from cloning.errors import ModelError, UserError, message_of
 from cloning.pilot.attention import MAGENTA, opacity, visual_backprop
 from cloning.pilot.network import Network, load_model
@@ -58,7 +58,10 @@ def picture(jpeg: bytes, model: str) -> bytes:
         _, mask = visual_backprop(network(model, Path(model).stat().st_mtime_ns), frame)
     except ArithmeticError as error:
         raise ModelError(f"{model}: {error}; train the model again") from None
-    return layer(MAGENTA, np.round(255 * opacity(mask)).astype(np.uint8))
+    shown = np.empty((*frame.shape[:2], 4), np.uint8)
+    shown[..., :3] = MAGENTA[::-1]  # BGR, as OpenCV writes it
+    shown[..., 3] = np.round(255 * opacity(mask))
+    return cv2.imencode(".png", shown, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
 @lru_cache(maxsize=8)

@@ -11,7 +11,6 @@ import numpy as np
 from cloning.browse import replays, summary
 from cloning.browse.analyses import LANE, Analyses, Analysis, Result, file_stamp, read_result, stamp
 from cloning.browse.attention import Attention
-from cloning.browse.layers import path_layer
 from cloning.errors import RecordingError, UserError, message_of
 from cloning.recordings.excluded import Cut, add_cut, cut_rows, delete_cut, one_line, read_cuts
 from cloning.recordings.format import CAMERAS, DRIVING_LOG, FRAME
@@ -161,17 +160,24 @@ class Library:
         names = [recording.name(row, camera) for camera in range(len(CAMERAS))]
         return {"line": int(recording.lines[row]), "images": names}
 
-    def jpeg(self, identifier: str, row: int, picture: str, version: str | None = None) -> bytes:
+    def jpeg(
+        self, identifier: str, row: int, picture: str, version: str | None = None, with_path: bool = False
+    ) -> bytes:
         """Return the JPEG of a frame; picture: one of CAMERAS, or a replay's column: what its car sees there.
 
-        Raises UnknownError, NotReplayedError, and RecordingError if a frame is unusable.
+        with_path: draw the path ahead at the model's steering on what a replayed car sees. Raises UnknownError,
+        NotReplayedError, and RecordingError if a frame is unusable.
         """
         recording = self._with_row(identifier, row, version)
+        if picture.startswith(REPLAY) and picture in self.analysed:
+            folder, replay = self.folder(identifier), self.analysed[picture][0]
+            of = stamp(folder, replay)
+            result = _result(folder, replay, of)
+            place = replays.place_of(result, int(recording.images[row, 0]))
+            line = int(result.columns["line"][place])
+            return _line_views(folder, self.version(identifier), replay, of, line).jpeg(place, with_path)
         if picture not in CAMERAS:
-            replay, of, place = self._replayed(identifier, recording, row, picture)
-            folder = self.folder(identifier)
-            line = int(_result(folder, replay, of).columns["line"][place])
-            return _line_views(folder, self.version(identifier), replay, of, line).jpeg(place)
+            raise UnknownError(f"no picture {picture[:40]}")
         path = recording.path(row, CAMERAS.index(picture))
         try:
             jpeg = read_jpeg(path)
@@ -181,34 +187,11 @@ class Library:
             raise RecordingError(f"{path}: {error}") from None
         return jpeg
 
-    def path(self, identifier: str, row: int, picture: str, version: str | None = None) -> bytes:
-        """Return a PNG to lay over a frame, with the path ahead at the driver's steering.
-
-        picture: the centre camera, in which the human drives, or a replay's column. Raises UnknownError,
-        NotReplayedError, RecordingError.
-        """
-        recording = self._with_row(identifier, row, version)
-        if picture == CAMERAS[0]:
-            return path_layer(float(recording.steering[row]))
-        replay, of, place = self._replayed(identifier, recording, row, picture)
-        return path_layer(float(_result(self.folder(identifier), replay, of).columns["steering"][place]))
-
     def model(self, number: int) -> str:
         """Return a model's file. Raises UnknownError."""
         if number >= len(self.models):
             raise UnknownError(f"no model {number}")
         return self.models[number]
-
-    def _replayed(self, identifier: str, recording: Recording, row: int, picture: str) -> tuple[Analysis, str, int]:
-        """Return a replay, its stamp, and the place of a row in its columns; picture: the replay's column.
-
-        Raises UnknownError, NotReplayedError, RecordingError.
-        """
-        if not (picture.startswith(REPLAY) and picture in self.analysed):
-            raise UnknownError(f"no picture {picture[:40]}")
-        folder, replay = self.folder(identifier), self.analysed[picture][0]
-        of = stamp(folder, replay)
-        return replay, of, replays.place_of(_result(folder, replay, of), int(recording.images[row, 0]))
 
     def _with_row(self, identifier: str, row: int, version: str | None) -> Recording:
         recording = self.recording(identifier, version)

@@ -21,12 +21,11 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     `/` is the page; `/recordings` lists identifiers. Below `/recordings/ID`: `overview` and `details`, JSON;
     `columns/NAME`, little-endian float32 (n,), and POST tries its analysis again, which failed; `rows/N`, JSON,
-    `rows/N/PICTURE.jpg`, and to lay over it, what a model looks at, `rows/N/PICTURE/MODEL.png`, and the path ahead,
-    `rows/N/PICTURE/path.png`; `cuts`, to which POST adds and DELETE deletes one, {"first", "last", "reason"}; they
-    answer with the details, and with the cut as "changed". `replays/LIMIT`: POST begins a recording's replays, DELETE
-    ends them; `details?limit=` tells how far they are. What depends on the log takes `?version=`, and is refused with
-    409 when it has changed since. `/runs` and `/runs/N` tell of training runs, and `/runs/N/NAME` is a picture of one.
-    An error is {"message"}.
+    `rows/N/PICTURE.jpg`, and what a model looks at on it, `rows/N/PICTURE/MODEL.png`; `cuts`, to which POST adds and
+    DELETE deletes one, {"first", "last", "reason"}; they answer with the details, and with the cut as "changed".
+    `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are. What
+    depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/runs` and `/runs/N` tell
+    of training runs, and `/runs/N/NAME` is a picture of one. An error is {"message"}.
     """
     app = flask.Flask(__name__)
     site.prepare(app, "img-src 'self' data:")
@@ -84,11 +83,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>.jpg")
     def frame(identifier: str, row: int, picture: str) -> flask.Response:
-        return kept(library.jpeg(identifier, row, picture, version()), "image/jpeg")
-
-    @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/path.png")
-    def path(identifier: str, row: int, picture: str) -> flask.Response:
-        return kept(library.path(identifier, row, picture, version()), "image/png")
+        return kept(library.jpeg(identifier, row, picture, version(), with_path=True), "image/jpeg")
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/<int:model>.png")
     def attention(identifier: str, row: int, picture: str, model: int) -> flask.Response:

@@ -7,8 +7,7 @@ const AT_ONCE = 3; // rows that are loaded at the same time; of those asked for 
 const PATIENCE = 100; // ms that a row's frames wait for what the models look at
 
 export class Frames {
-  // pictures: {canvas, caption(row), path, over, has?(row)}; over: what lies over it, the lowest first: "path", the path
-  // ahead, and numbers of the models whose attention does
+  // pictures: {canvas, caption(row), path, looks, has?(row)}; looks: numbers of the models whose attention lies over it
   constructor(id, version, count, pictures) {
     Object.assign(this, {id, version, count, pictures, closed: false, row: 0});
     this.wanted = undefined; // the row to load next
@@ -58,9 +57,9 @@ export class Frames {
   // Promises of a row's pictures, {layers, message?} each: the frames alone, and with what the models look at.
   load(row) {
     if (!this.loaded.has(row)) {
-      const parts = this.pictures.map(({path, over, has}) => has && !has(row)
+      const parts = this.pictures.map(({path, looks, has}) => has && !has(row)
         ? [Promise.resolve({message: "not replayed here"})]
-        : [`${path}.jpg`, ...over.map(layer => `${path}/${layer}.png`)].map(path => this.layer(row, path)));
+        : [`${path}.jpg`, ...looks.map(model => `${path}/${model}.png`)].map(path => this.layer(row, path)));
       this.loaded.set(row, {
         frames: Promise.all(parts.map(async ([frame]) => together([await frame]))),
         whole: Promise.all(parts.map(async layers => together(await Promise.all(layers)))),

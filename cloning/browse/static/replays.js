@@ -11,16 +11,15 @@ export function cameras() {
   const {details, replays, attention} = page.open, isReplayed = replays.some(Boolean);
   element("cameras").className = isReplayed ? "replaying" : "";
   document.querySelectorAll("#cameras .replayed").forEach(figure => figure.remove());
-  const recorded = (canvas, caption, over = []) => ({canvas, caption: () => caption, path: canvas, over});
-  const path = isReplayed ? ["path"] : [], looks = attention == null ? [] : [attention];
-  const centre = recorded("center", isReplayed ? "Centre, driven by the human" : "Centre", [...looks, ...path]);
+  const recorded = (canvas, caption, looks = []) => ({canvas, caption: () => caption, path: canvas, looks});
+  const centre = recorded("center", isReplayed ? "Centre, driven by the human" : "Centre", attention == null ? [] : [attention]);
   if (!isReplayed) return [recorded("left", "Left"), centre, recorded("right", "Right")];
   const views = replays.map((replay, number) => replay && {
     canvas: `view-${number}`,
     caption: row => `${details.models[number].name} at ${replay.limit} m: ${metres(replay.offset[row])}`,
     has: row => !Number.isNaN(replay.offset[row]),
     path: `replay-${number}-${replay.limit}`,
-    over: [...looks.filter(model => model == number), ...path],
+    looks: attention == number ? [number] : [],
   }).filter(Boolean);
   for (const {canvas} of views) {
     element("cameras").append(make("figure", "", {class: "replayed"},
