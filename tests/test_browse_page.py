@@ -159,12 +159,17 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.wait(f"{which}.startsWith('after 1,200 observations')")
         page.press("ArrowLeft")
         page.wait(f"{which}.startsWith('after 0 observations')")
+        page.run("document.querySelector('#run-read summary').focus()")
+        page.press("Enter")
+        page.wait("document.querySelector('#run-read').open")
+        assert "It reads 1 recording\nlake" in page.text()
         page.wait("document.querySelector('#run-pictures img').naturalWidth == 60")
         files.progress.write_text(
             files.progress.read_text(encoding="utf-8").replace('"finished": 1', '"finished": 4'), encoding="utf-8"
         )
         page.wait("document.querySelector('#run-figures').textContent.includes('finished: 4 epochs')")
         assert page.run("document.querySelector('#run-bar').value") == 1
+        assert page.run("document.querySelector('#run-read').open"), "after it has refreshed itself"
         assert page.complaints() == []
 
 
@@ -207,6 +212,21 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
     page.press("?")
     page.wait("document.querySelector('#help[open]')")
     check()
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+def test_the_focus_stays_on_a_button_of_what_is_shown_anew(served, page):
+    page.open(served.base)
+    page.wait("document.querySelector('article dl')")
+    focused = """import('/static/common.js').then(({make, renew}) => {
+      const place = document.body.appendChild(document.createElement('div'));
+      const show = name => renew(place, name, () => [make('button', 'Go'), make('button', name)]);
+      show('Stop: 3 %');
+      place.lastChild.focus();
+      show('Stop: 4 %');
+      return document.activeElement.textContent;
+    })"""
+    assert page.run(focused) == "Stop: 4 %"
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")

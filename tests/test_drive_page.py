@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from test_drive import Car
 import drive
 from cloning.pilot import page as drive_page
 from cloning.pilot.network import Network
+from tools import bench_driving
 from tools.simulator_client import Simulator, telemetry
 
 needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
@@ -83,6 +85,17 @@ def shown(port: int) -> dict:
         return json.loads(connection.getresponse().readline()[6:])
     finally:
         connection.close()
+
+
+def test_the_benchmark_finds_the_latencies_in_what_a_page_is_told(server, jpegs):
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        for _ in range(3):
+            simulator.drive(telemetry(jpegs[0], speed="9.0000"))
+        time.sleep(2 * drive_page.UPDATE_INTERVAL)
+        told = SimpleNamespace(port=server.port, latencies=[])
+        bench_driving.Server.read_latencies(told, 2)
+    assert len(told.latencies) == 2 and all(0 < seconds < 60 for seconds in told.latencies)
 
 
 def test_the_page_changes_the_set_speed_of_a_car_that_drives(server, jpegs):
