@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from conftest import HERE
+from conftest import ROOT
 
 from cloning.browse.analyses import LANE, Analysis, Result, stamp, write_result
 from cloning.recordings.log import read_recording
@@ -22,9 +22,11 @@ from cloning.training.run_files import RunFiles
 class Browse:
     """A server of recordings, in a process of its own."""
 
-    def __init__(self, *arguments):
+    def __init__(self, *arguments, modules: Path = ROOT):
+        """modules: a folder of modules that go before the installed ones."""
         command = [sys.executable, "-m", "cloning.browse", *map(str, arguments), "--port", "0"]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, **HERE})
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(modules), str(ROOT)])}
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
         self.said = self.process.stdout.readline()
         self.port = int(re.search(r"http://127.0.0.1:(\d+)/", self.said)[1])
         self.base = f"http://127.0.0.1:{self.port}/"
@@ -49,10 +51,14 @@ class Browse:
         """Where each recording is, by its folder's name."""
         return {Path(each["folder"]).name: f"/recordings/{each['id']}" for each in self.get("/recordings")}
 
+    def hash(self, name: str) -> str:
+        """The page's address of a recording, after the server's; name: its folder's."""
+        return self.recordings()[name].replace("/recordings", "#")
+
 
 @contextmanager
-def browsing(*arguments):
-    server = Browse(*arguments)
+def browsing(*arguments, **more):
+    server = Browse(*arguments, **more)
     try:
         yield server
     finally:
@@ -71,11 +77,19 @@ def placed(folder: Path, offset: np.ndarray) -> None:
     write_result(folder, LANE, stamp(folder, LANE), Result(recording.images[:, 0], columns, about))
 
 
+def steered(folder: Path, model: Path) -> None:
+    """As if a model's steering, 0.1, were known already."""
+    recording, analysis = read_recording(folder), Analysis("steering", str(model))
+    columns = {"steering": np.full(len(recording), 0.1, np.float32)}
+    about = {"unusable": 0, "first_unusable": []}
+    write_result(folder, analysis, stamp(folder, analysis), Result(recording.images[:, 0], columns, about))
+
+
 def replayed(folder: Path, model: Path, limit: float, offset: np.ndarray, where: list) -> None:
     """As if a model had driven the recording beside the human's path; offset: float (n,), m; where: as in a result."""
     recording, replay = read_recording(folder), Analysis("replay", str(model), limit)
     still = np.zeros(len(offset))
-    columns = {"offset": offset, "human": still, "right": offset, "yaw": still, "line": still}
+    columns = {"offset": offset, "human": still, "right": offset, "yaw": still, "steering": -offset, "line": still}
     about = {"autonomy_percent": 90.0, "interventions": len(where), "distance_mean_m": 0.25, "distance_p95_m": 0.48,
              "human_mean_m": 0.0, "where": where, "by_lane": len(offset)}  # fmt: skip
     write_result(folder, replay, stamp(folder, replay), Result(recording.images[:, 0], columns, about))

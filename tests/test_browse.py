@@ -10,7 +10,7 @@ import pytest
 
 from cloning.browse import analyse, analyses, summary
 from cloning.browse.analyses import LANE, Analysis, Result, read_result, stamp, write_result
-from cloning.browse.library import Library
+from cloning.browse.library import Library, UnknownError
 from cloning.errors import RecordingError
 from cloning.lane.place import Localisation
 from cloning.pilot.network import load_model, steer
@@ -159,6 +159,12 @@ def test_an_analysis_tells_how_far_it_is_and_why_it_failed(linked, monkeypatch):
         states = ended(library, linked, LANE)
         assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
         assert states[-1] == {"state": "failed", "message": "analyse: no model"}
+        [name] = library.folders
+        library.retry(name, "offset")
+        assert library.analyses.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
+        assert ended(library, linked, LANE)[-1] == states[-1]
+        with pytest.raises(UnknownError):
+            library.retry(name, "steering")
         time.sleep(0.02)  # longer than a tick of the file system's clock
         (linked / "driving_log.csv").touch()
         assert library.analyses.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"

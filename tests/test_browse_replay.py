@@ -21,7 +21,7 @@ from cloning.browse.library import Library
 from cloning.browse.replays import NotReplayedError
 from cloning.errors import ModelError
 from cloning.pilot.attention import MAGENTA, overlay, visual_backprop
-from cloning.pilot.network import load_model
+from cloning.pilot.network import load_model, steer
 from cloning.recordings.excluded import Cut, add_cut
 from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording
@@ -63,6 +63,11 @@ def test_a_replay_on_the_page_is_that_of_the_command(linked, model_file, tmp_pat
         for row, jpeg in given[::9]:
             seen = decode(library.jpeg(name, row + 5, "replay-0-1"))  # the replay does not have the five rows
             assert np.abs(seen.astype(int) - decode(jpeg)).mean() < 0.5
+            drawn = decode(library.jpeg(name, row + 5, "replay-0-1", with_path=True)).astype(int)
+            film = overlay(decode(jpeg), float(steer(load_model(model_file), decode(jpeg))))
+            film = cv2.resize(film, (320, 160), interpolation=cv2.INTER_AREA)
+            path = np.abs(film.astype(int) - decode(jpeg)).max(axis=2) > 80
+            assert path.sum() > 50 and np.abs(drawn - film)[path].mean() < 45 < np.abs(drawn - seen)[path].mean()
         with pytest.raises(NotReplayedError):
             library.jpeg(name, 4, "replay-0-1")
         add_cut(linked, Cut(center(linked, 50), center(linked, 59), "crash"))

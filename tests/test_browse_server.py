@@ -87,6 +87,14 @@ def test_nothing_but_rows_cameras_and_columns_is_served(served, path):
     assert served.ask("/static/..%2f__main__.py")[0] == served.ask("/static/../page.py")[0] == 404
 
 
+def test_an_analysis_is_tried_again_by_pages_of_this_site(served):
+    here = served.recordings()["lake sample"]
+    status, data, _ = served.ask(f"{here}/columns/offset", "POST")
+    assert status == 200 and json.loads(data)["lane"] == {"state": "ready"}, "what is there stays"
+    assert served.ask(f"{here}/columns/steering", "POST")[0] == 404
+    assert served.ask(f"{here}/columns/offset", "POST", Origin="http://evil.example")[0] == 403
+
+
 def test_an_image_that_is_no_frame_is_not_served(linked):
     """A csv may name any file below its IMG/, and that may be a link to anywhere."""
     recording = read_recording(linked)
@@ -138,7 +146,8 @@ def test_cuts_over_the_socket(linked):
         assert status == 409 and "has changed since this page read it" in json.loads(data)["message"]
         assert server.get(f"{here}/details")["frames"] == 59
         linked.rename(linked.with_name("elsewhere"))
-        for path, method in ((f"{here}/details", "GET"), (f"{here}/rows/0", "GET"), (f"{here}/cuts", "POST")):
+        for path, method in ((f"{here}/details", "GET"), (f"{here}/rows/0", "GET"), (f"{here}/cuts", "POST"),
+                             (f"{here}/columns/offset", "POST")):  # fmt: skip
             status, data, _ = server.ask(path, method, one if method == "POST" else None)
             assert status == 409 and "driving_log.csv: No such file" in json.loads(data)["message"]
         assert "No such file" in server.get(f"{here}/overview")["message"]

@@ -6,11 +6,11 @@ import re
 import threading
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from browse_process import browsing, placed
 from browser import CHROMIUM, chromium
 from drive_process import serving
 from test_drive import Car
@@ -18,6 +18,7 @@ from test_drive import Car
 import drive
 from cloning.pilot import page as drive_page
 from cloning.pilot.network import Network
+from tools import bench_driving
 from tools.simulator_client import Simulator, telemetry
 
 needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
@@ -84,6 +85,17 @@ def shown(port: int) -> dict:
         return json.loads(connection.getresponse().readline()[6:])
     finally:
         connection.close()
+
+
+def test_the_benchmark_finds_the_latencies_in_what_a_page_is_told(server, jpegs):
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        for _ in range(3):
+            simulator.drive(telemetry(jpegs[0], speed="9.0000"))
+        time.sleep(2 * drive_page.UPDATE_INTERVAL)
+        told = SimpleNamespace(port=server.port, latencies=[])
+        bench_driving.Server.read_latencies(told, 2)
+    assert len(told.latencies) == 2 and all(0 < seconds < 60 for seconds in told.latencies)
 
 
 def test_the_page_changes_the_set_speed_of_a_car_that_drives(server, jpegs):
@@ -352,18 +364,4 @@ def test_the_page_fits_every_screen_and_bars_nobody(server, jpegs, page, width, 
         )
         level = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
         assert (level[0] > level[1]) == dark and abs(level[0] - level[1]) > 400
-        assert page.barriers() == []
-
-
-@needs_chromium
-@pytest.mark.parametrize("dark", [False, True])
-def test_the_pages_of_recordings_bar_nobody(sample_recording, page, dark):
-    placed(sample_recording, np.zeros(60))
-    with browsing(sample_recording) as server:
-        page.look(1280, 900, dark)
-        page.open(server.base)
-        page.wait("document.querySelector('article dl')")
-        assert page.barriers() == []
-        page.run(f"location.hash = '{server.recordings()['lake sample'].replace('recordings/', '#/').lstrip('/')}/5'")
-        page.wait("document.querySelector('#where').textContent.endsWith('frame 6 of 60')")
         assert page.barriers() == []

@@ -31,6 +31,7 @@ import torch
 from cloning.arguments import number
 from cloning.errors import UserError
 from cloning.pilot.network import Network, load_model
+from cloning.pilot.page import DrivenFrame
 from cloning.recordings.images import decode
 from tools.server_process import start_server
 from tools.simulator_client import Simulator, fragments, telemetry
@@ -92,7 +93,7 @@ class Server:
         """Read the latencies of the last frames, as the server measured them, from the events for its page."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/live", timeout=10) as events:
             rows = json.loads(next(line for line in events if line.startswith(b"data:"))[6:])["rows"]
-        self.latencies += [row[-1] / 1000 for row in rows[-frames:]]
+        self.latencies += [DrivenFrame(*row).latency / 1000 for row in rows[-frames:]]
 
 
 @contextmanager

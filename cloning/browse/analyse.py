@@ -114,8 +114,8 @@ def replayed(recording: Recording, analysis: Analysis) -> Result:
     """Return how a model drives; see `cloning.replay.replay` and `Drive`. Raises UserError.
 
     The columns are offset and human, the cars' lateral offset in m from the reference line, right positive; right and
-    yaw, the pose of `ReplayedCar`; line, the number of the reference line. about has the metrics, and the interventions
-    as [place in the columns, offset in m].
+    yaw, the pose of `ReplayedCar`; steering, the model's, -1..1; line, the number of the reference line. about has the
+    metrics, and the interventions as [place in the columns, offset in m].
     """
     lines = reference_lines(recording)
     total = sum(len(line.stretch) for line in lines)
@@ -134,6 +134,7 @@ def replayed(recording: Recording, analysis: Analysis) -> Result:
         "human": offset - done.offset_from_human,
         "right": right,
         "yaw": yaw,
+        "steering": np.array(done.steering),
         "line": np.repeat(np.arange(len(lines)), [len(line.stretch) for line in lines]),
     }
     about = {

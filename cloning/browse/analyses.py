@@ -23,7 +23,7 @@ from cloning.recordings.check import cache_file
 from cloning.recordings.excluded import read_cuts
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
 
-RULES = 1  # of what a result contains: counted up when they change
+RULES = 2  # of what a result contains: counted up when they change
 COMMAND = (sys.executable, "-m", "cloning.browse.analyse")
 PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
 
@@ -162,6 +162,12 @@ class Analyses:
                     self.thread.start()
                 self.changed.notify()
         return {"state": "waiting"}
+
+    def retry(self, folder: Path, analysis: Analysis) -> None:
+        """Begin an analysis again that has failed. Raises RecordingError as `stamp` does."""
+        with self.changed:
+            self.failed.pop((folder, analysis, stamp(folder, analysis)), None)
+        self.state(folder, analysis)
 
     def stop(self, folder: Path, analysis: Analysis) -> None:
         """End an analysis that runs or waits; what is done already stays."""

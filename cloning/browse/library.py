@@ -132,6 +132,12 @@ class Library:
             else:
                 self.analyses.stop(folder, replay)
 
+    def retry(self, identifier: str, name: str) -> None:
+        """Begin the analysis that has a column again, after it failed. Raises UnknownError, RecordingError."""
+        if name not in self.analysed:
+            raise UnknownError(f"no analysis of {name[:40]}")
+        self.analyses.retry(self.folder(identifier), self.analysed[name][0])
+
     def column(self, identifier: str, name: str, version: str | None = None) -> np.ndarray:
         """Return a column of a recording: float32 (n,), nan where nothing is known.
 
@@ -154,10 +160,13 @@ class Library:
         names = [recording.name(row, camera) for camera in range(len(CAMERAS))]
         return {"line": int(recording.lines[row]), "images": names}
 
-    def jpeg(self, identifier: str, row: int, picture: str, version: str | None = None) -> bytes:
+    def jpeg(
+        self, identifier: str, row: int, picture: str, version: str | None = None, with_path: bool = False
+    ) -> bytes:
         """Return the JPEG of a frame; picture: one of CAMERAS, or a replay's column: what its car sees there.
 
-        Raises UnknownError, NotReplayedError, and RecordingError if a frame is unusable.
+        with_path: draw the path ahead at the model's steering on what a replayed car sees. Raises UnknownError,
+        NotReplayedError, and RecordingError if a frame is unusable.
         """
         recording = self._with_row(identifier, row, version)
         if picture.startswith(REPLAY) and picture in self.analysed:
@@ -166,7 +175,7 @@ class Library:
             result = _result(folder, replay, of)
             place = replays.place_of(result, int(recording.images[row, 0]))
             line = int(result.columns["line"][place])
-            return _line_views(folder, self.version(identifier), replay, of, line).jpeg(place)
+            return _line_views(folder, self.version(identifier), replay, of, line).jpeg(place, with_path)
         if picture not in CAMERAS:
             raise UnknownError(f"no picture {picture[:40]}")
         path = recording.path(row, CAMERAS.index(picture))

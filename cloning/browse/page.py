@@ -20,12 +20,12 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     """Return the web application.
 
     `/` is the page; `/recordings` lists identifiers. Below `/recordings/ID`: `overview` and `details`, JSON;
-    `columns/NAME`, little-endian float32 (n,); `rows/N`, JSON, `rows/N/PICTURE.jpg`, and what a model looks at on it,
-    `rows/N/PICTURE/MODEL.png`; `cuts`, to which POST adds and DELETE deletes one, {"first", "last", "reason"}; they
-    answer with the details, and with the cut as "changed". `replays/LIMIT`: POST begins a recording's replays, DELETE
-    ends them; `details?limit=` tells how far they are. What depends on the log takes `?version=`, and is refused with
-    409 when it has changed since. `/runs` and `/runs/N` tell of training runs, and `/runs/N/NAME` is a picture of one.
-    An error is {"message"}.
+    `columns/NAME`, little-endian float32 (n,), and POST tries its analysis again, which failed; `rows/N`, JSON,
+    `rows/N/PICTURE.jpg`, and what a model looks at on it, `rows/N/PICTURE/MODEL.png`; `cuts`, to which POST adds and
+    DELETE deletes one, {"first", "last", "reason"}; they answer with the details, and with the cut as "changed".
+    `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are. What
+    depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/runs` and `/runs/N` tell
+    of training runs, and `/runs/N/NAME` is a picture of one. An error is {"message"}.
     """
     app = flask.Flask(__name__)
     site.prepare(app, "img-src 'self' data:")
@@ -72,13 +72,18 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
         values = library.column(identifier, name, version())
         return flask.Response(np.ascontiguousarray(values, "<f4").tobytes(), mimetype="application/octet-stream")
 
+    @app.post("/recordings/<identifier>/columns/<name>")
+    def retry(identifier: str, name: str) -> dict[str, Any]:
+        library.retry(identifier, name)
+        return library.details(identifier, limit_asked())
+
     @app.get("/recordings/<identifier>/rows/<int:row>")
     def row(identifier: str, row: int) -> dict[str, Any]:
         return library.row(identifier, row, version())
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>.jpg")
     def frame(identifier: str, row: int, picture: str) -> flask.Response:
-        return kept(library.jpeg(identifier, row, picture, version()), "image/jpeg")
+        return kept(library.jpeg(identifier, row, picture, version(), with_path=True), "image/jpeg")
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/<int:model>.png")
     def attention(identifier: str, row: int, picture: str, model: int) -> flask.Response:

@@ -7,6 +7,7 @@ import numpy as np
 
 from cloning.browse.analyses import Result
 from cloning.errors import UserError
+from cloning.pilot.path import draw_path
 from cloning.recordings.images import encode
 from cloning.recordings.log import Recording
 from cloning.replay.views import StretchViews
@@ -45,16 +46,22 @@ class LineViews:
         part.keep(rows_driven(result, recording.images[:, 0])[places])
         self.views = StretchViews(part, Stretch.of(part, slice(0, len(part))))
         self.right, self.yaw = result.columns["right"][places], result.columns["yaw"][places]
+        self.steering = result.columns["steering"][places]
         self.first = int(places[0])
 
-    def jpeg(self, place: int) -> bytes:
+    def jpeg(self, place: int, with_path: bool) -> bytes:
         """Return the view at a place in the result's columns; at the human driver's pose, the recorded file itself.
 
-        Raises RecordingError if an image became unusable.
+        with_path: draw the path ahead at the model's steering. Raises RecordingError if an image became unusable.
         """
         at = place - self.first
         pose = float(self.right[at]), float(self.yaw[at])
-        return encode(self.views.view_from(at, *pose), VIEW_JPEG_QUALITY) if any(pose) else self.views.jpeg(at)
+        if not (any(pose) or with_path):
+            return self.views.jpeg(at)
+        view = self.views.view_from(at, *pose) if any(pose) else self.views.frame(at, 0).copy()
+        if with_path:
+            draw_path(view, float(self.steering[at]))
+        return encode(view, VIEW_JPEG_QUALITY)
 
 
 def place_of(result: Result, image: int) -> int:

@@ -8,11 +8,10 @@ import torch
 from torch import nn
 
 from cloning.pilot.network import Network, steer
+from cloning.pilot.path import draw_path
 from cloning.recordings.format import FRAME
-from cloning.road.camera import project_ground
-from cloning.road.motion import curvature
 
-GREEN, MAGENTA = (60, 255, 60), (255, 0, 200)  # RGB
+MAGENTA = (255, 0, 200)  # RGB
 
 
 def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndarray]:
@@ -69,9 +68,7 @@ def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) 
         strength = opacity(mask)[..., None]
         picture = picture * (1 - strength) + np.asarray(MAGENTA, np.float32) * strength
     enlarged = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-    ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides the nearer part
-    points = project_ground(curvature(steering) * ahead**2 / 2, ahead) * 2
-    cv2.polylines(enlarged, [np.round(points).astype(np.int32)], False, GREEN, 3, cv2.LINE_AA)
+    draw_path(enlarged, steering)
     return enlarged
 
 

@@ -4,22 +4,27 @@ import {showList, leaveList} from "./list.js";
 import {showRun, leaveRun, pressedInRun} from "./run.js";
 import {showRecording, leaveRecording, pressed, KEYS} from "./recording.js";
 
-async function route() {
-  const [, id, row] = location.hash.split("/"), isRun = id == "run";
+const VIEWS = ["list", "recording", "run"], AGAIN = 5000; // ms until a view that could not be shown is tried again
+let routed = 0, again; // number of the last view, what an earlier one says is dropped; timer of the next try
+
+async function route(isAgain) {
+  const [, id, row] = location.hash.split("/"), number = ++routed;
+  clearTimeout(again);
   leaveList();
   leaveRecording();
   leaveRun();
-  notice();
-  element("list").hidden = Boolean(id);
-  element("recording").hidden = !id || isRun;
-  element("run").hidden = !isRun;
+  VIEWS.forEach(view => element(view).hidden = true);
+  if (!isAgain) notice();
   element("title").textContent = "";
   document.title = "Recordings";
   try {
-    await (isRun ? showRun(row) : id ? showRecording(id, Number(row) || 0) : showList());
+    await (id == "run" ? showRun(row) : id ? showRecording(id, Number(row) || 0) : showList());
+    if (isAgain && number == routed) notice();
   } catch (error) {
-    element("recording").hidden = element("run").hidden = true;
+    if (number != routed) return;
+    VIEWS.forEach(view => element(view).hidden = true);
     notice(error.message);
+    if (error.status != 404) again = setTimeout(route, AGAIN, true);
   }
 }
 
@@ -32,7 +37,7 @@ for (const [keys, what] of KEYS) {
   element("keys").append(make("tr", "", {}, make("td", "", {}, ...shown), make("td", what)));
 }
 element("help-button").onclick = help;
-addEventListener("hashchange", route);
+addEventListener("hashchange", () => route());
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || document.querySelector("dialog[open]")) return;
   if (event.key == "?") help();

@@ -19,8 +19,8 @@ export async function request(path, {binary = false, ...options} = {}) {
   return binary ? answer.arrayBuffer() : answer.json();
 }
 
-export function notice(message) {
-  element("notice").textContent = message ?? "";
+export function notice(message = "") {
+  if (element("notice").textContent != message) element("notice").textContent = message; // else it is read out again
   element("notice").hidden = !message;
 }
 
@@ -35,10 +35,13 @@ export function onClick(button, action) {
   };
 }
 
-// Give an element new children, unless they would show the same as before: a focus in them stays. build: makes them.
+// Give an element new children, unless they would show the same as before; build: makes them. A focus in them stays:
+// on the button at the same place.
 export function renew(place, content, build) {
   const now = JSON.stringify(content);
   if (place.shown == now) return;
   place.shown = now;
+  const focused = [...place.querySelectorAll("button")].indexOf(document.activeElement);
   place.replaceChildren(...build());
+  place.querySelectorAll("button")[focused]?.focus();
 }

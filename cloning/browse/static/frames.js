@@ -46,6 +46,7 @@ export class Frames {
       this.drawn = number;
       pictures.forEach((picture, at) => paint(picture, row, loaded[at]));
       whole.then(all => { // the attention may take long: it is laid over the frames when it comes
+        if (all.some(({message}) => message)) this.loaded.delete(row); // it is asked for again the next time
         if (all == loaded || this.closed || number != this.drawn || pictures != this.pictures) return;
         pictures.forEach((picture, at) => paint(picture, row, all[at]));
       });
@@ -74,7 +75,6 @@ export class Frames {
       if (!answer.ok) return {message: (await answer.json()).message};
       return {layer: await createImageBitmap(await answer.blob())};
     } catch (error) {
-      this.loaded.delete(row);
       return {message: "The program that shows the recordings does not answer."};
     }
   }

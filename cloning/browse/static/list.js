@@ -1,8 +1,8 @@
 // All recordings at a glance.
-import {ask, element, make, many, notice, renew, request} from "./common.js";
+import {ask, element, make, many, notice, onClick, renew, request} from "./common.js";
 import {stateOf} from "./run.js";
 
-const AGAIN = 3000; // ms until a recording whose lane is being analysed is asked for again
+const AGAIN = 3000; // ms until a recording that cannot be read, or whose lane is being analysed, is asked for again
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
 let shown = 0; // counted up when the list is left, so that answers that come later are dropped
 const known = new Map(); // card -> its recording's overview
@@ -18,6 +18,7 @@ export function leaveList() {
 export async function showList() {
   const now = shown, recordings = await ask("");
   if (now != shown) return;
+  element("list").hidden = false;
   showRuns(now);
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);
@@ -52,7 +53,7 @@ async function fill(id, card, now) {
   element("total").textContent = `${many(all.length, "recording")}, ${many(sum("frames"), "frame")}, ` +
     `${(sum("seconds") / 60).toFixed(1)} minutes, ${many(sum("cut_frames"), "frame")} cut`;
   draw(overview, card);
-  if (["waiting", "running"].includes(overview.lane?.state)) {
+  if (overview.message || ["waiting", "running"].includes(overview.lane?.state)) {
     setTimeout(() => now == shown && fill(id, card, now).catch(error => notice(error.message)), AGAIN);
   }
 }
@@ -80,14 +81,20 @@ function draw(overview, card) {
     make("div", "", {class: "pictures"}, map(overview), histogram),
     make("dl", "", {}, ...lines.flatMap(([name, value]) => [make("dt", name), make("dd", value)])),
   );
+  if (overview.lane.state == "failed") {
+    const retry = make("button", "Look for the road again"), now = shown;
+    onClick(retry, () => ask(`/${overview.id}/columns/offset`, {method: "POST"}).then(() => fill(overview.id, card, now))
+      .catch(error => notice(error.message)));
+    card.append(retry);
+  }
   histograms.get(card)?.destroy();
   histograms.set(card, bars(overview.histogram, histogram));
 }
 
-export function road({lane, roads}) {
+function road({lane, roads}) {
   if (lane.state == "waiting") return "not known yet: waits for its turn";
   if (lane.state == "running") return `not known yet: ${(100 * lane.progress).toFixed(0)} % of the frames analysed`;
-  if (lane.state == "failed") return `not known: ${lane.message}`;
+  if (lane.state == "failed") return `not known, the analysis failed: ${lane.message}`;
   if (!roads.length) return "other";
   return roads.map(([name, direction]) => `${name}, ${DIRECTIONS[direction]}`).join("; ");
 }

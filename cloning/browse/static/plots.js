@@ -62,9 +62,9 @@ export class Plots {
     const figure = make("figure"), caption = make("figcaption", "", {}, make("span", title)), place = make("div");
     for (const curve of curves) {
       curve.colour ??= colour("--line");
-      const label = make("span", "", {}, make("span", curve.name ? `${curve.name} ` : "", {style: `color: ${curve.colour}`}), make("b"));
-      caption.append(label);
-      this.shown.push({value: label.lastChild, unit, digits, values: curve.values});
+      const named = curve.name ? [make("i", "", {style: `background: ${curve.colour}`}), `${curve.name} `] : [], value = make("b");
+      caption.append(make("span", "", {}, ...named, value));
+      this.shown.push({value, unit, digits, values: curve.values});
     }
     figure.append(caption, place);
     element("plots").append(figure);
@@ -124,7 +124,7 @@ export class Plots {
   }
 
   // The stretches behind the curves: [first row, row after the last, custom property of the colour].
-  // The interventions of the curves are lines in their colours.
+  // The interventions of the curves are ticks in their colours, which leave the curves to be seen where there are many.
   shade(plot, curves) {
     const {ctx, bbox} = plot, colours = getComputedStyle(document.body);
     ctx.save();
@@ -140,7 +140,7 @@ export class Plots {
       ctx.fillStyle = colour;
       for (const row of marks) {
         const at = plot.valToPos(row, "x", true);
-        if (at >= bbox.left && at <= bbox.left + bbox.width) ctx.fillRect(at - 1, bbox.top, 2, bbox.height);
+        if (at >= bbox.left && at <= bbox.left + bbox.width) ctx.fillRect(at - 1, bbox.top + 0.7 * bbox.height, 2, 0.3 * bbox.height);
       }
     }
     ctx.restore();

@@ -1,17 +1,17 @@
 // One recording: its frames and curves, news of it from the server, and the keys.
-import {ask, element, make, many, notice, onClick} from "./common.js";
+import {ask, element, make, many, notice, onClick, renew} from "./common.js";
 import {askForReason, mark, showCuts, undo} from "./cuts.js";
 import {Frames} from "./frames.js";
 import {goTo, jump, play, PLACES, seek} from "./moving.js";
 import {Plots} from "./plots.js";
 import {cameras, nextAttention, nextLimit, showReplays} from "./replays.js";
-import {page, say} from "./state.js";
+import {orderButton, page, say} from "./state.js";
 
 const SECOND = 15; // rows, of the larger step
 const PENDING = 2000, IDLE = 5000; // ms between two questions for news, while something is being analysed and else
 export const KEYS = [
   ["Space", "play and pause, at the recording's own rate"],
-  ["← →", "one frame back, on"],
+  ["← →", "one frame back, on; in a training run, earlier and later pictures"],
   ["Shift+← Shift+→", "one second back, on"],
   ["PageUp PageDown", "ten seconds back, on"],
   ["Home End", "to the beginning, the end"],
@@ -51,6 +51,7 @@ export async function showRecording(id, row) {
   if (mine != latest) return;
   names.forEach((name, at) => columns[name] = parts[at]);
   leaveRecording();
+  element("recording").hidden = false;
   // What this page has done stays undoable when it reads again, and it shows the same replays.
   const count = columns.seconds.length, marks = again?.details.version == details.version ? again.marks : {};
   const now = page.open = {
@@ -105,7 +106,10 @@ async function refresh(now) {
   try {
     const details = await ask(`/${now.id}/details${now.query()}`);
     if (page.open != now) return;
-    if (now.lost) notice();
+    if (now.lost) {
+      notice();
+      now.frames.show(now.row);
+    }
     now.lost = false;
     await update(details);
   } catch (error) {
@@ -125,13 +129,17 @@ function showFindings() {
   };
   listed(details.rejected, details.first_rejected);
   if (details.unusable) listed(details.unusable, details.first_unusable);
-  for (const analysis of [{name: "lateral offset", ...details.lane}, ...details.models]) {
-    if (analysis.state == "waiting") found.push(`${analysis.name}: waits for its turn`);
-    if (analysis.state == "running") found.push(`${analysis.name}: ${(100 * analysis.progress).toFixed(0)} % analysed`);
-    if (analysis.state == "failed") found.push(`${analysis.name}: ${analysis.message}`);
-  }
+  const columns = ["offset", ...details.models.map((_, number) => `model-${number}`)];
+  [{name: "lateral offset", ...details.lane}, ...details.models].forEach(({name, state, progress, message}, at) => {
+    if (state == "waiting") found.push(`${name}: waits for its turn`);
+    if (state == "running") found.push(`${name}: ${(100 * progress).toFixed(0)} % analysed`);
+    if (state == "failed") found.push([`${name} failed: ${message}. `, columns[at]]);
+  });
   if (!found.length) found.push("Every row could be read as it is.");
-  element("findings").replaceChildren(...found.map(text => make("li", text)));
+  renew(element("findings"), [page.open.id, found], () => found.map(each => {
+    const [text, column] = [each].flat(), button = column ? [orderButton("Try again", "POST", `columns/${column}`)] : [];
+    return make("li", text, {}, ...button);
+  }));
 }
 
 function buttons() {

@@ -1,8 +1,8 @@
 // Replays of the recording with each model as the driver, and what a model looks at.
-import {ask, clock, element, make, many, notice, onClick, renew} from "./common.js";
+import {clock, element, make, many, onClick, renew} from "./common.js";
 import {seek} from "./moving.js";
 import {MODEL_COLOURS} from "./plots.js";
-import {page, say} from "./state.js";
+import {order, orderButton, page, say} from "./state.js";
 
 const LIMITS = [...document.querySelectorAll("[data-limit]")].map(button => button.dataset.limit);
 
@@ -12,7 +12,7 @@ export function cameras() {
   element("cameras").className = isReplayed ? "replaying" : "";
   document.querySelectorAll("#cameras .replayed").forEach(figure => figure.remove());
   const recorded = (canvas, caption, looks = []) => ({canvas, caption: () => caption, path: canvas, looks});
-  const centre = recorded("center", "Centre", attention == null ? [] : [attention]);
+  const centre = recorded("center", isReplayed ? "Centre, driven by the human" : "Centre", attention == null ? [] : [attention]);
   if (!isReplayed) return [recorded("left", "Left"), centre, recorded("right", "Right")];
   const views = replays.map((replay, number) => replay && {
     canvas: `view-${number}`,
@@ -70,16 +70,12 @@ async function load(now, replay, number) {
 function section(replay, number) {
   const {details, limit} = page.open, {name} = details.models[number];
   const heading = make("h3", `${name} at ${limit} m`, {style: `border-color: ${MODEL_COLOURS[number % MODEL_COLOURS.length]}`});
-  const button = (text, method) => {
-    const made = make("button", text);
-    onClick(made, () => drive(method));
-    return made;
-  };
+  const button = (text, method) => orderButton(text, method, `replays/${limit}`);
   const waiting = {
     none: ["Not replayed with these files and cuts. ", button("Replay", "POST")],
     waiting: ["Waits for its turn. ", button("Stop", "DELETE")],
     running: [`Replaying: ${(100 * replay.progress).toFixed(0)} % driven. `, button("Stop", "DELETE")],
-    failed: [`Failed: ${replay.message}`],
+    failed: [`Failed: ${replay.message}. `, orderButton("Try again", "POST", `columns/replay-${number}-${limit}`)],
   }[replay.state];
   if (waiting) return make("section", "", {}, heading, make("p", "", {}, ...waiting));
   const lines = Object.entries({
@@ -95,7 +91,10 @@ function section(replay, number) {
   if (replay.where.length) {
     made.append(make("ol", "", {class: "where"}, ...replay.where.map(([row, offset]) => {
       const time = clock(page.open.columns.seconds[row]), go = make("button", time, {"aria-label": `Go to the intervention at ${time}`});
-      onClick(go, () => seek(row));
+      onClick(go, () => {
+        seek(row);
+        say(`Here ${name} was ${metres(offset)}, and was set back.`);
+      });
       return make("li", "", {}, go, ` ${metres(offset)}`);
     })));
   }
@@ -112,22 +111,11 @@ async function choose(limit) {
   const now = page.open;
   now.limit = limit;
   say(limit ? `Replays at a limit of ${limit} m.` : "No replays.");
-  if (limit) return drive("POST");
+  if (limit) return order("POST", `replays/${limit}`);
   now.replays = [];
   now.plots.setReplays([]);
   now.frames.setPictures(cameras());
   await now.update({...now.details, limit: null, replays: []});
-}
-
-// Begin (POST) or stop (DELETE) the replays at the limit that is shown.
-async function drive(method) {
-  const now = page.open;
-  try {
-    const details = await ask(`/${now.id}/replays/${now.limit}`, {method});
-    if (page.open == now) await now.update(details);
-  } catch (error) {
-    notice(error.message);
-  }
 }
 
 export function nextLimit() {

@@ -1,5 +1,5 @@
 // A training run: how far it is, its losses, and the pictures of what it trains on; it refreshes itself.
-import {element, make, many, notice, request} from "./common.js";
+import {element, make, many, notice, renew, request} from "./common.js";
 
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
 const KINDS = ["LRC_", "augmented-"]; // of pictures, in the order of the page
@@ -17,7 +17,9 @@ export function leaveRun() {
 export async function showRun(id) {
   const now = open = {id, at: undefined};
   const run = await request(`/runs/${id}`);
-  if (open == now) update(run);
+  if (open != now) return;
+  element("run").hidden = false;
+  update(run);
 }
 
 export const stateOf = ({state, history, epochs, samples_per_epoch: samples, images, left}) => {
@@ -67,9 +69,11 @@ function update(run) {
     "last epoch": last ? `loss ${loss(last.loss)}, validation ${loss(last.val_loss)}` : "none finished yet",
     best: best ? `validation ${loss(best.val_loss)} in epoch ${best.epoch}` : "–",
     trained: run.robust ? "with --robust" : "as in the report",
-    recordings: run.recordings.join(", ") || "–",
     folder: run.folder,
   });
+  element("run-read").hidden = !run.recordings.length;
+  element("run-count").textContent = many(run.recordings.length, "recording");
+  renew(element("run-recordings"), run.recordings, () => run.recordings.map(folder => make("li", folder)));
   element("run-figures").replaceChildren(...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)]));
   if (JSON.stringify([before?.history, before?.loss]) != JSON.stringify([history, run.loss])) draw();
   showPictures();
