@@ -434,8 +434,9 @@ class TrainingRun:
         """Return a table of the errors of the last and the best epoch's models, and in words how they will drive."""
         labels, mean, models = self.validation.steering, self.training.steering.mean(), {}
         for path in (self.files.last, self.files.best):
-            network = load_model(path, self.device)
-            models[path.name] = self.predict(network, self.validation.center, np.arange(len(labels)))
+            models[path.name] = self.predict(
+                load_model(path, self.device), self.validation.center, np.arange(len(labels))
+            )
         table = summary.error_table(labels, mean, models, (0, STRAIGHT, *TURN, 1), self.validation.label_source)
         return table + summary.driving(self.progress.history, type(self.validation), still_drifts(self.held_out))
 
