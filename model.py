@@ -363,9 +363,9 @@ class TrainingRun:
         while len(progress.history) < self.arguments.epochs:
             self.epoch(batches)
             started = time.monotonic()
-            loss, drift = self.validate()
+            figures = self.validate()
             progress.seconds += time.monotonic() - started
-            is_best, history = progress.finish_epoch(loss, drift, self.validation.best_by), progress.history
+            is_best, history = progress.finish_epoch(*figures, self.validation.best_by), progress.history
             if rank() == 0:  # first: a run killed before `save` repeats this
                 write(self.files.log, summary.history_csv(history))
                 write(self.files.losses, loss_picture(history, self.training.dropout))
@@ -409,9 +409,9 @@ class TrainingRun:
         count = min(len(self.validation), self.arguments.samples_per_epoch // 5)
         chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[: max(count, 1)]
         mine = chosen[rank() :: world()]
-        error = 0.0
-        for images, labels in self.validation_sets:
-            error += float(((self.predict(self.network, images, mine) - labels[mine]) ** 2).sum())
+        error = sum(
+            float(((self.predict(self.network, x, mine) - y[mine]) ** 2).sum()) for x, y in self.validation_sets
+        )
         far = drifts(self.held_out[rank() :: world()], self.network, self.pool)
         error, metres, n = summed(torch.tensor([error, far.sum(), len(far)], dtype=torch.float64), self.device).tolist()
         return error / len(self.validation_sets) / len(chosen), metres / n if n else math.nan
@@ -434,9 +434,8 @@ class TrainingRun:
         """Return a table of the errors of the last and the best epoch's models, and in words how they will drive."""
         labels, mean, models = self.validation.steering, self.training.steering.mean(), {}
         for path in (self.files.last, self.files.best):
-            models[path.name] = self.predict(
-                load_model(path, self.device), self.validation.center, np.arange(len(labels))
-            )
+            network = load_model(path, self.device)
+            models[path.name] = self.predict(network, self.validation.center, np.arange(len(labels)))
         table = summary.error_table(labels, mean, models, (0, STRAIGHT, *TURN, 1), self.validation.label_source)
         return table + summary.driving(self.progress.history, type(self.validation), still_drifts(self.held_out))
 
