@@ -408,13 +408,11 @@ class TrainingRun:
         """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m."""
         count = min(len(self.validation), self.arguments.samples_per_epoch // 5)
         chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[: max(count, 1)]
-        mine = chosen[rank() :: world()]
-        error = sum(
-            float(((self.predict(self.network, x, mine) - y[mine]) ** 2).sum()) for x, y in self.validation_sets
-        )
+        mine, sets = chosen[rank() :: world()], self.validation_sets
+        error = sum(float(((self.predict(self.network, x, mine) - y[mine]) ** 2).sum()) for x, y in sets)
         far = drifts(self.held_out[rank() :: world()], self.network, self.pool)
         error, metres, n = summed(torch.tensor([error, far.sum(), len(far)], dtype=torch.float64), self.device).tolist()
-        return error / len(self.validation_sets) / len(chosen), metres / n if n else math.nan
+        return error / len(sets) / len(chosen), metres / n if n else math.nan
 
     def save(self, *models: Path) -> None:
         """Write the network to these files, and the state that --resume needs."""
