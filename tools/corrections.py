@@ -216,6 +216,7 @@ def picture(results: list[Measured], track: str) -> bytes:
     """Return a plot of departures per lap against laps, as PNG: a thin line for each seed, a thick one for the mean."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # here, because loading matplotlib takes long
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MultipleLocator
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -224,11 +225,12 @@ def picture(results: list[Measured], track: str) -> bytes:
         for rounds in by_seed(results, kind).values():
             axes.plot([r.laps for r in rounds], [r.departures for r in rounds], color=colour, linewidth=0.7, alpha=0.6)
         axes.plot(*zip(*means(results, kind), strict=True), "o-", color=colour, label=kind)
-    axes.set(xlabel="laps driven for recordings", ylabel="departures per lap", title=f"{track}, mean of the seeds")
+    axes.set(xlabel="laps driven for recordings", ylabel="departures per lap", title=f"{track}: seeds, and their mean")
     axes.set_ylim(bottom=0)
+    axes.xaxis.set_major_locator(MultipleLocator(1))
     axes.legend()
     png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=110)
+    figure.savefig(png, format="png", dpi=150)
     return png.getvalue()
 
 
