@@ -102,6 +102,11 @@ def test_correlation_is_of_ranks_and_signed():
     assert np.isnan(figures.correlated(np.zeros(10), values, 1)).all()
 
 
+def test_driving_is_told_by_departures_and_among_equals_by_distance():
+    rows = [{"departures_per_km": far, "offset_mean": off} for far, off in ((0, 3.5), (0, 0.2), (0.4, 0.1), (2, 1))]
+    assert np.argsort(figures.column(rows, "driving")).tolist() == [1, 0, 2, 3]
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     return load_recording(render_recording(tmp_path_factory.mktemp("study") / "lake-cw", rows=100))
@@ -168,7 +173,7 @@ def test_the_command_measures_and_goes_on(tmp_path):
     with open(folder / "study.csv", encoding="utf-8", newline="") as file:
         [row] = csv.DictReader(file)
     assert (row["kind"], row["recordings"]) == ("centre camera", "lake-ccw")
-    assert {measure.name for measure in figures.MEASURES} | set(figures.DRIVING) <= set(row)
+    assert {measure.name for measure in figures.MEASURES} | (set(figures.DRIVING) - {"driving"}) <= set(row)
     assert float(row["recovered"]) in (0, 1)
     again = study("--networks", "1")
     assert (again.returncode, "is measured" in again.stdout) == (0, False), "it was measured before"

@@ -48,7 +48,12 @@ MEASURES = (
     Measure("metres_per_intervention_1", "replay: m per intervention at 1 m", -1, "replay"),
     Measure("replay_distance_2.5", "replay: mean distance", 1, "replay"),
 )
-DRIVING = {"offset_mean": "mean distance from the lane's centre", "departures_per_km": "departures per km"}
+DRIVING = {
+    "driving": "departures per km and, among equals, mean distance",
+    "departures_per_km": "departures per km",
+    "offset_mean": "mean distance from the lane's centre",
+}
+EQUALS = 0.01  # departures per km that a metre of mean distance counts: less than one departure in a lap
 COLOURS = {"loss": "tab:orange", "replay": "tab:blue"}
 
 
@@ -60,7 +65,9 @@ def row(variant: Variant, found: dict[str, float]) -> Row:
 
 
 def column(rows: Sequence[Row], name: str) -> np.ndarray:
-    """Return a column of numbers: float64 (n,)."""
+    """Return a column of numbers, or what DRIVING calls driving: float64 (n,)."""
+    if name == "driving":
+        return column(rows, "departures_per_km") + EQUALS * column(rows, "offset_mean")
     return np.array([float(each[name]) for each in rows])
 
 
@@ -82,17 +89,22 @@ def correlated(measure: np.ndarray, driving: np.ndarray, sign: int) -> tuple[flo
     return float(values[0]), float(low), float(high)
 
 
-def on_track(rows: Sequence[Row], track: str) -> list[Row]:
-    """Return the networks that were measured on a track."""
-    return [each for each in rows if each["track"] == track]
+def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Return the groups in which networks are compared, by title: each track's, and those without --robust of each.
+
+    The labels of --robust are not the driver's steering, which the losses are measured by here; so the groups without
+    it show what a loss tells of networks that all learned that.
+    """
+    found = {track: [each for each in rows if each["track"] == track] for track in TRACKS}
+    for track in TRACKS:
+        found[f"{track}, without --robust"] = [row for row in found[track] if "--robust" not in str(row["options"])]
+    return found
 
 
-def correlations(rows: Sequence[Row], driving: str) -> dict[tuple[str, str], tuple[float, float, float]]:
-    """Return (track, name of the measure) -> correlation with driving and its interval; driving: key of DRIVING."""
+def correlations(rows: Sequence[Row], driving: str) -> dict[str, tuple[float, float, float]]:
+    """Return, by measure, the correlation of some networks with driving and its interval; driving: key of DRIVING."""
     return {
-        (track, measure.name): correlated(column(part, measure.name), column(part, driving), measure.sign)
-        for track in TRACKS
-        if len(part := on_track(rows, track)) > 2
+        measure.name: correlated(column(rows, measure.name), column(rows, driving), measure.sign)
         for measure in MEASURES
     }
 
@@ -100,14 +112,14 @@ def correlations(rows: Sequence[Row], driving: str) -> dict[tuple[str, str], tup
 def report(rows: Sequence[Row]) -> str:
     """Return study.md: the correlations on each track, the recovery, and all networks."""
     lines = ["# Does the loss tell how a network drives?", "", "Made by `python -m tools.study`."]
-    for name, title in DRIVING.items():
-        found = correlations(rows, name)
-        tracks = [track for track in TRACKS if (track, MEASURES[0].name) in found]
-        lines += ["", f"## Rank correlation with {title} in the stand-in simulator", ""]
-        heads = [f"{track}, {len(on_track(rows, track))} networks" for track in tracks]
-        lines += [f"| {' | '.join(['measure', *heads])} |", "|---" * (1 + len(tracks)) + "|"]
+    compared = {title: part for title, part in groups(rows).items() if len(part) > 2}
+    for name, words in DRIVING.items():
+        found = [correlations(part, name) for part in compared.values()]
+        lines += ["", f"## Rank correlation with laps in the stand-in simulator: {words}", ""]
+        heads = [f"{title}, {len(part)} networks" for title, part in compared.items()]
+        lines += [f"| {' | '.join(['measure', *heads])} |", "|---" * (1 + len(heads)) + "|"]
         for measure in MEASURES:
-            cells = ["{:.2f} ({:.2f} to {:.2f})".format(*found[track, measure.name]) for track in tracks]
+            cells = ["{:.2f} ({:.2f} to {:.2f})".format(*each[measure.name]) for each in found]
             lines.append(f"| {' | '.join([measure.title, *cells])} |")
         lines += ["", "Spearman's, signed so that 1 is perfect foresight; in brackets, 95 % of a bootstrap's draws."]
     seconds, metres = RECOVERY_SECONDS, RECOVERY_SPEED * MPH
@@ -147,28 +159,28 @@ def png(draw: Callable[[Figure], None], width: float, height: float) -> bytes:
 
 
 def correlation_picture(rows: Sequence[Row]) -> bytes:
-    """Return bars of each measure's correlation with the mean distance, on each track, with their intervals."""
-    found = correlations(rows, "offset_mean")
+    """Return bars of each measure's correlation with driving, in each group, with their intervals."""
+    compared = groups(rows)
 
     def draw(figure: Figure) -> None:
-        for axes, track in zip(figure.subplots(1, len(TRACKS), sharey=True), TRACKS, strict=True):
+        for axes, (title, part) in zip(figure.subplots(1, len(compared), sharey=True), compared.items(), strict=True):
+            found = correlations(part, "driving") if len(part) > 2 else {}
             for place, measure in enumerate(MEASURES):
-                value, low, high = found.get((track, measure.name), (np.nan,) * 3)
-                colour = COLOURS[measure.group]
-                axes.barh(place, value, color=colour, alpha=0.8, height=0.7)
+                value, low, high = found.get(measure.name, (np.nan,) * 3)
+                axes.barh(place, value, color=COLOURS[measure.group], alpha=0.8, height=0.7)
                 axes.plot([low, high], [place, place], color="black", linewidth=1.2)
             axes.axvline(0, color="black", linewidth=0.8)
             axes.set(
                 yticks=range(len(MEASURES)),
                 yticklabels=[measure.title for measure in MEASURES],
                 xlim=(-1, 1),
-                xlabel="rank correlation with driving",
-                title=f"{track}, {len(on_track(rows, track))} networks",
+                title=f"{title}\n{len(part)} networks",
             )
             axes.grid(axis="x", alpha=0.3)
         axes.invert_yaxis()
+        figure.supxlabel("rank correlation with driving: 1 is perfect foresight")
 
-    return png(draw, 10, 4.6)
+    return png(draw, 12, 4.6)
 
 
 def scatter_picture(rows: Sequence[Row]) -> bytes:
@@ -178,7 +190,7 @@ def scatter_picture(rows: Sequence[Row]) -> bytes:
     def draw(figure: Figure) -> None:
         grid = figure.subplots(len(TRACKS), len(shown), squeeze=False)
         for line, track in zip(grid, TRACKS, strict=True):
-            part = on_track(rows, track)
+            part = groups(rows)[track]
             for axes, measure in zip(line, shown, strict=True):
                 for group, colour in (("recipe", "tab:orange"), ("robust", "tab:blue")):
                     some = [each for each in part if ("--robust" in str(each["options"])) == (group == "robust")]
