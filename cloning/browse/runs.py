@@ -68,10 +68,10 @@ class Runs:
 def overview(files: RunFiles) -> dict[str, Any]:
     """Return what the page shows of a run.
 
-    run: its identifier, or None; state: running, finished or stopped; history: a dict of METRICS for each finished
-    epoch; epochs, samples_per_epoch; images and loss so far in this epoch, with their age in s; rate in images/s, and
-    left, s of training from there on, None if unknown; pictures: numbers of observations, ascending. Raises RunError,
-    OSError.
+    run: its identifier, or None; state: running, finished or stopped; history: a dict of METRICS and val_drift for each
+    finished epoch; epochs, samples_per_epoch; images and loss so far in this epoch, with their age in s; rate in
+    images/s, and left, s of training from there on, None if unknown; pictures: numbers of observations, ascending.
+    Raises RunError, OSError.
     """
     options, progress = _json(files.arguments, OPTIONS, 1), {}
     history = _history(files.log)
@@ -132,7 +132,11 @@ def _history(path: Path) -> list[dict[str, float]]:
         return []
     rows = list(csv.DictReader(path.read_text(encoding="utf-8", errors="replace").splitlines()))
     try:
-        return [{name: kind(row[name]) for name, kind in METRICS.items()} for row in rows]
+        return [
+            {name: kind(row[name]) for name, kind in METRICS.items()}
+            | {"val_drift": float(row.get("val_drift") or "nan")}
+            for row in rows
+        ]
     except (KeyError, TypeError, ValueError):
         raise RunError(f"{path}: not a log of epochs; `python model.py` writes it anew") from None
 

@@ -75,7 +75,10 @@ def batch_pictures(choices: Choices, augment: Augment) -> dict[str, bytes]:
 
 
 def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:
-    """Return a PNG of both losses by epoch, with the lowest validation loss marked; dropout: whether it trains so."""
+    """Return a PNG of both losses by epoch, and of val_drift where it is known, with the lowest validation loss marked.
+
+    dropout: whether the network is trained with it.
+    """
     # matplotlib is large, and not needed before the first epoch is finished.
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -85,12 +88,20 @@ def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:
     epochs, best = [row["epoch"] for row in history], min(history, key=lambda row: row["val_loss"])
     name = f"training (augmented, with{'' if dropout else 'out'} dropout)"
     axes.plot(epochs, [row["loss"] for row in history], "o-", label=name)
-    name = f"validation (best: {best['val_loss']:.4f} in epoch {best['epoch']:.0f})"
+    name = f"validation (lowest: {best['val_loss']:.4f} in epoch {best['epoch']:.0f})"
     (line,) = axes.plot(epochs, [row["val_loss"] for row in history], "o-", label=name)
     axes.plot(best["epoch"], best["val_loss"], "o", color=line.get_color(), markersize=13, fillstyle="none")
     axes.margins(x=0.08)
     axes.set(title="Mean squared error of the steering", xlabel="epoch", ylabel="mean squared error", ylim=(0, None))
     axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True))
+    drift = [row["val_drift"] for row in history]
+    if not np.isnan(drift).all():
+        right = axes.twinx()
+        (line,) = right.plot(
+            epochs, drift, "s--", color="tab:green", label="drift in two seconds of driving, validation"
+        )
+        right.set(ylabel="drift, m", ylim=(0, None))
+        axes.plot([], [], "s--", color=line.get_color(), label=line.get_label())  # for the one legend
     axes.legend()
     axes.grid(alpha=0.3)
     file = io.BytesIO()

@@ -66,8 +66,9 @@ function update(run) {
     "this epoch": run.images ? `${run.images.toLocaleString("en")} of ${run.samples_per_epoch.toLocaleString("en")} images` +
       (run.state == "running" ? `, as of ${Math.round(run.age)} s ago` : "") : "–",
     rate: run.rate ? `${Math.round(run.rate).toLocaleString("en")} images/s` : "–",
-    "last epoch": last ? `loss ${loss(last.loss)}, validation ${loss(last.val_loss)}` : "none finished yet",
-    best: best ? `validation ${loss(best.val_loss)} in epoch ${best.epoch}` : "–",
+    "last epoch": last ? `loss ${loss(last.loss)}, validation ${loss(last.val_loss)}` +
+      (last.val_drift == null ? "" : `, drift in two seconds of driving ${last.val_drift.toFixed(2)} m`) : "none finished yet",
+    "lowest loss": best ? `validation ${loss(best.val_loss)} in epoch ${best.epoch}` : "–",
     trained: run.robust ? "with --robust" : "as in the report",
     folder: run.folder,
   });
