@@ -121,7 +121,7 @@ def test_documents_name_what_exists(document):
     for link in re.findall(r"\]\((?!https?:)([^)#]+)", text):
         assert (document.parent / link).exists(), link
     for tool in re.findall(r"python -m tools\.([a-z_]+)", text):
-        assert (ROOT / "tools" / f"{tool}.py").exists(), tool
+        assert any((ROOT / "tools" / file).exists() for file in (f"{tool}.py", f"{tool}/__main__.py")), tool
     for path in re.findall(r"`((?:cloning|simulator|tools|tests)/[a-z_/.]*)`", text):
         assert (ROOT / path).exists(), path
 
