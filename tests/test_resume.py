@@ -360,3 +360,12 @@ def test_a_flipped_bit_in_the_optimizers_state_is_noticed(begun):
     done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
     assert done.returncode == 2
     assert f"{path}: " in done.stderr and "checksum" in done.stderr and "new run without --resume" in done.stderr
+
+
+def test_a_run_of_a_version_that_measured_no_drift_goes_on(begun):
+    with edited(begun / "model-resume.pt") as saved:
+        for row in saved["history"]:
+            del row["val_drift"]
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    assert done.returncode == 0, done.stderr
+    assert [row["val_drift"] for row in log(begun)] == ["", ""], "a recording of four seconds has no stretch to drive"

@@ -105,7 +105,7 @@ def test_the_legend_of_the_losses_says_whether_training_uses_dropout(
     finished_run(sample_recording, tmp_path, *SHORT, "--epochs", 1, *options)
     training, validation = (text.get_text() for text in legends[0].get_texts())
     assert training == f"training (augmented, {dropout})" and re.fullmatch(
-        r"validation \(best: .* in epoch 1\)", validation
+        r"validation \(lowest: .* in epoch 1\)", validation
     )
 
 
