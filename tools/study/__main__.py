@@ -1,6 +1,6 @@
 """Does a network's loss tell how it drives? Train networks that differ as people's do, and measure each in three ways.
 
-    python -m tools.study data                   # 71 networks: about two hours on 2 cores
+    python -m tools.study data                   # 71 networks: one to two hours on 2 cores
     python -m tools.study data --networks 2 --images 200 --laps 0.1 --starts 2  # a trial
 
 `data` holds real recordings by the names lake-ccw, lake-cw, jungle and jungle-shadows (data/README.md says where they
