@@ -1,6 +1,6 @@
 """A simulated run: the car on its track, its trajectory, and its departures from the road."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -73,9 +73,13 @@ class Run:
         self.steering = self.throttle = 0.0
         self.set_back()
 
-    def set_back(self, offset: float = 0.0, speed: float = 0.0) -> None:
-        """Place the car on the road at `s`, settled on its springs, with a lateral offset in m and a speed in m/s."""
-        self.car.place(self.track.at(self.s, offset))
+    def set_back(self, offset: float = 0.0, speed: float = 0.0, turn: float = 0.0) -> None:
+        """Place the car on the road at `s`, settled on its springs.
+
+        offset: lateral, m, right positive; speed: m/s, along its heading; turn: radians from the road to the right.
+        """
+        place = self.track.at(self.s, offset)
+        self.car.place(replace(place, heading=place.heading - turn))  # headings grow to the left
         self.car.settle()
         self.car.body.set_linear_velocity(self.car.node.get_quat().get_forward() * speed)
         self.offset = offset

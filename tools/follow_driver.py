@@ -22,7 +22,7 @@ import torch
 from cloning.errors import UserError
 from cloning.pilot.network import Network, load_model
 from cloning.recordings.images import read_frame
-from cloning.recordings.log import read_recording
+from cloning.recordings.log import Recording, read_recording
 
 SMOOTHED_FRAMES = 9
 FRAMES_PER_BATCH = 32
@@ -33,16 +33,15 @@ def smooth(steering: np.ndarray) -> np.ndarray:
     return np.convolve(steering, np.ones(SMOOTHED_FRAMES) / SMOOTHED_FRAMES, "valid")
 
 
-def predict(network: Network, folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the network's and the driver's steering on a recording's centre frames: float32 (n,) each."""
-    recording = read_recording(folder)
+def predict(network: Network, recording: Recording) -> np.ndarray:
+    """Return a network's steering on a recording's centre frames: float32 (n,). Raises RecordingError."""
     paths = [recording.path(row) for row in range(len(recording))]
     predicted = []
     for start in range(0, len(paths), FRAMES_PER_BATCH):
         frames = np.stack([read_frame(path) for path in paths[start : start + FRAMES_PER_BATCH]])
         with torch.inference_mode():
             predicted.append(network(torch.from_numpy(frames)).numpy())
-    return np.concatenate(predicted), recording.steering
+    return np.concatenate(predicted)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -57,7 +56,8 @@ def main(argv: list[str] | None = None) -> int:
         network = load_model(args.model)
         print(f"{'':24} correlation, smoothed    network: mean, deviation    driver: mean, deviation")
         for folder in args.recordings:
-            predicted, driven = predict(network, folder)
+            recording = read_recording(folder)
+            predicted, driven = predict(network, recording), recording.steering
             predicted_smoothed, driven_smoothed = smooth(predicted), smooth(driven)
             correlation = np.corrcoef(predicted, driven)[0, 1]
             smoothed = np.corrcoef(predicted_smoothed, driven_smoothed)[0, 1]

@@ -19,7 +19,7 @@ from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 from cloning.replay.drivers import ModelDriver
 from cloning.replay.replay import Driver, ReferenceLine, drive
-from cloning.road.motion import Stretch, stretches
+from cloning.road.motion import Stretch, stretch_rows
 
 SECONDS = 2.0  # as long as the stretches that model.py validates with
 ROWS, LEAST_ROWS = round(SECONDS * SAMPLE_RATE), round(0.75 * SECONDS * SAMPLE_RATE)  # of a piece
@@ -53,16 +53,16 @@ def held_out(recordings: Sequence[Recording], recording: np.ndarray, row: np.nda
     for number, whole in enumerate(recordings):
         rows, first = np.unique(row[recording == number], return_index=True)
         aims = aim[recording == number][first]
-        drives = stretches(whole)
+        drives = stretch_rows(whole)
         for group in np.split(rows, np.flatnonzero(np.abs(np.diff(whole.time[rows])) > SECONDS) + 1):
             for driven in drives if len(group) else ():
-                start, end = max(driven.rows.start, int(group[0])), min(driven.rows.stop, int(group[-1]) + 1)
+                start, end = max(driven.start, int(group[0])), min(driven.stop, int(group[-1]) + 1)
                 for at in range(start, end - LEAST_ROWS + 1, ROWS):
                     stop = min(at + ROWS, end)
                     last = np.searchsorted(rows, stop - 1, "right") - 1  # or the row before, if that one is missing
-                    found.append(Piece(whole, _line(whole, slice(at, stop)), float(aims[last])))
+                    found.append((whole, slice(at, stop), float(aims[last])))
     chosen = np.linspace(0, len(found) - 1, min(len(found), MOST_PIECES)).round().astype(int)
-    return [found[number] for number in chosen]
+    return [Piece(whole, _line(whole, rows), aim_there) for whole, rows, aim_there in (found[n] for n in chosen)]
 
 
 def _line(recording: Recording, rows: slice) -> ReferenceLine:

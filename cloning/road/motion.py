@@ -121,6 +121,11 @@ class Stretch:
 
 def stretches(recording: "Recording") -> list[Stretch]:
     """Split a recording at gaps in time, jumps in speed and standstills; each stretch is at least 2 s long."""
+    return [Stretch.of(recording, rows) for rows in stretch_rows(recording)]
+
+
+def stretch_rows(recording: "Recording") -> list[slice]:
+    """Return the rows of each of a recording's `stretches`."""
     speed = np.abs(recording.speed.astype(float)) * MPH
     pause = np.diff(recording.time)
     continuous = (
@@ -133,7 +138,7 @@ def stretches(recording: "Recording") -> list[Stretch]:
     starts = np.flatnonzero(np.r_[True, ~joined])
     ends = np.r_[starts[1:], len(speed)]
     return [
-        Stretch.of(recording, slice(start, end))
+        slice(start, end)
         for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
         if end - start >= MIN_STRETCH_ROWS
     ]

@@ -87,9 +87,8 @@ def write_study(rows: list[Row], folder: Path) -> None:
     table.writerows(rows)
     write_output(folder / "study.csv", text.getvalue().encode())
     write_output(folder / "study.md", report(rows).encode())
-    for name, picture in (("correlation", correlation_picture), ("scatter", scatter_picture)):
-        write_output(folder / f"study_{name}.png", picture(rows))
-    write_output(folder / "study_recovery.png", recovery_picture(rows))
+    for picture in (correlation_picture, scatter_picture, recovery_picture):
+        write_output(folder / f"study_{picture.__name__.removesuffix('_picture')}.png", picture(rows))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -109,10 +108,8 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--folder", type=Path, default=Path("study"), help="where to write (default %(default)s)")
     args = parser.parse_args(argv)
-    args.folder, args.recordings = (
-        args.folder.resolve(),
-        args.recordings.resolve(),
-    )  # the children run in another folder
+    args.folder = args.folder.resolve()  # the networks' processes run in another folder
+    args.recordings = args.recordings.resolve()
     variants = plan()[: args.networks]
     try:
         prepare(args)

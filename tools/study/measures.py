@@ -2,28 +2,26 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
-import torch
 
 from cloning.pilot.network import Network, steer
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.images import read_image
 from cloning.recordings.log import Recording
 from cloning.recordings.writer import SampleClock
 from cloning.replay.autonomy import LIMITS
+from cloning.replay.command import drive_at_limits
 from cloning.replay.drift import drifts, held_out
 from cloning.replay.drivers import ModelDriver
-from cloning.replay.replay import ReferenceLine, drive
+from cloning.replay.replay import ReferenceLine
 from cloning.road.motion import MPH, wrap_angle
 from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.run import Run
 from simulator.world import Scene
+from tools.follow_driver import predict
 
-BATCH = 32  # frames
 LARGE_ERROR = 0.2  # of steering: the "thresholded relative error" of Codevilla et al. (1809.04843) has another unit
 TIME_OUT = 1.5  # times the time of a lap at the set speed; a car that leaves the road over and over gets no further
 RECOVERY_SPEED, RECOVERY_SECONDS = 20.0, 3.0  # mph; the time is ChauffeurNet's (1812.03079)
@@ -37,13 +35,7 @@ def offline(network: Network, recording: Recording) -> dict[str, float]:
     whiteness: root mean square of the steering's change per second (University of Tartu's measure), here of the
     steering on the recorded frames.
     """
-    guesses = []
-    for start in range(0, len(recording), BATCH):
-        rows = range(start, min(start + BATCH, len(recording)))
-        frames = np.stack([read_image(recording.path(row, 0))[1] for row in rows])
-        with torch.inference_mode():
-            guesses.append(network(torch.from_numpy(frames)).numpy())
-    guess = np.concatenate(guesses).clip(-1, 1)
+    guess = predict(network, recording).clip(-1, 1)
     error = guess - recording.steering
     seconds = np.diff(recording.time)
     change = np.diff(guess)[seconds > 0] / seconds[seconds > 0]
@@ -59,8 +51,8 @@ def offline(network: Network, recording: Recording) -> dict[str, float]:
 def replayed(recording: Recording, lines: list[ReferenceLine], driver: ModelDriver) -> dict[str, float]:
     """Return what replays of a recording measure: NVIDIA's autonomy at both limits, distances, and drift."""
     found: dict[str, float] = {}
-    for limit in LIMITS:
-        done = drive(recording, lines, limit, driver)
+    for done in drive_at_limits(recording, lines, driver, dict.fromkeys(LIMITS), parallel=True):
+        limit = done.limit
         metres = float(np.sum(np.abs(recording.speed[done.row]) * MPH * done.seconds))
         found[f"autonomy_{limit:g}"] = done.autonomy()
         found[f"replay_distance_{limit:g}"] = float(np.abs(done.offset).mean())
@@ -127,11 +119,8 @@ class Simulator:
 
         s: m along the track; offset: m, right positive; turn: radians to the right.
         """
-        place = self.track.at(s, offset)
-        run.car.place(replace(place, heading=place.heading - turn))  # headings grow to the left
-        run.car.settle()
-        run.car.body.set_linear_velocity(run.car.node.get_quat().get_forward() * (RECOVERY_SPEED * MPH))
-        run.s, run.offset, until = s, offset, run.time + RECOVERY_SECONDS
+        run.s, until = s, run.time + RECOVERY_SECONDS
+        run.set_back(offset, RECOVERY_SPEED * MPH, turn)
         clock, steering = SampleClock(run.time + 1 / SAMPLE_RATE), self.steering(run)
         while run.time < until:
             if not run.advance(steering, 1.0):
