@@ -104,6 +104,7 @@ class ReportObservations(Observations):
     dropout: ClassVar[bool] = True
     best_by: ClassVar[str] = "val_drift"
     aimed_at: ClassVar[str] = "the driver's path"
+    remedy: ClassVar[str] = "train longer, record more, or use --robust"
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:

@@ -133,6 +133,7 @@ def test_the_last_lines_say_in_words_how_the_network_will_drive():
     assert text.endswith("leave the road now and then.")
     assert driving([epoch(1, 0.1, 0.4)], report, still).endswith("stay on the road.")
     assert "--robust" in driving([epoch(1, 0.1, 4.0)], report, still)
+    assert driving([epoch(1, 0.1, 4.0)], robust, still).endswith("leave the road often: train longer, or record more.")
     text = driving([epoch(1, 0.2, 1.0), epoch(2, 0.1, 1.2)], robust, still)
     assert "1.20 m from the lane's centre" in text and "model-best" not in text
     assert driving([epoch(1, 0.1, math.nan)], robust, still) == ""

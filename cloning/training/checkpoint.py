@@ -74,11 +74,9 @@ class Progress:
     def finish_epoch(self, val_loss: float, val_drift: float, by: str = "val_loss") -> bool:
         """Add the epoch to the history and begin the next one; return whether its model is the best so far.
 
-        val_drift: m, nan if unknown; by: the metric whose lowest value is the best, or val_loss if val_drift is nan.
-        The first epoch always is, so that there is a best model even if the losses are not numbers.
+        val_drift: m, nan if unknown; by: see `best_epoch`. The first epoch always is, so that there is a best model
+        even if the losses are not numbers.
         """
-        if math.isnan(val_drift):
-            by = "val_loss"
         row = {
             "epoch": len(self.history) + 1,
             "images": self.images,
@@ -87,11 +85,19 @@ class Progress:
             "val_loss": val_loss,
             "val_drift": val_drift,
         }
-        earlier = [before[by] for before in self.history if not math.isnan(before[by])]
-        is_best = not self.history or row[by] < min(earlier, default=math.inf)
         self.history.append(row)
         self.images, self.loss, self.seconds = 0, 0.0, 0.0
-        return is_best
+        return best_epoch(self.history, by) is row
+
+
+def best_epoch(history: list[EpochMetrics], by: str) -> EpochMetrics:
+    """Return the epoch whose model is the best, the first of equals.
+
+    by: the metric whose lowest value is the best; it is val_loss if the last epoch's val_drift is unknown.
+    """
+    if math.isnan(history[-1]["val_drift"]):
+        by = "val_loss"
+    return min(history, key=lambda row: math.inf if math.isnan(row[by]) else row[by])
 
 
 def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, dict[str, Any] | None]:

@@ -134,6 +134,7 @@ class Observations(ABC):
     dropout: ClassVar[bool]  # whether the network is trained with it
     best_by: ClassVar[str]  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
     aimed_at: ClassVar[str]  # where the car should be, in words
+    remedy: ClassVar[str]  # what helps a network that drives badly
 
     def __post_init__(self) -> None:
         self.cache = ImageCache(self.cached_rows.stop - self.cached_rows.start)

@@ -214,6 +214,7 @@ class RobustObservations(Observations):
     dropout: ClassVar[bool] = False
     best_by: ClassVar[str] = "val_loss"  # which, unlike the report's, counts steering back
     aimed_at: ClassVar[str] = "the lane's centre"
+    remedy: ClassVar[str] = "train longer, or record more"
 
     @staticmethod
     def dropped(arguments: Arguments) -> str:

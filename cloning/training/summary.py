@@ -19,7 +19,7 @@ from cloning.files import write
 from cloning.pilot.network import Network, layer_table
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
-from cloning.training.checkpoint import EpochMetrics, Progress
+from cloning.training.checkpoint import EpochMetrics, Progress, best_epoch
 from cloning.training.distributed import rank, world
 from cloning.training.observations import Observations
 from cloning.training.options import Arguments
@@ -29,7 +29,7 @@ MIN_CORRELATION = 0.3  # with the labels; below it, the model has hardly learned
 VERDICTS = (
     (0.8, "Networks like this one stay on the road."),
     (1.6, "Networks like this one leave the road now and then."),
-    (math.inf, "Networks like this one leave the road often: train longer, record more, or use --robust."),
+    (math.inf, "Networks like this one leave the road often: {remedy}."),
 )
 TIMED_BATCHES, TIMED_SECONDS = 10, 5.0  # at least, before the time of the whole run is told
 
@@ -187,11 +187,10 @@ def driving(history: list[EpochMetrics], kind: type[Observations], still: np.nda
 
     kind: of the observations; still: float64 (n,), m, of `drift.still_drifts`.
     """
-    last, by = history[-1], kind.best_by
-    best = min(history, key=lambda row: math.inf if math.isnan(row[by]) else row[by])
+    last, best = history[-1], best_epoch(history, kind.best_by)
     if math.isnan(last["val_drift"]) or not len(still):
         return ""
-    verdict = next(words for limit, words in VERDICTS if last["val_drift"] <= limit)
+    verdict = next(words for limit, words in VERDICTS if last["val_drift"] <= limit).format(remedy=kind.remedy)
     others = f"{still.mean():.2f} m with the wheels straight ahead"
     if best is not last and not math.isnan(best["val_drift"]):
         others = f"{best['val_drift']:.2f} m by model-best.pt of epoch {best['epoch']:.0f}, {others}"
