@@ -41,12 +41,13 @@ from cloning.files import write
 from cloning.pilot.network import CROP, UNITS, Network, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS, FRAME
+from cloning.recordings.frames import KEPT_FRAMES, FrameCache
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import summary
-from cloning.training.adam import Adam
 from cloning.training.checkpoint import Checkpoint, Progress, RunFiles, fingerprint, resumed_arguments
 from cloning.training.distributed import from_first_rank, join_processes, leave_processes, rank, summed, world
+from cloning.training.muon import OPTIMIZERS
 from cloning.training.observations import SEEN_SHAPE, Augmented, Choices, Example, Observations, Views, center_digests
 from cloning.training.options import Arguments, parse
 from cloning.training.pictures import batch_pictures, loss_picture
@@ -76,13 +77,12 @@ def read_observations(kind: type[Kind], folders: list[Path], arguments: Argument
     Unusable rows are listed in `rejected_file`. Raises RecordingError if too few rows are left,
     and with --strict if a row is unusable.
     """
-    parts, counts = [], []
+    parts, counts, frames = [], [], FrameCache(KEPT_FRAMES)
     for folder in folders:
         recording = read_recording(folder)
-        check_images(recording, threads())
-        part = kind.select(recording, arguments)
-        parts.append(part)
-        counts.append(summary.Counts.of(recording, len(part)))
+        check_images(recording, threads(), frames)
+        parts.append(kind.select(recording, arguments))
+        counts.append(summary.Counts.of(recording, len(parts[-1])))
         print_findings(recording)
     observations, rows = kind.joined(parts), summary.total(counts)
     summary.list_rejected(observations.recordings, rejected_file, arguments.strict)
@@ -348,7 +348,7 @@ class TrainingRun:
         self.errors: torch.nn.Module = SquaredErrors(self.network, self.precision, self.device, self.pool)
         if world() > 1:
             self.errors = DistributedDataParallel(self.errors)
-        self.optimizer = Adam(self.network.parameters())
+        self.optimizer = OPTIMIZERS[arguments.optimizer](self.network.parameters())
         self.generator = Generator(training, arguments, self.pool, ahead=1 if self.device.type == "cpu" else 4)
         self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
         data = fingerprint(training, validation)

@@ -33,7 +33,7 @@ from cloning.lane.reader import (
     load_network,
     normalize,
 )
-from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.format import FRAME, ROAD_ROWS, SAMPLE_RATE
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
 from cloning.road.motion import MIN_TRUSTED, REAR_AXLE, Stretch, stretches
@@ -78,6 +78,13 @@ def test_a_strip_is_the_frame_at_half_the_resolution():
     assert found.shape == STRIP_SHAPE and found.dtype == np.uint8
     row, column = np.unravel_index(found[..., 0].argmax(), STRIP_SHAPE[:2])
     assert abs(row - 16) <= 2 and abs(column - 80) <= 2
+
+
+def test_a_strip_shows_only_the_rows_that_are_kept_of_a_frame():
+    frame = np.random.default_rng(0).integers(0, 256, FRAME).astype(np.uint8)
+    road = np.zeros_like(frame)
+    road[ROAD_ROWS] = frame[ROAD_ROWS]
+    assert np.array_equal(extract_strip(road), extract_strip(frame))
 
 
 def test_brightness_and_contrast_are_normalised():

@@ -15,13 +15,14 @@ from conftest import ROOT, SHORT, finished_run, render_recording, run_here, run_
 import model
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
-from cloning.pilot.network import CROP
-from cloning.recordings.format import FRAME
+from cloning.pilot.network import CROP, Network
+from cloning.recordings.format import FRAME, ROAD_ROWS
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
-from cloning.road.warp import SOURCE_ROWS, ground_mask
+from cloning.road.warp import ground_mask
 from cloning.training import light, robust
+from cloning.training.adam import Adam
 from cloning.training.observations import SEEN_SHAPE
 from cloning.training.robust import Lanes, Poses, RobustObservations
 
@@ -150,7 +151,7 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
             x + AXLE_TO_CAMERA * np.sin(heading) + side * np.cos(heading),
             z + AXLE_TO_CAMERA * np.cos(heading) - side * np.sin(heading),
             heading,
-        )[SOURCE_ROWS]
+        )[ROAD_ROWS]
 
     def read(_, before):
         offset, turned = float(one.offset[0]), float(one.yaw[0])
@@ -219,7 +220,7 @@ def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording)
         assert (folder / "diagnostic_images" / name).exists()
     arguments = torch.load(folder / "model.pt", weights_only=True)["arguments"]
     assert arguments["robust"]
-    assert (arguments["batch_size"], arguments["learning_rate"]) == (8, 1e-3)  # as given, and as --robust sets it
+    assert (arguments["batch_size"], arguments["learning_rate"]) == (8, 4e-3)  # as given, and as --robust sets it
 
 
 def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_recording, tmp_path):
@@ -241,7 +242,21 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_r
         assert all(torch.equal(a[key], b[key]) for key in a)
 
 
-@pytest.mark.parametrize("options, begins", [([], 1e-4), (["--robust"], 1e-3)])
+def test_a_robust_run_of_a_version_without_muon_goes_on_with_adam(finished, tmp_path):
+    shutil.copytree(finished[1], tmp_path, dirs_exist_ok=True)
+    saved = torch.load(tmp_path / "model-resume.pt", weights_only=True)
+    del saved["arguments"]["optimizer"], saved["digest"]
+    optimizer = Adam(Network().parameters())
+    saved["training"]["optimizer"]["state"] = {number: optimizer.zeros(number) for number in range(18)}
+    torch.save(saved, tmp_path / "model-resume.pt")
+    done = run_here("--output", tmp_path / "model.pt", "--resume", "--epochs", 3)
+    assert done.returncode == 0, done.stderr
+    after = torch.load(tmp_path / "model-resume.pt", weights_only=True)
+    assert after["arguments"]["optimizer"] == "adam"
+    assert all("exp_avg_sq" in state for state in after["training"]["optimizer"]["state"].values())
+
+
+@pytest.mark.parametrize("options, begins", [([], 1e-4), (["--robust"], 4e-3)])
 def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
     sample_recording, tmp_path, monkeypatch, options, begins
 ):
@@ -251,8 +266,8 @@ def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
         if not models:
             steps.append((len(run.progress.history), run.progress.images, rates[-1]))
 
-    step = model.Adam.step
-    monkeypatch.setattr(model.Adam, "step", lambda optimizer, rate: rates.append(rate) or step(optimizer, rate))
+    step = Adam.step
+    monkeypatch.setattr(Adam, "step", lambda optimizer, rate: rates.append(rate) or step(optimizer, rate))
     monkeypatch.setattr(model, "SAVE_SECONDS", -1)
     monkeypatch.setattr(model.TrainingRun, "save", note)
     monkeypatch.setattr(model.TrainingRun, "summary", lambda run: "")  # of model files that are not written

@@ -23,7 +23,7 @@ from torch import nn
 from cloning import tensors
 from cloning.compute import choose_precision, in_precision, one_thread, threads
 from cloning.errors import ModelError
-from cloning.recordings.images import read_frame
+from cloning.recordings.format import FRAME, ROAD_ROWS
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_MATRIX, CAMERA_OFFSETS, LEVEL_CAMERA_MATRIX
 from cloning.road.motion import AXLE_TO_CAMERA, MAX_GAP, REAR_AXLE, Stretch
@@ -52,7 +52,7 @@ def extract_strip(frame: np.ndarray) -> np.ndarray:
     """Warp a frame's road to what the network sees: uint8 (160, 320, 3) -> uint8 (32, 160, 3).
 
     The strip has half the resolution and is seen by a camera that looks straight ahead and is not rolled, so that the
-    mirror image of a strip is the strip of the mirrored world.
+    mirror image of a strip is the strip of the mirrored world. Only the frame's `ROAD_ROWS` matter.
     """
     return cv2.warpPerspective(
         frame,
@@ -167,8 +167,10 @@ def read_strips(recording: Recording) -> np.ndarray:
     strips = np.empty((len(recording), 3, *STRIP_SHAPE), np.uint8)
 
     def read(row: int) -> None:
+        frame = np.zeros(FRAME, np.uint8)
         for camera in range(3):
-            strips[row, camera] = extract_strip(read_frame(recording.path(row, camera)))
+            frame[ROAD_ROWS] = recording.road(row, camera)
+            strips[row, camera] = extract_strip(frame)
 
     with ThreadPoolExecutor(threads()) as pool:
         for _ in pool.map(read, range(len(recording))):

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from cloning.errors import RecordingError
 from cloning.files import written_whole
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
+from cloning.recordings.frames import FrameCache
 from cloning.recordings.images import RULES, decode, read_jpeg
 from cloning.recordings.log import Recording
 
@@ -21,13 +22,17 @@ MISSING = "missing"
 COPY_OR_DELETE = "copy it again, or delete the row"
 
 
-def check_images(recording: Recording, threads: int = 2, show_progress: bool = True) -> None:
+def check_images(
+    recording: Recording, threads: int = 2, frames: FrameCache | None = None, show_progress: bool = True
+) -> None:
     """Decode every image of a recording; remove the rows that have an unusable image.
 
     Usable images are remembered in the user's cache folder: one whose file has not changed since (same size and time of
     change) is not decoded again. Sets `recording.digests`; adds line, kind and detail of each removed row to
-    `recording.rejected`. threads: that decode at the same time. Raises RecordingError if `IMG/` cannot be listed.
+    `recording.rejected`. threads: that decode at the same time; frames:
+    becomes the recording's, and is filled with what is decoded. Raises RecordingError if `IMG/` cannot be listed.
     """
+    recording.frames = frames or FrameCache()
     names, folder = recording.names, recording.folder / IMAGE_FOLDER
     states = _file_states(folder, names)
     cache = cache_file(folder)
@@ -40,7 +45,7 @@ def check_images(recording: Recording, threads: int = 2, show_progress: bool = T
         def examine(at: int) -> tuple[str, int]:
             try:
                 jpeg = read_jpeg(folder / os.fsdecode(names[at]))
-                decode(jpeg)
+                recording.frames.put((recording.folder, at), decode(jpeg))
             except ValueError as error:
                 return str(error), 0
             return "", int.from_bytes(hashlib.blake2b(jpeg, digest_size=8).digest(), "big")

@@ -4,7 +4,7 @@ A number that cannot be read for certain is never guessed: its row is left out a
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +13,8 @@ import numpy as np
 from cloning.errors import RecordingError
 from cloning.recordings.excluded import EXCLUDED, Cut, cut_rows, read_cuts
 from cloning.recordings.format import COLUMNS, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE
+from cloning.recordings.frames import FrameCache
+from cloning.recordings.images import read_frame
 from cloning.recordings.plain import as_narrow_as_possible, line_starts, read_blocks, read_plain
 from cloning.recordings.tolerant import TolerantReader
 
@@ -43,6 +45,7 @@ class Recording:
     rejected   rows that were left out: (line, kind, detail)
     cuts       stretches that `excluded.csv` leaves out, and how many rows each leaves out that none before it does
     digests    uint64 (m,): of the image files' contents; None before `check_images` has set them
+    frames     keeps decoded frames in memory for `road`; none unless `check_images` is given a larger one
     """
 
     folder: Path
@@ -59,6 +62,7 @@ class Recording:
     rejected: list[tuple[int, str, str]] = field(default_factory=list)
     cuts: list[tuple[Cut, int]] = field(default_factory=list)
     digests: np.ndarray | None = None
+    frames: FrameCache = field(default_factory=FrameCache)
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -79,6 +83,14 @@ class Recording:
     def path(self, row: int, camera: int = 0) -> Path:
         """Return the file of a row's image; camera: 0 centre, 1 left, 2 right."""
         return self.folder / IMAGE_FOLDER / self.name(row, camera)
+
+    def road(self, row: int, camera: int = 0, read: Callable[[Path], np.ndarray] = read_frame) -> np.ndarray:
+        """Return the `ROAD_ROWS` of a row's frame, decoded once: uint8 (90, 320, 3), RGB, not to be changed.
+
+        read: decodes the file if need be; its errors are raised.
+        """
+        key = self.folder, int(self.images[row, camera])  # rows may share an image
+        return self.frames.get(key, lambda: read(self.path(row, camera)))
 
 
 def find_folders(given: list[str]) -> list[Path]:

@@ -7,7 +7,7 @@ section 6). A camera's pose relative to another is (right, forward, yaw): metres
 import cv2
 import numpy as np
 
-from cloning.recordings.format import FRAME
+from cloning.recordings.format import FRAME, ROAD_ROWS
 from cloning.road.motion import AXLE_TO_CAMERA, CAMERA_FORWARD, right_of
 
 # Fitted by warping real centre frames to the side cameras; recordings of both tracks agree within 0.01 m, 0.05 degrees
@@ -18,7 +18,7 @@ CAMERA_HEIGHT = 1.255  # m above the ground
 # Degrees down, right and clockwise (the horizon falls to the right).
 CAMERA_PITCH, CAMERA_YAW, CAMERA_ROLL = 7.85, 0.7, 1.2
 CAMERA_OFFSETS = {"center": 0.0, "left": -0.806, "right": 0.825}  # m to the right, in the order of a recording's images
-FIRST_BONNET_ROW = 135  # from this row down the bonnet hides the road
+FIRST_BONNET_ROW = ROAD_ROWS.stop  # from this row down the bonnet hides the road
 FAR_SLOPE = 0.004  # tangent of the angle below the horizon: ground nearer to the horizon counts as infinitely far
 EARLIER_FRAME = 3.0  # m: a frame taken this far back shows all the road that a view 2 m to the side lacks
 VIEW_JPEG_QUALITY = 95  # of a warped frame, which was compressed at quality 75 when it was recorded

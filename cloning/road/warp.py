@@ -5,7 +5,7 @@ import functools
 import cv2
 import numpy as np
 
-from cloning.recordings.format import FRAME
+from cloning.recordings.format import FRAME, ROAD_ROWS
 from cloning.road.camera import (
     CAMERA_MATRIX,
     FAR_SLOPE,
@@ -17,7 +17,6 @@ from cloning.road.camera import (
 from cloning.road.motion import components, forward_vector
 
 FIRST_GROUND_ROW, FIRST_ROW_WITHOUT_SKY = 57, 66  # the first row with any ground, and the first without sky
-SOURCE_ROWS = slice(45, FIRST_BONNET_ROW)  # of a recorded frame: all rows that `CroppedView` reads
 
 
 def _shifted(top: int, left: int = 0) -> np.ndarray:
@@ -81,7 +80,7 @@ def warp(
 class CroppedView:
     """Warps recorded frames to the rows that a network sees, as from another pose.
 
-    To be fast enough for every training image, it computes only those rows, from a frame's `SOURCE_ROWS`.
+    To be fast enough for every training image, it computes only those rows, from a frame's `ROAD_ROWS`.
     """
 
     def __init__(self, crop: tuple[int, int]) -> None:
@@ -93,7 +92,7 @@ class CroppedView:
         # The second matrix is for the mirrored world. A flipped frame does not show what the cameras would see of it,
         # because they are turned and rolled.
         self.to_pixels = np.stack([to_view, to_view @ np.diag([-1.0, 1, 1])])
-        self.from_pixels = FROM_PIXELS @ _shifted(-SOURCE_ROWS.start)
+        self.from_pixels = FROM_PIXELS @ _shifted(-ROAD_ROWS.start)
         ground = [_shows_ground((self.sky_rows, self.columns), np.linalg.inv(matrix)) for matrix in self.to_pixels]
         self.sky = [np.where(mask, 0, 255).astype(np.uint8) for mask in ground]
 
@@ -115,13 +114,13 @@ class CroppedView:
     def warp(self, rows: np.ndarray, matrices: np.ndarray, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return a view, uint8 (75, 320, 3), and a mask, uint8 (75, 320): 255 where the camera really saw it.
 
-        rows: uint8 (90, 320, 3), `SOURCE_ROWS` of a frame; matrices: float64 (2, 3, 3), of `homographies`; mirrored:
+        rows: uint8 (90, 320, 3), `ROAD_ROWS` of a frame; matrices: float64 (2, 3, 3), of `homographies`; mirrored:
         whether they are for the mirrored world.
         """
         ground, sky = matrices
         view = self.warp_ground(rows, ground)
         seen = cv2.warpPerspective(
-            road_mask()[SOURCE_ROWS],
+            road_mask()[ROAD_ROWS],
             ground,
             (self.columns, self.rows),
             flags=cv2.INTER_NEAREST,

@@ -4,7 +4,7 @@ torch.optim.Adam does the same, but its constructor imports torch's compiler, wh
 an idle machine, a twentieth of a training on one lap.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import nn
@@ -24,15 +24,26 @@ class Adam:
         self.parameters = list(parameters)
         self.state: dict[int, dict[str, torch.Tensor]] = {}
 
+    def zeros(self, number: int) -> dict[str, torch.Tensor]:
+        """Return a parameter's state before the first step: float32, on its device, in its order in memory."""
+        parameter = self.parameters[number]
+        count = torch.zeros((), device=parameter.device)
+        return dict(zip(AVERAGES, (count, torch.zeros_like(parameter), torch.zeros_like(parameter)), strict=True))
+
     @torch.no_grad()
     def step(self, learning_rate: float) -> None:
         """Update the parameters by their gradients."""
-        if not self.state:
-            self.state = {number: zeros(parameter) for number, parameter in enumerate(self.parameters)}
-        steps, averages, squares = ([of[name] for of in self.state.values()] for name in AVERAGES)
+        numbers = range(len(self.parameters))
+        self.state = self.state or {number: self.zeros(number) for number in numbers}
+        self.update(numbers, learning_rate)
+
+    def update(self, numbers: Sequence[int], learning_rate: float) -> None:
+        """Update some parameters, whose state is there, by their gradients; numbers: of the parameters."""
+        parameters: list[torch.Tensor] = [self.parameters[number] for number in numbers]
+        steps, averages, squares = ([self.state[number][name] for number in numbers] for name in AVERAGES)
         adam(
-            list(self.parameters),
-            [parameter.grad for parameter in self.parameters if parameter.grad is not None],
+            parameters,
+            [parameter.grad for parameter in parameters if parameter.grad is not None],
             averages,
             squares,
             [],
@@ -54,13 +65,7 @@ class Adam:
 
     def restore(self, state: dict[int, dict[str, torch.Tensor]]) -> None:
         """Copy a saved `state`, whose tensors have the right shapes, to the parameters' device."""
-        self.state = {number: zeros(self.parameters[number]) for number in state}
+        self.state = {number: self.zeros(number) for number in state}
         for number, saved in state.items():
-            for name in AVERAGES:
-                self.state[number][name].copy_(saved[name])
-
-
-def zeros(parameter: nn.Parameter) -> dict[str, torch.Tensor]:
-    """Return a parameter's state before the first step: float32, on its device, in its order in memory."""
-    count = torch.zeros((), device=parameter.device)
-    return dict(zip(AVERAGES, (count, torch.zeros_like(parameter), torch.zeros_like(parameter)), strict=True))
+            for name, value in saved.items():
+                self.state[number][name].copy_(value)

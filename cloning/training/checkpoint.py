@@ -25,7 +25,8 @@ from cloning.errors import ModelError
 from cloning.files import write
 from cloning.pilot.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
 from cloning.tensors import matching, shown
-from cloning.training.adam import Adam, zeros
+from cloning.training.adam import Adam
+from cloning.training.muon import OPTIMIZERS
 from cloning.training.observations import Observations
 from cloning.training.options import Arguments, option
 from cloning.training.run_files import RunFiles
@@ -158,10 +159,12 @@ def _initial_arguments(saved: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(initial, dict):
         raise ValueError("it has no arguments")
     for name, default in asdict(Arguments()).items():
-        if name in initial and name not in NEVER_RESUMED:
-            value = known[name] = initial[name]
+        if name not in NEVER_RESUMED:
+            value = known[name] = initial.get(name, default)  # an earlier version may have had no such argument
             if type(value) is not type(default) or (name == "recordings" and not all(type(it) is str for it in value)):
                 raise ValueError(f"its {option(name)} is of type {type(value).__name__}")
+    if known["optimizer"] not in OPTIMIZERS:
+        raise ValueError(f"its optimizer is {shown(known['optimizer'])}, not {' or '.join(OPTIMIZERS)}")
     return known
 
 
@@ -275,13 +278,13 @@ class Checkpoint:
     def _restore_optimizer(self, saved: object, has_begun: bool) -> None:
         """Load the averages of a checkpoint into the optimizer; its settings follow from the arguments."""
         averages = saved.get("state") if isinstance(saved, dict) else None
-        parameters = dict(enumerate(self.network.parameters())) if has_begun else {}
-        if not isinstance(averages, dict) or averages.keys() != parameters.keys():
+        numbers = range(len(self.optimizer.parameters) if has_begun else 0)
+        if not isinstance(averages, dict) or averages.keys() != set(numbers):
             raise ValueError("the optimizer's state is not that of this network")
         state = {}
-        for number, parameter in parameters.items():
+        for number in numbers:
             try:
-                state[number] = matching(averages[number], zeros(parameter))
+                state[number] = matching(averages[number], self.optimizer.zeros(number))
             except ValueError as error:
                 raise ValueError(f"in the optimizer's state {number}: {error}") from None
         self.optimizer.restore(state)

@@ -13,10 +13,9 @@ import numpy as np
 
 from cloning.errors import RecordingError
 from cloning.pilot.network import CROP
-from cloning.recordings.format import DRIVE_GAP, FRAME, PROBLEM_AREAS, REPEATS
+from cloning.recordings.format import DRIVE_GAP, FRAME, PROBLEM_AREAS, REPEATS, ROAD_ROWS
 from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.log import Recording
-from cloning.training.image_cache import ImageCache
 from cloning.training.options import Arguments
 
 SEEN_ROWS = slice(CROP[0], FRAME[0] - CROP[1])  # the rows of a frame that the network sees
@@ -128,16 +127,12 @@ class Observations(ABC):
     frame: np.ndarray
     time: np.ndarray
 
-    cached_rows: ClassVar[slice] = SEEN_ROWS  # of a frame; must end where SEEN_ROWS end
     label_source: ClassVar[str]  # whose steering the label is, as the summary calls it
     too_few: ClassVar[str]  # the reason to print if `select` leaves too few rows
     dropout: ClassVar[bool]  # whether the network is trained with it
     best_by: ClassVar[str]  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
     aimed_at: ClassVar[str]  # where the car should be, in words
     remedy: ClassVar[str]  # what helps a network that drives badly
-
-    def __post_init__(self) -> None:
-        self.cache = ImageCache(self.cached_rows.stop - self.cached_rows.start)
 
     def __len__(self) -> int:
         return len(self.steering)
@@ -238,19 +233,19 @@ class Observations(ABC):
         return read_checked(self.path(at, camera))
 
     def read_cropped(self, at: int, camera: int) -> np.ndarray:
-        """Return the `cached_rows` of an observation's frame: uint8, RGB, not to be changed. Raises RecordingError."""
-        return self.crop(self.recording[at], self.row[at], camera)
+        """Return what the network sees of an observation's frame: uint8 (75, 320, 3), RGB, not to be changed."""
+        return self.road(self.recording[at], self.row[at], camera)[SEEN_ROWS.start - ROAD_ROWS.start :]
 
-    def crop(self, number: int, row: int, camera: int) -> np.ndarray:
-        """Return the `cached_rows` of any frame of recording `number`: uint8, RGB, not to be changed."""
-        recording = self.recordings[number]
-        key = number, recording.images[row, camera]  # rows may share an image
-        return self.cache.get(key, lambda: read_checked(recording.path(row, camera))[self.cached_rows])
+    def road(self, number: int, row: int, camera: int) -> np.ndarray:
+        """Return the `ROAD_ROWS` of any frame of recording `number`: uint8 (90, 320, 3), RGB, not to be changed.
+
+        Raises RecordingError.
+        """
+        return self.recordings[number].road(row, camera, read_checked)
 
     def center(self, rows: np.ndarray) -> np.ndarray:
         """Return the centre images of these observations, cropped: uint8 (len(rows), 75, 320, 3), RGB."""
-        first = SEEN_ROWS.start - self.cached_rows.start
-        return np.stack([self.read_cropped(at, 0)[first:] for at in rows])
+        return np.stack([self.read_cropped(at, 0) for at in rows])
 
 
 def center_digests(recording: Recording, rows: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from cloning.road.motion import (
     forward_vector,
     stretches,
 )
-from cloning.road.warp import SOURCE_ROWS, CroppedView
+from cloning.road.warp import CroppedView
 from cloning.training import light
 from cloning.training.observations import SEEN_SHAPE, Example, Observations, ValidationSet, Views, center_digests
 from cloning.training.options import Arguments
@@ -138,7 +138,7 @@ class Poses:
     yaw       float (n,): heading error, radians
     camera    int (n,): the camera whose frame is warped: 0 centre, 1 left, 2 right
     mirrored  bool (n,): whether the image shows the mirrored world, as seen by the same, slightly rolled camera
-    warps     float64 (n, 2, 2, 3, 3): homographies from a frame's `SOURCE_ROWS` to what the network sees: from the
+    warps     float64 (n, 2, 2, 3, 3): homographies from a frame's `ROAD_ROWS` to what the network sees: from the
               row's own frame and from the earlier one, for the ground and for the sky
     steering  float32 (n,): the label, -1..1
     colours   float32 (n, 3, 3): matrices by which (red, green, blue) is multiplied, see `light.tints`
@@ -177,7 +177,7 @@ class Poses:
     def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:
         """Return what the network sees of one row: uint8 (75, 320, 3), RGB.
 
-        at: index of the row; read(camera, earlier): returns the `SOURCE_ROWS` of the camera's frame, uint8, in the row
+        at: index of the row; read(camera, earlier): returns the `ROAD_ROWS` of the camera's frame, uint8, in the row
         or in the earlier one.
         """
         camera, mirrored = int(self.camera[at]), bool(self.mirrored[at])
@@ -207,7 +207,6 @@ class RobustObservations(Observations):
 
     lanes: Lanes
 
-    cached_rows: ClassVar[slice] = SOURCE_ROWS
     label_source: ClassVar[str] = "recovery steering"
     too_few: ClassVar[str] = "the drives are too short"
     # As in NVIDIA's paper. No image is seen twice; with dropout val_loss was higher after the same number of images.
@@ -294,8 +293,8 @@ class RobustObservations(Observations):
         return images
 
     def read_source(self, at: int, camera: int, earlier: bool) -> np.ndarray:
-        """Return the `SOURCE_ROWS` of an observation's frame, or of the earlier row's: uint8 (90, 320, 3), RGB."""
-        return self.crop(self.recording[at], self.lanes.earlier[at] if earlier else self.row[at], camera)
+        """Return the `ROAD_ROWS` of an observation's frame, or of the earlier row's: uint8 (90, 320, 3), RGB."""
+        return self.road(self.recording[at], self.lanes.earlier[at] if earlier else self.row[at], camera)
 
 
 class PoseViews(Views):

@@ -1,4 +1,4 @@
-"""The optimizer against torch's."""
+"""The optimizers against torch's."""
 
 import subprocess
 import sys
@@ -8,12 +8,13 @@ from conftest import ROOT
 
 from cloning.pilot.network import Network
 from cloning.training.adam import Adam
+from cloning.training.muon import Muon, orthogonal
 
 STEPS = """
 import sys, torch
-from cloning.training.adam import Adam
-weight = torch.nn.Parameter(torch.ones(3))
-optimizer = Adam([weight])
+from cloning.training.muon import Muon
+weight = torch.nn.Parameter(torch.ones(3, 3))
+optimizer = Muon([weight])
 weight.sum().backward()
 optimizer.step(0.1)
 optimizer.zero_grad()
@@ -77,3 +78,49 @@ def test_it_continues_from_torchs_state():
 def test_it_does_not_import_torchs_compiler():
     done = subprocess.run([sys.executable, "-c", STEPS], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_orthogonal_keeps_the_singular_vectors_and_makes_the_values_about_one():
+    for rows, columns, smallest in [(24, 75, 1e-1), (100, 4224, 1e-1), (50, 20, 1e-1), (8, 8, 0.05)]:
+        torch.manual_seed(rows)
+        left, _ = torch.linalg.qr(torch.randn(rows, min(rows, columns)))
+        right, _ = torch.linalg.qr(torch.randn(columns, min(rows, columns)))
+        values = torch.linspace(smallest, 1, min(rows, columns))
+        found = orthogonal(1e-3 * left @ torch.diag(values) @ right.T)
+        inner = left.T @ found @ right
+        assert torch.allclose(inner, torch.diag(inner.diag()), atol=1e-3)
+        assert inner.diag().min() > 0.6 and inner.diag().max() < 1.25
+        assert torch.allclose(left @ inner @ right.T, found, atol=1e-3)
+    assert orthogonal(torch.zeros(3, 4)).abs().max() == 0
+
+
+def test_weights_move_as_with_torchs_muon_and_biases_as_with_adam():
+    torch.manual_seed(0)
+    ours, torchs = (torch.nn.Sequential(torch.nn.Linear(40, 30), torch.nn.Linear(30, 1)) for _ in "ab")
+    torchs.load_state_dict(ours.state_dict())
+    begin = ours[0].weight.detach().clone()
+    optimizer = Muon(ours.parameters())
+    muon = torch.optim.Muon([torchs[0].weight], 1e-2, weight_decay=0, adjust_lr_fn="match_rms_adamw")
+    adam = torch.optim.Adam([torchs[0].bias, *torchs[1].parameters()], 1e-2, fused=True)
+    for seed in range(4):
+        give_gradients((ours, torchs), seed)
+        optimizer.step(1e-2)
+        muon.step()
+        adam.step()
+    moved, expected = ours[0].weight - begin, torchs[0].weight - begin
+    assert (moved - expected).norm() < 0.05 * expected.norm()  # torch's computes in bfloat16
+    assert torch.equal(ours[0].bias, torchs[0].bias)
+    assert all(map(torch.equal, ours[1].parameters(), torchs[1].parameters()))
+
+
+def test_muon_continues_from_its_state():
+    network, other = networks()
+    optimizer, restored = Muon(network.parameters()), Muon(other.parameters())
+    give_gradients((network,), 5)
+    optimizer.step(1e-3)
+    other.load_state_dict(network.state_dict())
+    restored.restore(optimizer.state)
+    give_gradients((network, other), 6)
+    optimizer.step(1e-3)
+    restored.step(1e-3)
+    assert all(map(torch.equal, network.parameters(), other.parameters()))

@@ -1,0 +1,44 @@
+"""Keep decoded frames in memory: decoding them is half of the work of whoever looks at each one several times."""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from cloning.recordings.format import FRAME, ROAD_ROWS
+
+ROAD_SHAPE = (ROAD_ROWS.stop - ROAD_ROWS.start, *FRAME[1:])  # (90, 320, 3)
+KEPT_FRAMES = 5_000  # by a training run: 432 MB
+
+
+class FrameCache:
+    """Keeps the `ROAD_ROWS` of the first `capacity` frames that it is given; recordings and threads may share it."""
+
+    def __init__(self, capacity: int = 0):
+        """Reserve memory, which the system provides as it is filled; capacity: frames."""
+        self._kept = np.empty((capacity, *ROAD_SHAPE), np.uint8)
+        self._places: dict[tuple[Path, int], int] = {}
+        self._free = itertools.count()
+
+    def get(self, key: tuple[Path, int], read: Callable[[], np.ndarray]) -> np.ndarray:
+        """Return a frame's `ROAD_ROWS`: uint8 (90, 320, 3), RGB, not to be changed.
+
+        key: of the frame: folder of the recording, number of the image; read: returns the whole frame, if it is not
+        kept yet. If two threads request a new frame at once, both read it and keep equal copies.
+        """
+        if (place := self._places.get(key)) is not None:
+            return self._kept[place]
+        return self.put(key, read())
+
+    def put(self, key: tuple[Path, int], frame: np.ndarray) -> np.ndarray:
+        """Keep a frame, uint8 (160, 320, 3), if there is a place left; return what `get` does."""
+        road = frame[ROAD_ROWS]
+        if len(self._places) < len(self._kept) and (place := next(self._free)) < len(self._kept):
+            self._kept[place] = road
+            self._places[key] = place
+        return road
+
+    def __reduce__(self) -> tuple[type["FrameCache"], tuple[int]]:
+        """Pickle the cache without its frames: in another process it is empty."""
+        return FrameCache, (len(self._kept),)
