@@ -67,6 +67,7 @@ def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
         ["video.py", "nowhere"],
         ["-m", "simulator", "replay", "nowhere"],
         ["-m", "tools.follow_driver", "nowhere.pt", "nowhere"],
+        ["-m", "tools.pose_errors", "nowhere.pt", "nowhere"],
         ["-m", "tools.scoreboard", "nowhere.pt", "--name", "x", "--recordings", "nowhere"],
     ],
 )
