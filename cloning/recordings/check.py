@@ -29,8 +29,8 @@ def check_images(
 
     Usable images are remembered in the user's cache folder: one whose file has not changed since (same size and time of
     change) is not decoded again. Sets `recording.digests`; adds line, kind and detail of each removed row to
-    `recording.rejected`. threads: that decode at the same time; frames:
-    becomes the recording's, and is filled with what is decoded. Raises RecordingError if `IMG/` cannot be listed.
+    `recording.rejected`. threads: that decode at the same time; frames: becomes the recording's, and keeps what is
+    decoded. Raises RecordingError if `IMG/` cannot be listed.
     """
     recording.frames = frames or FrameCache()
     names, folder = recording.names, recording.folder / IMAGE_FOLDER
