@@ -7,6 +7,7 @@ import pytest
 
 from cloning.errors import RecordingError
 from cloning.recordings import log, plain
+from cloning.recordings.frames import FrameCache
 from cloning.recordings.log import read_recording
 
 FOLDERS = [b"/Users/driver/data/IMG/", b"IMG/", b" IMG/", b"C:\\Users\\Doe\\IMG\\", b"", b" ", b"a b/", b"./IMG/ "]
@@ -126,7 +127,7 @@ def contents(folder) -> list:
         recording = read_recording(folder)
     except RecordingError as error:
         return [str(error)]
-    values = [value for value in vars(recording).values() if not isinstance(value, np.ndarray)]
+    values = [value for value in vars(recording).values() if not isinstance(value, np.ndarray | FrameCache)]
     arrays = [value for value in vars(recording).values() if isinstance(value, np.ndarray)]
     return [*values, *((array.dtype, array.shape, array.tobytes()) for array in arrays), list(recording.repairs)]
 
