@@ -1,4 +1,4 @@
-"""Keep decoded frames in memory: decoding them is half of the work of whoever looks at each one several times."""
+"""Keep decoded frames in memory, so that checking, estimating the lane and training decode each one only once."""
 
 import itertools
 from collections.abc import Callable
