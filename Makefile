@@ -10,9 +10,12 @@ PYTHON ?= python3
 RECORDINGS ?= data
 BIN = .venv/bin
 # Debian's python3 comes without ensurepip, which venv needs, and panda3d's wheel needs libX11 even without a screen.
+# The tests look at the pages in Chromium and at the window on Xvfb's screen, and skip what they can't look at.
 APT = ./.ci/apt
 
 test: lint
+	@(for command in chromium Xvfb xdotool; do command -v $$command || exit; done) > /dev/null \
+		|| $(APT) --optional chromium xvfb xdotool
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: .venv/installed

@@ -9,9 +9,10 @@
     and augments the images one by one
 (k) Keras with the same one-by-one generator, if TensorFlow is installed
 
-The limit for (b) is the rate at which the processor could train if it only multiplied matrices. Each part runs in a
-process of its own; the parts take turns, so that a change of the machine's speed affects all of them. Rates are in
-training images per second.
+The limit for (b) is the rate at which the processor could train if it only multiplied matrices, or if it only moved the
+activations in memory, whichever is lower. Each part runs in a process of its own; the parts take turns, so that a
+change of the machine's speed affects all of them. Rates are in training images per second. On a CPU, a last table shows
+what each layer costs.
 """
 
 import argparse
@@ -45,10 +46,11 @@ if TYPE_CHECKING:
     import model
     from cloning.pilot.network import Network
 
-PARTS = ("limit", "ab", "c", "k")
+PARTS = ("limit", "ab", "c", "k")  # that measure rates
 BATCH_IMAGES = 474  # images in a batch of 128 observations, at 3.7 images each on average
 NAMES = {
     "limit": "limit by matrix multiplication",
+    "memory": "limit by memory traffic",
     "a": "(a) an epoch of model.py",
     "b": "(b) only the optimisation step",
     "c": "(c) a typical training loop",
@@ -62,7 +64,9 @@ def begin(folders: list[str], samples: int, output: Path) -> "model.TrainingRun"
 
     options = ["--samples-per-epoch", str(samples), "--epochs", "1", "--output", str(output)]
     arguments, training, validation, _ = model.prepare(*model.parse([*folders, *options]))
-    return model.TrainingRun(arguments, training, validation)
+    run = model.TrainingRun(arguments, training, validation)
+    run.files.pictures.mkdir()
+    return run
 
 
 def flops(network: "Network") -> int:
@@ -187,13 +191,22 @@ def part_k(run: "model.TrainingRun", steps: int) -> dict[str, float]:
 
 
 def part_limit(run: "model.TrainingRun", _: int) -> dict[str, float]:
-    """Measure the limit: images per second if a step only multiplied matrices, the best of eight measurements."""
+    """Measure the limits: images per second if a step only multiplied matrices, or only moved its activations.
+
+    Each is the best of eight measurements; the second one only on a CPU.
+    """
     import torch
+
+    from tools import bench_layers
 
     torch.set_num_threads(threads())
     size = 2048 if run.device.type == "cpu" else 8192
     a, b = (torch.randn(size, size, device=run.device).to(run.precision) for _ in "ab")
-    return {"limit": max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size**3 / flops(run.network)}
+    fastest = max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size**3
+    limits = {"limit": fastest / flops(run.network)}
+    if run.device.type == "cpu":
+        limits["memory"] = bench_layers.memory_limit(run.network, run.precision)
+    return limits
 
 
 def rate(step: Callable[[], object], images: int, steps: int, device: "torch.device") -> float:
@@ -216,6 +229,14 @@ def synchronize(device: "torch.device") -> None:
 
 
 PART_FUNCTIONS = {"limit": part_limit, "ab": part_ab, "c": part_c, "k": part_k}
+
+
+def layer_table(run: "model.TrainingRun") -> str:
+    """Return what each layer costs in an optimisation step, as a table."""
+    from tools import bench_layers
+
+    keep_freed_memory()
+    return bench_layers.table(*bench_layers.costs(run.network, run.precision))
 
 
 def measure(part: str, recordings: list[str], samples: int, steps: int, folder: Path) -> dict:
@@ -249,14 +270,18 @@ def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> Non
     rates: dict[str, list[float]] = {}
     memory: dict[str, float] = {}
     measured: dict = {}
+
+    def output(part: str) -> str:
+        command = [sys.executable, "-m", "tools.bench_training", *recordings, "--part", part]
+        command += ["--samples", str(samples), "--steps", str(steps)]
+        process = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+        if process.returncode:
+            raise UserError(f"part {part} failed; its error message is above")
+        return process.stdout
+
     for round_number in range(1, rounds + 1):
         for part in parts:
-            command = [sys.executable, "-m", "tools.bench_training", *recordings, "--part", part]
-            command += ["--samples", str(samples), "--steps", str(steps)]
-            process = subprocess.run(command, stdout=subprocess.PIPE, text=True)
-            if process.returncode:
-                raise UserError(f"part {part} failed; its error message is above")
-            measured = json.loads(process.stdout.splitlines()[-1])
+            measured = json.loads(output(part).splitlines()[-1])
             for name, value in measured["rates"].items():
                 rates.setdefault(name, []).append(value)
                 memory[name] = max(memory.get(name, 0.0), measured["gb"] or 0.0)
@@ -268,9 +293,14 @@ def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> Non
         cells = (statistics.median(values), min(values), max(values))
         print(f"| {NAMES[name]} | {' | '.join(f'{cell:.0f}' for cell in cells)} | {memory[name]:.2f} |")
     print("\n| ratio in each round | median | least | most |\n|---|---|---|---|")
+    if "memory" in rates:
+        rates["limit"] = [min(pair) for pair in zip(rates["limit"], rates["memory"], strict=True)]
     for above, below in (("b", "limit"), ("a", "b"), ("a", "c"), *((("a", "k"),) if "k" in parts else ())):
         ratios = [x / y for x, y in zip(rates[above], rates[below], strict=True)]
         print(f"| {above} / {below} | {statistics.median(ratios):.2f} | {min(ratios):.2f} | {max(ratios):.2f} |")
+    if measured["device"] == "cpu":
+        layers = output("layers")
+        print(f"\n{layers[layers.index('| layer') :]}", end="")
 
 
 def main() -> int:
@@ -293,10 +323,13 @@ def main() -> int:
     parser.add_argument(
         "--steps", type=number(int, 1), default=5, help="measured batches in (c) and (k) (default %(default)s)"
     )
-    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    parser.add_argument("--part", choices=(*PARTS, "layers"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     try:
         with tempfile.TemporaryDirectory() as folder:
+            if args.part == "layers":
+                print("\n" + layer_table(begin(args.recordings, args.samples, Path(folder, "model.pt"))))
+                return program.DONE
             if args.part:
                 measured = measure(args.part, args.recordings, args.samples, args.steps, Path(folder))
                 print("\n" + json.dumps(measured))

@@ -1,6 +1,8 @@
 """Keep decoded frames in memory, so that checking, estimating the lane and training decode each one only once."""
 
 import itertools
+import math
+import mmap
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +19,9 @@ class FrameCache:
 
     def __init__(self, capacity: int = 0):
         """Reserve memory, which the system provides as it is filled; capacity: frames."""
-        self._kept = np.empty((capacity, *ROAD_SHAPE), np.uint8)
+        shape = (capacity, *ROAD_SHAPE)
+        # Not np.empty, which asks for huge pages: in a virtual machine their first use took four times as long.
+        self._kept = np.frombuffer(mmap.mmap(-1, max(math.prod(shape), 1)), np.uint8, math.prod(shape)).reshape(shape)
         self._places: dict[tuple[Path, int], int] = {}
         self._free = itertools.count()
 

@@ -1,0 +1,44 @@
+"""The tools that measure how fast training is run, and count what the network computes."""
+
+import re
+import subprocess
+import sys
+
+import torch
+from conftest import ROOT
+
+from cloning.pilot.network import Network
+from tools import bench_layers
+
+
+def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording):
+    command = [sys.executable, "-m", "tools.bench_training", sample_recording, "--part", "ab", "--samples", "2370"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    rates = re.search(r'"rates": \{"a": ([\d.]+), "b": ([\d.]+)\}', done.stdout)
+    assert rates, done.stdout
+    assert float(rates[1]) > 0 and float(rates[2]) > 0
+
+
+def test_the_layers_costs_are_those_of_the_network():
+    network = Network().to(memory_format=torch.channels_last)
+    found, whole = bench_layers.costs(network, torch.float32)
+    assert [cost.name for cost in found[:3]] == [
+        "convolution 1, 3 to 24",
+        "ELU of convolution 1",
+        "convolution 2, 24 to 36",
+    ]
+    images = bench_layers.PIECE
+    assert found[0].operations == 2 * images * 36 * 158 * 24 * 75
+    assert found[0].operations_back == found[0].operations  # the image needs no gradient
+    assert found[2].operations == 2 * images * 16 * 77 * 36 * 600
+    assert found[2].operations_back == 2 * found[2].operations
+    rows = bench_layers.table(found, whole).splitlines()
+    shares = [int(re.search(r"(-?\d+) % \|$", row)[1]) for row in rows[2:-1]]
+    assert abs(sum(shares) - 100) <= len(shares)  # rounded
+
+
+def test_activations_in_half_the_precision_are_half_the_traffic():
+    network = Network().to(memory_format=torch.channels_last)
+    single, half = (bench_layers.costs(network, precision)[0] for precision in (torch.float32, torch.bfloat16))
+    assert sum(cost.traffic for cost in single) == 2 * sum(cost.traffic for cost in half)
