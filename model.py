@@ -32,7 +32,7 @@ if __name__ == "__main__":
 import cv2
 import numpy as np
 import torch
-from torch.nn.parallel import DistributedDataParallel
+from torch import nn
 from tqdm import tqdm
 
 from cloning.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable, threads
@@ -345,9 +345,9 @@ class TrainingRun:
         repeatable(self.device)
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
-        self.errors: torch.nn.Module = SquaredErrors(self.network, self.precision, self.device, self.pool)
+        self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.device, self.pool, arguments.loss)
         if world() > 1:
-            self.errors = DistributedDataParallel(self.errors)
+            self.errors = nn.parallel.DistributedDataParallel(self.errors)
         self.optimizer = OPTIMIZERS[arguments.optimizer](self.network.parameters())
         self.generator = Generator(training, arguments, self.pool, ahead=1 if self.device.type == "cpu" else 4)
         self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)

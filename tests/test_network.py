@@ -20,7 +20,7 @@ from cloning.files import write
 from cloning.pilot import network as network_module
 from cloning.pilot.network import SHIPPED_MODEL, Network, layer_table, load_model, save_model, steer
 from cloning.recordings.images import decode
-from cloning.training.pieces import SquaredErrors, squared_errors
+from cloning.training.pieces import LOSSES, SquaredErrors, squared_errors
 from model import Batch
 
 REPORT = """
@@ -126,12 +126,30 @@ def test_pieces_give_the_gradient_of_the_whole_batch(network):
     whole = [parameter.grad.clone() for parameter in network.parameters()]
     network.zero_grad()
     with ThreadPoolExecutor(2) as pool:
-        loss = SquaredErrors(network, torch.float32, cpu, pool)(batch)
+        loss = SquaredErrors(network, torch.float32, cpu, pool, "squared")(batch)
         (loss * 3).backward()
         for parameter, expected in zip(network.parameters(), whole, strict=True):
             torch.testing.assert_close(parameter.grad, expected * 3, rtol=1e-4, atol=1e-4)
-        again = SquaredErrors(network, torch.float32, cpu, pool)(batch)
+        again = SquaredErrors(network, torch.float32, cpu, pool, "squared")(batch)
     assert torch.equal(loss, again)  # whichever thread was faster
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_gradient_is_that_of_the_loss_and_the_value_the_squared_errors(network, loss):
+    rng = np.random.default_rng(3)
+    images, labels = rng.integers(0, 256, (20, 75, 320, 3), np.uint8), rng.normal(0, 0.2, 20).astype(np.float32)
+    batch, cpu, parameters = Batch(images, labels, None, 20), torch.device("cpu"), list(network.parameters())
+    predicted, wanted = network(torch.from_numpy(images)), torch.from_numpy(labels)
+    assert 2 < int(((predicted - wanted).abs() < LOSSES["huber"]).sum()) < 18  # both sides of the limit
+    squared = torch.nn.functional.mse_loss(predicted, wanted, reduction="sum")
+    huber = torch.nn.functional.huber_loss(predicted, wanted, reduction="sum", delta=LOSSES["huber"])
+    expected = torch.autograd.grad({"squared": squared, "huber": 2 * huber}[loss], parameters)
+    with ThreadPoolExecutor(2) as pool:
+        errors = SquaredErrors(network, torch.float32, cpu, pool, loss)(batch)
+        errors.backward()
+    assert errors.item() == pytest.approx(squared.item(), rel=1e-4)
+    for parameter, gradient in zip(parameters, expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-4)
 
 
 def test_bfloat16_steps_where_float32_does(network):

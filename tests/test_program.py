@@ -82,3 +82,36 @@ def test_an_error_of_the_user_is_a_line_and_status_2(tmp_path, command):
 def test_ctrl_c_in_a_command_lets_it_clean_up():
     done = subprocess.run([sys.executable, "-c", INTERRUPTED_MAIN], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "cleaned up\n", "test: stopped\n")
+
+
+ENDING_MAIN = """
+import atexit, sys, threading, time
+from cloning import program
+def main():
+    atexit.register(print, "at exit", end="")
+    if "thread" in sys.argv:
+        threading.Thread(target=lambda: [time.sleep(0.3), print("thread done")]).start()
+    print("main done")
+    return 1
+program.run(main)
+"""
+
+
+@pytest.mark.parametrize("arguments", [[], ["thread"]], ids=["alone", "beside a thread"])
+def test_a_command_ends_when_all_is_done_and_printed(arguments):
+    command = [sys.executable, "-c", ENDING_MAIN, *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    said = ["main done", *["thread done"] * len(arguments), "at exit"]
+    assert (done.returncode, done.stdout, done.stderr) == (1, "\n".join(said), "")
+
+
+def test_a_command_whose_last_lines_cannot_be_printed_says_so():
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        command = [sys.executable, "-c", ENDING_MAIN]
+        done = subprocess.run(command, cwd=ROOT, env=environment, stdout=writer, stderr=subprocess.PIPE)
+    finally:
+        os.close(writer)
+    assert (done.returncode, done.stderr) == (FAILED, b"stdout: Broken pipe\n")

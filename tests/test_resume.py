@@ -335,6 +335,7 @@ def set_place(name, value):
         (lambda saved: saved["arguments"].update(batch_size="8"), "--batch-size is of type str"),
         (lambda saved: saved["arguments"].update(recordings=[1]), "--recordings is of type list"),
         (lambda saved: saved["arguments"].update(optimizer="sgd"), "optimizer is 'sgd', not adam or muon"),
+        (lambda saved: saved["arguments"].update(loss="cubed"), "loss is 'cubed', not squared or huber"),
         (lambda saved: saved["recipe"].update(crop=(61, 24)), "recipe"),
         (lambda saved: saved["recipe"].update(scale=0), "scale 0"),
         (lambda saved: saved["network"].update({"dense.3.bias": torch.full((1,), torch.inf)}), "not finite"),

@@ -29,6 +29,7 @@ from cloning.training.adam import Adam
 from cloning.training.muon import OPTIMIZERS
 from cloning.training.observations import Observations
 from cloning.training.options import Arguments, option
+from cloning.training.pieces import LOSSES
 from cloning.training.run_files import RunFiles
 
 EpochMetrics = dict[str, float]  # a row of training_log.csv: epoch, images, seconds, loss, val_loss, val_drift
@@ -163,8 +164,9 @@ def _initial_arguments(saved: dict[str, Any]) -> dict[str, Any]:
             value = known[name] = initial.get(name, default)  # an earlier version may have had no such argument
             if type(value) is not type(default) or (name == "recordings" and not all(type(it) is str for it in value)):
                 raise ValueError(f"its {option(name)} is of type {type(value).__name__}")
-    if known["optimizer"] not in OPTIMIZERS:
-        raise ValueError(f"its optimizer is {shown(known['optimizer'])}, not {' or '.join(OPTIMIZERS)}")
+    for name, values in (("optimizer", OPTIMIZERS), ("loss", LOSSES)):
+        if known[name] not in values:
+            raise ValueError(f"its {name} is {shown(known[name])}, not {' or '.join(values)}")
     return known
 
 

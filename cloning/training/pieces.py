@@ -1,5 +1,6 @@
 """Compute loss, gradients and predictions, on a CPU in pieces of a batch that fit its cache."""
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -12,6 +13,9 @@ from torch import nn
 from cloning.compute import in_precision
 
 PIECE = 16  # images: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
+# The loss -> the largest error that the gradient knows. Huber's loss grows linearly beyond it, so that the few views
+# that are warped beyond recognition do not decide what is learned from all the others.
+LOSSES = {"squared": math.inf, "huber": 0.1}
 
 
 @dataclass
@@ -39,12 +43,19 @@ def squared_errors(
     images: np.ndarray,
     labels: np.ndarray,
     keep: np.ndarray | None = None,
+    loss: str = "squared",
 ) -> torch.Tensor:
-    """Return the sum over the images of (predicted - label)², a scalar, float32; arrays as in Batch."""
+    """Return the sum over the images of (predicted - label)², a scalar, float32; arrays as in Batch.
+
+    loss: one of LOSSES; its gradient is that of the result, and differs from the squared errors' with "huber".
+    """
     frames, wanted = torch.from_numpy(images).to(device), torch.from_numpy(labels).to(device)
     with in_precision(precision, device):
         predicted = network(frames, None if keep is None else torch.from_numpy(keep).to(device))
-    return ((predicted - wanted) ** 2).sum()
+    error = predicted - wanted
+    known = error.detach()
+    limit = LOSSES[loss]
+    return (known**2 + 2 * known.clamp(-limit, limit) * (error - known)).sum()
 
 
 class PieceByPiece(torch.autograd.Function):
@@ -60,6 +71,7 @@ class PieceByPiece(torch.autograd.Function):
         precision: torch.dtype,
         pool: ThreadPoolExecutor,
         batch: Batch,
+        loss: str,
         *parameters: nn.Parameter,
     ) -> torch.Tensor:
         """Return the sum of squared errors; the gradients are computed, too, and kept for `backward`."""
@@ -67,44 +79,47 @@ class PieceByPiece(torch.autograd.Function):
         def piece(start: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
             part = slice(start, start + PIECE)
             keep = None if batch.keep is None else batch.keep[part]
+            images, labels = batch.images[part], batch.labels[part]
             with torch.enable_grad():
-                loss = squared_errors(
-                    network, precision, torch.device("cpu"), batch.images[part], batch.labels[part], keep
-                )
-            return loss.detach(), torch.autograd.grad(loss, parameters)
+                errors = squared_errors(network, precision, torch.device("cpu"), images, labels, keep, loss)
+            return errors.detach(), torch.autograd.grad(errors, parameters)
 
         pieces = pool.map(piece, range(0, len(batch.labels), PIECE))
         batch.start_next()
-        loss, gradients = torch.zeros(()), None
-        for piece_loss, piece_gradients in pieces:
-            loss += piece_loss
+        total, gradients = torch.zeros(()), None
+        for piece_errors, piece_gradients in pieces:
+            total += piece_errors
             if gradients is None:
                 gradients = [gradient.clone() for gradient in piece_gradients]
             else:
                 torch._foreach_add_(gradients, list(piece_gradients))
         context.gradients = gradients or [torch.zeros_like(p) for p in parameters]
-        return loss
+        return total
 
     @staticmethod
     def backward(context: Any, scale: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Return the gradients of the parameters, times `scale`; the first four inputs have none."""
-        return None, None, None, None, *torch._foreach_mul(context.gradients, scale)
+        """Return the gradients of the parameters, times `scale`; the first five inputs have none."""
+        return None, None, None, None, None, *torch._foreach_mul(context.gradients, scale)
 
 
 class SquaredErrors(nn.Module):
     """Sums a batch's squared errors; a module, so that DistributedDataParallel can wrap it."""
 
-    def __init__(self, network: nn.Module, precision: torch.dtype, device: torch.device, pool: ThreadPoolExecutor):
-        """pool: its threads compute the pieces on a CPU."""
+    def __init__(
+        self, network: nn.Module, precision: torch.dtype, device: torch.device, pool: ThreadPoolExecutor, loss: str
+    ):
+        """pool: its threads compute the pieces on a CPU; loss: one of LOSSES, whose gradient is taken."""
         super().__init__()
-        self.network, self.precision, self.device, self.pool = network, precision, device, pool
+        self.network, self.precision, self.device, self.pool, self.loss = network, precision, device, pool, loss
 
     def forward(self, batch: Batch) -> torch.Tensor:
         """Return the sum over this process's images: a scalar, float32."""
         if self.device.type == "cpu":
-            return PieceByPiece.apply(self.network, self.precision, self.pool, batch, *self.network.parameters())
+            whole = self.network, self.precision, self.pool, batch, self.loss
+            return PieceByPiece.apply(*whole, *self.network.parameters())
         batch.start_next()
-        return squared_errors(self.network, self.precision, self.device, batch.images, batch.labels, batch.keep)
+        images, labels = batch.images, batch.labels
+        return squared_errors(self.network, self.precision, self.device, images, labels, batch.keep, self.loss)
 
 
 def predict(
