@@ -35,7 +35,7 @@ from cloning.replay.replay import ReferenceLine, drive, load_recording, referenc
 from cloning.training.options import ROBUST_DEFAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
-IMAGES = 8_000  # enough for one lap of the lake; writeup_report.md has what was tried
+IMAGES = 6_500  # enough for one lap of the lake; writeup_report.md has what was tried
 
 
 class Result(NamedTuple):

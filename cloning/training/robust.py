@@ -34,7 +34,7 @@ from cloning.training import light
 from cloning.training.observations import SEEN_SHAPE, Example, Observations, ValidationSet, Views, center_digests
 from cloning.training.options import Arguments
 
-MAX_POSE_OFFSET = 2.0  # m: the lateral offsets of sampled poses are uniform between - and + this
+MAX_POSE_OFFSET = 2.0  # m: sampled poses are at most this far from the lane's centre, most often near it
 # Radians: standard deviation and limit of the heading errors of sampled poses, which are normally distributed.
 YAW_DEVIATION, MAX_POSE_YAW = np.radians(8), np.radians(25)
 MAX_SHIFT = 2.4  # m from the recorded trajectory: further away the frames show too little of the road
@@ -119,7 +119,7 @@ class Lanes(LaneAhead):
         """
         n = len(self)
         offset = np.clip(
-            rng.uniform(-MAX_POSE_OFFSET, MAX_POSE_OFFSET, n), self.offset - MAX_SHIFT, self.offset + MAX_SHIFT
+            rng.triangular(-MAX_POSE_OFFSET, 0, MAX_POSE_OFFSET, n), self.offset - MAX_SHIFT, self.offset + MAX_SHIFT
         )
         yaw = np.clip(rng.normal(0, YAW_DEVIATION, n), -MAX_POSE_YAW, MAX_POSE_YAW)
         eye = offset - self.offset + AXLE_TO_CAMERA * (np.sin(yaw) - np.sin(self.yaw))
