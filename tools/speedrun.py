@@ -35,7 +35,7 @@ from cloning.replay.replay import ReferenceLine, drive, load_recording, referenc
 from cloning.training.options import ROBUST_DEFAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
-IMAGES = 6_500  # enough for one lap of the lake; writeup_report.md has what was tried
+IMAGES, BATCH = 7_000, 8  # enough for one lap of the lake; writeup_report.md has what was tried
 
 
 class Result(NamedTuple):
@@ -100,7 +100,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--batch-size",
         type=number(int, 1),
-        default=ROBUST_DEFAULTS["batch_size"],
+        default=BATCH,
         help="observations (default %(default)s)",
     )
     parser.add_argument(
