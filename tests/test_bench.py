@@ -42,3 +42,15 @@ def test_activations_in_half_the_precision_are_half_the_traffic():
     network = Network().to(memory_format=torch.channels_last)
     single, half = (bench_layers.costs(network, precision)[0] for precision in (torch.float32, torch.bfloat16))
     assert sum(cost.traffic for cost in single) == 2 * sum(cost.traffic for cost in half)
+
+
+def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording):
+    few = ["--in-sample", "--seeds", "1", "--images", "60", "--limit", "20", "--autonomy", "99"]
+    command = [sys.executable, "-m", "tools.speedrun", sample_recording, *few]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    name = sample_recording.name
+    row = re.search(rf"\| {name} \| {name} \| 0 \| [\d.]+ \| (.*?) % \|", done.stdout)
+    assert row, done.stderr
+    passed = float(row[1]) >= 99
+    assert f"{int(passed)} of 1 runs at 99 % or better at 20 m" in done.stdout
+    assert done.returncode == (0 if passed else 1)

@@ -78,7 +78,7 @@ def driving_metrics(done: Drive) -> DrivingMetrics:
     """Return the metrics of one drive."""
     distance = np.abs(done.offset)
     return {
-        "autonomy_percent": round(100 * done.autonomy(), 2),
+        "autonomy_percent": round(100 * done.autonomy(), 4),
         "interventions": len(done.interventions),
         "distance_mean_m": round(float(distance.mean()), 3),
         "distance_p95_m": round(float(np.percentile(distance, 95)), 3),
