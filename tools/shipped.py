@@ -107,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
         "--looks", type=number(int, 1, 101), default=15, help="looks of each track (default %(default)s)"
     )
     parser.add_argument("--roads", type=number(int, 0, 101), default=24, help="generated roads (default %(default)s)")
-    parser.add_argument("--epochs", type=number(int, 1), default=8, help="of 60,000 images (default %(default)s)")
+    parser.add_argument("--epochs", type=number(int, 1), default=10, help="of 60,000 images (default %(default)s)")
     parser.add_argument("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
     parser.add_argument("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
     args = parser.parse_args(argv)
