@@ -130,6 +130,6 @@ def table(found: list[Cost], whole: float) -> str:
         row(cost.name, [cost])
     row("the other layers", [cost for cost in found if cost not in large])
     rest = whole - sum(cost.forward + cost.backward for cost in found)
-    rows.append(f"| conversions, copies | | | | | {100 * rest / whole:.0f} % |")
+    rows.append(f"| conversions, copies | | | | | {round(100 * rest / whole)} % |")
     rows.append(f"| **all, {1e3 * whole:.1f} ms** | | | | | {PIECE / whole:.0f} images/s |")
     return "\n".join(rows)
