@@ -174,7 +174,7 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
 def test_sampled_poses_are_on_both_sides_and_of_every_camera(monkeypatch):
     found = lanes(monkeypatch).take(np.full(4000, 100))
     poses = found.sample_poses(np.random.default_rng(0), np.zeros(4000, bool))
-    assert np.bincount(poses.camera, minlength=3).min() > 1200
+    assert np.bincount(poses.camera, minlength=3).min() > 1100
     assert abs(poses.steering.mean()) < 0.002
     for camera in range(3):  # the camera does not tell the side
         assert 0.2 < (poses.steering[poses.camera == camera] > 0).mean() < 0.8
@@ -193,7 +193,9 @@ def test_sampled_poses_are_near_the_lane_and_near_the_recorded_car(monkeypatch, 
     found.sample_poses(np.random.default_rng(0), np.zeros(2000, bool))
     offset, yaw = sampled
     least, most = max(-2.0, human - 2.4), min(2.0, human + 2.4)  # m from the lane's centre and from the recorded car
-    assert (offset.min(), offset.max()) == (pytest.approx(least, abs=0.01), pytest.approx(most, abs=0.01))
+    assert abs(offset.min() - least) < 0.1 and abs(offset.max() - most) < 0.1
+    if human == 0:  # nothing is cut off: a triangle's deviation
+        assert offset.std() == pytest.approx(2 / np.sqrt(6), abs=0.03)
     assert np.degrees(np.abs(yaw).max()) <= 25 and np.degrees(yaw.std()) == pytest.approx(8, abs=0.5)
 
 

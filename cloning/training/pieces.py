@@ -47,7 +47,7 @@ def squared_errors(
 ) -> torch.Tensor:
     """Return the sum over the images of (predicted - label)², a scalar, float32; arrays as in Batch.
 
-    loss: one of LOSSES; its gradient is that of the result, and differs from the squared errors' with "huber".
+    loss: one of LOSSES, whose gradient the result has, whatever its value.
     """
     frames, wanted = torch.from_numpy(images).to(device), torch.from_numpy(labels).to(device)
     with in_precision(precision, device):
