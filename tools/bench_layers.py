@@ -25,7 +25,6 @@ class Cost(NamedTuple):
     name                          of the layer
     forward, backward             seconds
     operations, operations_back   multiplications and additions
-    traffic                       bytes of activations and of their gradients read and written, forward and backward
     """
 
     name: str
@@ -33,7 +32,6 @@ class Cost(NamedTuple):
     backward: float
     operations: int
     operations_back: int
-    traffic: int
 
 
 def seconds(work: Callable[[], object]) -> float:
@@ -47,18 +45,35 @@ def seconds(work: Callable[[], object]) -> float:
     return statistics.median(times)
 
 
-def inputs(network: Network, precision: torch.dtype) -> dict[nn.Module, torch.Tensor]:
-    """Return what each layer is given for a piece of random frames, in the precision and order of a training step."""
-    given: dict[nn.Module, torch.Tensor] = {}
-    hooks = [
-        layer.register_forward_pre_hook(lambda layer, args: given.update({layer: args[0].detach().to(precision)}))
-        for layer in (*network.convolutions, *network.dense)
-    ]
+def operations(layer: nn.Conv2d | nn.Linear, out: torch.Tensor) -> int:
+    """Return how many multiplications and additions a layer's output takes; a gradient by input or weights as many."""
+    return 2 * out.numel() * layer.weight[0].numel()
+
+
+def activations(network: Network, precision: torch.dtype) -> dict[nn.Module, tuple[torch.Tensor, torch.Tensor]]:
+    """Return each layer's input and output for a piece of random frames, in a training step's precision and order."""
+    seen: dict[nn.Module, tuple[torch.Tensor, torch.Tensor]] = {}
+
+    def note(layer: nn.Module, given: tuple[torch.Tensor], out: torch.Tensor) -> None:
+        seen[layer] = given[0].to(precision, copy=True), out.clone()  # ELU overwrites both
+
+    hooks = [layer.register_forward_hook(note) for layer in (*network.convolutions, *network.dense)]
     with torch.no_grad(), in_precision(precision, torch.device("cpu")):
         network(torch.randint(0, 256, (PIECE, *SEEN_SHAPE), dtype=torch.uint8))
     for hook in hooks:
         hook.remove()
-    return given
+    return seen
+
+
+def traffic(network: Network, precision: torch.dtype) -> int:
+    """Return how many bytes of activations and of their gradients a step reads and writes for a piece."""
+    total = 0
+    for layer, (x, out) in activations(network, precision).items():
+        # Forward: read x, write out. Backward: read x and the gradient of out; write that of x, unless it is the image.
+        total += (2 + (layer is not network.convolutions[0])) * x.nbytes + 2 * out.nbytes
+        if layer is not network.dense[-1]:
+            total += 5 * out.nbytes  # ELU, likewise
+    return total
 
 
 def timed(name: str, layer: Callable, x: torch.Tensor, weights: list[nn.Parameter], first: bool) -> Cost:
@@ -69,11 +84,8 @@ def timed(name: str, layer: Callable, x: torch.Tensor, weights: list[nn.Paramete
     into = torch.randn_like(out)
     forward = seconds(lambda: layer(x))
     backward = seconds(lambda: torch.autograd.grad(out, wanted, into, retain_graph=True))
-    products = 2 * out.numel() * weights[0][0].numel() if weights else 0
-    size = x.element_size()
-    # Forward: read x, write out. Backward: read the gradient of out, and x or out; write the gradient of x.
-    traffic = size * (x.numel() + out.numel() + out.numel() + x.numel() + (0 if first else x.numel()))
-    return Cost(name, forward, backward, products, products if first else 2 * products, traffic)
+    count = operations(layer, out) if isinstance(layer, nn.Conv2d | nn.Linear) else 0
+    return Cost(name, forward, backward, count, count if first else 2 * count)
 
 
 def costs(network: Network, precision: torch.dtype) -> tuple[list[Cost], float]:
@@ -82,7 +94,7 @@ def costs(network: Network, precision: torch.dtype) -> tuple[list[Cost], float]:
     device, found = torch.device("cpu"), []
     convolutions, dense = list(network.convolutions), list(network.dense)
     with in_precision(precision, device):
-        for layer, x in inputs(network, precision).items():
+        for layer, (x, out) in activations(network, precision).items():
             assert isinstance(layer, nn.Conv2d | nn.Linear)
             if isinstance(layer, nn.Conv2d):
                 name = f"convolution {convolutions.index(layer) + 1}, {layer.in_channels} to {layer.out_channels}"
@@ -90,8 +102,6 @@ def costs(network: Network, precision: torch.dtype) -> tuple[list[Cost], float]:
                 name = f"dense {dense.index(layer) + 1}, {layer.in_features} to {layer.out_features}"
             found.append(timed(name, layer, x, [*layer.parameters()], layer is convolutions[0]))
             if layer is not dense[-1]:
-                with torch.no_grad():
-                    out = layer(x)
                 found.append(timed(f"ELU of {name.split(',')[0]}", nn.functional.elu, out, [], False))
     images = torch.randint(0, 256, (PIECE, *SEEN_SHAPE), dtype=torch.uint8).numpy()
     labels = torch.zeros(PIECE).numpy()
@@ -105,13 +115,12 @@ def costs(network: Network, precision: torch.dtype) -> tuple[list[Cost], float]:
 
 def memory_limit(network: Network, precision: torch.dtype) -> float:
     """Return images per second if a step only moved its activations, at the rate of copying the largest of them."""
-    given = inputs(network, precision)
-    largest = max(given.values(), key=torch.Tensor.numel)
+    largest = max((out for _, out in activations(network, precision).values()), key=torch.Tensor.numel)
     torch.set_num_threads(threads())
     source = torch.empty(threads() * largest.numel(), dtype=largest.dtype)
     target = torch.empty_like(source)
     rate = 2 * source.nbytes / min(seconds(lambda: target.copy_(source)) for _ in range(8))  # bytes/s
-    return PIECE * rate / sum(cost.traffic for cost in costs(network, precision)[0])
+    return PIECE * rate / traffic(network, precision)
 
 
 def table(found: list[Cost], whole: float) -> str:

@@ -73,12 +73,14 @@ def flops(network: "Network") -> int:
     """Count the multiplications and additions per image, forward and backward."""
     import torch
 
+    from tools.bench_layers import operations
+
     total: list[int] = []
 
     def count(module: torch.nn.Module, _: tuple, output: torch.Tensor) -> None:
         assert isinstance(module, torch.nn.Conv2d | torch.nn.Linear)
-        products = 2 * output[0].numel() * module.weight[0].numel()
-        total.append(products * (2 if module is network.convolutions[0] else 3))  # no gradient for the image
+        passes = 2 if module is network.convolutions[0] else 3  # no gradient for the image
+        total.append(operations(module, output) * passes)
 
     hooks = [module.register_forward_hook(count) for module in (*network.convolutions, *network.dense)]
     network(torch.zeros((1, 160, 320, 3), dtype=torch.uint8, device=next(network.parameters()).device))
