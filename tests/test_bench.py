@@ -44,6 +44,17 @@ def test_activations_in_half_the_precision_are_half_the_traffic():
     assert single == 2 * half
 
 
+def test_the_simulator_benchmark_measures_both_tracks():
+    command = [sys.executable, "-m", "tools.bench_simulator", "--laps", "0.005", "--repeat", "1"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    for track in ("lake", "jungle"):
+        row = re.search(rf"^{track} (.*)$", done.stdout, re.MULTILINE)
+        assert row, done.stdout
+        speeds = [float(number) for number in re.findall(r"[\d.]+", row[1])]
+        assert len(speeds) == 7 and min(speeds) > 0
+
+
 def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording):
     few = ["--in-sample", "--seeds", "1", "--images", "60", "--limit", "20", "--autonomy", "99"]
     command = [sys.executable, "-m", "tools.speedrun", sample_recording, *few]

@@ -5,6 +5,7 @@ Thresholds are about 1.25 times what was measured with bfloat16; with float32 th
 
 import copy
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ import torch
 from conftest import HERE, ROOT, render_recording
 
 from cloning.errors import ModelError, RecordingError
-from cloning.lane import reader
+from cloning.lane import place, reader
 from cloning.lane.place import MIN_LOG_LIKELIHOOD, centre_ahead, estimate_lane_position, localise
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
@@ -41,7 +42,7 @@ from cloning.road.track import Track
 from simulator import __main__ as simulator
 from simulator.car import STEP
 from simulator.record import record
-from tools import follow_driver, lane_accuracy, train_lane
+from tools import follow_driver, lane_accuracy, likeness, train_lane
 from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
@@ -327,6 +328,20 @@ def test_a_damaged_image_is_named(copied):
     damaged.write_bytes(damaged.read_bytes()[:-200])
     with pytest.raises(RecordingError, match=f"{damaged.name}: cut short"):
         detect_centres(read_recording(copied))
+
+
+def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsys):
+    """The table of differences, of a rendered recording against the same places rendered again."""
+    recording, _ = drive
+    monkeypatch.setattr(place, "MIN_LOCALISED_ROWS", len(recording) // 2)  # the drive is short
+    picture = tmp_path / "both.png"
+    assert likeness.main([str(recording.folder), "--frames", "8", "--picture", str(picture)]) == 0
+    table = capsys.readouterr().out
+    assert table.startswith(f"lake, ccw, {len(stretches(recording)[0])} rows\n")
+    assert cv2.imread(str(picture)).shape == (8 * FRAME[0], 6 * FRAME[1], 3)
+    assert likeness.main([str(recording.folder), "--frames", "8", "--look", "3"]) == 0
+    same, other = (float(re.search(r"mean difference ([\d.]+)", text)[1]) for text in (table, capsys.readouterr().out))
+    assert same < 5 and other > 2 * same  # not 0, because so short a drive is placed only to some metres
 
 
 @pytest.mark.parametrize("tool", [train_lane, lane_accuracy, follow_driver], ids=lambda tool: tool.__name__)

@@ -156,7 +156,7 @@ def write_picture(path: str, real: np.ndarray, rendered: np.ndarray) -> None:
         raise UserError(f"{path}: cannot be written; give an image file in an existing folder")
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> int:
     """Parse the command line, compare and return the exit status."""
     parser = argparse.ArgumentParser(
         prog="likeness", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -165,7 +165,7 @@ def main() -> int:
     parser.add_argument("--frames", type=number(int, 1), default=120, help="number of places to compare (default 120)")
     parser.add_argument("--look", type=number(int, 0), default=0, help="look of the rendered frames (default 0)")
     parser.add_argument("--picture", metavar="FILE.png", help="write real frames above rendered ones")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     try:
         compare(args.recording, args.frames, args.look, args.picture)
     except UserError as error:
