@@ -1,19 +1,22 @@
-"""The tools that measure how fast training is run, and count what the network computes."""
+"""The tools that measure how fast training and the stand-in simulator are, and count what the network computes."""
 
 import re
-import subprocess
 import sys
 
 import torch
-from conftest import ROOT
+from conftest import ROOT, run_model
 
 from cloning.pilot.network import Network
 from tools import bench_layers
 
 
+def run_tool(name, *arguments):
+    """A tool in a process of its own, with its output."""
+    return run_model(*arguments, command=[sys.executable, "-m", f"tools.{name}"], cwd=ROOT)
+
+
 def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording):
-    command = [sys.executable, "-m", "tools.bench_training", sample_recording, "--part", "ab", "--samples", "2370"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = run_tool("bench_training", sample_recording, "--part", "ab", "--samples", 2370)
     assert done.returncode == 0, done.stderr
     rates = re.search(r'"rates": \{"a": ([\d.]+), "b": ([\d.]+)\}', done.stdout)
     assert rates, done.stdout
@@ -45,8 +48,7 @@ def test_activations_in_half_the_precision_are_half_the_traffic():
 
 
 def test_the_simulator_benchmark_measures_both_tracks():
-    command = [sys.executable, "-m", "tools.bench_simulator", "--laps", "0.005", "--repeat", "1"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = run_tool("bench_simulator", "--laps", 0.02, "--repeat", 1)
     assert done.returncode == 0, done.stderr
     for track in ("lake", "jungle"):
         row = re.search(rf"^{track} (.*)$", done.stdout, re.MULTILINE)
@@ -57,8 +59,7 @@ def test_the_simulator_benchmark_measures_both_tracks():
 
 def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording):
     few = ["--in-sample", "--seeds", "1", "--images", "60", "--limit", "20", "--autonomy", "99"]
-    command = [sys.executable, "-m", "tools.speedrun", sample_recording, *few]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = run_tool("speedrun", sample_recording, *few)
     name = sample_recording.name
     row = re.search(rf"\| {name} \| {name} \| 0 \| [\d.]+ \| (.*?) % \|", done.stdout)
     assert row, done.stderr
