@@ -373,13 +373,13 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 
 @pytest.fixture(scope="module", params=["lake", "jungle"])
-def cameras(request, tmp_path_factory) -> list[np.ndarray]:
-    """Steering by the shipped network for rendered frames from the centre, left and right camera of the same drive."""
+def cameras(request, tmp_path_factory) -> tuple[str, list[np.ndarray]]:
+    """The track, and the shipped network's steering for its rendered frames from the centre, left and right camera."""
     folder = tmp_path_factory.mktemp("shipped") / request.param
     command = [sys.executable, "-m", "simulator", "record", str(folder), "--track", request.param, "--laps", "0.1"]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
     network = load_model(SHIPPED_MODEL)
-    return [
+    return request.param, [
         np.array([steer(network, decode(path.read_bytes())) for path in sorted(folder.glob(f"IMG/{camera}_*.jpg"))])
         for camera in ("center", "left", "right")
     ]
@@ -387,10 +387,11 @@ def cameras(request, tmp_path_factory) -> list[np.ndarray]:
 
 def test_the_shipped_network_steers_back_to_the_centre(cameras):
     """The side cameras see the road as a car does that is 0.8 m off: further right from the left, and vice versa."""
-    centre, left, right = cameras
+    track, (centre, left, right) = cameras
     assert len(centre) == len(left) == len(right) > 50
     assert (left > centre).all()
-    assert np.mean(right < centre) > 0.98  # measured: all but three of 247 frames, before a crest that hides the road
+    # Measured in the jungle: 3 of 247, before a crest that hides the road; a fourth is as good as equal.
+    assert np.sum(right >= centre) <= {"lake": 0, "jungle": 4}[track]
     # Measured: 0.21 to 0.23. At 0.2 the car is back in the centre after about 7 m.
     assert 0.17 < np.mean(left - centre) < 0.27
     assert 0.17 < np.mean(centre - right) < 0.27
