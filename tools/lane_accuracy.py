@@ -4,7 +4,8 @@
     python -m tools.lane_accuracy RECORDING --picture lane.png    # real frames with the estimated lane drawn in
 
 For rendered frames the true position is known. Single frames from random poses and whole drives are rendered, in looks
-that the network was not trained on. For real recordings only the position of the side cameras in the car is known.
+that the network was not trained on. For real recordings only the position of the side cameras in the car is known, and
+in the jungle the line that is painted along the road's centre.
 """
 
 import argparse
@@ -24,7 +25,14 @@ import numpy as np
 from cloning.arguments import number
 from cloning.errors import UserError
 from cloning.files import write
-from cloning.lane.place import estimate_lane_position
+from cloning.lane.place import (
+    MIN_LOCALISED_ROWS,
+    TrackFilter,
+    estimate_lane_position,
+    follow_line,
+    line_deviations,
+    localise,
+)
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
@@ -89,13 +97,15 @@ def measure_drives(network: LaneNetwork, laps: float) -> None:
             run, _ = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
             recording = read_recording(folder)
             position = fuse_detections(recording, detect_centres(recording, network))
+            placed = estimate_lane_position(recording, stretches(recording), network)
         step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
         true = np.array(run.trajectory.offset)[step]
         error = position.lateral_offset - true
         print(
             f"{f'rendered drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
             f"95th percentile {np.quantile(np.abs(error), 0.95):.2f}, bias {error.mean():+.2f}, "
-            f"slope {np.polyfit(true, position.lateral_offset, 1)[0]:.2f}; trusted {position.trusted.mean():.1%}"
+            f"slope {np.polyfit(true, position.lateral_offset, 1)[0]:.2f}; trusted {position.trusted.mean():.1%}; "
+            f"localised, if possible: error {np.abs(placed.lateral_offset - true).mean():.2f} m"
         )
 
 
@@ -126,6 +136,29 @@ def measure_recording(folder: str, network: LaneNetwork) -> None:
     )
     ms = np.diff([started, decoded, estimated, finished]) / len(recording) * 1e3
     print(f"  {'ms a row':32}{ms.sum():.2f}: decode {ms[0]:.2f}, network {ms[1]:.2f}, fuse {ms[2]:.2f}")
+    measure_line(recording, strips, centres)
+
+
+def measure_line(recording: Recording, strips: np.ndarray, centres: np.ndarray) -> None:
+    """Print how far the line painted along the road is from the lane's centre, before and after this is corrected.
+
+    strips: of `read_strips`; centres: of `estimate_centres`.
+    """
+    for stretch in stretches(recording):
+        if len(stretch) < MIN_LOCALISED_ROWS:
+            continue
+        detected, seen = centres[stretch.rows], strips.__getitem__
+        found = localise(stretch, detected)
+        if not ROADS[found.track.name].centre_line:
+            continue
+        follower, followed = TrackFilter(stretch, detected, found.track), follow_line(found, stretch, detected, seen)
+        for label, localisation in (("painted line, m from the centre", found), ("when followed", followed)):
+            away = line_deviations(localisation, stretch, follower, seen)
+            median = np.nanmedian(away)
+            print(
+                f"  {label:32}median {median:+.2f}, median deviation {np.nanmedian(np.abs(away - median)):.2f}; "
+                f"found in {np.mean(~np.isnan(away).all(1)):.0%} of the rows"
+            )
 
 
 def draw_lane(recording: Recording, position: LanePosition, row: int, line_offset: float) -> np.ndarray:

@@ -21,7 +21,7 @@ import numpy as np
 from cloning.arguments import number
 from cloning.errors import RecordingError, UserError
 from cloning.lane.place import localise_all
-from cloning.lane.reader import detect_centres
+from cloning.lane.reader import estimate_centres, read_strips
 from cloning.recordings.format import CAMERAS, FRAME
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
@@ -100,7 +100,8 @@ def render(track: Track, look: int, positions: np.ndarray) -> np.ndarray:
 def compare(folder: Path, count: int, look: int, picture: str | None) -> None:
     """Compare `count` places of a recording with a look, print the table and write the picture. Raises UserError."""
     recording = read_recording(folder)
-    drives = list(localise_all(stretches(recording), detect_centres(recording)))
+    strips = read_strips(recording)
+    drives = list(localise_all(stretches(recording), estimate_centres(strips), strips.__getitem__))
     if not drives:
         raise RecordingError(f"{folder}: not on a known road; give a recording of the lake or the jungle")
     rows, placed = max(drives, key=lambda drive: drive[0].stop - drive[0].start)

@@ -25,7 +25,7 @@ from cloning.compute import one_thread
 from cloning.cores import threads
 from cloning.errors import ModelError, UserError
 from cloning.lane.place import place, shipped_networks
-from cloning.lane.reader import LaneNetwork, detect_centres
+from cloning.lane.reader import LaneNetwork, detect_centres, read_row_strips
 from cloning.pilot.network import load_model, steer
 from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
@@ -76,7 +76,10 @@ def lane(recording: Recording) -> Result:
         of_parts = [detect_centres(part, network) for part in parts(recording)]
         return np.concatenate(of_parts or [np.empty((0, 3, 5), np.float32)])
 
-    position, placed = place(recording, stretches(recording), detect, shipped_networks())
+    def strips(row: int) -> np.ndarray:
+        return read_row_strips(recording, row)
+
+    position, placed = place(recording, stretches(recording), detect, strips, shipped_networks())
     x, y = np.full((2, n), np.nan, np.float32)
     road, roads = np.full(n, -1, np.float32), []
     for rows, localisation in placed:

@@ -3,18 +3,21 @@
 The centre lines of both tracks are known. Once a recording is localised on one, the lane's centre is known even where
 no single frame shows it well. An extended Kalman filter with a Rauch-Tung-Striebel smoother localises a stretch:
 steering, speed and time stamps predict the rear axle's state, and the lane's centre ahead, as detected by `reader.py`,
-corrects it. The filter gives less weight to detections that are outliers.
+corrects it. The filter gives less weight to detections that are outliers. Where the track's centre is painted, a second
+pass adds the line's detections (`marking.py`), which are several times as exact.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cloning.lane import marking
 from cloning.lane.reader import (
     ANY_ROAD_WEIGHTS,
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
+    SMOOTHING_ROWS,
     LaneNetwork,
     LanePosition,
     estimate_centres,
@@ -28,7 +31,7 @@ from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, wrap_angle
 from cloning.road.track import ROADS, Track
 
 MEASUREMENT_NOISE = 0.3 + 0.08 * DISTANCES_AHEAD  # standard deviation of a detection at each distance ahead, m
-LIKELIHOOD_SCALE = 2 * MEASUREMENT_NOISE  # of the distribution by which a localisation is judged
+MARKING_NOISE = 0.02 + 0.03 * marking.DISTANCES  # likewise, of a painted line's
 OUTLIER_THRESHOLD = 2.0  # standard deviations beyond which a detection gets less weight
 MISSING_DETECTION = 3.0  # standard deviations that are counted where the track is out of the camera's view
 # Process noise: standard deviations of (s, lateral offset, heading error) that each row adds: per metre driven, per
@@ -38,14 +41,16 @@ NOISE_PER_ROW = np.array([0, 0, 0.003])
 # Covariance of the state at a candidate position: m², m², radians²; candidates are up to 4 m off along the track.
 INITIAL_COVARIANCE = np.diag([4.0**2, 4.0, 0.05])
 SLOPE_STEP = 0.5  # m before and behind a distance ahead, over which the centre line's slope is taken
-DISTANCES_WITH_NEIGHBOURS = np.r_[DISTANCES_AHEAD, DISTANCES_AHEAD - SLOPE_STEP, DISTANCES_AHEAD + SLOPE_STEP]
 VISIBLE_POINTS = np.arange(-6, 40)  # indices, relative to the car, of a track's points that the camera may see
 PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m: part of the trajectory whose heading is compared, and its step
 SEARCH = ((8, 150), (2, 600))  # two rounds: number of the best candidates that the filter follows, and rows
+LINE_ROUNDS = 2  # in the second, the painted line is expected where the first one found it
 # A shorter stretch may resemble a bend of any track.
 MIN_LOCALISED_ROWS = 300
 # Stretches of 300 rows of real recordings have -0.25 to 0 on their own track, -0.45 or less on the other.
 MIN_LOG_LIKELIHOOD = -0.35
+
+Strips = Callable[[int], np.ndarray]  # returns those of the three cameras in a recording's row: uint8 (3, 32, 160, 3)
 
 
 def centre_ahead(
@@ -84,11 +89,24 @@ class Localisation:
 class TrackFilter:
     """The extended Kalman filter that follows a stretch along a track; its state is as in `Localisation`."""
 
-    def __init__(self, stretch: Stretch, centres: np.ndarray, track: Track) -> None:
-        """Prepare a stretch's motion and measurements; centres: float32 (n, 3, 5), of `reader.detect_centres`."""
+    def __init__(self, stretch: Stretch, centres: np.ndarray, track: Track, marks: np.ndarray | None = None) -> None:
+        """Prepare a stretch's motion and measurements.
+
+        centres: float32 (n, 3, 5), of `reader.detect_centres`; marks: float (n, 3), m from the centre camera to the
+        painted line at `marking.DISTANCES`, nan where none was found.
+        """
         self.track, self.step, self.turn = track, np.diff(stretch.driven), np.diff(stretch.heading)
         self.slip = stretch.slip
         self.measured = np.median(centres + MOUNT_OFFSETS[:, None], axis=1)
+        self.distances, self.noise = DISTANCES_AHEAD, np.tile(MEASUREMENT_NOISE, (len(stretch), 1))
+        if marks is not None:
+            self.measured = np.concatenate([self.measured, marks], axis=1)
+            self.distances = np.r_[DISTANCES_AHEAD, marking.DISTANCES]
+            # The network errs alike in successive rows, so near the line its detections count less.
+            marked = ~np.isnan(marks).all(1)
+            self.noise[np.convolve(marked, np.ones(2 * SMOOTHING_ROWS + 1), "same") > 0] *= 2
+            self.noise = np.concatenate([self.noise, np.tile(MARKING_NOISE, (len(stretch), 1))], axis=1)
+        self.with_neighbours = np.r_[self.distances, self.distances - SLOPE_STEP, self.distances + SLOPE_STEP]
 
     def curvature(self, s: float) -> float:
         """Return the track's curvature at s, 1/m, right positive."""
@@ -111,17 +129,21 @@ class TrackFilter:
         moved = s + along, right + step * np.sin(yaw + (turn - road_turn) / 2 + slip), yaw + turn - road_turn
         return np.array(moved), jacobian
 
-    def expect(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the expected measurement, (5,), and its Jacobian by the state, (5, 3); nan out of sight."""
+    def centre_at(self, state: np.ndarray, distances: np.ndarray) -> np.ndarray:
+        """Return where the centre line lies at distances ahead of the centre camera: float64 (k,), m to its right."""
         s, right, yaw = state
         axle = self.track.at(s, right)
         heading = axle.heading - yaw
         camera = camera_position(np.array([axle.x, axle.y]), np.array([np.cos(heading), np.sin(heading)]))
-        seen = centre_ahead(self.track, s, camera, heading, DISTANCES_WITH_NEIGHBOURS)
-        centre, before, after = seen.reshape(3, -1)
+        return centre_ahead(self.track, s, camera, heading, distances)
+
+    def expect(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the expected measurement, (k,), and its Jacobian by the state, (k, 3); nan out of sight."""
+        s, right, yaw = state
+        centre, before, after = self.centre_at(state, self.with_neighbours).reshape(3, -1)
         slope = (after - before) / (2 * SLOPE_STEP)
         bend = self.curvature(s)
-        by_yaw = -(DISTANCES_AHEAD + AXLE_TO_CAMERA) - slope * centre  # the car turns about its rear axle
+        by_yaw = -(self.distances + AXLE_TO_CAMERA) - slope * centre  # the car turns about its rear axle
         by_s = (1 - bend * right) * (slope * np.cos(yaw) + np.sin(yaw)) + bend * by_yaw
         return centre, np.stack([by_s, slope * np.sin(yaw) - np.cos(yaw), by_yaw], axis=1)
 
@@ -142,15 +164,16 @@ class TrackFilter:
                 p = f @ p @ f.T + np.diag(noise**2)
             predicted.append((x, p, f))
             expected, jacobian = self.expect(x)
-            visible = ~np.isnan(jacobian).any(1)
-            error = np.where(visible, (self.measured[row] - expected) / LIKELIHOOD_SCALE, MISSING_DETECTION)
-            log_likelihood -= np.log1p(error**2).mean()
-            for k in np.flatnonzero(visible):
+            visible, measured = ~np.isnan(jacobian).any(1), ~np.isnan(self.measured[row])
+            # By a distribution of twice the noise's width.
+            error = np.where(visible, (self.measured[row] - expected) / (2 * self.noise[row]), MISSING_DETECTION)
+            log_likelihood -= np.log1p(error[measured] ** 2).mean()
+            for k in np.flatnonzero(visible & measured):
                 h = jacobian[k]
                 innovation = self.measured[row, k] - expected[k] - h @ (x - predicted[-1][0])
                 variance = h @ p @ h
-                outlier = max(1.0, innovation**2 / (variance + MEASUREMENT_NOISE[k] ** 2) / OUTLIER_THRESHOLD**2)
-                gain = p @ h / (variance + MEASUREMENT_NOISE[k] ** 2 * outlier)
+                outlier = max(1.0, innovation**2 / (variance + self.noise[row, k] ** 2) / OUTLIER_THRESHOLD**2)
+                gain = p @ h / (variance + self.noise[row, k] ** 2 * outlier)
                 x, p = x + gain * innovation, p - np.outer(gain, h @ p)
             filtered.append((x, p))
         states = [filtered[-1][0]]
@@ -194,15 +217,45 @@ def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
     return Localisation(follower.track, *follower.run(s, n, smooth=True))
 
 
-def localise_all(stretches: list[Stretch], centres: np.ndarray) -> Iterator[tuple[slice, Localisation]]:
+def line_deviations(localisation: Localisation, stretch: Stretch, follower: TrackFilter, strips: Strips) -> np.ndarray:
+    """Return how far right of the track's centre line a painted one is found: float64 (n, 3), of `marking.find_line`.
+
+    follower: of the stretch.
+    """
+    found = [
+        marking.find_line(strips(stretch.rows.start + row), follower.centre_at(state, marking.AHEAD))
+        for row, state in enumerate(localisation.states)
+    ]
+    return np.array(found)
+
+
+def follow_line(localisation: Localisation, stretch: Stretch, centres: np.ndarray, strips: Strips) -> Localisation:
+    """Return the localisation of a stretch, corrected by the line that is painted along the track's centre.
+
+    centres: as for `localise`.
+    """
+    follower = TrackFilter(stretch, centres, localisation.track)
+    for _ in range(LINE_ROUNDS):
+        found = marking.supported(line_deviations(localisation, stretch, follower, strips))
+        expected = [follower.centre_at(state, marking.DISTANCES) for state in localisation.states]
+        follower = TrackFilter(stretch, centres, localisation.track, np.array(expected) + found)
+        states, _ = follower.run(localisation.states[0, 0], len(found), smooth=True)
+        localisation = replace(localisation, states=states)
+    return localisation
+
+
+def localise_all(stretches: list[Stretch], centres: np.ndarray, strips: Strips) -> Iterator[tuple[slice, Localisation]]:
     """Yield the rows and localisation of each stretch of a recording that is certainly on a known road.
 
     centres: float32 (n, 3, 5): of `reader.detect_centres`, in the recording's rows.
     """
     for stretch in stretches:
         if len(stretch) >= MIN_LOCALISED_ROWS:
-            localisation = localise(stretch, centres[stretch.rows])
+            detected = centres[stretch.rows]
+            localisation = localise(stretch, detected)
             if localisation.log_likelihood > MIN_LOG_LIKELIHOOD:
+                if ROADS[localisation.track.name].centre_line:
+                    localisation = follow_line(localisation, stretch, detected, strips)
                 yield stretch.rows, localisation
 
 
@@ -219,7 +272,7 @@ def estimate_lane_position(
     def detect(detector: LaneNetwork) -> np.ndarray:
         return estimate_centres(strips, detector)
 
-    return place(recording, stretches, detect, [network] if network else shipped_networks())[0]
+    return place(recording, stretches, detect, strips.__getitem__, [network] if network else shipped_networks())[0]
 
 
 def shipped_networks() -> Iterator[LaneNetwork]:
@@ -231,6 +284,7 @@ def place(
     recording: Recording,
     stretches: list[Stretch],
     detect: Callable[[LaneNetwork], np.ndarray],
+    strips: Strips,
     networks: Iterable[LaneNetwork],
 ) -> tuple[LanePosition, list[tuple[slice, Localisation]]]:
     """Return the position in the lane at every row of a recording, and where its stretches are on known roads.
@@ -245,7 +299,7 @@ def place(
     for network in networks:
         centres = detect(network)
         position = fuse_detections(recording, centres, stretches)
-        placed = list(localise_all(stretches, centres))
+        placed = list(localise_all(stretches, centres, strips))
         for rows, localisation in placed:
             _, lateral_offset, heading_error = localisation.states.T
             position.heading_error[rows] = heading_error

@@ -162,15 +162,21 @@ class LanePosition:
     trusted: np.ndarray
 
 
+def read_row_strips(recording: Recording, row: int) -> np.ndarray:
+    """Return the strips of one row's three cameras: uint8 (3, 32, 160, 3). Raises RecordingError."""
+    frame, strips = np.zeros(FRAME, np.uint8), []
+    for camera in range(3):
+        frame[ROAD_ROWS] = recording.road(row, camera)
+        strips.append(extract_strip(frame))
+    return np.stack(strips)
+
+
 def read_strips(recording: Recording) -> np.ndarray:
     """Return the strips of a recording's three cameras: uint8 (n, 3, 32, 160, 3). Raises RecordingError."""
     strips = np.empty((len(recording), 3, *STRIP_SHAPE), np.uint8)
 
     def read(row: int) -> None:
-        frame = np.zeros(FRAME, np.uint8)
-        for camera in range(3):
-            frame[ROAD_ROWS] = recording.road(row, camera)
-            strips[row, camera] = extract_strip(frame)
+        strips[row] = read_row_strips(recording, row)
 
     with ThreadPoolExecutor(threads()) as pool:
         for _ in pool.map(read, range(len(recording))):

@@ -48,6 +48,7 @@ class Road:
     bridge                its start and end, metres along the centre line; equal where there is none
     bridge_edge           as edge, on the bridge; None if it is the same
     kerbs, kerb_edge      sections with a kerb, and the edge of the road surface there
+    centre_line           whether a line is painted along the centre
     training, autonomous  x, y at which these modes start, in metres; None: the first point listed
     """
 
@@ -57,6 +58,7 @@ class Road:
     bridge_edge: float | None = None
     kerbs: tuple[Section, ...] = ()
     kerb_edge: float = 0.0
+    centre_line: bool = False
     training: tuple[float, float] | None = None
     autonomous: tuple[float, float] | None = None
 
@@ -83,7 +85,7 @@ ROADS = {
         training=(179.8, 89.9),
         autonomous=(-40.6, 108.7),
     ),
-    "jungle": Road(forward="cw", edge=4.1, bridge=(806, 872)),
+    "jungle": Road(forward="cw", edge=4.5, bridge=(806, 872), centre_line=True),
 }
 
 

@@ -31,7 +31,7 @@ from simulator.scenery.textures import Line
 
 ROAD = ROADS["jungle"]  # its bridge crosses the road at 1350 m, 20 m below
 EDGE_LINE = ROAD.edge  # m from the centre line to the white line along the road's edge
-ASPHALT_EDGE = 4.45  # m from the centre line to the end of the asphalt
+ASPHALT_EDGE = 4.7  # m from the centre line to the end of the asphalt
 DASH, GAP = 6.0, 6.0  # m, of the dashed centre line
 # Sections with guard rails
 RAILS = (Section(LEFT, 0, 45), Section(RIGHT, 880, 940), Section(LEFT, 1440, 1493))
