@@ -8,9 +8,9 @@ import pytest
 
 from cloning.lane import marking
 from cloning.lane.place import place, shipped_networks
-from cloning.lane.reader import MOUNT_OFFSETS, STRIP_SHAPE, STRIP_TO_LEVEL, estimate_centres, read_strips
+from cloning.lane.reader import MOUNT_OFFSETS, STRIP_FROM_LEVEL, STRIP_SHAPE, estimate_centres, read_strips
 from cloning.recordings.log import read_recording
-from cloning.road.camera import CAMERA_HEIGHT, LEVEL_CAMERA_MATRIX
+from cloning.road.camera import CAMERA_HEIGHT
 from cloning.road.motion import stretches
 from cloning.road.track import ROADS, Track
 from simulator.car import STEP
@@ -24,10 +24,9 @@ STRAIGHT = np.zeros(len(marking.AHEAD))  # a line that is expected straight ahea
 def paint(lines, brightness=210, road=110):
     """Return strips of a straight road, uint8 (3, 32, 160, 3), with lines at these m right of the centre camera."""
     strips = np.random.default_rng(0).normal(road, 4, (3, *STRIP_SHAPE)).clip(0, 255).astype(np.uint8)
-    into_strip = np.linalg.inv(STRIP_TO_LEVEL) @ LEVEL_CAMERA_MATRIX
     for strip, mount in zip(strips, MOUNT_OFFSETS, strict=True):
         for line in lines:
-            sides = np.array([(line - mount + side, CAMERA_HEIGHT, z) for side, z in CORNERS]) @ into_strip.T
+            sides = np.array([(line - mount + side, CAMERA_HEIGHT, z) for side, z in CORNERS]) @ STRIP_FROM_LEVEL.T
             cv2.fillPoly(strip, [np.round(sides[:, :2] / sides[:, 2:] * 16).astype(int)], [brightness] * 3, 8, 4)
     return strips
 

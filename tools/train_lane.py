@@ -8,7 +8,7 @@ between two rows of a drive, and between two warps of a frame. The network learn
 all frames are mirrored, so that no side is preferred. The weights are written to lane.pt in the current folder, which
 git ignores. To ship them, measure them with `python -m tools.lane_accuracy --network lane.pt`, then copy the file to
 cloning/lane/any_road.pt, which was made like this. cloning/lane/lane.pt was made by an earlier version of this file,
-from the two tracks without shadows.
+from the two tracks without shadows. For both, the jungle was rendered with 4.1 m between its centre and its edge lines.
 """
 
 import argparse
@@ -31,6 +31,7 @@ from cloning.errors import UserError
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
+    STRIP_FROM_LEVEL,
     STRIP_SHAPE,
     STRIP_TO_LEVEL,
     LaneNetwork,
@@ -55,7 +56,6 @@ TRAVEL = (1.0, 8.0)  # m that the car drives between the two frames of a pair
 # --------------------------------------------------------------------------------------------------
 # Augmentation
 
-STRIP_FROM_LEVEL = np.linalg.inv(STRIP_TO_LEVEL) @ LEVEL_CAMERA_MATRIX  # from level directions to a strip's pixels
 LEVEL_FROM_STRIP = np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_LEVEL
 
 

@@ -6,8 +6,8 @@ The lane network sees the whole road and is a few tenths of a metre off; the pai
 import cv2
 import numpy as np
 
-from cloning.lane.reader import MOUNT_OFFSETS, STRIP_SHAPE, STRIP_TO_LEVEL
-from cloning.road.camera import CAMERA_HEIGHT, LEVEL_CAMERA_MATRIX
+from cloning.lane.reader import MOUNT_OFFSETS, STRIP_FROM_LEVEL, STRIP_SHAPE
+from cloning.road.camera import CAMERA_HEIGHT
 
 AHEAD = np.arange(3.3, 6.3, 0.1)  # m from the camera: nearer ground lies below the strip, further ground is seldom flat
 PARTS = np.array_split(np.arange(len(AHEAD)), 3)  # of AHEAD; each gives a detection
@@ -20,16 +20,17 @@ MIN_PROMINENCE = 1.6  # contrast of the line relative to that of any other line 
 APART = 0.3  # m: lines closer together count as one
 NEAR_ROWS, SUPPORT, AGREEMENT = 7, 8, 0.3  # of a detection: see `supported`
 
-ACROSS = np.arange(-round(REACH / STEP), round(REACH / STEP) + 1) * STEP  # m right of the expected centre
-BESIDE = round(FLANK / STEP)  # points of ACROSS
-# The points whose brightness decides the contrast at ACROSS, m right of the expected centre.
-SEEN = np.arange(-len(ACROSS) // 2 - BESIDE + 1, len(ACROSS) // 2 + BESIDE + 1) * STEP
+BESIDE = round(FLANK / STEP)  # points
+SEEN = (
+    np.arange(-round(REACH / STEP) - BESIDE, round(REACH / STEP) + BESIDE + 1) * STEP
+)  # m right of the expected centre
+ACROSS = SEEN[BESIDE:-BESIDE]  # where the line is sought; it has road on both sides
 
 
 def _strip_pixels(right: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the columns and the rows, (k,), of a strip at which points so far to the right are seen, at AHEAD."""
     points = np.stack([np.full_like(AHEAD, right), np.full_like(AHEAD, CAMERA_HEIGHT), AHEAD], axis=1)
-    pixels = points @ (np.linalg.inv(STRIP_TO_LEVEL) @ LEVEL_CAMERA_MATRIX).T
+    pixels = points @ STRIP_FROM_LEVEL.T
     return pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
 
 

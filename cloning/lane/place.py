@@ -3,8 +3,8 @@
 The centre lines of both tracks are known. Once a recording is localised on one, the lane's centre is known even where
 no single frame shows it well. An extended Kalman filter with a Rauch-Tung-Striebel smoother localises a stretch:
 steering, speed and time stamps predict the rear axle's state, and the lane's centre ahead, as detected by `reader.py`,
-corrects it. The filter gives less weight to detections that are outliers. Where the track's centre is painted, a second
-pass adds the line's detections (`marking.py`), which are several times as exact.
+corrects it. The filter gives less weight to detections that are outliers. Where the track's centre is painted, two more
+passes add the line's detections (`marking.py`), which are several times as exact.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -218,9 +218,9 @@ def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
 
 
 def line_deviations(localisation: Localisation, stretch: Stretch, follower: TrackFilter, strips: Strips) -> np.ndarray:
-    """Return how far right of the track's centre line a painted one is found: float64 (n, 3), of `marking.find_line`.
+    """Return how far right of the track's centre line a painted one is found: float64 (n, 3), m, of `find_line`.
 
-    follower: of the stretch.
+    localisation, follower: of the stretch, on the same track. Raises RecordingError for unreadable images.
     """
     found = [
         marking.find_line(strips(stretch.rows.start + row), follower.centre_at(state, marking.AHEAD))
@@ -232,7 +232,7 @@ def line_deviations(localisation: Localisation, stretch: Stretch, follower: Trac
 def follow_line(localisation: Localisation, stretch: Stretch, centres: np.ndarray, strips: Strips) -> Localisation:
     """Return the localisation of a stretch, corrected by the line that is painted along the track's centre.
 
-    centres: as for `localise`.
+    centres: as for `localise`. Raises RecordingError for unreadable images.
     """
     follower = TrackFilter(stretch, centres, localisation.track)
     for _ in range(LINE_ROUNDS):
