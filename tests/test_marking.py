@@ -8,7 +8,7 @@ import pytest
 
 from cloning.lane import marking
 from cloning.lane.place import place, shipped_networks
-from cloning.lane.reader import MOUNT_OFFSETS, STRIP_FROM_LEVEL, STRIP_SHAPE, estimate_centres, read_strips
+from cloning.lane.reader import DIRECTION_TO_STRIP, MOUNT_OFFSETS, STRIP_SHAPE, estimate_centres, read_strips
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT
 from cloning.road.motion import stretches
@@ -26,7 +26,7 @@ def paint(lines, brightness=210, road=110):
     strips = np.random.default_rng(0).normal(road, 4, (3, *STRIP_SHAPE)).clip(0, 255).astype(np.uint8)
     for strip, mount in zip(strips, MOUNT_OFFSETS, strict=True):
         for line in lines:
-            sides = np.array([(line - mount + side, CAMERA_HEIGHT, z) for side, z in CORNERS]) @ STRIP_FROM_LEVEL.T
+            sides = np.array([(line - mount + side, CAMERA_HEIGHT, z) for side, z in CORNERS]) @ DIRECTION_TO_STRIP.T
             cv2.fillPoly(strip, [np.round(sides[:, :2] / sides[:, 2:] * 16).astype(int)], [brightness] * 3, 8, 4)
     return strips
 

@@ -29,9 +29,9 @@ from cloning.arguments import number
 from cloning.compute import choose_precision, in_precision, one_thread
 from cloning.errors import UserError
 from cloning.lane.reader import (
+    DIRECTION_TO_STRIP,
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
-    STRIP_FROM_LEVEL,
     STRIP_SHAPE,
     STRIP_TO_LEVEL,
     LaneNetwork,
@@ -56,7 +56,7 @@ TRAVEL = (1.0, 8.0)  # m that the car drives between the two frames of a pair
 # --------------------------------------------------------------------------------------------------
 # Augmentation
 
-LEVEL_FROM_STRIP = np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_LEVEL
+STRIP_TO_DIRECTION = np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_LEVEL
 
 
 def strip_homography(right: float, yaw: float) -> np.ndarray:
@@ -64,7 +64,7 @@ def strip_homography(right: float, yaw: float) -> np.ndarray:
 
     right: m further right; yaw: radians, turned right.
     """
-    return homographies(right, 0.0, yaw, STRIP_FROM_LEVEL, LEVEL_FROM_STRIP)[0]
+    return homographies(right, 0.0, yaw, DIRECTION_TO_STRIP, STRIP_TO_DIRECTION)[0]
 
 
 def visible_mask(homography: np.ndarray) -> np.ndarray:

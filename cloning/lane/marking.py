@@ -6,7 +6,7 @@ The lane network sees the whole road and is a few tenths of a metre off; the pai
 import cv2
 import numpy as np
 
-from cloning.lane.reader import MOUNT_OFFSETS, STRIP_FROM_LEVEL, STRIP_SHAPE
+from cloning.lane.reader import DIRECTION_TO_STRIP, MOUNT_OFFSETS, STRIP_SHAPE
 from cloning.road.camera import CAMERA_HEIGHT
 
 AHEAD = np.arange(3.3, 6.3, 0.1)  # m from the camera: nearer ground lies below the strip, further ground is seldom flat
@@ -21,16 +21,15 @@ APART = 0.3  # m: lines closer together count as one
 NEAR_ROWS, SUPPORT, AGREEMENT = 7, 8, 0.3  # of a detection: see `supported`
 
 BESIDE = round(FLANK / STEP)  # points
-SEEN = (
-    np.arange(-round(REACH / STEP) - BESIDE, round(REACH / STEP) + BESIDE + 1) * STEP
-)  # m right of the expected centre
+SIDE = round(REACH / STEP) + BESIDE  # points
+SEEN = np.arange(-SIDE, SIDE + 1) * STEP  # m right of the expected centre
 ACROSS = SEEN[BESIDE:-BESIDE]  # where the line is sought; it has road on both sides
 
 
 def _strip_pixels(right: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the columns and the rows, (k,), of a strip at which points so far to the right are seen, at AHEAD."""
     points = np.stack([np.full_like(AHEAD, right), np.full_like(AHEAD, CAMERA_HEIGHT), AHEAD], axis=1)
-    pixels = points @ STRIP_FROM_LEVEL.T
+    pixels = points @ DIRECTION_TO_STRIP.T
     return pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
 
 

@@ -46,7 +46,7 @@ MAX_RESIDUAL = 0.9  # m, smoothed: between the detections and the centre line fi
 # strip's pixels to those of the level camera's frame and to those of the real camera's.
 STRIP_TO_LEVEL = np.array([[2, 0, 0.5], [0, 2, FIRST_ROW + 0.5], [0, 0, 1]])
 STRIP_TO_FRAME = CAMERA_MATRIX @ np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_LEVEL
-STRIP_FROM_LEVEL = np.linalg.inv(STRIP_TO_LEVEL) @ LEVEL_CAMERA_MATRIX  # (3, 3), from level directions to its pixels
+DIRECTION_TO_STRIP = np.linalg.inv(STRIP_TO_LEVEL) @ LEVEL_CAMERA_MATRIX  # (3, 3), of a ray from the level camera
 
 
 def extract_strip(frame: np.ndarray) -> np.ndarray:
