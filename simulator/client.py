@@ -26,6 +26,7 @@ from simulator.run import Run
 
 STANDSTILL_TIME = 60.0  # simulated seconds within which the car must move by a metre
 MAX_CATCH_UP = 25  # physics steps to catch up with real time, before the next look for an answer
+ANSWERS_PER_STEP = 6  # 300 per second in real time; the real simulator's client took at most 264
 RECONNECT_INTERVAL = 1.0  # s between two attempts of the window to connect
 WINDOW_SEND_TIMEOUT = 0.1  # s that the window waits for a server that does not read
 
@@ -116,7 +117,8 @@ class Client(ClientSession):
         """Drive to the goal, in m travelled, while simulated time follows the wall clock.
 
         A frame is sent for each "open" event and for each answer. So, as in the real simulator, each lost answer leaves
-        one frame less in flight.
+        one frame less in flight. More answers than ANSWERS_PER_STEP wait for the next physics step: otherwise a server
+        that floods the client gets frames until its buffers are full, before the car has moved.
         """
         sent: list[float] = []  # when each telemetry that has no answer yet was sent
         greeted = answered = False  # commands that arrive before CONNECT answer no telemetry
@@ -124,13 +126,19 @@ class Client(ClientSession):
             self.connection.send(self.next_frame())
             sent.append(time.perf_counter())
         begin, origin, until = time.perf_counter(), self.run.time, self.first_answer_due()
+        taken = 0  # answers since the last physics step
         while self.run.travelled < goal:
             due = int((time.perf_counter() - begin) / STEP) * STEP + origin
             for _ in range(min(MAX_CATCH_UP, round((due - self.run.time) / STEP))):
                 self.step()
+                taken = 0
                 if answered:
                     self.progressed()
-            packet = self.connection.receive(max(0.0, begin + self.run.time - origin + STEP - time.perf_counter()))
+            pause = max(0.0, begin + self.run.time - origin + STEP - time.perf_counter())
+            if taken == ANSWERS_PER_STEP:
+                time.sleep(pause)
+                continue
+            packet = self.connection.receive(pause)
             self._show(bar)
             answer = self.parse(packet) if packet else None
             greeted = greeted or packet == CONNECT
@@ -138,6 +146,7 @@ class Client(ClientSession):
                 if time.monotonic() > until:
                     raise self.no_answer()
                 continue
+            taken += 1
             until = time.monotonic() + self.wait
             if sent and greeted:
                 self.round_trips.append(time.perf_counter() - sent.pop(0))
