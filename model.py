@@ -118,7 +118,7 @@ class ReportObservations(Observations):
         number, digests = np.zeros(len(rows), np.int16), center_digests(recording, rows)
         return cls([recording], number, rows, recording.steering[rows], digests, recording.time[rows])
 
-    def resample(self, seed: int) -> Self:
+    def resample(self, seed: int, repeats: int) -> Self:
         """Steps 5 to 7: undersample straight driving, oversample turns with jitter, repeat problem areas."""
         rng, size = np.random.default_rng([seed, 1]), np.abs(self.steering)
         kept = np.flatnonzero((size >= STRAIGHT) | (rng.random(len(size)) < KEEP_STRAIGHT))
@@ -126,10 +126,10 @@ class ReportObservations(Observations):
         jittered = self.steering[turns] * (1 + JITTER * rng.uniform(-1, 1, len(turns)))
         rows = np.concatenate([kept, turns])
         labels = np.concatenate([self.steering[kept], jittered.astype(np.float32)])
-        times = self.repeats()[rows]
+        times = self.times(repeats)[rows]
         return self.take(np.repeat(rows, times), np.repeat(labels, times))
 
-    def shuffle(self, rng: np.random.Generator) -> np.ndarray:
+    def shuffle(self, rng: np.random.Generator, repeats: int) -> np.ndarray:
         """Step 8: return the indices of all observations in random order, int (n,)."""
         return rng.permutation(len(self))
 
@@ -256,8 +256,8 @@ class Generator:
     def __init__(self, observations: Observations, arguments: Arguments, pool: ThreadPoolExecutor, ahead: int):
         """pool: makes the images; ahead: number of batches that are made at the same time."""
         self.observations, self.arguments, self.pool, self.ahead = observations, arguments, pool, ahead
-        seed = arguments.seed
-        self.shuffled = functools.lru_cache(2)(lambda n: observations.shuffle(np.random.default_rng([seed, 2, n])))
+        seed, repeats, shuffle = arguments.seed, arguments.repeats, observations.shuffle
+        self.shuffled = functools.lru_cache(2)(lambda n: shuffle(np.random.default_rng([seed, 2, n]), repeats))
 
     def sample(self, number: int) -> Choices:
         """Return the random choices for batch `number`, counted from 0."""
@@ -451,7 +451,7 @@ def prepare(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, Obs
     arguments = replace(arguments, recordings=[str(folder.resolve()) for folder in folders])
     observations = read_observations(kind, folders, arguments, RunFiles(arguments.output).rejected)
     train, validation = split(observations, arguments.seed)
-    training = observations.take(train).resample(arguments.seed)
+    training = observations.take(train).resample(arguments.seed, arguments.repeats)
     sizes = f"training: {len(train):,} rows, {len(training):,} observations after resampling"
     print(f"\n{sizes}; validation: {len(validation):,} rows\n")
     return arguments, training, observations.take(validation), checkpoint

@@ -83,7 +83,7 @@ def test_copies_of_a_frame_are_all_on_one_side():
 
 def test_resampling_has_the_recipes_shares():
     steering = np.repeat([0.0, 0.019, -0.02, 0.2, 0.21, -0.5, 0.51, 1], 10000)
-    got = observations(steering).resample(seed=1).steering
+    got = observations(steering).resample(seed=1, repeats=4).steering
     straight = (np.abs(got) < 0.0195).sum()
     assert straight / 20000 == pytest.approx(0.8, abs=0.01)
     for once in (-0.02, 0.2, 0.51, 1):
@@ -96,10 +96,11 @@ def test_resampling_has_the_recipes_shares():
         assert jitter.mean() == pytest.approx(0, abs=3e-4)
 
 
-def test_problem_areas_are_repeated_four_times():
+@pytest.mark.parametrize("repeats", [1, 4, 9])
+def test_problem_areas_are_repeated(repeats):
     names = ["lake", "bridge-repetitive", "data-corrections"]
-    got = observations(np.full(30, 0.1), [recording(10, name) for name in names]).resample(seed=0)
-    assert np.bincount(got.recording).tolist() == [10, 40, 40]
+    got = observations(np.full(30, 0.1), [recording(10, name) for name in names]).resample(0, repeats)
+    assert np.bincount(got.recording).tolist() == [10, 10 * repeats, 10 * repeats]
 
 
 @pytest.mark.parametrize("factor", [0.4, 0.83, 1.2])

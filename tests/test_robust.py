@@ -363,7 +363,8 @@ def test_a_pose_with_a_shadow_is_seen_in_it(monkeypatch):
     assert shaded[poses.shade >= 0].mean() > 0.9  # a shadow may be faint
 
 
-def test_problem_areas_are_sampled_four_times_as_often(monkeypatch):
+@pytest.mark.parametrize("repeats", [1, 4, 36])
+def test_problem_areas_are_sampled_so_many_times_as_often(monkeypatch, repeats):
     def part(folder):
         rows = np.arange(50)
         known = lanes(monkeypatch, 0.05).take(rows + 50)
@@ -371,8 +372,8 @@ def test_problem_areas_are_sampled_four_times_as_often(monkeypatch):
         return RobustObservations([recording], np.zeros(50, np.int16), rows, rows * 0.0, rows, rows * 1.0, known)
 
     both = RobustObservations.joined([part("plain"), part("bend-repetitive")])
-    chosen = np.concatenate([both.shuffle(np.random.default_rng(seed)) for seed in range(100)])
-    assert (chosen >= 50).mean() == pytest.approx(0.8, abs=0.02)
+    chosen = np.concatenate([both.shuffle(np.random.default_rng(seed), repeats) for seed in range(100)])
+    assert (chosen >= 50).mean() == pytest.approx(repeats / (repeats + 1), abs=0.02)
 
 
 def test_rows_in_bends_are_sampled_more_often(monkeypatch):
@@ -392,7 +393,7 @@ def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monk
     rows = np.full(n, 100, np.int32)
     labels = both.steering(both.offset, both.yaw)
     everything = RobustObservations([drive], np.zeros(n, int), rows, labels, np.arange(n, dtype=np.uint64), rows, both)
-    turn = everything.shuffle(np.random.default_rng(0))
+    turn = everything.shuffle(np.random.default_rng(0), repeats=4)
     assert len(turn) == n
     expected = both.weights()[2000:].sum()  # of the rows in a bend
     assert expected > 0.6

@@ -62,9 +62,9 @@ def test_a_kind_of_image_is_left_out(restored, sample_recording, alteration, kin
 
 def test_without_resampling_each_observation_counts_once(restored):
     steering = np.float32([0, 0.01, 0.3, -0.4, 1] * 20)
-    assert len(observations(steering).resample(seed=0)) != len(steering)
+    assert len(observations(steering).resample(seed=0, repeats=1)) != len(steering)
     ALTERATIONS["no resampling"]()
-    assert sorted(observations(steering).resample(seed=0).steering) == sorted(steering)
+    assert sorted(observations(steering).resample(seed=0, repeats=1).steering) == sorted(steering)
 
 
 def test_the_centre_camera_alone(restored, sample_recording):

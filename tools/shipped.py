@@ -12,7 +12,6 @@ what came out.
 """
 
 import argparse
-import itertools
 import shutil
 import subprocess
 import sys
@@ -28,7 +27,7 @@ if __name__ == "__main__":
 from cloning.arguments import number
 from cloning.errors import RecordingError, UserError
 from cloning.recordings.excluded import EXCLUDED
-from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
+from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, PROBLEM_AREAS
 from cloning.recordings.log import find_folders
 from cloning.road.track import ROADS, Track
 from simulator.record import record
@@ -36,7 +35,7 @@ from simulator.scenery.looks import SHADOWED
 from tools.lane_frames import FIRST_ROAD, shadowed
 
 ROOT = Path(__file__).resolve().parent.parent
-COPIES = 3  # of each real recording, which training repeats four times each: the rendered ones are many
+REPEATS = 12  # how often each real recording counts, because the rendered ones are many
 LEARNING_RATE = 2e-3  # half of --robust's: this training is longer
 DIRECTIONS = ("ccw", "cw")
 # What is driven in the end: both tracks in look 0 and in one that was not trained on, without and with shadows, and ten
@@ -86,9 +85,9 @@ def render(folder: Path, chosen: list[Lap]) -> None:
 
 
 def repeat(folder: Path, recordings: list[Path]) -> None:
-    """Make folders of the real recordings that training repeats as it does problem areas: their names say so."""
-    for recording, copy in itertools.product(recordings, range(1, COPIES + 1)):
-        twin = folder / f"{recording.resolve().name}{copy}-repetitive"
+    """Make a folder of each real recording that training repeats as it does problem areas: its name says so."""
+    for recording in recordings:
+        twin = folder / f"{recording.resolve().name}{PROBLEM_AREAS[0]}"
         twin.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(recording / DRIVING_LOG, twin / DRIVING_LOG)
         (twin / EXCLUDED).unlink(missing_ok=True)
@@ -118,7 +117,7 @@ def main(argv: list[str] | None = None) -> int:
     except (UserError, OSError) as error:
         return program.failed("shipped", error)
     length = ("--epochs", str(args.epochs), "--learning-rate", str(LEARNING_RATE))
-    training = ("--robust", *length, "--seed", str(args.seed), "--resume")
+    training = ("--robust", *length, "--repeats", str(REPEATS), "--seed", str(args.seed), "--resume")
     folders = (args.folder / "real", args.folder / "rendered", "--output", args.folder / "model.pt")
     status = subprocess.run([sys.executable, ROOT / "model.py", *folders, *training]).returncode
     if status != program.DONE:

@@ -17,7 +17,6 @@ from cloning.recordings.format import (
     DRIVING_LOG,
     IMAGE_FOLDER,
     PROBLEM_AREAS,
-    REPEATS,
     SAMPLE_RATE,
     time_stamp,
 )
@@ -37,7 +36,7 @@ def check_name_of_corrections(folder: str | Path) -> None:
     if not path.name.endswith(PROBLEM_AREAS):
         remedy = path.with_name(f"{path.name}{PROBLEM_AREAS[-1]}")
         raise RecordingError(
-            f"{folder}: model.py repeats corrections {REPEATS} times only if the folder's name ends in "
+            f"{folder}: model.py repeats corrections only if the folder's name ends in "
             f"{' or '.join(PROBLEM_AREAS)}; name it {remedy.name}"
         )
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from cloning.errors import RecordingError
 from cloning.pilot.network import CROP
-from cloning.recordings.format import DRIVE_GAP, FRAME, PROBLEM_AREAS, REPEATS, ROAD_ROWS
+from cloning.recordings.format import DRIVE_GAP, FRAME, PROBLEM_AREAS, ROAD_ROWS
 from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.log import Recording
 from cloning.training.options import Arguments
@@ -150,12 +150,12 @@ class Observations(ABC):
         """Return the observations of a recording that training uses. Raises RecordingError, ModelError."""
 
     @abstractmethod
-    def resample(self, seed: int) -> Self:
-        """Return the training observations balanced: some left out, others repeated."""
+    def resample(self, seed: int, repeats: int) -> Self:
+        """Return the training observations balanced: some left out, others repeated; repeats: see `times`."""
 
     @abstractmethod
-    def shuffle(self, rng: np.random.Generator) -> np.ndarray:
-        """Return the order of the observations in one pass over them: int (n,), indices."""
+    def shuffle(self, rng: np.random.Generator, repeats: int) -> np.ndarray:
+        """Return the order of the observations in one pass over them: int (n,), indices; repeats: see `times`."""
 
     @abstractmethod
     def sample_views(
@@ -206,10 +206,10 @@ class Observations(ABC):
             time=np.concatenate([part.time for part in parts]),
         )
 
-    def repeats(self) -> np.ndarray:
-        """Return how often each observation counts: int (n,), REPEATS in a recording of problem areas, else 1."""
+    def times(self, repeats: int) -> np.ndarray:
+        """Return how often each observation counts: int (n,), `repeats` in a recording of problem areas, else 1."""
         names = [recording.folder.resolve().name for recording in self.recordings]
-        return np.array([REPEATS if name.endswith(PROBLEM_AREAS) else 1 for name in names])[self.recording]
+        return np.array([repeats if name.endswith(PROBLEM_AREAS) else 1 for name in names])[self.recording]
 
     def drives(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the drive without a break that each observation is of, and the time since its start.

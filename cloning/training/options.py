@@ -6,11 +6,12 @@ from pathlib import Path
 
 from cloning.arguments import number
 from cloning.compute import DEVICES, is_available
-from cloning.recordings.format import DRIVING_LOG
+from cloning.recordings.format import DRIVING_LOG, PROBLEM_AREAS
 
 MAX_SEED = 2**63 - 1  # torch takes no larger one
 MAX_COUNT = 10**9  # of epochs or images: more than a lifetime of training
 MAX_BATCH = 10**5  # observations: 56 GB of images
+MAX_REPEATS = 1000  # the report's training keeps as many copies of the rows in memory
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Arguments:
     device: str = "auto"
     throttle_threshold: float = 0.25
     side_correction: float = 0.2
+    repeats: int = 4
     strict: bool = False
     robust: bool = False
     from_: str = ""
@@ -140,6 +142,11 @@ def build_parser() -> argparse.ArgumentParser:
         "--side-correction",
         type=number(float),
         help=text("side_correction", "steering added to the label of left images, subtracted from that of right ones"),
+    )
+    group.add_argument(
+        "--repeats",
+        type=number(int, 1, MAX_REPEATS),
+        help=text("repeats", f"how often a recording counts whose name ends in {' or '.join(PROBLEM_AREAS)}"),
     )
     group.add_argument("--strict", action="store_true", help="fail if a row is unusable, instead of leaving it out")
     group.add_argument(

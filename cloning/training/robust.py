@@ -246,16 +246,16 @@ class RobustObservations(Observations):
         """Join the observations of several recordings; parts: those of one recording each."""
         return replace(super().joined(parts), lanes=Lanes.joined([part.lanes for part in parts]))
 
-    def resample(self, seed: int) -> Self:
+    def resample(self, seed: int, repeats: int) -> Self:
         """Return all observations once, because `shuffle` samples bends more often."""
         return self
 
-    def shuffle(self, rng: np.random.Generator) -> np.ndarray:
+    def shuffle(self, rng: np.random.Generator, repeats: int) -> np.ndarray:
         """Sample as many observations as there are, with replacement: int (n,), indices.
 
         Bends are sampled more often, and recordings of problem areas, as in the report.
         """
-        weights = self.lanes.weights() * self.repeats()
+        weights = self.lanes.weights() * self.times(repeats)
         return rng.choice(len(self), len(self), p=weights / weights.sum())
 
     def aim(self) -> np.ndarray:
