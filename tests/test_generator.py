@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -101,6 +102,19 @@ def test_problem_areas_are_repeated(repeats):
     names = ["lake", "bridge-repetitive", "data-corrections"]
     got = observations(np.full(30, 0.1), [recording(10, name) for name in names]).resample(0, repeats)
     assert np.bincount(got.recording).tolist() == [10, 10 * repeats, 10 * repeats]
+
+
+def test_the_command_line_says_how_often_problem_areas_count(sample_recording, tmp_path):
+    folder = tmp_path / "bridge-repetitive"
+    shutil.copytree(sample_recording, folder)
+
+    def rows(*options):
+        arguments = ["--throttle-threshold", "0", "--output", str(tmp_path / "model.pt"), *options]
+        return len(model.prepare(*model.parse([str(folder), *arguments]))[1])
+
+    once = rows("--repeats", "1")
+    assert rows("--repeats", "3") == 3 * once
+    assert rows() == 4 * once
 
 
 @pytest.mark.parametrize("factor", [0.4, 0.83, 1.2])
