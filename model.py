@@ -126,8 +126,8 @@ class ReportObservations(Observations):
         jittered = self.steering[turns] * (1 + JITTER * rng.uniform(-1, 1, len(turns)))
         rows = np.concatenate([kept, turns])
         labels = np.concatenate([self.steering[kept], jittered.astype(np.float32)])
-        times = self.times(repeats)[rows]
-        return self.take(np.repeat(rows, times), np.repeat(labels, times))
+        counts = self.counts(repeats)[rows]
+        return self.take(np.repeat(rows, counts), np.repeat(labels, counts))
 
     def shuffle(self, rng: np.random.Generator, repeats: int) -> np.ndarray:
         """Step 8: return the indices of all observations in random order, int (n,)."""

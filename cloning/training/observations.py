@@ -151,11 +151,11 @@ class Observations(ABC):
 
     @abstractmethod
     def resample(self, seed: int, repeats: int) -> Self:
-        """Return the training observations balanced: some left out, others repeated; repeats: see `times`."""
+        """Return the training observations balanced: some left out, others repeated; repeats: see `counts`."""
 
     @abstractmethod
     def shuffle(self, rng: np.random.Generator, repeats: int) -> np.ndarray:
-        """Return the order of the observations in one pass over them: int (n,), indices; repeats: see `times`."""
+        """Return the order of the observations in one pass over them: int (n,), indices; repeats: see `counts`."""
 
     @abstractmethod
     def sample_views(
@@ -206,7 +206,7 @@ class Observations(ABC):
             time=np.concatenate([part.time for part in parts]),
         )
 
-    def times(self, repeats: int) -> np.ndarray:
+    def counts(self, repeats: int) -> np.ndarray:
         """Return how often each observation counts: int (n,), `repeats` in a recording of problem areas, else 1."""
         names = [recording.folder.resolve().name for recording in self.recordings]
         return np.array([repeats if name.endswith(PROBLEM_AREAS) else 1 for name in names])[self.recording]

@@ -255,7 +255,7 @@ class RobustObservations(Observations):
 
         Bends are sampled more often, and recordings of problem areas, as in the report.
         """
-        weights = self.lanes.weights() * self.times(repeats)
+        weights = self.lanes.weights() * self.counts(repeats)
         return rng.choice(len(self), len(self), p=weights / weights.sum())
 
     def aim(self) -> np.ndarray:
