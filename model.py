@@ -51,7 +51,7 @@ from cloning.training.muon import OPTIMIZERS
 from cloning.training.observations import SEEN_SHAPE, Augmented, Choices, Example, Observations, Views, center_digests
 from cloning.training.options import Arguments, parse
 from cloning.training.pictures import batch_pictures, loss_picture
-from cloning.training.pieces import PIECE, Batch, SquaredErrors, predict
+from cloning.training.pieces import Batch, SquaredErrors, pieces, predict
 from cloning.training.robust import RobustObservations
 from cloning.training.stop import SIGNALS, Interrupted, StopSignals
 
@@ -299,7 +299,7 @@ class Generator:
                 at = np.searchsorted(order, choices.places[which, kind])
                 images[at], labels[at] = augmented, choices.views.labels[which, kind]
 
-        parts = [self.pool.submit(make, mine[start : start + PIECE]) for start in range(0, len(mine), PIECE)]
+        parts = [self.pool.submit(make, mine[piece]) for piece in pieces(len(mine))]
 
         def wait() -> Batch:
             for part in parts:
@@ -345,11 +345,11 @@ class TrainingRun:
         repeatable(self.device)
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
-        self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.device, self.pool, arguments.loss)
+        self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, arguments.loss)
         if world() > 1:
             self.errors = nn.parallel.DistributedDataParallel(self.errors)
         self.optimizer = OPTIMIZERS[arguments.optimizer](self.network.parameters())
-        self.generator = Generator(training, arguments, self.pool, ahead=1 if self.device.type == "cpu" else 4)
+        self.generator = Generator(training, arguments, self.pool, ahead=2 if self.device.type == "cpu" else 4)
         self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
         data = fingerprint(training, validation)
         self.checkpoint = Checkpoint(self.files, arguments, self.network, self.optimizer, data)

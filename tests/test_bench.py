@@ -7,6 +7,7 @@ import torch
 from conftest import ROOT, run_model
 
 from cloning.pilot.network import Network
+from cloning.training.pieces import converted
 from tools import bench_layers
 
 
@@ -43,7 +44,9 @@ def test_the_layers_costs_are_those_of_the_network():
 
 def test_activations_in_half_the_precision_are_half_the_traffic():
     network = Network().to(memory_format=torch.channels_last)
-    single, half = (bench_layers.traffic(network, precision) for precision in (torch.float32, torch.bfloat16))
+    single, half = (
+        bench_layers.traffic(converted(network, precision)) for precision in (torch.float32, torch.bfloat16)
+    )
     assert single == 2 * half
 
 

@@ -224,7 +224,7 @@ def test_without_dropout_a_batch_is_the_same_but_keeps_every_unit(generator, mon
     assert batch.keep is None and batch.total == usual.total
     np.testing.assert_array_equal(batch.images, usual.images)
     network, pool = model.Network().eval(), generator.pool
-    errors = SquaredErrors(network, torch.float32, torch.device("cpu"), pool, "squared")(batch)
+    errors = SquaredErrors(network, torch.float32, pool, "squared")(batch)
     predicted = network(torch.from_numpy(batch.images)).detach().numpy()
     assert errors.item() == pytest.approx(float(((predicted - batch.labels) ** 2).sum()), rel=1e-4)
 

@@ -20,7 +20,7 @@ from cloning.files import write
 from cloning.pilot import network as network_module
 from cloning.pilot.network import SHIPPED_MODEL, Network, layer_table, load_model, save_model, steer
 from cloning.recordings.images import decode
-from cloning.training.pieces import LOSSES, SquaredErrors, squared_errors
+from cloning.training.pieces import LOSSES, PIECE, SquaredErrors, pieces, squared_errors
 from model import Batch
 
 REPORT = """
@@ -113,6 +113,25 @@ def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):
     assert not flat[1][:, 1::2].any()
 
 
+@pytest.mark.parametrize("images", [0, 1, 2, 48, 56, 57, 474])
+def test_pieces_are_an_even_number_of_about_the_same_size(images):
+    parts = pieces(images)
+    assert np.concatenate([np.arange(images)[part] for part in parts] or [[]]).tolist() == list(range(images))
+    sizes = [part.stop - part.start for part in parts]
+    assert len(parts) % 2 == 0 and all(size <= PIECE for size in sizes)
+    assert not images or max(sizes) - min(sizes) <= 1
+
+
+def test_later_batches_are_computed_with_the_weights_of_then(network):
+    batch = Batch(np.zeros((2, 75, 320, 3), np.uint8), np.zeros(2, np.float32), None, 2)
+    with ThreadPoolExecutor(1) as pool:
+        errors = SquaredErrors(network, torch.bfloat16, pool, "squared")
+        errors(batch)
+        with torch.no_grad():
+            network.dense[-1].bias.fill_(1000)
+        assert errors(batch).item() == pytest.approx(2e6, rel=0.02)
+
+
 def test_pieces_give_the_gradient_of_the_whole_batch(network):
     rng = np.random.default_rng(1)
     batch = Batch(
@@ -121,16 +140,15 @@ def test_pieces_give_the_gradient_of_the_whole_batch(network):
         rng.random((45, 4224)) < 0.5,
         45,
     )
-    cpu = torch.device("cpu")
-    squared_errors(network, torch.float32, cpu, batch.images, batch.labels, batch.keep).backward()
+    squared_errors(network, batch.images, batch.labels, batch.keep).backward()
     whole = [parameter.grad.clone() for parameter in network.parameters()]
     network.zero_grad()
     with ThreadPoolExecutor(2) as pool:
-        loss = SquaredErrors(network, torch.float32, cpu, pool, "squared")(batch)
+        loss = SquaredErrors(network, torch.float32, pool, "squared")(batch)
         (loss * 3).backward()
         for parameter, expected in zip(network.parameters(), whole, strict=True):
             torch.testing.assert_close(parameter.grad, expected * 3, rtol=1e-4, atol=1e-4)
-        again = SquaredErrors(network, torch.float32, cpu, pool, "squared")(batch)
+        again = SquaredErrors(network, torch.float32, pool, "squared")(batch)
     assert torch.equal(loss, again)  # whichever thread was faster
 
 
@@ -138,14 +156,14 @@ def test_pieces_give_the_gradient_of_the_whole_batch(network):
 def test_the_gradient_is_that_of_the_loss_and_the_value_the_squared_errors(network, loss):
     rng = np.random.default_rng(3)
     images, labels = rng.integers(0, 256, (20, 75, 320, 3), np.uint8), rng.normal(0, 0.2, 20).astype(np.float32)
-    batch, cpu, parameters = Batch(images, labels, None, 20), torch.device("cpu"), list(network.parameters())
+    batch, parameters = Batch(images, labels, None, 20), list(network.parameters())
     predicted, wanted = network(torch.from_numpy(images)), torch.from_numpy(labels)
     assert 2 < int(((predicted - wanted).abs() < LOSSES["huber"]).sum()) < 18  # both sides of the limit
     squared = torch.nn.functional.mse_loss(predicted, wanted, reduction="sum")
     huber = torch.nn.functional.huber_loss(predicted, wanted, reduction="sum", delta=LOSSES["huber"])
     expected = torch.autograd.grad({"squared": squared, "huber": 2 * huber}[loss], parameters)
     with ThreadPoolExecutor(2) as pool:
-        errors = SquaredErrors(network, torch.float32, cpu, pool, loss)(batch)
+        errors = SquaredErrors(network, torch.float32, pool, loss)(batch)
         errors.backward()
     assert errors.item() == pytest.approx(squared.item(), rel=1e-4)
     for parameter, gradient in zip(parameters, expected, strict=True):
@@ -157,10 +175,12 @@ def test_bfloat16_steps_where_float32_does(network):
     rng = np.random.default_rng(2)
     images, angles = rng.integers(0, 256, (4, 75, 320, 3), np.uint8), rng.normal(0, 0.2, 4).astype(np.float32)
     gradients = []
-    for precision in (torch.float32, torch.bfloat16):
-        network.zero_grad()
-        squared_errors(network, precision, torch.device("cpu"), images, angles).backward()
-        gradients.append(torch.cat([parameter.grad.flatten() for parameter in network.parameters()]))
+    with ThreadPoolExecutor(1) as pool:
+        for precision in (torch.float32, torch.bfloat16):
+            network.zero_grad()
+            SquaredErrors(network, precision, pool, "squared")(Batch(images, angles, None, 4)).backward()
+            gradients.append(torch.cat([parameter.grad.flatten() for parameter in network.parameters()]))
+            assert gradients[-1].dtype == torch.float32
     assert torch.cosine_similarity(*gradients, dim=0) > 0.99
 
 

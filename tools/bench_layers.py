@@ -1,6 +1,6 @@
 """Where the time of an optimisation step goes, by layer, and how fast the machine's memory would allow it to be.
 
-Part of `tools.bench_training`. As in model.py, one thread computes a piece of 16 images, in the run's precision.
+Part of `tools.bench_training`. As in model.py, one thread computes a piece of a batch, in the run's precision.
 """
 
 import statistics
@@ -11,16 +11,16 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from cloning.compute import in_precision, threads
+from cloning.compute import threads
 from cloning.pilot.network import Network
 from cloning.training.observations import SEEN_SHAPE
-from cloning.training.pieces import PIECE, squared_errors
+from cloning.training.pieces import PIECE, converted, squared_errors
 
 REPEATS = 15  # of each measurement, of which the median counts
 
 
 class Cost(NamedTuple):
-    """What one layer costs for a piece of 16 images.
+    """What one layer costs for a piece of a batch.
 
     name                          of the layer
     forward, backward             seconds
@@ -50,25 +50,25 @@ def operations(layer: nn.Conv2d | nn.Linear, out: torch.Tensor) -> int:
     return 2 * out.numel() * layer.weight[0].numel()
 
 
-def activations(network: Network, precision: torch.dtype) -> dict[nn.Module, tuple[torch.Tensor, torch.Tensor]]:
-    """Return each layer's input and output for a piece of random frames, in a training step's precision and order."""
+def activations(network: Network) -> dict[nn.Module, tuple[torch.Tensor, torch.Tensor]]:
+    """Return each layer's input and output for a piece of random frames, in the network's precision."""
     seen: dict[nn.Module, tuple[torch.Tensor, torch.Tensor]] = {}
 
     def note(layer: nn.Module, given: tuple[torch.Tensor], out: torch.Tensor) -> None:
-        seen[layer] = given[0].to(precision, copy=True), out.clone()  # ELU overwrites both
+        seen[layer] = given[0].clone(), out.clone()  # ELU overwrites both
 
     hooks = [layer.register_forward_hook(note) for layer in (*network.convolutions, *network.dense)]
-    with torch.no_grad(), in_precision(precision, torch.device("cpu")):
+    with torch.no_grad():
         network(torch.randint(0, 256, (PIECE, *SEEN_SHAPE), dtype=torch.uint8))
     for hook in hooks:
         hook.remove()
     return seen
 
 
-def traffic(network: Network, precision: torch.dtype) -> int:
+def traffic(network: Network) -> int:
     """Return how many bytes of activations and of their gradients a step reads and writes for a piece."""
     total = 0
-    for layer, (x, out) in activations(network, precision).items():
+    for layer, (x, out) in activations(network).items():
         # Forward: read x, write out. Backward: read x and the gradient of out; write that of x, unless it is the image.
         total += (2 + (layer is not network.convolutions[0])) * x.nbytes + 2 * out.nbytes
         if layer is not network.dense[-1]:
@@ -91,36 +91,36 @@ def timed(name: str, layer: Callable, x: torch.Tensor, weights: list[nn.Paramete
 def costs(network: Network, precision: torch.dtype) -> tuple[list[Cost], float]:
     """Return what each layer costs, and the seconds of the whole piece, forward and backward."""
     torch.set_num_threads(1)
-    device, found = torch.device("cpu"), []
+    network, found = converted(network, precision), []
     convolutions, dense = list(network.convolutions), list(network.dense)
-    with in_precision(precision, device):
-        for layer, (x, out) in activations(network, precision).items():
-            assert isinstance(layer, nn.Conv2d | nn.Linear)
-            if isinstance(layer, nn.Conv2d):
-                name = f"convolution {convolutions.index(layer) + 1}, {layer.in_channels} to {layer.out_channels}"
-            else:
-                name = f"dense {dense.index(layer) + 1}, {layer.in_features} to {layer.out_features}"
-            found.append(timed(name, layer, x, [*layer.parameters()], layer is convolutions[0]))
-            if layer is not dense[-1]:
-                found.append(timed(f"ELU of {name.split(',')[0]}", nn.functional.elu, out, [], False))
+    for layer, (x, out) in activations(network).items():
+        assert isinstance(layer, nn.Conv2d | nn.Linear)
+        if isinstance(layer, nn.Conv2d):
+            name = f"convolution {convolutions.index(layer) + 1}, {layer.in_channels} to {layer.out_channels}"
+        else:
+            name = f"dense {dense.index(layer) + 1}, {layer.in_features} to {layer.out_features}"
+        found.append(timed(name, layer, x, [*layer.parameters()], layer is convolutions[0]))
+        if layer is not dense[-1]:
+            found.append(timed(f"ELU of {name.split(',')[0]}", nn.functional.elu, out, [], False))
     images = torch.randint(0, 256, (PIECE, *SEEN_SHAPE), dtype=torch.uint8).numpy()
     labels = torch.zeros(PIECE).numpy()
     parameters = [*network.parameters()]
 
     def piece() -> None:
-        torch.autograd.grad(squared_errors(network, precision, device, images, labels), parameters)
+        torch.autograd.grad(squared_errors(network, images, labels), parameters)
 
     return found, seconds(piece)
 
 
 def memory_limit(network: Network, precision: torch.dtype) -> float:
     """Return images per second if a step only moved its activations, at the rate of copying the largest of them."""
-    largest = max((out for _, out in activations(network, precision).values()), key=torch.Tensor.numel)
+    network = converted(network, precision)
+    largest = max((out for _, out in activations(network).values()), key=torch.Tensor.numel)
     torch.set_num_threads(threads())
     source = torch.empty(threads() * largest.numel(), dtype=largest.dtype)
     target = torch.empty_like(source)
     rate = 2 * source.nbytes / min(seconds(lambda: target.copy_(source)) for _ in range(8))  # bytes/s
-    return PIECE * rate / traffic(network, precision)
+    return PIECE * rate / traffic(network)
 
 
 def table(found: list[Cost], whole: float) -> str:

@@ -83,6 +83,7 @@ class Network(nn.Module):
         if frames.shape[1] == FRAME[0]:
             frames = frames[:, self.crop[0] : FRAME[0] - self.crop[1]]
         x = frames.permute(0, 3, 1, 2).float().div_(self.scale).sub_(self.offset)  # in memory still channels last
+        x = x.to(next(self.parameters()).dtype)
         for convolution in self.convolutions:
             x = nn.functional.elu(convolution(x), inplace=True)
         x = x.flatten(1)

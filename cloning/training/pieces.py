@@ -1,10 +1,12 @@
 """Compute loss, gradients and predictions, on a CPU in pieces of a batch that fit its cache."""
 
+import copy
+import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +14,8 @@ from torch import nn
 
 from cloning.compute import in_precision
 
-PIECE = 16  # images: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
+PIECE = 28  # images at most: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
+Module = TypeVar("Module", bound=nn.Module)
 # The loss -> the largest error that the gradient knows. Huber's loss grows linearly beyond it, so that the few views
 # that are warped beyond recognition do not decide what is learned from all the others.
 LOSSES = {"squared": math.inf, "huber": 0.1}
@@ -36,10 +39,23 @@ class Batch:
     start_next: Callable[[], None] = lambda: None
 
 
+def pieces(images: int) -> list[slice]:
+    """Return the pieces of a batch of this many images: of about the same size, at most PIECE.
+
+    Their number is even, so that two threads finish together, and the same on every machine, as are then the sums.
+    """
+    count = 2 * math.ceil(images / (2 * PIECE))
+    edges = [images * piece // count for piece in range(count + 1)] if count else [0]
+    return [slice(*ends) for ends in itertools.pairwise(edges)]
+
+
+def converted(network: Module, precision: torch.dtype) -> Module:
+    """Return the network if it has this precision, else a copy that has it."""
+    return network if precision == torch.float32 else copy.deepcopy(network).to(precision)
+
+
 def squared_errors(
     network: nn.Module,
-    precision: torch.dtype,
-    device: torch.device,
     images: np.ndarray,
     labels: np.ndarray,
     keep: np.ndarray | None = None,
@@ -49,9 +65,9 @@ def squared_errors(
 
     loss: one of LOSSES, whose gradient the result has, whatever its value.
     """
+    device = next(network.parameters()).device
     frames, wanted = torch.from_numpy(images).to(device), torch.from_numpy(labels).to(device)
-    with in_precision(precision, device):
-        predicted = network(frames, None if keep is None else torch.from_numpy(keep).to(device))
+    predicted = network(frames, None if keep is None else torch.from_numpy(keep).to(device))
     error = predicted - wanted
     known = error.detach()
     limit = LOSSES[loss]
@@ -68,58 +84,59 @@ class PieceByPiece(torch.autograd.Function):
     def forward(
         context: Any,
         network: nn.Module,
-        precision: torch.dtype,
         pool: ThreadPoolExecutor,
         batch: Batch,
         loss: str,
         *parameters: nn.Parameter,
     ) -> torch.Tensor:
-        """Return the sum of squared errors; the gradients are computed, too, and kept for `backward`."""
+        """Return the sum of squared errors; the gradients are computed, too, and kept for `backward`.
 
-        def piece(start: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-            part = slice(start, start + PIECE)
+        network: computes, with the values of the parameters, which are float32; it may have them in bfloat16.
+        """
+        weights = list(network.parameters())
+
+        def piece(part: slice) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
             keep = None if batch.keep is None else batch.keep[part]
-            images, labels = batch.images[part], batch.labels[part]
             with torch.enable_grad():
-                errors = squared_errors(network, precision, torch.device("cpu"), images, labels, keep, loss)
-            return errors.detach(), torch.autograd.grad(errors, parameters)
+                errors = squared_errors(network, batch.images[part], batch.labels[part], keep, loss)
+            return errors.detach(), torch.autograd.grad(errors, weights)
 
-        pieces = pool.map(piece, range(0, len(batch.labels), PIECE))
+        done = pool.map(piece, pieces(len(batch.labels)))
         batch.start_next()
-        total, gradients = torch.zeros(()), None
-        for piece_errors, piece_gradients in pieces:
+        total, gradients = torch.zeros(()), [torch.zeros_like(parameter) for parameter in parameters]
+        for piece_errors, piece_gradients in done:
             total += piece_errors
-            if gradients is None:
-                gradients = [gradient.clone() for gradient in piece_gradients]
-            else:
-                torch._foreach_add_(gradients, list(piece_gradients))
-        context.gradients = gradients or [torch.zeros_like(p) for p in parameters]
+            torch._foreach_add_(gradients, list(piece_gradients))
+        context.gradients = gradients
         return total
 
     @staticmethod
     def backward(context: Any, scale: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Return the gradients of the parameters, times `scale`; the first five inputs have none."""
-        return None, None, None, None, None, *torch._foreach_mul(context.gradients, scale)
+        """Return the gradients of the parameters, times `scale`; the first four inputs have none."""
+        return None, None, None, None, *torch._foreach_mul(context.gradients, scale)
 
 
 class SquaredErrors(nn.Module):
     """Sums a batch's squared errors; a module, so that DistributedDataParallel can wrap it."""
 
-    def __init__(
-        self, network: nn.Module, precision: torch.dtype, device: torch.device, pool: ThreadPoolExecutor, loss: str
-    ):
+    def __init__(self, network: nn.Module, precision: torch.dtype, pool: ThreadPoolExecutor, loss: str):
         """pool: its threads compute the pieces on a CPU; loss: one of LOSSES, whose gradient is taken."""
         super().__init__()
-        self.network, self.precision, self.device, self.pool, self.loss = network, precision, device, pool, loss
+        self.network, self.precision, self.pool, self.loss = network, precision, pool, loss
+        self.device = next(network.parameters()).device
+        # In a tuple, because the weights of the copy are not this module's parameters.
+        self.converted = (converted(network, precision),)
 
     def forward(self, batch: Batch) -> torch.Tensor:
         """Return the sum over this process's images: a scalar, float32."""
         if self.device.type == "cpu":
-            whole = self.network, self.precision, self.pool, batch, self.loss
-            return PieceByPiece.apply(*whole, *self.network.parameters())
+            (network,) = self.converted  # once for a batch: converting the weights for each piece would take longer
+            with torch.no_grad():
+                torch._foreach_copy_(list(network.parameters()), list(self.network.parameters()))
+            return PieceByPiece.apply(network, self.pool, batch, self.loss, *self.network.parameters())
         batch.start_next()
-        images, labels = batch.images, batch.labels
-        return squared_errors(self.network, self.precision, self.device, images, labels, batch.keep, self.loss)
+        with in_precision(self.precision, self.device):
+            return squared_errors(self.network, batch.images, batch.labels, batch.keep, self.loss)
 
 
 def predict(
@@ -139,5 +156,5 @@ def predict(
         with torch.inference_mode(), in_precision(precision, device):
             return network(torch.from_numpy(images(chosen)).to(device)).cpu().numpy()
 
-    pieces = [rows[start : start + PIECE] for start in range(0, len(rows), PIECE)]
-    return np.concatenate([np.empty(0, np.float32), *pool.map(part, pieces)])
+    parts = [rows[piece] for piece in pieces(len(rows))]
+    return np.concatenate([np.empty(0, np.float32), *pool.map(part, parts)])
