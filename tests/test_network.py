@@ -14,13 +14,12 @@ from conftest import ROOT
 from torch import nn
 
 from cloning import tensors
-from cloning.compute import in_precision
 from cloning.errors import ModelError
 from cloning.files import write
 from cloning.pilot import network as network_module
-from cloning.pilot.network import SHIPPED_MODEL, Network, layer_table, load_model, save_model, steer
+from cloning.pilot.network import SHIPPED_MODEL, Network, OverPairs, layer_table, load_model, save_model, steer
 from cloning.recordings.images import decode
-from cloning.training.pieces import LOSSES, PIECE, SquaredErrors, pieces, squared_errors
+from cloning.training.pieces import LOSSES, PIECE, SquaredErrors, converted, pieces, squared_errors
 from model import Batch
 
 REPORT = """
@@ -86,20 +85,36 @@ def test_convolution_in_blocks_is_torchs(size):
         torch.testing.assert_close(got, wanted, rtol=1e-12, atol=1e-11)
 
 
-def test_only_training_in_bfloat16_with_amx_computes_in_blocks(network, frames, monkeypatch):
-    calls, in_blocks = [], network_module.in_blocks
+@pytest.mark.parametrize("shape", [(2, 24, 36, 158), (3, 4, 9, 8)])
+def test_the_gradients_over_pairs_of_columns_are_those_of_the_convolution(shape):
+    x = torch.randn(shape, dtype=torch.float64).contiguous(memory_format=torch.channels_last).requires_grad_()
+    layer = torch.nn.Conv2d(shape[1], 36, 5, 2).to(torch.float64, memory_format=torch.channels_last)
+    inputs = (x, layer.weight, layer.bias)
+    expected, out = layer(x), OverPairs.apply(*inputs)
+    assert torch.equal(out, expected)
+    direction = torch.randn_like(expected)
+    gradients = torch.autograd.grad(out, inputs, direction)
+    for got, wanted in zip(gradients, torch.autograd.grad(expected, inputs, direction), strict=True):
+        torch.testing.assert_close(got, wanted, rtol=1e-12, atol=1e-11)
+    assert gradients[0].is_contiguous(memory_format=torch.channels_last)
+
+
+def test_only_training_in_bfloat16_computes_in_blocks_or_over_pairs(network, frames, monkeypatch):
+    calls, in_blocks, over_pairs = [], network_module.in_blocks, OverPairs.apply
     monkeypatch.setattr(network_module, "in_blocks", lambda x: calls.append(x.shape[1:]) or in_blocks(x))
-    for amx in (False, True):
+    monkeypatch.setattr(OverPairs, "apply", lambda *inputs: calls.append("pairs") or over_pairs(*inputs))
+    half = converted(network, torch.bfloat16)
+    for amx, expected in ((False, ["pairs"]), (True, [(24, 36, 158), (24, 5, 5)])):
         monkeypatch.setattr(network_module, "has_amx", lambda amx=amx: amx)
-        with torch.inference_mode(), in_precision(torch.bfloat16, torch.device("cpu")):
-            network(frames)
+        with torch.inference_mode():
+            half(frames)
         network(frames).sum().backward()  # float32
         assert not calls
-        with in_precision(torch.bfloat16, torch.device("cpu")):
-            steering = network(frames)
-            steering.sum().backward()
-        assert calls == [(24, 36, 158), (24, 5, 5)] * amx
-    torch.testing.assert_close(steering, network(frames), rtol=0, atol=0.01)
+        steering = half(frames)
+        steering.sum().backward()
+        assert calls == expected
+        calls.clear()
+        torch.testing.assert_close(steering, network(frames), rtol=0, atol=0.01)
 
 
 def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):
