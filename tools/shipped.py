@@ -35,7 +35,7 @@ from simulator.scenery.looks import SHADOWED
 from tools.lane_frames import FIRST_ROAD, shadowed
 
 ROOT = Path(__file__).resolve().parent.parent
-REPEATS = 12  # how often each real recording counts, because the rendered ones are many
+REPEATS = 20  # how often each real recording counts, because the rendered ones are many
 LEARNING_RATE = 2e-3  # half of --robust's: this training is longer
 DIRECTIONS = ("ccw", "cw")
 # What is driven in the end: both tracks in look 0 and in one that was not trained on, without and with shadows, and ten
@@ -107,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
         "--looks", type=number(int, 1, 101), default=15, help="looks of each track (default %(default)s)"
     )
     parser.add_argument("--roads", type=number(int, 0, 101), default=100, help="generated roads (default %(default)s)")
-    parser.add_argument("--epochs", type=number(int, 1), default=10, help="of 60,000 images (default %(default)s)")
+    parser.add_argument("--epochs", type=number(int, 1), default=17, help="of 60,000 images (default %(default)s)")
     parser.add_argument("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
     parser.add_argument("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
     args = parser.parse_args(argv)
