@@ -50,8 +50,9 @@ def pieces(images: int) -> list[slice]:
 
 
 def converted(network: Module, precision: torch.dtype) -> Module:
-    """Return the network if it has this precision, else a copy that has it."""
-    return network if precision == torch.float32 else copy.deepcopy(network).to(precision)
+    """Return the network if its weights have this precision, else a copy whose weights have it."""
+    same = next(network.parameters()).dtype == precision
+    return network if same else copy.deepcopy(network).to(precision)
 
 
 def squared_errors(
