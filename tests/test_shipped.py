@@ -8,7 +8,7 @@ import pytest
 
 from cloning.errors import RecordingError
 from cloning.recordings.excluded import EXCLUDED
-from cloning.recordings.format import PROBLEM_AREAS
+from cloning.recordings.format import IMAGE_FOLDER, PROBLEM_AREAS
 from cloning.recordings.log import read_recording, read_uncut
 from cloning.road.generated import road_number
 from simulator.scenery.looks import SHADOWED
@@ -48,9 +48,9 @@ def test_rendering_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
     chosen = [Lap("lake", "ccw", 0), Lap("lake", "cw", 10_000), Lap("road-1001", "ccw", 1)]
     with pytest.raises(KeyboardInterrupt):
         render(tmp_path, chosen)
-    render(tmp_path, chosen)
-    assert [seed for *_, seed in recorded] == [0, 1, 1, 2]
     names = ["lake-ccw-look0", "lake-cw-look10000", "road-1001-ccw-look1"]
+    assert render(tmp_path, chosen) == [tmp_path / name for name in names]
+    assert [seed for *_, seed in recorded] == [0, 1, 1, 2]
     assert sorted(folder.name for folder in tmp_path.iterdir()) == names
 
 
@@ -72,13 +72,52 @@ def test_a_repeated_recording_is_read_like_the_original(sample_recording, tmp_pa
     for is_cut in (True, cut):  # a second run takes over what has changed
         names = [read_uncut(source).name(row) for row in (3, 9)]
         (source / EXCLUDED).write_text(",".join(names) + ",off the road\n" if is_cut else "", encoding="utf-8")
-        repeat(folder, [source])
-    [twin], original = folder.iterdir(), read_recording(source)
-    assert twin.name.endswith(PROBLEM_AREAS)
+        [twin] = repeat(folder, [source])
+    original = read_recording(source)
+    assert twin.parent == folder and twin.name.endswith(PROBLEM_AREAS)
     repeated = read_recording(twin)
     assert len(repeated) == 60 - 7 * cut
     np.testing.assert_array_equal(repeated.steering, original.steering)
     assert repeated.path(0).read_bytes() == original.path(0).read_bytes()
+
+
+def test_a_repeated_recording_shows_the_images_of_this_run(sample_recording, tmp_path):
+    sources = [tmp_path / place / "lake" for place in ("before", "now")]
+    for source in sources:
+        shutil.copytree(sample_recording, source)
+        [twin] = repeat(tmp_path / "repeated", [source])
+    assert (twin / IMAGE_FOLDER).resolve() == sources[1] / IMAGE_FOLDER
+
+
+def test_two_recordings_of_one_name_are_not_mixed(sample_recording, tmp_path):
+    sources = [tmp_path / place / "lake" for place in ("one", "other")]
+    for source in sources:
+        shutil.copytree(sample_recording, source)
+    with pytest.raises(RecordingError, match=r"other/lake and .*one/lake have the same name"):
+        repeat(tmp_path / "repeated", sources)
+
+
+def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path, monkeypatch):
+    """The folder may hold laps and recordings of an earlier run with other arguments."""
+    commands = []
+
+    def record(folder, *_, **__):
+        folder.mkdir(parents=True)
+        return SimpleNamespace(departures=[]), 1
+
+    def run(command):
+        commands.append([str(part) for part in command])
+        return SimpleNamespace(returncode=1)
+
+    monkeypatch.setattr(shipped, "record", record)
+    monkeypatch.setattr(shipped.subprocess, "run", run)
+    out = tmp_path / "out"
+    for name, roads in (("first", "2"), ("second", "1")):
+        shutil.copytree(sample_recording, tmp_path / name)
+        assert shipped.main([str(tmp_path / name), "--looks", "1", "--roads", roads, "--folder", str(out)]) == 1
+    first, second = commands
+    assert sum("road-" in part for part in first) == 2 and sum("road-" in part for part in second) == 1
+    assert [part for part in second if "/real/" in part] == [str(out / "real" / f"second{PROBLEM_AREAS[0]}")]
 
 
 def test_recordings_that_are_not_there_are_named(tmp_path, capsys, monkeypatch):
