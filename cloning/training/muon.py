@@ -36,10 +36,10 @@ def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
     matrix = matrix / (matrix.norm() + 1e-7)
     gram = matrix @ matrix.T
     a, b, c = COEFFICIENTS
-    identity = torch.eye(len(gram), device=gram.device)
-    whole = identity
+    whole = torch.eye(len(gram), device=gram.device)
     for _ in range(NEWTON_SCHULZ_STEPS):
-        step = a * identity + b * gram + c * (gram @ gram)
+        step = torch.addmm(gram, gram, gram, beta=b, alpha=c)  # b(XX') + c(XX')²
+        step.diagonal().add_(a)
         whole, gram = step @ whole, step @ gram @ step
     return whole @ matrix
 
