@@ -30,6 +30,7 @@ from cloning.lane.reader import (
     detect_centres,
     estimate_centres,
     extract_strip,
+    fold_norms,
     fuse_detections,
     load_network,
     normalize,
@@ -251,6 +252,16 @@ def test_real_recordings_are_trusted(folder):
     recording.keep(np.arange(min(len(recording), 600)))
     trusted = fuse_detections(recording, detect_centres(recording)).trusted.mean()
     assert trusted > (0.98 if "lake" in folder.name else 0.7)  # measured: 1 on two lakes, 0.84 and 0.76 on two jungles
+
+
+def test_the_network_without_norms_computes_the_same():
+    network = load_network()
+    folded = fold_norms(network)
+    strips = torch.from_numpy(np.random.default_rng(0).normal(size=(7, *STRIP_SHAPE)).astype(np.float32))
+    with torch.inference_mode():
+        torch.testing.assert_close(folded(strips), network(strips), rtol=0, atol=1e-5)
+    assert not any(isinstance(layer, torch.nn.BatchNorm2d) for layer in folded.modules())
+    assert sum(isinstance(layer, torch.nn.BatchNorm2d) for layer in network.modules()) == 4
 
 
 def test_training_leaves_weights_that_load(tmp_path, sample_recording):

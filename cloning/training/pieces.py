@@ -125,8 +125,9 @@ class SquaredErrors(nn.Module):
         super().__init__()
         self.network, self.precision, self.pool, self.loss = network, precision, pool, loss
         self.device = next(network.parameters()).device
+        on_cpu = self.device.type == "cpu"
         # In a tuple, because the weights of the copy are not this module's parameters.
-        self.converted = (converted(network, precision),)
+        self.converted = (converted(network, precision) if on_cpu else network,)
 
     def forward(self, batch: Batch) -> torch.Tensor:
         """Return the sum over this process's images: a scalar, float32."""
