@@ -129,7 +129,10 @@ def load_network(path: str | Path | None = None) -> LaneNetwork:
 
 
 def fold_norms(network: LaneNetwork) -> LaneNetwork:
-    """Return a copy, for inference alone, whose convolutions do the batch norms' work as well: a third less time."""
+    """Return a copy whose convolutions do the work of the batch norms as well: in float32 a sixth less time.
+
+    network: in evaluation mode, as is the copy.
+    """
     folded, layers = copy.deepcopy(network), list[nn.Module]()
     for layer in folded.convolutions:
         if isinstance(layer, nn.BatchNorm2d) and isinstance(convolution := layers[-1], nn.Conv2d):
