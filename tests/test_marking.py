@@ -21,6 +21,11 @@ CORNERS = [(-WIDTH / 2, 2.5), (WIDTH / 2, 2.5), (WIDTH / 2, 20), (-WIDTH / 2, 20
 STRAIGHT = np.zeros(len(marking.AHEAD))  # a line that is expected straight ahead of the centre camera
 
 
+def find_line(strips, expected):
+    """Return what `find_lines` finds in one row."""
+    return marking.find_lines(strips[None], expected[None])[0]
+
+
 def paint(lines, brightness=210, road=110):
     """Return strips of a straight road, uint8 (3, 32, 160, 3), with lines at these m right of the centre camera."""
     strips = np.random.default_rng(0).normal(road, 4, (3, *STRIP_SHAPE)).clip(0, 255).astype(np.uint8)
@@ -34,22 +39,30 @@ def paint(lines, brightness=210, road=110):
 @pytest.mark.parametrize("right", [-1.0, -0.4, 0.0, 0.25, 0.9])
 @pytest.mark.parametrize("road, brightness", [(110, 210), (40, 60)])
 def test_a_line_is_found_where_it_is_painted(right, road, brightness):
-    found = marking.find_line(paint([right], brightness, road), STRAIGHT)
+    found = find_line(paint([right], brightness, road), STRAIGHT)
     assert found == pytest.approx(right, abs=0.04)
-    assert marking.find_line(paint([right + 1.5], brightness, road), STRAIGHT + 1.5) == pytest.approx(right, abs=0.1)
+    assert find_line(paint([right + 1.5], brightness, road), STRAIGHT + 1.5) == pytest.approx(right, abs=0.1)
 
 
 def test_no_line_is_found_where_there_is_none_or_more_than_one():
-    assert np.isnan(marking.find_line(paint([]), STRAIGHT)).all()
-    assert np.isnan(marking.find_line(paint([2.5]), STRAIGHT)).all()  # out of reach
-    assert np.isnan(marking.find_line(paint([-0.5, 0.5]), STRAIGHT)).all()
-    assert np.isnan(marking.find_line(paint([0]), np.full_like(STRAIGHT, np.nan))).all()  # behind a crest
+    assert np.isnan(find_line(paint([]), STRAIGHT)).all()
+    assert np.isnan(find_line(paint([2.5]), STRAIGHT)).all()  # out of reach
+    assert np.isnan(find_line(paint([-0.5, 0.5]), STRAIGHT)).all()
+    assert np.isnan(find_line(paint([0]), np.full_like(STRAIGHT, np.nan))).all()  # behind a crest
 
 
 def test_the_edge_of_a_shadow_is_no_line():
     strips = paint([])
     strips[:, :, 80:] //= 3
-    assert np.isnan(marking.find_line(strips, STRAIGHT)).all()
+    assert np.isnan(find_line(strips, STRAIGHT)).all()
+
+
+def test_each_row_is_searched_on_its_own():
+    strips = np.stack([paint([right]) for right in (-0.6, 0.4, 2.5)])
+    expected = np.stack([STRAIGHT, STRAIGHT + 0.1, STRAIGHT])
+    np.testing.assert_array_equal(
+        marking.find_lines(strips, expected), [find_line(*row) for row in zip(strips, expected, strict=True)]
+    )
 
 
 def test_detections_need_support():

@@ -25,7 +25,7 @@ from cloning.compute import one_thread
 from cloning.cores import threads
 from cloning.errors import ModelError, UserError
 from cloning.lane.place import place, shipped_networks
-from cloning.lane.reader import LaneNetwork, detect_centres, read_row_strips
+from cloning.lane.reader import LaneNetwork, detect_centres, read_strips
 from cloning.pilot.network import load_model, steer
 from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
@@ -76,8 +76,8 @@ def lane(recording: Recording) -> Result:
         of_parts = [detect_centres(part, network) for part in parts(recording)]
         return np.concatenate(of_parts or [np.empty((0, 3, 5), np.float32)])
 
-    def strips(row: int) -> np.ndarray:
-        return read_row_strips(recording, row)
+    def strips(rows: slice) -> np.ndarray:
+        return read_strips(recording, rows)
 
     position, placed = place(recording, stretches(recording), detect, strips, shipped_networks())
     x, y = np.full((2, n), np.nan, np.float32)

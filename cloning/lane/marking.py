@@ -18,6 +18,7 @@ LINE, FLANK = 0.25, 0.35  # m: width over which brightness is averaged, and from
 MIN_CONTRAST = 0.08  # of the line, relative to the road beside it, averaged over a part
 MIN_PROMINENCE = 1.6  # contrast of the line relative to that of any other line within reach
 APART = 0.3  # m: lines closer together count as one
+ROWS_AT_ONCE = 64  # of a recording: more do not fit into a core's cache
 NEAR_ROWS, SUPPORT, AGREEMENT = 7, 8, 0.3  # of a detection: see `supported`
 
 BESIDE = round(FLANK / STEP)  # points
@@ -37,48 +38,51 @@ MIDDLE, ROWS = _strip_pixels(0.0)  # the camera is level, so that a row of pixel
 COLUMNS_PER_METRE = _strip_pixels(1.0)[0] - MIDDLE
 
 
-def line_contrast(strip: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Return by how much points are brighter than the road on both of their sides: float32 (k, m), relative, 0..1.
+def line_contrast(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Return by how much points are brighter than the road on both of their sides: float32 (n, k, m), relative, 0..1.
 
-    strip: uint8 (32, 160, 3); expected: float (k,), m right of its camera, at AHEAD; the points are at AHEAD, and at
-    ACROSS from there. The contrast is 0 where a point is not seen.
+    strips: uint8 (n, 32, 160, 3), n at most 1,000; expected: float (n, k), m right of each strip's camera, at AHEAD;
+    the points are at AHEAD, and at ACROSS from there. The contrast is 0 where a point is not seen.
     """
-    columns = (MIDDLE[:, None] + COLUMNS_PER_METRE[:, None] * (expected[:, None] + SEEN)).astype(np.float32)
-    rows = np.repeat(ROWS.astype(np.float32)[:, None], len(SEEN), axis=1)
+    columns = (MIDDLE[:, None] + COLUMNS_PER_METRE[:, None] * (expected[..., None] + SEEN)).astype(np.float32)
     seen = (columns > 0) & (columns < STRIP_SHAPE[1] - 1)
-    above = cv2.remap(cv2.cvtColor(strip, cv2.COLOR_RGB2GRAY), columns, rows, cv2.INTER_LINEAR).astype(np.float32)
-    bright = cv2.blur(above, (round(LINE / STEP), 1), borderType=cv2.BORDER_REPLICATE)
-    left, middle, right = bright[:, : -2 * BESIDE], bright[:, BESIDE:-BESIDE], bright[:, 2 * BESIDE :]
+    # All strips as one image, one below the other: OpenCV's calls take longer than its work on a single strip.
+    tops = np.arange(len(strips))[:, None] * STRIP_SHAPE[0]
+    rows = np.repeat((tops + ROWS).astype(np.float32).reshape(-1, 1), len(SEEN), axis=1)
+    gray = cv2.cvtColor(strips.reshape(-1, *STRIP_SHAPE[1:]), cv2.COLOR_RGB2GRAY)
+    above = cv2.remap(gray, columns.reshape(rows.shape), rows, cv2.INTER_LINEAR).astype(np.float32)
+    bright = cv2.blur(above, (round(LINE / STEP), 1), borderType=cv2.BORDER_REPLICATE).reshape(columns.shape)
+    left, middle, right = bright[..., : -2 * BESIDE], bright[..., BESIDE:-BESIDE], bright[..., 2 * BESIDE :]
     beside = np.maximum(left, right)
     contrast = np.clip((middle - beside) / (beside + 10), 0, 1)
-    return np.where(seen[:, : -2 * BESIDE] & seen[:, 2 * BESIDE :], contrast, 0)
+    return np.where(seen[..., : -2 * BESIDE] & seen[..., 2 * BESIDE :], contrast, 0)
 
 
-def find_line(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Return how far right of where it is expected the centre line is painted, at DISTANCES: float64 (3,), m.
+def find_lines(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Return how far right of where it is expected the centre line is painted, at DISTANCES: float64 (n, 3), m.
 
-    strips: uint8 (3, 32, 160, 3), of the three cameras; expected: float (k,), m right of the centre camera, at AHEAD,
-    nan where it is out of sight. The result is nan where no line is found, or more than one.
+    strips: uint8 (n, 3, 32, 160, 3), of the three cameras in n rows of a recording, at most ROWS_AT_ONCE; expected:
+    float (n, k), m right of the centre camera, at AHEAD, nan where it is out of sight. The result is nan where no line
+    is found, or more than one.
     """
-    known = np.nan_to_num(expected, nan=1e3)
-    contrasts = [line_contrast(strip, known - mount) for strip, mount in zip(strips, MOUNT_OFFSETS, strict=True)]
-    contrast = np.max(contrasts, axis=0)
-    found = np.full(len(PARTS), np.nan)
-    for k, part in enumerate(PARTS):
-        profile = np.convolve(contrast[part].mean(0), np.array([1, 2, 1]) / 4, "same")
-        peak = ACROSS[profile.argmax()]
-        others = profile[np.abs(ACROSS - peak) > APART]
-        if profile.max() >= max(MIN_CONTRAST, MIN_PROMINENCE * others.max()):
-            near = np.abs(ACROSS - peak) < LINE
-            found[k] = (ACROSS[near] * profile[near]).sum() / profile[near].sum()
-    return found
+    from_cameras = np.nan_to_num(expected, nan=1e3)[:, None] - MOUNT_OFFSETS[:, None]
+    contrast = line_contrast(strips.reshape(-1, *STRIP_SHAPE), from_cameras.reshape(-1, len(AHEAD)))
+    contrast = contrast.reshape(*strips.shape[:2], *contrast.shape[1:]).max(1)
+    profile = np.stack([contrast[:, part].mean(1) for part in PARTS], axis=1).astype(float)
+    padded = np.pad(profile, [(0, 0), (0, 0), (1, 1)])
+    profile = (padded[..., :-2] + 2 * profile + padded[..., 2:]) / 4
+    away = np.abs(ACROSS - ACROSS[profile.argmax(2)][..., None])
+    others = np.where(away > APART, profile, 0).max(2)
+    near = np.where(away < LINE, profile, 0)
+    found = (near @ ACROSS) / np.maximum(near.sum(2), 1e-9)
+    return np.where(profile.max(2) >= np.maximum(MIN_CONTRAST, MIN_PROMINENCE * others), found, np.nan)
 
 
 def supported(found: np.ndarray) -> np.ndarray:
     """Return the detections with which others agree, and nan for the rest: float (n, 3), m.
 
-    found: of `find_line`, in successive rows. At least SUPPORT of those up to NEAR_ROWS before and after must be within
-    AGREEMENT m of a detection: what looks like a line in a few frames only is the edge of a shadow, or a post.
+    found: of `find_lines`, in successive rows. At least SUPPORT of those up to NEAR_ROWS before and after must be
+    within AGREEMENT m of a detection: what looks like a line in a few frames only is the edge of a shadow, or a post.
     """
     padded = np.pad(found, [(NEAR_ROWS, NEAR_ROWS), (0, 0)], constant_values=np.nan)
     near = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEAR_ROWS + 1, axis=0).reshape(len(found), 1, -1)

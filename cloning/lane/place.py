@@ -7,6 +7,7 @@ corrects it. The filter gives less weight to detections that are outliers. Where
 passes add the line's detections (`marking.py`), which are several times as exact.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -50,7 +51,7 @@ MIN_LOCALISED_ROWS = 300
 # Stretches of 300 rows of real recordings have -0.25 to 0 on their own track, -0.45 or less on the other.
 MIN_LOG_LIKELIHOOD = -0.35
 
-Strips = Callable[[int], np.ndarray]  # returns those of the three cameras in a recording's row: uint8 (3, 32, 160, 3)
+Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
 
 
 def centre_ahead(
@@ -63,10 +64,10 @@ def centre_ahead(
     """
     near = (round(s / track.step) + VISIBLE_POINTS) % len(track.points)
     away = track.points[near, :2] - camera
-    forward = away @ (np.cos(heading), np.sin(heading))
-    right = away @ (np.sin(heading), -np.cos(heading))
-    back = np.flatnonzero(np.diff(forward) <= 0)
-    end = back[0] + 1 if len(back) else len(forward)
+    along, across = math.cos(heading), math.sin(heading)
+    right, forward = (away @ np.array([[across, along], [-along, across]])).T
+    back = forward[1:] <= forward[:-1]
+    end = back.argmax() + 1 if back.any() else len(forward)
     return np.interp(distances, forward[:end], right[:end], right=np.nan)
 
 
@@ -97,6 +98,8 @@ class TrackFilter:
         """
         self.track, self.step, self.turn = track, np.diff(stretch.driven), np.diff(stretch.heading)
         self.slip = stretch.slip
+        noise = NOISE_PER_METRE * self.step[:, None] + NOISE_PER_RADIAN * np.abs(self.turn)[:, None] + NOISE_PER_ROW
+        self.process_noise = noise[:, :, None] ** 2 * np.eye(3)
         self.measured = np.median(centres + MOUNT_OFFSETS[:, None], axis=1)
         self.distances, self.noise = DISTANCES_AHEAD, np.tile(MEASUREMENT_NOISE, (len(stretch), 1))
         if marks is not None:
@@ -137,6 +140,10 @@ class TrackFilter:
         camera = camera_position(np.array([axle.x, axle.y]), np.array([np.cos(heading), np.sin(heading)]))
         return centre_ahead(self.track, s, camera, heading, distances)
 
+    def centres_at(self, states: np.ndarray, distances: np.ndarray) -> np.ndarray:
+        """Return `centre_at` for n states, (n, 3): float64 (n, k)."""
+        return np.array([self.centre_at(state, distances) for state in states])
+
     def expect(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the expected measurement, (k,), and its Jacobian by the state, (k, 3); nan out of sight."""
         s, right, yaw = state
@@ -147,39 +154,52 @@ class TrackFilter:
         by_s = (1 - bend * right) * (slope * np.cos(yaw) + np.sin(yaw)) + bend * by_yaw
         return centre, np.stack([by_s, slope * np.sin(yaw) - np.cos(yaw), by_yaw], axis=1)
 
-    def run(self, s: float, n: int, smooth: bool = False) -> tuple[np.ndarray, float]:
-        """Filter the first n rows from a candidate position s; return states and log-likelihood.
 
-        float64 (n, 3) if smooth, else only the last state: (1, 3).
-        """
-        x, p = np.array([s, 0.0, 0.0]), INITIAL_COVARIANCE
-        filtered, predicted, log_likelihood = [], [], 0.0
-        for row in range(n):
-            f = np.eye(3)
+class Candidate:
+    """A candidate position in a stretch's first row, which a filter follows along the track row by row."""
+
+    def __init__(self, follower: TrackFilter, s: float) -> None:
+        """s: m along the track."""
+        self.follower, self.s, self.log_likelihood = follower, s, 0.0
+        # Means and covariances of the states: predicted, with the Jacobian that led to it, and corrected.
+        self.predicted: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self.filtered: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def follow(self, end: int) -> float:
+        """Filter the rows before `end` that are still to do; return a detection's log-likelihood, on average."""
+        follower = self.follower
+        for row in range(len(self.filtered), end):
             if row:
-                x, f = self.predict(row - 1, x)
-                noise = (
-                    NOISE_PER_METRE * self.step[row - 1] + NOISE_PER_RADIAN * abs(self.turn[row - 1]) + NOISE_PER_ROW
-                )
-                p = f @ p @ f.T + np.diag(noise**2)
-            predicted.append((x, p, f))
-            expected, jacobian = self.expect(x)
-            visible, measured = ~np.isnan(jacobian).any(1), ~np.isnan(self.measured[row])
+                x, p = self.filtered[-1]
+                x, f = follower.predict(row - 1, x)
+                p = f @ p @ f.T + follower.process_noise[row - 1]
+            else:
+                x, p, f = np.array([self.s, 0.0, 0.0]), INITIAL_COVARIANCE, np.eye(3)
+            self.predicted.append((x, p, f))
+            expected, jacobian = follower.expect(x)
+            measured, noise = follower.measured[row], follower.noise[row]
+            visible = ~np.isnan(jacobian[:, 0])
+            counted = ~np.isnan(measured)
             # By a distribution of twice the noise's width.
-            error = np.where(visible, (self.measured[row] - expected) / (2 * self.noise[row]), MISSING_DETECTION)
-            log_likelihood -= np.log1p(error[measured] ** 2).mean()
-            for k in np.flatnonzero(visible & measured):
+            error = np.where(visible, (measured - expected) / (2 * noise), MISSING_DETECTION)[counted]
+            self.log_likelihood -= float(np.log1p(error * error).sum()) / len(error)
+            for k in np.flatnonzero(visible & counted):
                 h = jacobian[k]
-                innovation = self.measured[row, k] - expected[k] - h @ (x - predicted[-1][0])
-                variance = h @ p @ h
-                outlier = max(1.0, innovation**2 / (variance + self.noise[row, k] ** 2) / OUTLIER_THRESHOLD**2)
-                gain = p @ h / (variance + self.noise[row, k] ** 2 * outlier)
-                x, p = x + gain * innovation, p - np.outer(gain, h @ p)
-            filtered.append((x, p))
-        states = [filtered[-1][0]]
-        for (x, p), (y, q, f) in zip(filtered[-2::-1], predicted[:0:-1], strict=True) if smooth else ():
+                spread = p @ h
+                innovation = float(measured[k] - expected[k] - h @ (x - self.predicted[-1][0]))
+                variance, variance_measured = float(h @ spread), float(noise[k]) ** 2
+                outlier = max(1.0, innovation**2 / (variance + variance_measured) / OUTLIER_THRESHOLD**2)
+                gain = spread / (variance + variance_measured * outlier)
+                x, p = x + gain * innovation, p - gain[:, None] * spread
+            self.filtered.append((x, p))
+        return self.log_likelihood / end
+
+    def smooth(self) -> np.ndarray:
+        """Return the states of the rows that were filtered, each corrected by the later ones: float64 (n, 3)."""
+        states = [self.filtered[-1][0]]
+        for (x, p), (y, q, f) in zip(self.filtered[-2::-1], self.predicted[:0:-1], strict=True):
             states.append(x + p @ f.T @ np.linalg.solve(q, states[-1] - y))
-        return np.array(states[::-1]), log_likelihood / n
+        return np.array(states[::-1])
 
 
 def candidate_positions(follower: TrackFilter) -> list[tuple[float, float]]:
@@ -209,24 +229,26 @@ def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
     for name in ROADS:
         for direction in ("ccw", "cw"):
             follower = TrackFilter(stretch, centres, Track(name, direction))
-            candidates += [(deviation, follower, s) for deviation, s in candidate_positions(follower)]
+            candidates += [(deviation, Candidate(follower, s)) for deviation, s in candidate_positions(follower)]
     for count, rows in SEARCH:
-        candidates = sorted(candidates, key=lambda candidate: candidate[0])[:count]
-        candidates = [(-follower.run(s, min(rows, n))[1], follower, s) for _, follower, s in candidates]
-    _, follower, s = min(candidates, key=lambda candidate: candidate[0])
-    return Localisation(follower.track, *follower.run(s, n, smooth=True))
+        best = sorted(candidates, key=lambda candidate: candidate[0])[:count]
+        candidates = [(-candidate.follow(min(rows, n)), candidate) for _, candidate in best]
+    _, found = min(candidates, key=lambda candidate: candidate[0])
+    log_likelihood = found.follow(n)
+    return Localisation(found.follower.track, found.smooth(), log_likelihood)
 
 
-def line_deviations(localisation: Localisation, stretch: Stretch, follower: TrackFilter, strips: Strips) -> np.ndarray:
-    """Return how far right of the track's centre line a painted one is found: float64 (n, 3), m, of `find_line`.
+def line_deviations(expected: np.ndarray, stretch: Stretch, strips: Strips) -> np.ndarray:
+    """Return how far right of a stretch's expected centre line a painted one is found: float64 (n, 3), m.
 
-    localisation, follower: of the stretch, on the same track. Raises RecordingError for unreadable images.
+    expected: float64 (n, k), m right of the centre camera, at `marking.AHEAD`. See `marking.find_lines`. Raises
+    RecordingError for unreadable images.
     """
-    found = [
-        marking.find_line(strips(stretch.rows.start + row), follower.centre_at(state, marking.AHEAD))
-        for row, state in enumerate(localisation.states)
-    ]
-    return np.array(found)
+    found = []
+    for start in range(0, len(expected), marking.ROWS_AT_ONCE):
+        part, first = expected[start : start + marking.ROWS_AT_ONCE], stretch.rows.start + start
+        found.append(marking.find_lines(strips(slice(first, first + len(part))), part))
+    return np.concatenate(found)
 
 
 def follow_line(localisation: Localisation, stretch: Stretch, centres: np.ndarray, strips: Strips) -> Localisation:
@@ -236,11 +258,13 @@ def follow_line(localisation: Localisation, stretch: Stretch, centres: np.ndarra
     """
     follower = TrackFilter(stretch, centres, localisation.track)
     for _ in range(LINE_ROUNDS):
-        found = marking.supported(line_deviations(localisation, stretch, follower, strips))
-        expected = [follower.centre_at(state, marking.DISTANCES) for state in localisation.states]
-        follower = TrackFilter(stretch, centres, localisation.track, np.array(expected) + found)
-        states, _ = follower.run(localisation.states[0, 0], len(found), smooth=True)
-        localisation = replace(localisation, states=states)
+        centre = follower.centres_at(localisation.states, np.r_[marking.AHEAD, marking.DISTANCES])
+        expected, near = np.split(centre, [len(marking.AHEAD)], axis=1)
+        found = marking.supported(line_deviations(expected, stretch, strips))
+        follower = TrackFilter(stretch, centres, localisation.track, near + found)
+        again = Candidate(follower, localisation.states[0, 0])
+        again.follow(len(stretch))
+        localisation = replace(localisation, states=again.smooth())
     return localisation
 
 

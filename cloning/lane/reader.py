@@ -180,24 +180,22 @@ class LanePosition:
     trusted: np.ndarray
 
 
-def read_row_strips(recording: Recording, row: int) -> np.ndarray:
-    """Return the strips of one row's three cameras: uint8 (3, 32, 160, 3). Raises RecordingError."""
-    frame, strips = np.zeros(FRAME, np.uint8), []
-    for camera in range(3):
-        frame[ROAD_ROWS] = recording.road(row, camera)
-        strips.append(extract_strip(frame))
-    return np.stack(strips)
+def read_strips(recording: Recording, rows: slice = slice(None)) -> np.ndarray:
+    """Return the strips of a recording's three cameras in these rows: uint8 (n, 3, 32, 160, 3). Raises RecordingError.
 
-
-def read_strips(recording: Recording) -> np.ndarray:
-    """Return the strips of a recording's three cameras: uint8 (n, 3, 32, 160, 3). Raises RecordingError."""
-    strips = np.empty((len(recording), 3, *STRIP_SHAPE), np.uint8)
+    rows: without a step.
+    """
+    first, end, _ = rows.indices(len(recording))
+    strips = np.empty((end - first, 3, *STRIP_SHAPE), np.uint8)
 
     def read(row: int) -> None:
-        strips[row] = read_row_strips(recording, row)
+        frame = np.zeros(FRAME, np.uint8)
+        for camera in range(3):
+            frame[ROAD_ROWS] = recording.road(row, camera)
+            strips[row - first, camera] = extract_strip(frame)
 
     with ThreadPoolExecutor(threads()) as pool:
-        for _ in pool.map(read, range(len(recording))):
+        for _ in pool.map(read, range(first, end)):
             pass
     return strips
 

@@ -27,6 +27,7 @@ SLIP = 0.005  # radians per m/s² of lateral acceleration, to the outside of a b
 OFF_ROAD = 4.5  # m from the lane's centre: further away the car has left the road, and frames show no lane
 MIN_TRUSTED = 0.7  # share of a stretch's rows whose lane is trusted; below it, the human driver's path is used instead
 MIN_SPEED = 1.0  # m/s: slower rows are standstills, whose frames tell nothing about steering
+TURNED_RIGHT = np.array([1, -1])  # signs of a vector's components, exchanged, of the vector to its right
 
 Values = TypeVar("Values", float, np.ndarray)
 
@@ -38,7 +39,7 @@ def forward_vector(heading: np.ndarray | float) -> np.ndarray:
 
 def right_of(forward: np.ndarray) -> np.ndarray:
     """Return the unit vector to the right of another: (…, 2); both (right, forward) or both (x east, y north)."""
-    return np.stack([forward[..., 1], -forward[..., 0]], axis=-1)
+    return forward[..., ::-1] * TURNED_RIGHT
 
 
 def wrap_angle(angle: Values) -> Values:
