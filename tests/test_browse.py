@@ -74,7 +74,7 @@ def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
     """Rows placed on the lake at known places get these coordinates; what is not placed has none."""
     recording, track = read_recording(sample_recording), Track("lake", "cw")
     s = np.linspace(100, 120, 40)
-    placed = Localisation(track, np.stack([s, np.full(40, 1.5), np.zeros(40)], axis=1), 0.0)
+    placed = Localisation(track, np.stack([s, np.full(40, 1.5), np.zeros(40)], axis=1), 0.0, 0.0)
     monkeypatch.setattr("cloning.lane.place.localise_all", lambda *_: [(slice(10, 50), placed)])
     monkeypatch.setattr(analyse, "detect_centres", lambda part, _: np.zeros((len(part), 3, 5), np.float32))
     result = analyse.lane(recording)

@@ -50,6 +50,9 @@ LINE_ROUNDS = 2  # in the second, the painted line is expected where the first o
 MIN_LOCALISED_ROWS = 300
 # Stretches of 300 rows of real recordings have -0.25 to 0 on their own track, -0.45 or less on the other.
 MIN_LOG_LIKELIHOOD = -0.35
+# Real recordings and rendered drives have 0.12 to 0.33 on the lake and 0.56 to 0.92 in the jungle. Laps of generated
+# roads, which a position on a track can follow nearly as well, have at least 1.5; 300 m of gentle ones at least 0.67.
+MAX_TURN_RESIDUAL = {"lake": 0.5, "jungle": 1.2}
 
 Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
 
@@ -80,11 +83,20 @@ class Localisation:
                     right of its centre line; heading error, radians to its right
     log_likelihood  of a detection, on average, for a Cauchy distribution: 0 where detections agree with the track,
                     -2.3 where they have nothing to do with it
+    turn_residual   root mean square of what the heading errors change by besides what steering and track make of them,
+                    in standard deviations of the process noise: 1 at most on the right track, where the car turns as
+                    it steers
     """
 
     track: Track
     states: np.ndarray
     log_likelihood: float
+    turn_residual: float
+
+    def is_certain(self) -> bool:
+        """Tell whether the stretch certainly is on this track."""
+        likely = self.log_likelihood > MIN_LOG_LIKELIHOOD
+        return likely and self.turn_residual < MAX_TURN_RESIDUAL[self.track.name]
 
 
 class TrackFilter:
@@ -201,6 +213,14 @@ class Candidate:
             states.append(x + p @ f.T @ np.linalg.solve(q, states[-1] - y))
         return np.array(states[::-1])
 
+    def turn_residual(self, states: np.ndarray) -> float:
+        """Return that of `Localisation`; states: of `smooth`."""
+        before, after = (np.array([step[0] for step in steps]) for steps in (self.filtered[:-1], self.predicted[1:]))
+        jacobian = np.array([f[2] for _, _, f in self.predicted[1:]])
+        expected = after[:, 2] + (jacobian * (states[:-1] - before)).sum(1)
+        variance = self.follower.process_noise[: len(expected), 2, 2]
+        return float(np.sqrt(np.mean((states[1:, 2] - expected) ** 2 / variance)))
+
 
 def candidate_positions(follower: TrackFilter) -> list[tuple[float, float]]:
     """Find positions on the track at which the road bends like the stretch; only local minima of the deviation.
@@ -234,8 +254,8 @@ def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
         best = sorted(candidates, key=lambda candidate: candidate[0])[:count]
         candidates = [(-candidate.follow(min(rows, n)), candidate) for _, candidate in best]
     _, found = min(candidates, key=lambda candidate: candidate[0])
-    log_likelihood = found.follow(n)
-    return Localisation(found.follower.track, found.smooth(), log_likelihood)
+    log_likelihood, states = found.follow(n), found.smooth()
+    return Localisation(found.follower.track, states, log_likelihood, found.turn_residual(states))
 
 
 def line_deviations(expected: np.ndarray, stretch: Stretch, strips: Strips) -> np.ndarray:
@@ -277,7 +297,7 @@ def localise_all(stretches: list[Stretch], centres: np.ndarray, strips: Strips) 
         if len(stretch) >= MIN_LOCALISED_ROWS:
             detected = centres[stretch.rows]
             localisation = localise(stretch, detected)
-            if localisation.log_likelihood > MIN_LOG_LIKELIHOOD:
+            if localisation.is_certain():
                 if ROADS[localisation.track.name].centre_line:
                     localisation = follow_line(localisation, stretch, detected, strips)
                 yield stretch.rows, localisation
