@@ -34,6 +34,7 @@ from cloning.lane.reader import (
     fuse_detections,
     load_network,
     normalize,
+    read_strips,
 )
 from cloning.recordings.format import FRAME, ROAD_ROWS, SAMPLE_RATE
 from cloning.recordings.log import read_recording
@@ -190,6 +191,11 @@ def test_the_shipped_network_on_rendered_frames(track, look, error, bias, slope)
     assert np.abs(np.nanmean((found - true)[:, :3])) < bias
     for k in range(3):
         assert np.polyfit(true[:, k], found[:, k], 1)[0] == pytest.approx(1, abs=slope)
+
+
+def test_strips_of_some_rows(drive):
+    recording, _ = drive
+    assert np.array_equal(read_strips(recording, slice(5, 9)), read_strips(recording)[5:9])
 
 
 def test_mirrored_frames_mirror_the_place():

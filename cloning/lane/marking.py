@@ -18,7 +18,7 @@ LINE, FLANK = 0.25, 0.35  # m: width over which brightness is averaged, and from
 MIN_CONTRAST = 0.08  # of the line, relative to the road beside it, averaged over a part
 MIN_PROMINENCE = 1.6  # contrast of the line relative to that of any other line within reach
 APART = 0.3  # m: lines closer together count as one
-ROWS_AT_ONCE = 64  # of a recording: more do not fit into a core's cache
+ROWS_AT_ONCE = 64  # of a recording, 96 rows each of one image; OpenCV takes images of up to 32,767
 NEAR_ROWS, SUPPORT, AGREEMENT = 7, 8, 0.3  # of a detection: see `supported`
 
 BESIDE = round(FLANK / STEP)  # points
@@ -46,7 +46,7 @@ def line_contrast(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """
     columns = (MIDDLE[:, None] + COLUMNS_PER_METRE[:, None] * (expected[..., None] + SEEN)).astype(np.float32)
     seen = (columns > 0) & (columns < STRIP_SHAPE[1] - 1)
-    # All strips as one image, one below the other: OpenCV's calls take longer than its work on a single strip.
+    # All strips as one image, one below the other, so that OpenCV is called once for all instead of once for each.
     tops = np.arange(len(strips))[:, None] * STRIP_SHAPE[0]
     rows = np.repeat((tops + ROWS).astype(np.float32).reshape(-1, 1), len(SEEN), axis=1)
     gray = cv2.cvtColor(strips.reshape(-1, *STRIP_SHAPE[1:]), cv2.COLOR_RGB2GRAY)
