@@ -35,7 +35,7 @@ from cloning.replay.replay import ReferenceLine, drive, load_recording, referenc
 from cloning.training.options import ROBUST_DEFAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
-IMAGES, BATCH = 6_500, 8  # enough for one lap of the lake; writeup_report.md has what was tried
+IMAGES, BATCH = 6_500, 8  # enough for one lap of the lake; tools/experiments.md has what was tried
 
 
 class Result(NamedTuple):

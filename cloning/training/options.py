@@ -43,7 +43,7 @@ class Arguments:
 # With --robust, many small steps learn most from the warped images. After 30,000 of the jungle, Muon had a val_loss of
 # 0.065, 0.056, 0.051 and 0.053 at 5e-4, 1e-3, 2e-3 and 4e-3, which learned most (Adam at 1e-3: 0.068); after 8,000 of
 # a lake lap 0.013, 0.008 and 0.007 at 2e-3, 4e-3 and 8e-3. Four epochs of 70 recordings had the val_loss of 28 with
-# Adam, 0.017. writeup_report.md has more.
+# Adam, 0.017. tools/experiments.md has more.
 ROBUST_DEFAULTS = {"epochs": 4, "batch_size": 16, "learning_rate": 4e-3, "samples_per_epoch": 60_000}
 ROBUST_METHOD = {"optimizer": "muon", "loss": "huber"}
 REPORT_ONLY = ("throttle_threshold", "side_correction")  # options without an effect in a --robust run
