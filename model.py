@@ -89,9 +89,8 @@ def read_observations(kind: type[Kind], folders: list[Path], arguments: Argument
     print(summary.recordings_table(counts, kind.dropped(arguments)))
     if len(observations) < FOLDS:
         why = kind.too_few if rows.dropped > rows.unusable else f"see {rejected_file}"
-        raise RecordingError(
-            f"{len(observations)} of {rows.rows_read} rows are left, at least {FOLDS} are needed: {why}"
-        )
+        left = f"{len(observations)} of {rows.rows_read} rows are left"
+        raise RecordingError(f"{left}, at least {FOLDS} are needed: {why}")
     return observations
 
 
@@ -192,7 +191,8 @@ class CameraViews(Views):
 
 def kind_inputs(images: np.ndarray) -> list[np.ndarray]:
     """Return the four kinds of image before brightening and shadowing: uint8 (n, rows, columns, 3) each."""
-    return [images, images[:, :, ::-1], images, images]
+    flipped = cv2.flip(images.reshape(-1, *images.shape[2:]), 1).reshape(images.shape)
+    return [images, flipped, images, images]
 
 
 def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, to: int, back: int) -> np.ndarray:
@@ -223,9 +223,10 @@ def shade(images: np.ndarray, lines: np.ndarray, left: np.ndarray, factors: np.n
     """
     rows = np.arange(first_row, first_row + images.shape[1])
     edges = (lines[:, :1] + (lines[:, 1:] - lines[:, :1]) * rows / FRAME[0]).astype(np.float32)
-    shadow = (np.arange(images.shape[2], dtype=np.float32) < edges[:, :, None]) == left[:, None, None]
-    dark = multiply_channel(images, 1, factors, cv2.COLOR_RGB2HLS, cv2.COLOR_HLS2RGB)
-    return np.where(shadow[..., None], dark, images)
+    lit = (np.arange(images.shape[2], dtype=np.float32) < edges[:, :, None]) != left[:, None, None]
+    shaded = multiply_channel(images, 1, factors, cv2.COLOR_RGB2HLS, cv2.COLOR_HLS2RGB)
+    np.copyto(shaded.view("V3"), images.view("V3"), where=lit[..., None])  # whole pixels: in a tenth of the time
+    return shaded
 
 
 def augment(choices: Choices, part: np.ndarray, images: list[np.ndarray], first_row: int) -> list[Augmented]:
@@ -264,9 +265,8 @@ class Generator:
         rng, n = np.random.default_rng([self.arguments.seed, 3, number]), self.arguments.batch_size
         at = np.arange(number * n, (number + 1) * n)
         passes = at // len(self.observations)  # over all observations, each in another order
-        chosen = np.concatenate(
-            [self.shuffled(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
-        )
+        parts = [self.shuffled(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
+        chosen = np.concatenate(parts)
         camera = rng.integers(len(CAMERAS), size=n)
         kinds = np.stack([np.ones(n, bool), rng.random(n) < FLIP, np.ones(n, bool), rng.random(n) < SHADOW], axis=1)
         total_images = int(kinds.sum())

@@ -20,7 +20,7 @@ from cloning.recordings.format import FRAME, ROAD_ROWS
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
-from cloning.road.warp import ground_mask
+from cloning.road.warp import ground_mask, with_alpha
 from cloning.training import light, robust
 from cloning.training.adam import Adam
 from cloning.training.observations import SEEN_SHAPE
@@ -165,7 +165,7 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
     expected = plane(right + AXLE_TO_CAMERA * np.sin(yaw), AXLE_TO_CAMERA * np.cos(yaw), yaw, mirrored)[
         CROP[0] : FIRST_BONNET_ROW
     ]
-    wrong = np.abs(poses.view(0, read).astype(int) - expected).max(2)
+    wrong = np.abs(poses.view(0, lambda *frame: with_alpha(read(*frame))).astype(int) - expected).max(2)
     assert np.percentile(wrong[12:], 95) <= 3  # of 255
     assert np.median(wrong[12:]) <= 1
     assert poses.steering[0] == pytest.approx(one.steering(right, yaw)[0] * (-1 if mirrored else 1), rel=1e-6)
@@ -356,7 +356,7 @@ def test_shadows_darken_parts_of_some_images():
 def test_a_pose_with_a_shadow_is_seen_in_it(monkeypatch):
     many = lanes(monkeypatch, 0.05, offset=0.4).take(np.full(200, 100))
     poses = many.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
-    grey = np.full((90, 320, 3), 150, np.uint8)
+    grey = np.full((90, 320, 4), 150, np.uint8)
     views = np.stack([poses.view(at, lambda camera, earlier: grey) for at in range(200)])
     shaded = np.ptp(views, axis=(1, 2)).max(1) > 20  # of 150 in each colour
     assert not shaded[poses.shade < 0].any()

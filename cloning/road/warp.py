@@ -77,6 +77,28 @@ def warp(
     return warped, seen
 
 
+def with_alpha(image: np.ndarray) -> np.ndarray:
+    """Return an RGB image with a fourth channel, which OpenCV warps alike, in two thirds of the time."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2RGBA)
+
+
+def _warp_ground(rows: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return a frame's rows, warped by a homography, (3, 3), to this many columns and rows: uint8."""
+    return cv2.warpPerspective(rows, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def fill_ground(view: np.ndarray, missing: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> None:
+    """Fill in the ground that is missing in a view of `CroppedView` from another frame.
+
+    view: uint8 (75, 320, c), is changed; missing: uint8 (75, 320), 255 where it is; rows: `ROAD_ROWS` of the other
+    frame, uint8 (90, 320, c); matrix: that for the ground, (3, 3), of `CroppedView.homographies`.
+    """
+    left, top, width, height = cv2.boundingRect(missing)
+    box = slice(top, top + height), slice(left, left + width)
+    other = _warp_ground(rows, _shifted(top, left) @ matrix, (width, height))  # no more: it takes the longest
+    cv2.copyTo(other, missing[box], view[box])
+
+
 class CroppedView:
     """Warps recorded frames to the rows that a network sees, as from another pose.
 
@@ -112,13 +134,13 @@ class CroppedView:
         return homographies(right, forward, heading - axle[:, 2], to_pixels, self.from_pixels)
 
     def warp(self, rows: np.ndarray, matrices: np.ndarray, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return a view, uint8 (75, 320, 3), and a mask, uint8 (75, 320): 255 where the camera really saw it.
+        """Return a view, uint8 (75, 320, c), and a mask, uint8 (75, 320): 255 where the camera really saw it.
 
-        rows: uint8 (90, 320, 3), `ROAD_ROWS` of a frame; matrices: float64 (2, 3, 3), of `homographies`; mirrored:
+        rows: uint8 (90, 320, c), `ROAD_ROWS` of a frame; matrices: float64 (2, 3, 3), of `homographies`; mirrored:
         whether they are for the mirrored world.
         """
         ground, sky = matrices
-        view = self.warp_ground(rows, ground)
+        view = _warp_ground(rows, ground, (self.columns, self.rows))
         seen = cv2.warpPerspective(
             road_mask()[ROAD_ROWS],
             ground,
@@ -131,8 +153,3 @@ class CroppedView:
         cv2.copyTo(far, self.sky[mirrored], view[: self.sky_rows])
         np.bitwise_or(seen[: self.sky_rows], self.sky[mirrored], out=seen[: self.sky_rows])
         return view, seen
-
-    def warp_ground(self, rows: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        """Return a view, uint8 (75, 320, 3), as if all of it were ground; matrix: that for the ground, (3, 3)."""
-        size = self.columns, self.rows
-        return cv2.warpPerspective(rows, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

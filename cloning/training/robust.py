@@ -29,7 +29,7 @@ from cloning.road.motion import (
     forward_vector,
     stretches,
 )
-from cloning.road.warp import CroppedView
+from cloning.road.warp import CroppedView, fill_ground, with_alpha
 from cloning.training import light
 from cloning.training.observations import SEEN_SHAPE, Example, Observations, ValidationSet, Views, center_digests
 from cloning.training.options import Arguments
@@ -177,15 +177,14 @@ class Poses:
     def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:
         """Return what the network sees of one row: uint8 (75, 320, 3), RGB.
 
-        at: index of the row; read(camera, earlier): returns the `ROAD_ROWS` of the camera's frame, uint8, in the row
-        or in the earlier one.
+        at: index of the row; read(camera, earlier): returns the `ROAD_ROWS` of the camera's frame in the row or in the
+        earlier one, uint8 (90, 320, 4), RGBA, which is warped faster.
         """
         camera, mirrored = int(self.camera[at]), bool(self.mirrored[at])
         image, seen = VIEW.warp(read(camera, False), self.warps[at, 0], mirrored)
         if not seen.all():  # only ground can be missing
-            earlier = VIEW.warp_ground(read(camera, True), self.warps[at, 1, 0])
-            cv2.copyTo(earlier, cv2.bitwise_not(seen), image)
-        return light.relight(image, self.colours[at], int(self.shade[at]))
+            fill_ground(image, cv2.bitwise_not(seen), read(camera, True), self.warps[at, 1, 0])
+        return light.relight(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), self.colours[at], int(self.shade[at]))
 
     def title(self, at: int) -> str:
         """Return the pose that an image shows in words, such as `0.8 m left, turned 5° right`; at: index of the row."""
@@ -293,8 +292,9 @@ class RobustObservations(Observations):
         return images
 
     def read_source(self, at: int, camera: int, earlier: bool) -> np.ndarray:
-        """Return the `ROAD_ROWS` of an observation's frame, or of the earlier row's: uint8 (90, 320, 3), RGB."""
-        return self.road(self.recording[at], self.lanes.earlier[at] if earlier else self.row[at], camera)
+        """Return the `ROAD_ROWS` of an observation's frame, or of the earlier row's: uint8 (90, 320, 4), RGBA."""
+        row = self.lanes.earlier[at] if earlier else self.row[at]
+        return with_alpha(self.road(self.recording[at], row, camera))
 
 
 class PoseViews(Views):
