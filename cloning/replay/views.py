@@ -2,14 +2,15 @@
 
 import functools
 
+import cv2
 import numpy as np
 
 from cloning.recordings.format import FRAME
 from cloning.recordings.images import read_image
 from cloning.recordings.log import Recording
-from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, FIRST_BONNET_ROW, camera_position
+from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, FIRST_BONNET_ROW, camera_position, homographies
 from cloning.road.motion import AXLE_TO_CAMERA, Stretch, components, forward_vector, right_of
-from cloning.road.warp import warp
+from cloning.road.warp import fill_ground, warp, with_alpha
 
 WHOLE = slice(0, FRAME[0])  # rows of a frame
 
@@ -52,32 +53,23 @@ class StretchViews:
         offset = right + AXLE_TO_CAMERA * np.sin(yaw)
         camera = int(np.argmin([abs(offset - mounted) for mounted in CAMERA_OFFSETS.values()]))
         # From the first row on, whichever are asked for: OpenCV rounds the sky of another box differently.
-        view, seen = self._warp(at, camera, position, heading, (0, FIRST_BONNET_ROW, 0, FRAME[1]))
+        pose = self._pose(at, camera, position, heading)
+        view, seen = warp(with_alpha(self.frame(at, camera)), *pose, FIRST_BONNET_ROW)
         driven = self.stretch.driven
         earlier = int(np.searchsorted(driven, driven[at] - EARLIER_FRAME, "right")) - 1
-        unseen = ~seen
-        if earlier >= 0 and unseen.any():
-            (top, bottom), (left, right_end) = (np.flatnonzero(unseen.any(axis))[[0, -1]] + (0, 1) for axis in (1, 0))
-            box = np.s_[top:bottom, left:right_end]
-            earlier_view, _ = self._warp(earlier, camera, position, heading, (top, bottom, left, right_end))
-            np.copyto(view[box], earlier_view, where=unseen[box][..., None])
-        return np.concatenate([view[rows], self.frame(at, 0)[FIRST_BONNET_ROW : rows.stop]])
+        if earlier >= 0 and not seen.all():
+            ground, _ = homographies(*self._pose(earlier, camera, position, heading))
+            fill_ground(view, (~seen).view(np.uint8), with_alpha(self.frame(earlier, camera)), ground)
+        bonnet = self.frame(at, 0)[FIRST_BONNET_ROW : rows.stop]
+        return np.concatenate([cv2.cvtColor(view[rows], cv2.COLOR_RGBA2RGB), bonnet])
 
     def _axle(self, at: int) -> np.ndarray:
         """Return the middle of the rear axle, float64 (2,): m, right and forward in the stretch's frame."""
         return np.array([self.stretch.right[at], self.stretch.forward[at]])
 
-    def _warp(
-        self,
-        at: int,
-        camera: int,
-        position: np.ndarray,
-        heading: float,
-        box: tuple[int, int, int, int],
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return a camera's frame warped to another position, (2,), and heading; see `warp`."""
+    def _pose(self, at: int, camera: int, position: np.ndarray, heading: float) -> tuple[float, float, float]:
+        """Return a camera's position, (2,), and heading relative to a recorded one: m right, m forward, radians."""
         forward = forward_vector(self.stretch.heading[at])
         mounted = list(CAMERA_OFFSETS.values())[camera]
         moved = components(position - camera_position(self._axle(at), forward, mounted), forward)
-        pose = float(moved[0]), float(moved[1]), float(heading - self.stretch.heading[at])
-        return warp(self.frame(at, camera), *pose, box)
+        return float(moved[0]), float(moved[1]), float(heading - self.stretch.heading[at])

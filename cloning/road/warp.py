@@ -46,34 +46,22 @@ def road_mask() -> np.ndarray:
 
 
 def warp(
-    frame: np.ndarray,
-    right: float,
-    forward: float,
-    yaw: float,
-    box: tuple[int, int, int, int] = (0, FRAME[0], 0, FRAME[1]),
+    frame: np.ndarray, right: float, forward: float, yaw: float, end: int = FRAME[0]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a frame warped to this pose relative to its camera, and which of the pixels the camera really saw.
 
-    frame: uint8 (160, 320, 3); right, forward: m; yaw: radians; box: top, bottom, left and right of the part to
-    compute, bottom and right exclusive. Returns uint8 (rows, columns, 3) and bool (rows, columns); a pixel that was not
-    seen repeats the nearest one at the border.
+    frame: uint8 (160, 320, c); right, forward: m; yaw: radians; end: only the rows before this one are computed, and at
+    least `FIRST_ROW_WITHOUT_SKY`. Returns uint8 (end, 320, c) and bool (end, 320); a pixel that was not seen, which may
+    only be ground, repeats the nearest one at the border.
     """
-    top, bottom, left, end = box
-    width = end - left
     ground, sky = homographies(right, forward, yaw)
-    warped = np.empty((bottom - top, width, 3), np.uint8)
-    seen = np.ones(warped.shape[:2], bool)
-    if top < FIRST_ROW_WITHOUT_SKY:
-        height = min(bottom, FIRST_ROW_WITHOUT_SKY) - top
-        matrix = _shifted(top, left) @ sky
-        warped[:height] = cv2.warpPerspective(frame, matrix, (width, height), borderMode=cv2.BORDER_REFLECT_101)
-    first = max(top, FIRST_GROUND_ROW)
-    if first < bottom:
-        matrix, size = _shifted(first, left) @ ground, (width, bottom - first)
-        below = cv2.warpPerspective(frame, matrix, size, borderMode=cv2.BORDER_REPLICATE)
-        mask = ground_mask()[first:bottom, left:end]
-        cv2.copyTo(below, mask, warped[first - top :])
-        seen[first - top :] = (cv2.warpPerspective(road_mask(), matrix, size) == 255) | (mask == 0)
+    warped, seen = np.empty((end, *frame.shape[1:]), np.uint8), np.ones((end, FRAME[1]), bool)
+    size = FRAME[1], FIRST_ROW_WITHOUT_SKY
+    warped[:FIRST_ROW_WITHOUT_SKY] = cv2.warpPerspective(frame, sky, size, borderMode=cv2.BORDER_REFLECT_101)
+    matrix, size = _shifted(FIRST_GROUND_ROW) @ ground, (FRAME[1], end - FIRST_GROUND_ROW)
+    mask = ground_mask()[FIRST_GROUND_ROW:end]
+    cv2.copyTo(_warp_ground(frame, matrix, size), mask, warped[FIRST_GROUND_ROW:])
+    seen[FIRST_GROUND_ROW:] = (cv2.warpPerspective(road_mask(), matrix, size) == 255) | (mask == 0)
     return warped, seen
 
 
@@ -88,10 +76,10 @@ def _warp_ground(rows: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) ->
 
 
 def fill_ground(view: np.ndarray, missing: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> None:
-    """Fill in the ground that is missing in a view of `CroppedView` from another frame.
+    """Fill in the ground that is missing in a view from another frame.
 
-    view: uint8 (75, 320, c), is changed; missing: uint8 (75, 320), 255 where it is; rows: `ROAD_ROWS` of the other
-    frame, uint8 (90, 320, c); matrix: that for the ground, (3, 3), of `CroppedView.homographies`.
+    view: uint8 (k, 320, c), is changed; missing: uint8 (k, 320), not 0 where it is; rows: of the other frame, uint8
+    (rows, 320, c); matrix: that from these rows to the view, for the ground, (3, 3).
     """
     left, top, width, height = cv2.boundingRect(missing)
     box = slice(top, top + height), slice(left, left + width)
