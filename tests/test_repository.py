@@ -115,11 +115,19 @@ def test_the_package_carries_every_data_file():
     assert needed == carried
 
 
+def anchors(document: Path) -> set[str]:
+    """The names by which a web page of the document links to its headings, as GitHub forms them."""
+    headings = re.findall(r"^#+ (.*)$", document.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_documents_name_what_exists(document):
     text = document.read_text(encoding="utf-8")
     for link in re.findall(r"\]\((?!https?:)([^)#]+)", text):
         assert (document.parent / link).exists(), link
+    for file, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)", text):
+        assert anchor in anchors(document.parent / file if file else document), f"{file}#{anchor}"
     for tool in re.findall(r"python -m tools\.([a-z_]+)", text):
         assert any((ROOT / "tools" / file).exists() for file in (f"{tool}.py", f"{tool}/__main__.py")), tool
     for path in re.findall(r"`((?:cloning|simulator|tools|tests)/[a-z_/.]*)`", text):

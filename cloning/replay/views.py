@@ -52,8 +52,8 @@ class StretchViews:
         position = camera_position(axle, forward_vector(heading))
         offset = right + AXLE_TO_CAMERA * np.sin(yaw)
         camera = int(np.argmin([abs(offset - mounted) for mounted in CAMERA_OFFSETS.values()]))
-        # From the first row on, whichever are asked for: OpenCV rounds the sky of another box differently.
         pose = self._pose(at, camera, position, heading)
+        # From the first row on, whichever are asked for: OpenCV rounds the sky of other rows differently.
         view, seen = warp(with_alpha(self.frame(at, camera)), *pose, FIRST_BONNET_ROW)
         driven = self.stretch.driven
         earlier = int(np.searchsorted(driven, driven[at] - EARLIER_FRAME, "right")) - 1

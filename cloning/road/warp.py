@@ -66,7 +66,10 @@ def warp(
 
 
 def with_alpha(image: np.ndarray) -> np.ndarray:
-    """Return an RGB image with a fourth channel, which OpenCV warps alike, in two thirds of the time."""
+    """Return an image with a fourth channel, which OpenCV warps to the same pixels in two thirds of the time.
+
+    image: uint8 (rows, columns, 3), RGB; returns uint8 (rows, columns, 4), RGBA.
+    """
     return cv2.cvtColor(image, cv2.COLOR_RGB2RGBA)
 
 
@@ -78,8 +81,8 @@ def _warp_ground(rows: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) ->
 def fill_ground(view: np.ndarray, missing: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> None:
     """Fill in the ground that is missing in a view from another frame.
 
-    view: uint8 (k, 320, c), is changed; missing: uint8 (k, 320), not 0 where it is; rows: of the other frame, uint8
-    (rows, 320, c); matrix: that from these rows to the view, for the ground, (3, 3).
+    view: uint8 (k, 320, c), is changed; missing: uint8 (k, 320), not 0 where ground is missing; rows: of the other
+    frame, uint8 (n, 320, c); matrix: float64 (3, 3), the homography from these rows to the view, for the ground.
     """
     left, top, width, height = cv2.boundingRect(missing)
     box = slice(top, top + height), slice(left, left + width)
