@@ -19,7 +19,8 @@ from conftest import HERE, ROOT, render_recording
 
 from cloning.errors import ModelError, RecordingError
 from cloning.lane import place, reader
-from cloning.lane.place import MIN_LOG_LIKELIHOOD, centre_ahead, estimate_lane_position, localise
+from cloning.lane.ahead import centre_ahead
+from cloning.lane.place import MIN_LOG_LIKELIHOOD, estimate_lane_position, localise
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,

@@ -7,18 +7,20 @@ import numpy as np
 import pytest
 
 from cloning.lane import marking
+from cloning.lane.ahead import centre_ahead, line_ahead
 from cloning.lane.place import place, shipped_networks
 from cloning.lane.reader import DIRECTION_TO_STRIP, MOUNT_OFFSETS, STRIP_SHAPE, estimate_centres, read_strips
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT
-from cloning.road.motion import stretches
+from cloning.road.motion import AXLE_TO_CAMERA, WHEELBASE, stretches
 from cloning.road.track import ROADS, Track
 from simulator.car import STEP
 from simulator.record import record
 
 WIDTH = 0.2  # m, of a painted line
 CORNERS = [(-WIDTH / 2, 2.5), (WIDTH / 2, 2.5), (WIDTH / 2, 20), (-WIDTH / 2, 20)]  # m right and ahead
-STRAIGHT = np.zeros(len(marking.AHEAD))  # a line that is expected straight ahead of the centre camera
+STRAIGHT = np.stack([np.zeros(len(marking.AHEAD)), np.ones(len(marking.AHEAD))])  # straight ahead of the centre camera
+ASIDE = np.array([[1.0], [0]])  # m to the right
 
 
 def find_line(strips, expected):
@@ -26,12 +28,16 @@ def find_line(strips, expected):
     return marking.find_lines(strips[None], expected[None])[0]
 
 
-def paint(lines, brightness=210, road=110):
-    """Return strips of a straight road, uint8 (3, 32, 160, 3), with lines at these m right of the centre camera."""
+def paint(lines, brightness=210, road=110, factor=1.0):
+    """Return strips of a straight road, uint8 (3, 32, 160, 3), with lines at these m right of the centre camera.
+
+    factor: by which distances seem larger than they are.
+    """
     strips = np.random.default_rng(0).normal(road, 4, (3, *STRIP_SHAPE)).clip(0, 255).astype(np.uint8)
     for strip, mount in zip(strips, MOUNT_OFFSETS, strict=True):
         for line in lines:
-            sides = np.array([(line - mount + side, CAMERA_HEIGHT, z) for side, z in CORNERS]) @ DIRECTION_TO_STRIP.T
+            right = line - mount * factor
+            sides = np.array([(right + side, CAMERA_HEIGHT, z) for side, z in CORNERS]) @ DIRECTION_TO_STRIP.T
             cv2.fillPoly(strip, [np.round(sides[:, :2] / sides[:, 2:] * 16).astype(int)], [brightness] * 3, 8, 4)
     return strips
 
@@ -41,7 +47,7 @@ def paint(lines, brightness=210, road=110):
 def test_a_line_is_found_where_it_is_painted(right, road, brightness):
     found = find_line(paint([right], brightness, road), STRAIGHT)
     assert found == pytest.approx(right, abs=0.04)
-    assert find_line(paint([right + 1.5], brightness, road), STRAIGHT + 1.5) == pytest.approx(right, abs=0.1)
+    assert find_line(paint([right + 1.5], brightness, road), STRAIGHT + 1.5 * ASIDE) == pytest.approx(right, abs=0.1)
 
 
 def test_no_line_is_found_where_there_is_none_or_more_than_one():
@@ -49,6 +55,52 @@ def test_no_line_is_found_where_there_is_none_or_more_than_one():
     assert np.isnan(find_line(paint([2.5]), STRAIGHT)).all()  # out of reach
     assert np.isnan(find_line(paint([-0.5, 0.5]), STRAIGHT)).all()
     assert np.isnan(find_line(paint([0]), np.full_like(STRAIGHT, np.nan))).all()  # behind a crest
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+def test_the_cameras_agree_on_a_line_where_the_road_falls_or_rises(factor):
+    """All seems nearer or further than it is there, and the cameras as much nearer to each other or further apart."""
+    strips = paint([0.3], factor=factor)
+    assert find_line(strips, STRAIGHT * [[1], [factor]]) == pytest.approx(0.3, abs=0.04)
+    assert np.isnan(find_line(strips, STRAIGHT)).any()
+
+
+def test_where_a_line_is_seen_on_flat_ground():
+    track, distances = Track("lake"), np.arange(2.0, 9)
+    at = track.at(40)
+    pose = 40, np.array([at.x, at.y]), at.heading + 0.05
+    right, factor = line_ahead(track, *pose, distances)
+    assert right == pytest.approx(centre_ahead(track, *pose, distances), abs=1e-9)
+    assert (factor == 1).all()
+
+
+@pytest.mark.parametrize("bend", [-1, 1])
+def test_where_a_line_is_seen_where_the_road_falls_or_rises(bend):
+    """At the jungle's sharpest crest and dip, against its points, one by one, from a car as steep as the road below."""
+    track = Track("jungle")
+    s = track.step * (bend * (np.roll(track.grade, -10) - track.grade)).argmax()
+    place, front = track.at(s, right=0.5), track.at(s + WHEELBASE)
+    heading = place.heading - 0.07
+    level = np.array([np.cos(heading), np.sin(heading), 0])
+    ahead = level * WHEELBASE + [0, 0, front.z - place.z]
+    ahead /= np.linalg.norm(ahead)
+    right = np.array([level[1], -level[0], 0])
+    up = np.cross(right, ahead)
+    camera = np.array([place.x, place.y, place.z]) + AXLE_TO_CAMERA * ahead + CAMERA_HEIGHT * up
+    points = np.array([(at.x, at.y, at.z) for at in map(track.at, np.arange(s + 3, s + 25, 0.1))]) - camera
+    factors = -CAMERA_HEIGHT / (points @ up)  # to where the ray to the point meets flat ground
+    seen = points @ ahead * factors
+    end = (np.diff(seen) <= 0).argmax() + 1 if (np.diff(seen) <= 0).any() else len(seen)
+    distances = np.arange(2.0, 6, 0.25)
+    found, factor = line_ahead(track, s, np.array([place.x, place.y]) + AXLE_TO_CAMERA * level[:2], heading, distances)
+    expected = np.interp(distances, seen[:end], (points @ right * factors)[:end], right=np.nan)
+    hidden, beyond = np.isnan(found), np.isnan(expected)
+    assert hidden.any() == (bend < 0) and (~hidden).sum() > 5
+    assert (hidden != beyond).sum() <= 1  # the track's points are 1 m apart
+    visible = ~hidden & ~beyond
+    assert found[visible] == pytest.approx(expected[visible], abs=0.02)
+    assert factor[visible] == pytest.approx(np.interp(distances, seen[:end], factors[:end])[visible], abs=0.02)
+    assert ((factor[visible] - 1) * bend > 0.1).any()
 
 
 def test_the_edge_of_a_shadow_is_no_line():
@@ -59,7 +111,7 @@ def test_the_edge_of_a_shadow_is_no_line():
 
 def test_each_row_is_searched_on_its_own():
     strips = np.stack([paint([right]) for right in (-0.6, 0.4, 2.5)])
-    expected = np.stack([STRAIGHT, STRAIGHT + 0.1, STRAIGHT])
+    expected = np.stack([STRAIGHT, STRAIGHT + 0.1 * ASIDE, STRAIGHT])
     np.testing.assert_array_equal(
         marking.find_lines(strips, expected), [find_line(*row) for row in zip(strips, expected, strict=True)]
     )

@@ -154,7 +154,7 @@ def measure_line(recording: Recording, strips: np.ndarray, centres: np.ndarray) 
             continue
         follower, followed = TrackFilter(stretch, detected, found.track), follow_line(found, stretch, detected, seen)
         for label, localisation in (("painted line, m from the centre", found), ("when followed", followed)):
-            away = line_deviations(follower.centres_at(localisation.states, marking.AHEAD), stretch, seen)
+            away = line_deviations(follower.lines_at(localisation.states, marking.AHEAD), stretch, seen)
             median = np.nanmedian(away)
             print(
                 f"  {label:32}median {median:+.2f}, median deviation {np.nanmedian(np.abs(away - median)):.2f}; "

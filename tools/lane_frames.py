@@ -13,7 +13,7 @@ import numpy as np
 from panda3d.core import Point3, TransformState, Vec3
 
 from cloning.compute import threads
-from cloning.lane.place import centre_ahead
+from cloning.lane.ahead import centre_ahead
 from cloning.lane.reader import DISTANCES_AHEAD, STRIP_SHAPE, extract_strip
 from cloning.recordings.images import decode
 from cloning.road.motion import CAMERA_FORWARD

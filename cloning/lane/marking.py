@@ -19,7 +19,7 @@ MIN_CONTRAST = 0.08  # of the line, relative to the road beside it, averaged ove
 MIN_PROMINENCE = 1.6  # contrast of the line relative to that of any other line within reach
 APART = 0.3  # m: lines closer together count as one
 ROWS_AT_ONCE = 64  # of a recording, 96 rows each of one image; OpenCV takes images of up to 32,767
-NEAR_ROWS, SUPPORT, AGREEMENT = 7, 8, 0.3  # of a detection: see `supported`
+NEAR_ROWS, SUPPORT, AGREEMENT = 4, 5, 0.3  # of a detection: see `supported`
 
 BESIDE = round(FLANK / STEP)  # points
 SIDE = round(REACH / STEP) + BESIDE  # points
@@ -62,10 +62,11 @@ def find_lines(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Return how far right of where it is expected the centre line is painted, at DISTANCES: float64 (n, 3), m.
 
     strips: uint8 (n, 3, 32, 160, 3), of the three cameras in n rows of a recording, at most ROWS_AT_ONCE; expected:
-    float (n, k), m right of the centre camera, at AHEAD, nan where it is out of sight. The result is nan where no line
-    is found, or more than one.
+    float (n, 2, k), of `ahead.line_ahead` for the centre camera, at AHEAD. The result is nan where no line is found, or
+    more than one.
     """
-    from_cameras = np.nan_to_num(expected, nan=1e3)[:, None] - MOUNT_OFFSETS[:, None]
+    right, factor = np.nan_to_num(expected, nan=1e3).swapaxes(0, 1)[:, :, None]
+    from_cameras = right - MOUNT_OFFSETS[:, None] * factor
     contrast = line_contrast(strips.reshape(-1, *STRIP_SHAPE), from_cameras.reshape(-1, len(AHEAD)))
     contrast = contrast.reshape(*strips.shape[:2], *contrast.shape[1:]).max(1)
     profile = np.stack([contrast[:, part].mean(1) for part in PARTS], axis=1).astype(float)

@@ -3,8 +3,9 @@
 The centre lines of both tracks are known. Once a recording is localised on one, the lane's centre is known even where
 no single frame shows it well. An extended Kalman filter with a Rauch-Tung-Striebel smoother localises a stretch:
 steering, speed and time stamps predict the rear axle's state, and the lane's centre ahead, as detected by `reader.py`,
-corrects it. The filter gives less weight to detections that are outliers. Where the track's centre is painted, two more
-passes add the line's detections (`marking.py`), which are several times as exact.
+corrects it. The filter gives less weight to detections that are outliers. Where the track's centre is painted, more
+passes add the line's detections (`marking.py`), which are several times as exact; each is linearised about the one
+before, since in sharp bends over crests a filter's own prediction is too far off.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cloning.lane import marking
+from cloning.lane.ahead import centre_ahead, line_ahead
 from cloning.lane.reader import (
     ANY_ROAD_WEIGHTS,
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
-    SMOOTHING_ROWS,
     LaneNetwork,
     LanePosition,
     estimate_centres,
@@ -27,11 +28,13 @@ from cloning.lane.reader import (
 )
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
-from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, components, wrap_angle
+from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, wrap_angle
 from cloning.road.track import ROADS, Track
 
 MEASUREMENT_NOISE = 0.3 + 0.08 * DISTANCES_AHEAD  # standard deviation of a detection at each distance ahead, m
 MARKING_NOISE = 0.02 + 0.03 * marking.DISTANCES  # likewise, of a painted line's
+# The network errs alike in successive rows, so where the line is found, up to so many rows away, its noise counts more.
+LINE_ROWS, BESIDE_LINE = 40, 8.0
 OUTLIER_THRESHOLD = 2.0  # standard deviations beyond which a detection gets less weight
 MISSING_DETECTION = 3.0  # standard deviations that are counted where the track is out of the camera's view
 # Process noise: standard deviations of (s, lateral offset, heading error) that each row adds: per metre driven, per
@@ -41,10 +44,10 @@ NOISE_PER_ROW = np.array([0, 0, 0.003])
 # Covariance of the state at a candidate position: m², m², radians²; candidates are up to 4 m off along the track.
 INITIAL_COVARIANCE = np.diag([4.0**2, 4.0, 0.05])
 SLOPE_STEP = 0.5  # m before and behind a distance ahead, over which the centre line's slope is taken
-VISIBLE_POINTS = np.arange(-6, 40)  # indices, relative to the car, of a track's points that the camera may see
+NEIGHBOURS = np.array([[0], [-SLOPE_STEP], [SLOPE_STEP]])
 PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m: part of the trajectory whose heading is compared, and its step
 SEARCH = ((8, 150), (2, 600))  # two rounds: number of the best candidates that the filter follows, and rows
-LINE_ROUNDS = 2  # in the second, the painted line is expected where the first one found it
+LINE_ROUNDS = 3  # in each, the painted line is expected where the one before found it
 # A shorter stretch may resemble a bend of any track.
 MIN_LOCALISED_ROWS = 300
 # Stretches of 300 rows of real recordings have -0.25 to 0 on their own track, -0.45 or less on the other.
@@ -55,22 +58,6 @@ MIN_LOG_LIKELIHOOD = -0.35
 MAX_TURN_RESIDUAL = {"lake": 0.5, "jungle": 1.2}
 
 Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
-
-
-def centre_ahead(
-    track: Track, s: float, camera: np.ndarray, heading: float, distances: np.ndarray = DISTANCES_AHEAD
-) -> np.ndarray:
-    """Return where a track's centre line lies ahead of a camera: float64 (k,), m to its right.
-
-    s: m along the track near which to look; camera: (2,), its x and y, m; heading: radians, as the track's;
-    distances: (k,), m ahead of the camera. The result is nan beyond the point at which the track turns back.
-    """
-    near = (round(s / track.step) + VISIBLE_POINTS) % len(track.points)
-    away = track.points[near, :2] - camera
-    right, forward = components(away, np.array([np.cos(heading), np.sin(heading)])).T
-    back = forward[1:] <= forward[:-1]
-    end = back.argmax() + 1 if back.any() else len(forward)
-    return np.interp(distances, forward[:end], right[:end], right=np.nan)
 
 
 @dataclass
@@ -112,15 +99,14 @@ class TrackFilter:
         noise = NOISE_PER_METRE * self.step[:, None] + NOISE_PER_RADIAN * np.abs(self.turn)[:, None] + NOISE_PER_ROW
         self.process_noise = noise[:, :, None] ** 2 * np.eye(3)
         self.measured = np.median(centres + MOUNT_OFFSETS[:, None], axis=1)
+        self.has_marks = marks is not None
         self.distances, self.noise = DISTANCES_AHEAD, np.tile(MEASUREMENT_NOISE, (len(stretch), 1))
         if marks is not None:
             self.measured = np.concatenate([self.measured, marks], axis=1)
             self.distances = np.r_[DISTANCES_AHEAD, marking.DISTANCES]
-            # The network errs alike in successive rows, so near the line its detections count less.
             marked = ~np.isnan(marks).all(1)
-            self.noise[np.convolve(marked, np.ones(2 * SMOOTHING_ROWS + 1), "same") > 0] *= 2
+            self.noise[np.convolve(marked, np.ones(2 * LINE_ROWS + 1), "same") > 0.5] *= BESIDE_LINE
             self.noise = np.concatenate([self.noise, np.tile(MARKING_NOISE, (len(stretch), 1))], axis=1)
-        self.with_neighbours = np.r_[self.distances, self.distances - SLOPE_STEP, self.distances + SLOPE_STEP]
 
     def curvature(self, s: float) -> float:
         """Return the track's curvature at s, 1/m, right positive."""
@@ -129,7 +115,8 @@ class TrackFilter:
     def predict(self, row: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the state one row later, (3,), and its Jacobian by this one, (3, 3)."""
         s, right, yaw = state
-        step, turn, slip, bend = self.step[row], self.turn[row], self.slip[row], self.curvature(s)
+        turn, slip, bend = self.turn[row], self.slip[row], self.curvature(s)
+        step = self.step[row] / np.hypot(1, self.track.at(s).grade)  # s is the distance on the map
         slower = max(0.3, 1 - bend * right)  # on the inside of a bend the centre line is the shorter path
         along = step * np.cos(yaw + turn / 2 + slip) / slower
         road_turn = wrap_angle(self.track.at(s).heading - self.track.at(s + along).heading)
@@ -143,27 +130,32 @@ class TrackFilter:
         moved = s + along, right + step * np.sin(yaw + (turn - road_turn) / 2 + slip), yaw + turn - road_turn
         return np.array(moved), jacobian
 
-    def centre_at(self, state: np.ndarray, distances: np.ndarray) -> np.ndarray:
-        """Return where the centre line lies at distances ahead of the centre camera: float64 (k,), m to its right."""
+    def camera_at(self, state: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the centre camera's x and y, (2,), m, and its heading, radians."""
         s, right, yaw = state
         axle = self.track.at(s, right)
         heading = axle.heading - yaw
-        camera = camera_position(np.array([axle.x, axle.y]), np.array([np.cos(heading), np.sin(heading)]))
-        return centre_ahead(self.track, s, camera, heading, distances)
+        return camera_position(np.array([axle.x, axle.y]), np.array([np.cos(heading), np.sin(heading)])), heading
 
-    def centres_at(self, states: np.ndarray, distances: np.ndarray) -> np.ndarray:
-        """Return `centre_at` for n states, (n, 3): float64 (n, k)."""
-        return np.array([self.centre_at(state, distances) for state in states])
+    def lines_at(self, states: np.ndarray, distances: np.ndarray) -> np.ndarray:
+        """Return where the line along the centre is seen at n states, (n, 3): float64 (n, 2, k); see `line_ahead`."""
+        return np.array([line_ahead(self.track, state[0], *self.camera_at(state), distances) for state in states])
 
     def expect(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the expected measurement, (k,), and its Jacobian by the state, (k, 3); nan out of sight."""
         s, right, yaw = state
-        centre, before, after = self.centre_at(state, self.with_neighbours).reshape(3, -1)
+        camera = self.camera_at(state)
+        seen = centre_ahead(self.track, s, *camera, DISTANCES_AHEAD + NEIGHBOURS)
+        factor = np.ones(len(DISTANCES_AHEAD))
+        if self.has_marks:
+            line, factors = line_ahead(self.track, s, *camera, marking.DISTANCES + NEIGHBOURS)
+            seen, factor = np.concatenate([seen, line], axis=1), np.r_[factor, factors[0]]
+        centre, before, after = seen
         slope = (after - before) / (2 * SLOPE_STEP)
         bend = self.curvature(s)
-        by_yaw = -(self.distances + AXLE_TO_CAMERA) - slope * centre  # the car turns about its rear axle
-        by_s = (1 - bend * right) * (slope * np.cos(yaw) + np.sin(yaw)) + bend * by_yaw
-        return centre, np.stack([by_s, slope * np.sin(yaw) - np.cos(yaw), by_yaw], axis=1)
+        by_yaw = -(self.distances + AXLE_TO_CAMERA * factor) - slope * centre  # the car turns about its rear axle
+        by_s = (1 - bend * right) * (slope * np.cos(yaw) + np.sin(yaw)) * factor + bend * by_yaw
+        return centre, np.stack([by_s, (slope * np.sin(yaw) - np.cos(yaw)) * factor, by_yaw], axis=1)
 
 
 class Candidate:
@@ -176,18 +168,24 @@ class Candidate:
         self.predicted: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         self.filtered: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def follow(self, end: int) -> float:
-        """Filter the rows before `end` that are still to do; return a detection's log-likelihood, on average."""
+    def follow(self, end: int, around: np.ndarray | None = None) -> float:
+        """Filter the rows before `end` that are still to do; return a detection's log-likelihood, on average.
+
+        around: states of all rows, (n, 3), about which to linearise, of an earlier `smooth`; None: the filter's own.
+        """
         follower = self.follower
         for row in range(len(self.filtered), end):
             if row:
                 x, p = self.filtered[-1]
-                x, f = follower.predict(row - 1, x)
+                about = x if around is None else around[row - 1]
+                moved, f = follower.predict(row - 1, about)
+                x = moved + f @ (x - about)
                 p = f @ p @ f.T + follower.process_noise[row - 1]
             else:
                 x, p, f = np.array([self.s, 0.0, 0.0]), INITIAL_COVARIANCE, np.eye(3)
             self.predicted.append((x, p, f))
-            expected, jacobian = follower.expect(x)
+            about = x if around is None else around[row]
+            expected, jacobian = follower.expect(about)
             measured, noise = follower.measured[row], follower.noise[row]
             visible = ~np.isnan(jacobian[:, 0])
             counted = ~np.isnan(measured)
@@ -197,7 +195,7 @@ class Candidate:
             for k in np.flatnonzero(visible & counted):
                 h = jacobian[k]
                 spread = p @ h
-                innovation = float(measured[k] - expected[k] - h @ (x - self.predicted[-1][0]))
+                innovation = float(measured[k] - expected[k] - h @ (x - about))
                 variance, variance_measured = float(h @ spread), float(noise[k]) ** 2
                 outlier = max(1.0, innovation**2 / (variance + variance_measured) / OUTLIER_THRESHOLD**2)
                 gain = spread / (variance + variance_measured * outlier)
@@ -260,7 +258,7 @@ def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
 def line_deviations(expected: np.ndarray, stretch: Stretch, strips: Strips) -> np.ndarray:
     """Return how far right of a stretch's expected centre line a painted one is found: float64 (n, 3), m.
 
-    expected: float64 (n, k), m right of the centre camera, at `marking.AHEAD`. See `marking.find_lines`. Raises
+    expected: float64 (n, 2, k), of `TrackFilter.lines_at`, at `marking.AHEAD`. See `marking.find_lines`. Raises
     RecordingError for unreadable images.
     """
     found = []
@@ -277,12 +275,12 @@ def follow_line(localisation: Localisation, stretch: Stretch, centres: np.ndarra
     """
     follower = TrackFilter(stretch, centres, localisation.track)
     for _ in range(LINE_ROUNDS):
-        centre = follower.centres_at(localisation.states, np.r_[marking.AHEAD, marking.DISTANCES])
-        expected, near = np.split(centre, [len(marking.AHEAD)], axis=1)
+        centre = follower.lines_at(localisation.states, np.r_[marking.AHEAD, marking.DISTANCES])
+        expected, near = centre[..., : len(marking.AHEAD)], centre[:, 0, len(marking.AHEAD) :]
         found = marking.supported(line_deviations(expected, stretch, strips))
         follower = TrackFilter(stretch, centres, localisation.track, near + found)
         again = Candidate(follower, localisation.states[0, 0])
-        again.follow(len(stretch))
+        again.follow(len(stretch), localisation.states)
         localisation = replace(localisation, states=again.smooth())
     return localisation
 
