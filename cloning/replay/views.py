@@ -60,8 +60,10 @@ class StretchViews:
         if earlier >= 0 and not seen.all():
             ground, _ = homographies(*self._pose(earlier, camera, position, heading))
             fill_ground(view, (~seen).view(np.uint8), with_alpha(self.frame(earlier, camera)), ground)
-        bonnet = self.frame(at, 0)[FIRST_BONNET_ROW : rows.stop]
-        return np.concatenate([cv2.cvtColor(view[rows], cv2.COLOR_RGBA2RGB), bonnet])
+        road = cv2.cvtColor(view[rows], cv2.COLOR_RGBA2RGB)
+        if rows.stop <= FIRST_BONNET_ROW:
+            return road  # another camera's frame may do, and the centre one need not be decoded
+        return np.concatenate([road, self.frame(at, 0)[FIRST_BONNET_ROW : rows.stop]])
 
     def _axle(self, at: int) -> np.ndarray:
         """Return the middle of the rear axle, float64 (2,): m, right and forward in the stretch's frame."""
