@@ -62,8 +62,8 @@ def find_lines(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Return how far right of where it is expected the centre line is painted, at DISTANCES: float64 (n, 3), m.
 
     strips: uint8 (n, 3, 32, 160, 3), of the three cameras in n rows of a recording, at most ROWS_AT_ONCE; expected:
-    float (n, 2, k), of `ahead.line_ahead` for the centre camera, at AHEAD. The result is nan where no line is found, or
-    more than one.
+    float (n, 2, k), of `ahead.line_ahead` for the centre camera, at AHEAD, nan where it is out of sight. The result is
+    nan where no line is found, or more than one.
     """
     right, factor = np.nan_to_num(expected, nan=1e3).swapaxes(0, 1)[:, :, None]
     from_cameras = right - MOUNT_OFFSETS[:, None] * factor
