@@ -1,6 +1,7 @@
 """Replaying recordings: the integration against geometry, known drivers' scores, and the real commands."""
 
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -9,6 +10,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import av
 import cv2
@@ -28,6 +30,7 @@ from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
 from cloning.replay.autonomy import LIMITS
 from cloning.replay.drivers import ModelDriver
+from cloning.replay.processes import CAN_FORK
 from cloning.replay.score import ReplayFilm, driving_metrics, steering_metrics
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
 
@@ -301,21 +304,27 @@ def test_rows_compressed_alone_are_those_of_the_whole_frame(first):
     assert made.stop - made.start <= 75 + 2 * 16
 
 
-def test_drives_at_several_limits_ask_the_model_once_until_they_part(recording):
-    """They are the same as one after the other."""
+def weaving(frame) -> float:
+    return float(np.clip(frame.human_steering + 0.03 * (frame.row > 100), -1, 1))
 
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_drives_at_several_limits_are_those_at_each_limit(recording, parallel):
+    limits, lines, watched = (2.0, 1.0, 2.5), human(recording), []
+    expected = [replay.drive(recording, lines, limit, weaving) for limit in limits]
+    done = command.drive_at_limits(recording, lines, weaving, limits, lambda _, d: watched.append(d.limit), parallel)
+    assert done == expected and len(done[0].interventions) < len(done[1].interventions)
+    assert watched == [2.5] * len(recording)
+
+
+@pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
+def test_each_limit_is_driven_in_a_process_of_its_own(recording, tmp_path):
     def driver(frame):
-        asked.append((frame.row, frame.pose))
-        return float(np.clip(frame.human_steering + 0.03 * (frame.row > 100), -1, 1))
+        (tmp_path / str(os.getpid())).touch()
+        return frame.human_steering
 
-    limits, lines, asked = (1.0, 2.0, 2.5), human(recording), []
-    expected = [replay.drive(recording, lines, limit, driver) for limit in limits]
-    views, asked = set(asked), []
-    done = command.drive_at_limits(recording, lines, driver, dict.fromkeys(limits), parallel=True)
-    assert done == expected
-    parted = min(expected[0].interventions)
-    assert parted > 100 and sorted(asked) == sorted(views)
-    assert [row for row, _ in sorted(asked)[: parted + 2]] == [*range(parted), parted, parted], "two from there on"
+    command.drive_at_limits(recording, human(recording), driver, LIMITS, parallel=True)
+    assert len(list(tmp_path.iterdir())) == len(LIMITS) and (tmp_path / str(os.getpid())).exists()
 
 
 @pytest.mark.parametrize(
@@ -363,18 +372,62 @@ def test_a_full_disk_costs_the_film_alone(folder, model, tmp_path):
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]["2"]
 
 
-def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording):
-    rows = []
+def kill_itself():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fail():
+    raise SimulatorError("the network's steering is not finite")
+
+
+@pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
+@pytest.mark.parametrize(("at_fault", "message"), [(fail, "not finite"), (kill_itself, "was killed")])
+def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording, at_fault, message):
+    """At the first limit, while the last one is driven in this process."""
+    rows, this = [], os.getpid()
 
     def driver(frame):
+        if os.getpid() != this and frame.row == 50:
+            at_fault()
+        time.sleep(0.01)
         rows.append(frame.row)
-        if len(rows) > 100:
-            raise SimulatorError("the network's steering is not finite")
+        return 0.0
+
+    with pytest.raises(SimulatorError, match=message):
+        command.drive_at_limits(recording, human(recording), driver, (1.0, 2.0, 3.0), parallel=True)
+    assert len(rows) < 200 and not multiprocessing.active_children()
+
+
+@pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
+def test_an_error_in_this_process_ends_the_others(recording):
+    this = os.getpid()
+
+    def driver(frame):
+        if os.getpid() == this:
+            fail()
+        time.sleep(1)
         return 0.0
 
     with pytest.raises(SimulatorError, match="not finite"):
-        command.drive_at_limits(recording, human(recording), driver, {1.0: None, 2.0: None, 3.0: None}, parallel=True)
-    assert len(rows) < 110
+        command.drive_at_limits(recording, human(recording), driver, LIMITS, parallel=True)
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
+def test_ctrl_c_ends_drives_in_processes_with_one_message(folder, model, tmp_path):
+    """The terminal sends it to all of them."""
+    log = tmp_path / "log"
+    with log.open("w") as file:
+        command_line = [sys.executable, "-m", "simulator", "replay", folder, "--model", model, "--limit", *"123456789"]
+        command_line += ["--reference", "human"]
+        process = subprocess.Popen(command_line, cwd=ROOT, stderr=file, start_new_session=True)
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        while len(children.read_text().split()) < 8:
+            assert process.poll() is None
+            time.sleep(0.01)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(20) == 130
+    assert log.read_text() == "simulator: stopped; the files that it has written are complete\n"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot send itself Ctrl-C")
@@ -388,7 +441,7 @@ def test_ctrl_c_ends_a_drive_that_waits_for_a_server(recording):
 
     with pytest.raises(KeyboardInterrupt):
         begin = time.monotonic()
-        command.drive_at_limits(recording, human(recording), driver, {1.0: None, 2.5: None}, parallel=False)
+        command.drive_at_limits(recording, human(recording), driver, LIMITS)
     assert time.monotonic() - begin < 15
 
 

@@ -1,17 +1,16 @@
 """The command `python -m simulator replay`: a model drives real recordings."""
 
-import threading
+import functools
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from tqdm import tqdm
 
-from cloning.errors import SimulatorError
 from cloning.outputs import check_folders, run_all, write_json
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.drivers import ModelDriver, ServerDriver
+from cloning.replay.processes import CAN_FORK, ForkedDrives
 from cloning.replay.replay import (
     Drive,
     Driver,
@@ -23,8 +22,6 @@ from cloning.replay.replay import (
     reference_lines,
 )
 from cloning.replay.score import ReplayFilm, ReplayReport, replay_report, report_text, write_plot
-
-KEPT_ANSWERS = 1000  # views: drives at the same pose are few rows apart
 
 
 @dataclass(frozen=True)
@@ -60,11 +57,8 @@ def run(options: Options) -> None:
     folders = find_folders(options.folders)
     in_process = options.model is not None
     driver = ModelDriver(options.model) if options.model else ServerDriver(options.host, options.port, options.wait)
-    # One drive per limit; drives may run at the same time, so only the one at the last limit is filmed.
-    watchers: dict[float, Watcher | None] = dict.fromkeys(options.limits)
+    limits = list(dict.fromkeys(options.limits))  # each once
     film = ReplayFilm(options.film) if options.film else None
-    if film:
-        watchers[options.limits[-1]] = film.watch
     reports: list[ReplayReport] = []
 
     def replay_all() -> None:
@@ -73,7 +67,7 @@ def run(options: Options) -> None:
             lines = reference_lines(recording, options.reference == "lane")
             if film:
                 film.begin(recording)
-            drives = drive_at_limits(recording, lines, driver, watchers, in_process)
+            drives = drive_at_limits(recording, lines, driver, limits, film.watch if film else None, in_process)
             reports.append(replay_report(recording, lines, drives, options.reference))
             print(report_text(reports[-1]), flush=True)
             if options.picture:
@@ -90,71 +84,44 @@ def run(options: Options) -> None:
     run_all(*steps)
 
 
-class AskedOnce:
-    """A driver of several drives of a recording, which asks another driver only once about each view.
-
-    Until the first intervention in a stretch, the drives at all limits are the same.
-    """
-
-    def __init__(self, driver: Driver):
-        """driver: it must answer a view always alike."""
-        self.driver, self.lock = driver, threading.Lock()
-        self.answers: dict[tuple[int, float, float], Future[float]] = {}
-
-    def __call__(self, frame: ReplayFrame) -> float:
-        """Return the driver's steering, or raise its error; wait if another thread has asked and it computes still."""
-        view = frame.row, *frame.pose
-        with self.lock:
-            is_new = view not in self.answers
-            answer = self.answers.setdefault(view, Future())
-            if len(self.answers) > KEPT_ANSWERS:
-                del self.answers[next(iter(self.answers))]
-        if is_new:
-            try:
-                answer.set_result(self.driver(frame))
-            except BaseException as error:
-                answer.set_exception(error)
-        return answer.result()
-
-
 def drive_at_limits(
     recording: Recording,
     lines: list[ReferenceLine],
     driver: Driver,
-    watchers: dict[float, Watcher | None],
-    parallel: bool,
+    limits: Sequence[float],
+    watch: Watcher | None = None,
+    parallel: bool = False,
 ) -> list[Drive]:
-    """Return the drives of a recording at each limit, in the order of `watchers`.
+    """Return the drives of a recording at each limit, in this order.
 
-    parallel: drive in a thread per limit, by a driver that answers a view always alike. If one drive fails, or on
-    Ctrl-C, the others stop at their next row. Otherwise drive in this thread, which Ctrl-C interrupts also while it
-    waits for a server.
+    watch: of the drive at the last limit, called after each row, or None. parallel: on Linux, drive at all limits at
+    the same time, each in a process of its own but the last, which is driven in this one; the driver must not learn
+    from one drive anything that it needs in another. If one drive fails, or on Ctrl-C, the others are ended.
     """
     rows = sum(len(line.stretch) for line in lines)
-    stopped = threading.Event()
-    driver = AskedOnce(driver) if parallel else driver
 
-    def drive_at(limit: float) -> Drive:
-        film = watchers[limit]
+    def drive_at(place: int, watch: Watcher | None = None) -> Drive:
+        limit = limits[place]
         name = f"{recording.folder.name}, limit {limit:g} m"
-        with tqdm(total=rows, desc=name, unit="row", disable=None, leave=False) as bar:
+        with tqdm(total=rows, desc=name, unit="row", disable=None, leave=False, position=place) as bar:
 
-            def watch(frame: ReplayFrame, done: Drive) -> None:
-                if stopped.is_set():
-                    raise SimulatorError("stopped")
+            def after_row(frame: ReplayFrame, done: Drive) -> None:
                 bar.update()
-                if film:
-                    film(frame, done)
+                if watch:
+                    watch(frame, done)
 
-            return drive(recording, lines, limit, driver, watch)
+            return drive(recording, lines, limit, driver, after_row)
 
-    if not parallel:
-        return [drive_at(limit) for limit in watchers]
-    with ThreadPoolExecutor(len(watchers)) as pool:
-        drives = [pool.submit(drive_at, limit) for limit in watchers]
-        try:
-            return [done.result() for done in drives]
-        except BaseException:
-            stopped.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    *others, last = range(len(limits))
+    if not (parallel and CAN_FORK):
+        return [*map(drive_at, others), drive_at(last, watch)]
+    with ForkedDrives([functools.partial(drive_at, place) for place in others]) as forked:
+
+        def watch_all(frame: ReplayFrame, done: Drive) -> None:
+            forked.collect(0)
+            if watch:
+                watch(frame, done)
+
+        drive_at_last = drive_at(last, watch_all)
+        forked.collect(None)
+        return [*(forked.results[place] for place in others), drive_at_last]

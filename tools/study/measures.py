@@ -51,7 +51,7 @@ def offline(network: Network, recording: Recording) -> dict[str, float]:
 def replayed(recording: Recording, lines: list[ReferenceLine], driver: ModelDriver) -> dict[str, float]:
     """Return what replays of a recording measure: NVIDIA's autonomy at both limits, distances, and drift."""
     found: dict[str, float] = {}
-    for done in drive_at_limits(recording, lines, driver, dict.fromkeys(LIMITS), parallel=True):
+    for done in drive_at_limits(recording, lines, driver, LIMITS, parallel=True):
         limit = done.limit
         metres = float(np.sum(np.abs(recording.speed[done.row]) * MPH * done.seconds))
         found[f"autonomy_{limit:g}"] = done.autonomy()

@@ -1,0 +1,72 @@
+"""Drives of a recording in processes of their own: in threads, they would wait for one another's Python code."""
+
+import multiprocessing
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from types import TracebackType
+from typing import Self
+
+from cloning.errors import SimulatorError, UserError
+from cloning.replay.replay import Drive
+
+CAN_FORK = sys.platform == "linux"  # elsewhere, libraries do not survive a fork
+
+
+class ForkedDrives:
+    """Drives that run in forked processes, one each; a context, at whose end none of them runs any more."""
+
+    def __init__(self, drives: Sequence[Callable[[], Drive]]):
+        """Start them; what they change in memory is lost, but for the Drive that each returns."""
+        context = multiprocessing.get_context("fork")
+        self.processes: list[BaseProcess] = []
+        self.pending: dict[Connection, int] = {}  # where a drive's result will come from -> its number
+        self.results: dict[int, Drive] = {}
+        # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            for number, drive in enumerate(drives):
+                receiver, sender = context.Pipe(duplex=False)
+                process = context.Process(target=_send_result, args=(drive, sender), daemon=True)
+                process.start()
+                sender.close()
+                self.processes.append(process)
+                self.pending[receiver] = number
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        for process in self.processes:
+            process.terminate()
+        for process in self.processes:
+            process.join()
+
+    def collect(self, timeout: float | None) -> None:
+        """Take the results that are there, and wait for all others, each for so many seconds; None: until it is there.
+
+        Raises the UserError of a drive that failed, and SimulatorError if its process ended without a result.
+        """
+        while self.pending and (ready := wait(self.pending, timeout)):
+            for receiver in ready:
+                assert isinstance(receiver, Connection)
+                try:
+                    result = receiver.recv()
+                except EOFError:
+                    raise SimulatorError("the process of a drive was killed, or failed with the error above") from None
+                if isinstance(result, UserError):
+                    raise result
+                self.results[self.pending.pop(receiver)] = result
+
+
+def _send_result(drive: Callable[[], Drive], sender: Connection) -> None:
+    """Send what a drive returns, or the UserError that it raises."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        sender.send(drive())
+    except UserError as error:
+        sender.send(error)
