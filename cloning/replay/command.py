@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 from tqdm import tqdm
 
 from cloning.outputs import check_folders, run_all, write_json
@@ -115,6 +116,7 @@ def drive_at_limits(
     *others, last = range(len(limits))
     if not (parallel and CAN_FORK):
         return [*map(drive_at, others), drive_at(last, watch)]
+    cv2.setNumThreads(1)  # its threads do not survive a fork, and the other drives need the cores
     with ForkedDrives([functools.partial(drive_at, place) for place in others]) as forked:
 
         def watch_all(frame: ReplayFrame, done: Drive) -> None:

@@ -2,8 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-import cv2
-
 from cloning.errors import SimulatorError
 from cloning.recordings.format import FRAME
 from cloning.replay.replay import ReplayFrame
@@ -50,9 +48,7 @@ class ModelDriver:
 
         from cloning.pilot.network import load_model, steer
 
-        # Drives at several limits run at the same time, and in forked processes no other threads are left.
-        torch.set_num_threads(1)
-        cv2.setNumThreads(1)
+        torch.set_num_threads(1)  # other drives run at the same time
         self.network = load_model(model) if isinstance(model, str) else model
         top, bottom = self.network.crop
         self.rows = slice(top, FRAME[0] - bottom)  # of a frame, which the network sees
