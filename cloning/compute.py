@@ -66,12 +66,17 @@ def repeatable(device: torch.device) -> None:
 
 
 def keep_freed_memory() -> None:
-    """Make glibc keep freed blocks instead of returning them to the system: a training step is 8 to 20 % faster."""
+    """Make glibc keep freed blocks instead of returning them to the system: a training step is 8 to 20 % faster.
+
+    All threads share one arena, because those of other threads consist of heaps of 64 MB, which are returned whatever
+    the limits: in float32, a batch of 474 images took 60,000 page faults and 8 % more time in three of four runs.
+    """
     if sys.platform == "linux":
         libc = ctypes.CDLL(None)
         if hasattr(libc, "mallopt"):
             libc.mallopt(-1, 1 << 30)  # M_TRIM_THRESHOLD
             libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD
+            libc.mallopt(-8, 1)  # M_ARENA_MAX
 
 
 def one_thread() -> None:
