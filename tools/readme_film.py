@@ -7,6 +7,7 @@ Left the lake, right the jungle, each with and without shadows, as the stand-in 
 """
 
 import argparse
+import io
 from pathlib import Path
 
 from cloning import program
@@ -21,7 +22,7 @@ from PIL import Image
 
 import simulator.environment as environment
 from cloning.errors import UserError
-from cloning.outputs import check_folders
+from cloning.outputs import check_folders, write_output
 from cloning.pilot.attention import overlay, visual_backprop
 from cloning.pilot.network import SHIPPED_MODEL, Network, load_model
 from cloning.recordings.format import SAMPLE_RATE
@@ -70,10 +71,14 @@ def main() -> int:
     pictures = [Image.fromarray(picture) for picture in np.concatenate(clips, axis=2)]
     palette = pictures[0].quantize(COLOURS)  # one for all: colours that change from frame to frame flicker
     first, *rest = [picture.quantize(COLOURS, palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    first.save(
-        arguments.film, save_all=True, append_images=rest, duration=1000 * EVERY // SAMPLE_RATE, loop=0, optimize=True
-    )
-    print(f"{arguments.film}: {len(pictures)} frames, {Path(arguments.film).stat().st_size / 1e6:.1f} MB")
+    film = io.BytesIO()
+    duration = 1000 * EVERY // SAMPLE_RATE  # ms
+    first.save(film, "GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
+    try:
+        write_output(arguments.film, film.getvalue())
+    except UserError as error:
+        return program.failed("readme_film", error)
+    print(f"{arguments.film}: {len(pictures)} frames, {len(film.getvalue()) / 1e6:.1f} MB")
     return program.DONE
 
 

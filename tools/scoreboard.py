@@ -5,10 +5,10 @@
     python -m tools.scoreboard model.pt --name shipped --tracks road-1001 road-1002 --speeds 15 --looks own own+10000
 
 A run measures one model on the courses that its options select. It adds or replaces these results in
-tools/scoreboard.json, one by one as they come, and writes the tables to tools/scoreboard.md. Git tracks both files:
-unlike all other commands, this one changes tracked files on purpose, so that its results can be committed. --table
-names another table. Recordings are replayed with `python -m simulator replay --model`, laps are driven with
-`python -m simulator drive`, as many at a time as the machine has cores, all at one speed by the same drive.py.
+tools/scoreboard.json, one by one as they come, and writes the tables to tools/scoreboard.md. Git tracks both files, so
+that results can be committed. --table names another table. Recordings are replayed with
+`python -m simulator replay --model`, laps are driven with `python -m simulator drive`, as many at a time as the machine
+has cores, all at one speed by the same drive.py.
 
 What a model was trained on, and so what is in sample, is told by the names of the recordings in its file: rendered ones
 must be named by track, direction and look, such as jungle-cw-look5. --trained-on adds other names.
