@@ -124,6 +124,6 @@ def drive_at_limits(
             if watch:
                 watch(frame, done)
 
-        drive_at_last = drive_at(last, watch_all)
+        driven_here = drive_at(last, watch_all)
         forked.collect(None)
-        return [*(forked.results[place] for place in others), drive_at_last]
+        return [*(forked.results[place] for place in others), driven_here]

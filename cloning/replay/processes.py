@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from types import TracebackType
 from typing import Self
 
 from cloning.errors import SimulatorError, UserError
@@ -40,14 +39,14 @@ class ForkedDrives:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         for process in self.processes:
             process.terminate()
         for process in self.processes:
             process.join()
 
     def collect(self, timeout: float | None) -> None:
-        """Take the results that are there, and wait for all others, each for so many seconds; None: until it is there.
+        """Take the results that have come, and wait for the others: for the next one so many seconds, None: for all.
 
         Raises the UserError of a drive that failed, and SimulatorError if its process ended without a result.
         """
