@@ -66,15 +66,11 @@ def main() -> int:
         check_folders(arguments.film)
         network = load_model(arguments.model)
         clips = [np.concatenate([clip(network, track, look) for look in LOOKS]) for track in TRACKS]
-    except UserError as error:
-        return program.failed("readme_film", error)
-    pictures = [Image.fromarray(picture) for picture in np.concatenate(clips, axis=2)]
-    palette = pictures[0].quantize(COLOURS)  # one for all: colours that change from frame to frame flicker
-    first, *rest = [picture.quantize(COLOURS, palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    film = io.BytesIO()
-    duration = 1000 * EVERY // SAMPLE_RATE  # ms
-    first.save(film, "GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
-    try:
+        pictures = [Image.fromarray(picture) for picture in np.concatenate(clips, axis=2)]
+        palette = pictures[0].quantize(COLOURS)  # one for all: colours that change from frame to frame flicker
+        first, *rest = [picture.quantize(COLOURS, palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+        film, duration = io.BytesIO(), 1000 * EVERY // SAMPLE_RATE  # ms
+        first.save(film, "GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
         write_output(arguments.film, film.getvalue())
     except UserError as error:
         return program.failed("readme_film", error)

@@ -98,6 +98,7 @@ def drive_at_limits(
     watch: of the drive at the last limit, called after each row, or None. parallel: on Linux, drive at all limits at
     the same time, each in a process of its own but the last, which is driven in this one; the driver must not learn
     from one drive anything that it needs in another. If one drive fails, or on Ctrl-C, the others are ended.
+    Raises what a drive raises, and SimulatorError if its process was killed.
     """
     rows = sum(len(line.stretch) for line in lines)
 

@@ -11,7 +11,7 @@ from typing import Self
 from cloning.errors import SimulatorError, UserError
 from cloning.replay.replay import Drive
 
-CAN_FORK = sys.platform == "linux"  # elsewhere, libraries do not survive a fork
+CAN_FORK = sys.platform == "linux"  # elsewhere there is no fork, or libraries do not survive it
 
 
 class ForkedDrives:
