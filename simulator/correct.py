@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
-from cloning.road.motion import MPH, wrap_angle
+from cloning.road.motion import MPH
 from cloning.road.track import Track
 from cloning.wire.client import MANUAL_TELEMETRY
 from simulator import scenery
@@ -52,13 +52,13 @@ class CorrectedClient(Client):
         run = self.run
         if self.correcting:
             write_row(self.recording, self.recorded, run)
-        heading_error = wrap_angle(run.track.at(run.s).heading - run.car.heading)
-        if not self.correcting and abs(run.offset) > TOO_FAR:
+        offset, heading_error = run.lane
+        if not self.correcting and abs(offset) > TOO_FAR:
             self.correcting = True
             self.corrections += 1
             self.recording.begin_drive()
             self._away_at = run.time
-        elif abs(run.offset) > NEAR or abs(heading_error) > ALIGNED:
+        elif abs(offset) > NEAR or abs(heading_error) > ALIGNED:
             self._away_at = run.time
         elif run.time - self._away_at >= NEAR_TIME:
             self.correcting = False

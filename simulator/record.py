@@ -29,7 +29,7 @@ MAX_RENDERERS = 3  # processes; each uses one core and 50 MB
 
 
 class Row(NamedTuple):
-    """A row of the recording whose images are being rendered; time in simulated seconds, speed in mph."""
+    """A row of the recording whose images are being rendered; its fields: see `RecordingWriter.add`."""
 
     time: float
     images: Future[list[bytes]]
@@ -37,6 +37,7 @@ class Row(NamedTuple):
     throttle: float
     brake: float
     speed: float
+    lane: tuple[float, float]
 
 
 def _start_renderer() -> None:
@@ -65,7 +66,7 @@ def _render(track: str, look: int, transform: TransformState) -> list[bytes]:
 def write_row(recording: RecordingWriter, cameras: Cameras, run: Run) -> None:
     """Render the three cameras, and add a row of the run's present state to a recording. Raises RecordingError."""
     images = [jpeg(frame) for frame in cameras.frames(run.car.node.get_transform())]
-    recording.add(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph)
+    recording.add(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph, run.lane)
 
 
 def record(
@@ -97,14 +98,15 @@ def record(
 
         def write() -> None:
             row = pending.popleft()
-            recording.add(row.time, row.images.result(), row.steering, row.throttle, row.brake, row.speed)
+            recording.add(row.time, row.images.result(), row.steering, row.throttle, row.brake, row.speed, row.lane)
 
         try:
             while run.travelled < laps * track.length:
                 run.step(*expert.drive(run))
                 if clock.due(run.time) and expert.recordable:
                     images = pool.submit(_render, track.name, look, run.car.node.get_transform())
-                    pending.append(Row(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph))
+                    row = Row(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph, run.lane)
+                    pending.append(row)
                     if len(pending) > 2 * renderers:
                         write()
                     bar.update(round(max(0.0, run.travelled)) - bar.n)

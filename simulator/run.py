@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cloning.replay.autonomy import autonomy
-from cloning.road.motion import MPH
+from cloning.road.motion import MPH, wrap_angle
 from cloning.road.track import Track
 from simulator.car import STEP, WHEELS, Car
 from simulator.world import build_physics
@@ -88,6 +88,11 @@ class Run:
     def speed_mph(self) -> float:
         """Speed in mph."""
         return self.car.speed / MPH
+
+    @property
+    def lane(self) -> tuple[float, float]:
+        """Lateral offset, m, and heading error, radians, both positive to the right, as recordings have them."""
+        return self.offset, wrap_angle(self.track.at(self.s).heading - self.car.heading)  # headings grow to the left
 
     @property
     def throttle_and_brake(self) -> tuple[float, float]:

@@ -335,14 +335,14 @@ def test_a_frame_depends_on_the_pose_alone():
 def test_a_full_disk_is_reported_and_leaves_whole_rows(tmp_path, monkeypatch):
     images = [b"a whole JPEG"] * 3
     with RecordingWriter(tmp_path / "full") as recording:
-        recording.add(0, images, 0, 1, 0, 10)
+        recording.add(0, images, 0, 1, 0, 10, (0.5, 0.1))
 
         def full(*_):
             raise OSError(28, os.strerror(28))
 
         monkeypatch.setattr("pathlib.Path.write_bytes", full)
         with pytest.raises(RecordingError, match="No space left"):
-            recording.add(1, images, 0, 1, 0, 10)
+            recording.add(1, images, 0, 1, 0, 10, (0.5, 0.1))
     assert len((tmp_path / "full" / "driving_log.csv").read_text(encoding="utf-8").splitlines()) == 1
 
 

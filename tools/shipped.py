@@ -27,7 +27,7 @@ if __name__ == "__main__":
 from cloning.arguments import number
 from cloning.errors import RecordingError, UserError
 from cloning.recordings.excluded import EXCLUDED
-from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, PROBLEM_AREAS
+from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE, PROBLEM_AREAS
 from cloning.recordings.log import find_folders
 from cloning.road.track import ROADS, Track
 from simulator.record import record
@@ -101,9 +101,10 @@ def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
         twins[twin] = recording
         twin.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(recording / DRIVING_LOG, twin / DRIVING_LOG)
-        (twin / EXCLUDED).unlink(missing_ok=True)
-        if (recording / EXCLUDED).exists():
-            shutil.copyfile(recording / EXCLUDED, twin / EXCLUDED)
+        for name in (EXCLUDED, LANE_FILE):
+            (twin / name).unlink(missing_ok=True)
+            if (recording / name).exists():
+                shutil.copyfile(recording / name, twin / name)
         (twin / IMAGE_FOLDER).unlink(missing_ok=True)
         (twin / IMAGE_FOLDER).symlink_to((recording / IMAGE_FOLDER).resolve())
     return list(twins)

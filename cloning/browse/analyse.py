@@ -24,6 +24,7 @@ from cloning.browse.analyses import PROGRESS, Analysis, Result, stamp, write_res
 from cloning.compute import one_thread
 from cloning.cores import threads
 from cloning.errors import ModelError, UserError
+from cloning.lane.known import known_position
 from cloning.lane.place import place, shipped_networks
 from cloning.lane.reader import LaneNetwork, detect_centres, read_strips
 from cloning.pilot.network import load_model, steer
@@ -68,7 +69,8 @@ def main() -> int:
 def lane(recording: Recording) -> Result:
     """Return the columns offset (m, right positive), x and y (m, where the track is known), road, and the tracks.
 
-    road is an index into about["roads"], -1 where the track is not known; offset is nan where it is not trusted.
+    road is an index into about["roads"], -1 where the track is not known; offset is nan where it is not trusted. A
+    `lane.csv` tells the offset, but not the track.
     """
     n = len(recording)
 
@@ -80,6 +82,7 @@ def lane(recording: Recording) -> Result:
         return read_strips(recording, rows)
 
     position, placed = place(recording, stretches(recording), detect, strips, shipped_networks())
+    position = known_position(recording) or position
     x, y = np.full((2, n), np.nan, np.float32)
     road, roads = np.full(n, -1, np.float32), []
     for rows, localisation in placed:

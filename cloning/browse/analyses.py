@@ -21,9 +21,9 @@ from cloning.errors import RecordingError
 from cloning.files import written_whole
 from cloning.recordings.check import cache_file
 from cloning.recordings.excluded import read_cuts
-from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
+from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE
 
-RULES = 2  # of what a result contains: counted up when they change
+RULES = 3  # of what a result contains: counted up when they change
 COMMAND = (sys.executable, "-m", "cloning.browse.analyse")
 PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
 
@@ -75,10 +75,12 @@ class Result:
 def stamp(folder: Path, analysis: Analysis) -> str:
     """Return what tells whether a result is still of the same files: their sizes and times of change, and the cuts.
 
-    Only a replay leaves out what is cut. Raises RecordingError if the log, the images or the model is gone, and if a
-    replay cannot read the cuts.
+    A `lane.csv` counts if there is one. Only a replay leaves out what is cut. Raises RecordingError if the log, the
+    images or the model is gone, and if a replay cannot read the cuts.
     """
     paths = [folder / DRIVING_LOG, folder / IMAGE_FOLDER, *[Path(analysis.model)] * bool(analysis.model)]
+    if (folder / LANE_FILE).exists():
+        paths.append(folder / LANE_FILE)
     cuts = f" {[(cut.first, cut.last) for cut in read_cuts(folder)]}" if analysis.kind == "replay" else ""
     return f"{RULES} {[file_stamp(path) for path in paths]}{cuts}"
 

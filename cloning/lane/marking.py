@@ -3,6 +3,8 @@
 The lane network sees the whole road and is a few tenths of a metre off; the paint, where there is some, is the centre.
 """
 
+import functools
+
 import cv2
 import numpy as np
 
@@ -16,15 +18,17 @@ STEP = 0.05  # m, between points across the road
 REACH = 1.2  # m to the left and right of the expected centre in which the line is sought
 LINE, FLANK = 0.25, 0.35  # m: width over which brightness is averaged, and from a line's middle to the road beside it
 MIN_CONTRAST = 0.08  # of the line, relative to the road beside it, averaged over a part
-MIN_PROMINENCE = 1.6  # contrast of the line relative to that of any other line within reach
-APART = 0.3  # m: lines closer together count as one
+MIN_PROMINENCE = 2.0  # contrast of the line relative to that of any other line within reach
+APART = 0.6  # m: lines closer together count as one
+SLOPES = np.arange(-4, 5) * 0.15  # directions in which the line is sought: tangents of the angle to the expected one
 ROWS_AT_ONCE = 64  # of a recording, 96 rows each of one image; OpenCV takes images of up to 32,767
-NEAR_ROWS, SUPPORT, AGREEMENT = 4, 5, 0.3  # of a detection: see `supported`
+NEAR_ROWS, SUPPORT, AGREEMENT, DRIFT = 4, 5, 0.3, 0.12  # of a detection: see `supported`
 
 BESIDE = round(FLANK / STEP)  # points
 SIDE = round(REACH / STEP) + BESIDE  # points
 SEEN = np.arange(-SIDE, SIDE + 1) * STEP  # m right of the expected centre
 ACROSS = SEEN[BESIDE:-BESIDE]  # where the line is sought; it has road on both sides
+SHIFTS = [np.round(SLOPES[:, None] * (AHEAD[part] - AHEAD[part].mean()) / STEP).astype(int) for part in PARTS]
 
 
 def _strip_pixels(right: float) -> tuple[np.ndarray, np.ndarray]:
@@ -58,6 +62,21 @@ def line_contrast(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
     return np.where(seen[..., : -2 * BESIDE] & seen[..., 2 * BESIDE :], contrast, 0)
 
 
+def _sharpest(contrast: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """Return the mean contrast of the line through each point in the direction in which it is greatest: (n, m).
+
+    contrast: (n, k, m), at k distances, across the road; shifts: int (SLOPES, k), the points by which a line in each
+    direction is further right at each distance.
+    """
+    most = int(np.abs(shifts).max())
+    padded, m = np.pad(contrast, [(0, 0), (0, 0), (most, most)]), contrast.shape[2]
+    lines = (
+        sum(padded[:, k, most + shift : most + shift + m] for k, shift in enumerate(of_slope.tolist()))
+        for of_slope in shifts
+    )
+    return functools.reduce(np.maximum, lines) / contrast.shape[1]
+
+
 def find_lines(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Return how far right of where it is expected the centre line is painted, at DISTANCES: float64 (n, 3), m.
 
@@ -69,7 +88,7 @@ def find_lines(strips: np.ndarray, expected: np.ndarray) -> np.ndarray:
     from_cameras = right - MOUNT_OFFSETS[:, None] * factor
     contrast = line_contrast(strips.reshape(-1, *STRIP_SHAPE), from_cameras.reshape(-1, len(AHEAD)))
     contrast = contrast.reshape(*strips.shape[:2], *contrast.shape[1:]).max(1)
-    profile = np.stack([contrast[:, part].mean(1) for part in PARTS], axis=1).astype(float)
+    profile = np.stack([_sharpest(contrast[:, part], shifts) for part, shifts in zip(PARTS, SHIFTS, strict=True)], 1)
     padded = np.pad(profile, [(0, 0), (0, 0), (1, 1)])
     profile = (padded[..., :-2] + 2 * profile + padded[..., 2:]) / 4
     away = np.abs(ACROSS - ACROSS[profile.argmax(2)][..., None])
@@ -83,9 +102,11 @@ def supported(found: np.ndarray) -> np.ndarray:
     """Return the detections with which others agree, and nan for the rest: float (n, 3), m.
 
     found: of `find_lines`, in successive rows. At least SUPPORT of those up to NEAR_ROWS before and after must be
-    within AGREEMENT m of a detection: what looks like a line in a few frames only is the edge of a shadow, or a post.
+    within AGREEMENT m of a detection, and DRIFT m more for each row between them, since the expectation may be wrong:
+    what looks like a line in a few frames only is the edge of a shadow, or a post.
     """
     padded = np.pad(found, [(NEAR_ROWS, NEAR_ROWS), (0, 0)], constant_values=np.nan)
-    near = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEAR_ROWS + 1, axis=0).reshape(len(found), 1, -1)
-    agreeing = (np.abs(near - found[:, :, None]) < AGREEMENT).sum(2) - 1
+    near = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEAR_ROWS + 1, axis=0)[:, None]  # (n, 1, 3, rows)
+    allowed = AGREEMENT + DRIFT * np.abs(np.arange(-NEAR_ROWS, NEAR_ROWS + 1))
+    agreeing = (np.abs(near - found[:, :, None, None]) < allowed).sum((2, 3)) - 1
     return np.where(agreeing >= SUPPORT, found, np.nan)

@@ -4,6 +4,9 @@ from datetime import datetime
 
 DRIVING_LOG = "driving_log.csv"
 IMAGE_FOLDER = "IMG"  # next to the csv
+# Also next to it, in recordings of the stand-in simulator, which knows where the car is: see `cloning/lane/known.py`.
+LANE_FILE = "lane.csv"
+LANE_COLUMNS = ("center image", "lateral offset (m)", "heading error (radians)")
 CAMERAS = ("center", "left", "right")  # in the order of a row's images
 NUMBERS = ("steering", "throttle", "brake", "speed")
 COLUMNS = (*CAMERAS, *NUMBERS)

@@ -1,4 +1,4 @@
-"""Write recordings as the simulator does: IMG/ with three cameras' JPEGs, and driving_log.csv."""
+"""Write recordings as the simulator does: IMG/ with three cameras' JPEGs, and driving_log.csv; beside it lane.csv."""
 
 import errno
 import math
@@ -16,6 +16,8 @@ from cloning.recordings.format import (
     DRIVE_GAP,
     DRIVING_LOG,
     IMAGE_FOLDER,
+    LANE_COLUMNS,
+    LANE_FILE,
     PROBLEM_AREAS,
     SAMPLE_RATE,
     time_stamp,
@@ -42,10 +44,10 @@ def check_name_of_corrections(folder: str | Path) -> None:
 
 
 class RecordingWriter:
-    """Writes samples into a folder: three images and a row of `driving_log.csv` each.
+    """Writes samples into a folder: three images, a row of `lane.csv`, and one of `driving_log.csv` each.
 
-    The row is written after its images are complete: a process killed at any time leaves a readable recording, and at
-    most three whole images and a temporary file that no row names.
+    The last is written after the others are complete: a process killed at any time leaves a readable recording, and at
+    most three whole images, a row of `lane.csv` and a temporary file that no row names.
     """
 
     def __init__(self, folder: str | Path, start: datetime = DEFAULT_START):
@@ -62,32 +64,44 @@ class RecordingWriter:
                 raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
             self.images.mkdir(parents=True, exist_ok=True)
             self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
+            self.lane = open(self.folder / LANE_FILE, "wb", buffering=0)  # noqa: SIM115 - likewise
+            self.lane.write((",".join(LANE_COLUMNS) + "\n").encode())
         except OSError as error:
             raise RecordingError(f"{self.folder}: {error.strerror}; name a folder that can be written") from error
         self.start = start
         self.rows = 0
 
     def add(
-        self, time: float, images: list[bytes], steering: float, throttle: float, brake: float, speed: float
+        self,
+        time: float,
+        images: list[bytes],
+        steering: float,
+        throttle: float,
+        brake: float,
+        speed: float,
+        lane: tuple[float, float],
     ) -> None:
         """Write a sample; time: simulated seconds; images: JPEGs of the centre, left and right camera.
 
-        steering, throttle: -1..1; brake: 0..1; speed: mph. Raises RecordingError if the disk is full; what was written
-        of this sample is then removed.
+        steering, throttle: -1..1; brake: 0..1; speed: mph; lane: lateral offset, m, and heading error, radians, as in
+        `LanePosition`. Raises RecordingError if the disk is full; what was written of this sample is then removed.
         """
         stamp = time_stamp(self.start + timedelta(seconds=time))
         paths = [self.images / f"{name}_{stamp}.jpg" for name in CAMERAS]
         row = ",".join([*map(str, paths), *map(csharp_number, (steering, throttle, brake, speed))]) + "\n"
-        size = os.fstat(self.log.fileno()).st_size
+        lane_row = f"{paths[0].name},{lane[0]:.4f},{lane[1]:.5f}\n"
+        sizes = {file: os.fstat(file.fileno()).st_size for file in (self.log, self.lane)}
         try:
             for path, image in zip(paths, images, strict=True):
                 with written_whole(path) as temporary:
                     temporary.write_bytes(image)
-            if self.log.write(row.encode()) != len(row.encode()):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            for file, text in ((self.lane, lane_row), (self.log, row)):
+                if file.write(text.encode()) != len(text.encode()):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             with suppress(OSError):  # the first error matters more
-                os.ftruncate(self.log.fileno(), size)  # first: a row without its images would be unusable
+                for file, size in sizes.items():  # first: a row without its images would be unusable
+                    os.ftruncate(file.fileno(), size)
                 for path in paths:
                     path.unlink(missing_ok=True)
             raise RecordingError(
@@ -100,13 +114,15 @@ class RecordingWriter:
         self.start += timedelta(seconds=DRIVE_GAP)
 
     def close(self) -> None:
-        """Close driving_log.csv."""
+        """Close driving_log.csv and lane.csv."""
         self.log.close()
+        self.lane.close()
 
     def remove_if_empty(self) -> None:
         """Remove a closed recording without a row, which no program could read; what else is in its folder stays."""
         if not self.rows:
-            (self.folder / DRIVING_LOG).unlink()
+            for name in (DRIVING_LOG, LANE_FILE):
+                (self.folder / name).unlink()
             for folder in (self.images, self.folder):
                 if not any(folder.iterdir()):
                     folder.rmdir()

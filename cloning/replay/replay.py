@@ -104,15 +104,15 @@ def load_recording(folder: str | Path) -> Recording:
 def reference_lines(recording: Recording, by_lane: bool = True) -> list[ReferenceLine]:
     """Return the reference lines of the stretches to replay.
 
-    by_lane: use the lane centre in stretches in which its estimate is trusted, and leave out the parts in which the
-    human driver is off the road; in other stretches, and if not by_lane, use the human driver's path. Raises
-    RecordingError if there is no stretch to replay.
+    by_lane: use the lane centre in stretches in which it is known or its estimate is trusted, and leave out the parts
+    in which the human driver is off the road; in other stretches, and if not by_lane, use the human driver's path.
+    Raises RecordingError if there is no stretch to replay.
     """
     lines, driven = [], stretches(recording)
     if by_lane:
-        from cloning.lane.place import estimate_lane_position  # imports torch
+        from cloning.lane.known import lane_position  # imports torch
 
-        lane = estimate_lane_position(recording, driven)
+        lane = lane_position(recording, driven)
         offset, yaw, trusted = lane.lateral_offset, lane.heading_error, lane.trusted
     else:
         offset = yaw = trusted = np.zeros(len(recording))

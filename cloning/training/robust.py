@@ -15,10 +15,10 @@ from typing import ClassVar, Self
 import cv2
 import numpy as np
 
-from cloning.lane.place import estimate_lane_position
+from cloning.lane.known import lane_position
 from cloning.lane.recovery import LOOKAHEAD, LaneAhead
 from cloning.pilot.network import CROP
-from cloning.recordings.format import CAMERAS
+from cloning.recordings.format import CAMERAS, LANE_FILE
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
 from cloning.road.motion import (
@@ -73,15 +73,15 @@ class Lanes(LaneAhead):
 
     @staticmethod
     def of(recording: Recording) -> "Lanes":
-        """Estimate the lane at every row of a recording from its frames.
+        """Return the lane at every row of a recording, known or estimated from its frames.
 
-        Raises OSError, RecordingError for images that can't be read, ModelError without a usable lane network.
+        Raises OSError, and the errors of `lane_position`.
         """
         whole = stretches(recording)
-        estimated = estimate_lane_position(recording, whole)
+        position = lane_position(recording, whole)
         lanes = Lanes.unknown(len(recording))
         for stretch in whole:
-            lanes._fill(stretch, estimated.lateral_offset[stretch.rows], estimated.trusted[stretch.rows])
+            lanes._fill(stretch, position.lateral_offset[stretch.rows], position.trusted[stretch.rows])
         return lanes
 
     def _fill(self, stretch: Stretch, offset: np.ndarray, trusted: np.ndarray) -> None:
@@ -222,7 +222,8 @@ class RobustObservations(Observations):
     @classmethod
     def select(cls, recording: Recording, arguments: Arguments) -> Self:
         """Keep the rows whose lane ahead is known, labelled with the recovery steering from the recorded pose."""
-        print(f"estimating the lane in {recording.folder}", flush=True)
+        is_known = (recording.folder / LANE_FILE).exists()
+        print(f"{'reading' if is_known else 'estimating'} the lane in {recording.folder}", flush=True)
         all_lanes = Lanes.of(recording)
         rows = np.flatnonzero(all_lanes.known).astype(np.int32)
         lanes = all_lanes.take(rows)

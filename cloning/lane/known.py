@@ -1,0 +1,83 @@
+"""The position in the lane of a recording that tells it, in `lane.csv` beside its `driving_log.csv`.
+
+The stand-in simulator knows where its car is, so its recordings have this file, and the position need not be estimated
+from their frames. Each line has the name of a row's centre image, the lateral offset and the heading error, in the
+units of `LanePosition`.
+"""
+
+import csv
+import os
+from pathlib import Path
+
+import numpy as np
+
+from cloning.errors import RecordingError
+from cloning.lane.place import estimate_lane_position
+from cloning.lane.reader import LanePosition
+from cloning.recordings.columns import NUMBER
+from cloning.recordings.format import LANE_COLUMNS, LANE_FILE
+from cloning.recordings.log import Recording
+from cloning.road.motion import Stretch
+
+LIMITS = (100.0, np.pi)  # m and radians: larger values are certainly wrong
+
+
+def lane_position(recording: Recording, stretches: list[Stretch]) -> LanePosition:
+    """Return the position in the lane at every row: the known one if there is a `lane.csv`, or else an estimate.
+
+    stretches: of the recording, `motion.stretches`. Raises the errors of `known_position`, and RecordingError for
+    images that can't be read, ModelError without a usable lane network.
+    """
+    return known_position(recording) or estimate_lane_position(recording, stretches)
+
+
+def known_position(recording: Recording) -> LanePosition | None:
+    """Return the position in the lane that a recording's `lane.csv` tells, or None if there is no such file.
+
+    It is trusted in the rows that the file names. Raises RecordingError for a file that is not as described above.
+    """
+    path = recording.folder / LANE_FILE
+    if not path.exists():
+        return None
+    known = read_known(path)
+    unknown = (0.0, 0.0)
+    names = [os.fsencode(recording.name(row)) for row in range(len(recording))]
+    offset, heading_error = np.array([known.get(name, unknown) for name in names], np.float32).reshape(-1, 2).T
+    return LanePosition(offset, heading_error, np.array([name in known for name in names], bool))
+
+
+def read_known(path: Path) -> dict[bytes, tuple[float, float]]:
+    """Return the lateral offset and heading error of each centre image in a `lane.csv`.
+
+    Raises RecordingError, with the line, for anything that is not as `LANE_COLUMNS` says, and for two lines of an image
+    that differ.
+    """
+    known: dict[bytes, tuple[float, float]] = {}
+    try:
+        with open(path, encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
+            lines = csv.reader(file, strict=True)
+            if tuple(next(lines, ())) != LANE_COLUMNS:
+                raise RecordingError(f"{path}: line 1: not {','.join(LANE_COLUMNS)}; {_remedy(path)}")
+            for fields in lines:
+                name, position = _parse(fields)
+                if known.setdefault(name, position) != position:
+                    raise ValueError(f"another position for {os.fsdecode(name)}")
+    except (ValueError, csv.Error) as error:
+        raise RecordingError(f"{path}: line {lines.line_num}: {error}; {_remedy(path)}") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}; make it a readable file, or delete it") from None
+    return known
+
+
+def _remedy(path: Path) -> str:
+    return f"correct it, or delete {path.name}, and the lane is estimated from the frames"
+
+
+def _parse(fields: list[str]) -> tuple[bytes, tuple[float, float]]:
+    """Return the image, lateral offset and heading error of a line. Raises ValueError."""
+    if len(fields) != len(LANE_COLUMNS):
+        raise ValueError(f"{len(fields)} fields where {len(LANE_COLUMNS)} are expected")
+    for text, limit, column in zip(fields[1:], LIMITS, LANE_COLUMNS[1:], strict=True):
+        if not NUMBER.fullmatch(text) or abs(float(text)) > limit:
+            raise ValueError(f"{column}: {text!r} is not a number within ±{limit:g}")
+    return os.fsencode(fields[0]), (float(fields[1]), float(fields[2]))

@@ -1,0 +1,109 @@
+"""lane.csv: what the stand-in simulator writes into it, who reads it, and what is wrong with it."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from conftest import run_here
+
+from cloning.errors import RecordingError
+from cloning.lane.known import lane_position
+from cloning.lane.place import estimate_lane_position
+from cloning.recordings.log import read_recording
+from cloning.replay.replay import load_recording, reference_lines
+from cloning.road.motion import stretches
+from cloning.road.track import Track
+from simulator.car import STEP
+from simulator.record import record
+
+HEADER = "center image,lateral offset (m),heading error (radians)\n"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A recorded piece of a lap, and the offsets that the car really had at its rows."""
+    folder = tmp_path_factory.mktemp("known") / "lake"
+    run, rows = record(folder, Track("lake"), 0.1, 20, seed=3)
+    assert rows > 60
+    recording = read_recording(folder)
+    steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
+    return folder, np.array(run.trajectory.offset)[steps]
+
+
+@pytest.fixture
+def lane(drive, tmp_path):
+    """The lane.csv of a copy of the recording, with links to its images."""
+    folder = tmp_path / "lake"
+    folder.mkdir()
+    for name in ("driving_log.csv", "lane.csv"):
+        shutil.copyfile(drive[0] / name, folder / name)
+    (folder / "IMG").symlink_to(drive[0] / "IMG")
+    return folder / "lane.csv"
+
+
+def known(folder):
+    recording = read_recording(folder)
+    return lane_position(recording, stretches(recording))
+
+
+def test_the_simulator_tells_where_its_car_is(drive):
+    folder, true = drive
+    position = known(folder)
+    assert position.trusted.all()
+    assert position.lateral_offset == pytest.approx(true, abs=1e-4)
+    recording = read_recording(folder)
+    estimate = estimate_lane_position(recording, stretches(recording))
+    assert np.abs(estimate.lateral_offset - true).mean() > 0.02, "an estimate is never so exact"
+    rolling = slice(15, None)
+    assert np.corrcoef(position.heading_error[rolling], estimate.heading_error[rolling])[0, 1] > 0.9  # measured: 0.97
+    (line,) = reference_lines(load_recording(folder))
+    assert line.is_lane_centre and line.offset == pytest.approx(position.lateral_offset[line.rows], abs=1e-6)
+
+
+def test_without_it_the_lane_is_estimated(drive, lane):
+    lane.unlink()
+    recording = read_recording(lane.parent)
+    expected = estimate_lane_position(recording, stretches(recording))
+    assert np.array_equal(known(lane.parent).lateral_offset, expected.lateral_offset)
+
+
+def test_rows_that_it_does_not_name_are_not_trusted(lane):
+    lines = lane.read_text(encoding="utf-8").splitlines(keepends=True)
+    lane.write_text("".join(lines[:31]) + "another.jpg,9,3\n", encoding="utf-8")
+    position = known(lane.parent)
+    assert position.trusted[:30].all() and not position.trusted[30:].any()
+    assert np.abs(position.lateral_offset).max() < 2
+
+
+def test_training_says_so(lane, tmp_path):
+    done = run_here(lane.parent, "--robust", "--output", tmp_path / "model.pt", "--epochs", 1, "--samples-per-epoch", 64)
+    assert not done.returncode, done.stderr
+    assert f"reading the lane in {lane.parent}" in done.stdout and "estimating" not in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "line 1: not center image,"),
+        ("image,offset,heading\n", "line 1: not center image,"),
+        (HEADER + "c.jpg,0.5,0.1\nc.jpg,0.5\n", "line 3: 2 fields where 3 are expected"),
+        (HEADER + "c.jpg,nan,0\n", r"line 2: lateral offset \(m\): 'nan' is not a number within ±100"),
+        (HEADER + "c.jpg,1_0,0\n", r"line 2: lateral offset \(m\): '1_0' is not a number within ±100"),
+        (HEADER + "c.jpg,101,0\n", r"line 2: lateral offset \(m\): '101' is not"),
+        (HEADER + "c.jpg,0,90\n", r"line 2: heading error \(radians\): '90' is not a number within ±3.14159"),
+        (HEADER + "c.jpg,0.5,0\nc.jpg,0.6,0\n", "line 3: another position for c.jpg"),
+        (HEADER + '"c.jpg\n', "line 2: unexpected end of data"),
+    ],
+)
+def test_a_wrong_line_is_named_with_a_remedy(lane, text, message):
+    lane.write_text(text, encoding="utf-8")
+    with pytest.raises(RecordingError, match=f"^{re.escape(str(lane))}: {message}.*; correct it, or delete lane.csv"):
+        known(lane.parent)
+
+
+def test_a_file_that_cannot_be_read(lane, tmp_path):
+    lane.unlink()
+    lane.mkdir()
+    done = run_here(lane.parent, "--robust", "--output", tmp_path / "model.pt")
+    assert done.returncode == 2 and "lane.csv: Is a directory; make it a readable file, or delete it" in done.stderr
