@@ -77,7 +77,8 @@ def test_rows_that_it_does_not_name_are_not_trusted(lane):
 
 
 def test_training_says_so(lane, tmp_path):
-    done = run_here(lane.parent, "--robust", "--output", tmp_path / "model.pt", "--epochs", 1, "--samples-per-epoch", 64)
+    short = ("--epochs", 1, "--samples-per-epoch", 64)
+    done = run_here(lane.parent, "--robust", "--output", tmp_path / "model.pt", *short)
     assert not done.returncode, done.stderr
     assert f"reading the lane in {lane.parent}" in done.stdout and "estimating" not in done.stdout
 

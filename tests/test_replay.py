@@ -112,7 +112,7 @@ def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
     """The human drives 0.8 m right of the lane's centre: an echo is off by as much, and set back beyond a limit."""
     offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
     trusted = np.ones(len(recording), bool)
-    monkeypatch.setattr("cloning.lane.place.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
+    monkeypatch.setattr("cloning.lane.known.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
     lines = replay.reference_lines(recording)
     done = replay.drive(recording, lines, 1.0, lambda frame: frame.human_steering)
     assert not done.interventions and done.offset == pytest.approx(np.full(300, 0.8))
@@ -131,7 +131,7 @@ def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, monkeyp
     """From the human's path, 0.8 m right of the lane's centre; where that path is the reference, it stays on it."""
     offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
     trusted = np.ones(len(recording), bool)
-    monkeypatch.setattr("cloning.lane.place.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
+    monkeypatch.setattr("cloning.lane.known.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
     for by_lane, begin in ((True, 0.8), (False, 0.0)):
         done = replay.drive(recording, replay.reference_lines(recording, by_lane), 1.0, ORACLE_DRIVER)
         assert not done.interventions and done.offset[0] == pytest.approx(begin)

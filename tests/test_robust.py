@@ -48,7 +48,7 @@ def recording(steering, pause_after=None):
 
 def lanes(monkeypatch, steering=0.0, offset=0.0, **more) -> Lanes:
     reading = LanePosition(np.full(N, offset), np.zeros(N), np.ones(N, bool))
-    monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
+    monkeypatch.setattr(robust, "lane_position", lambda *_: reading)
     return Lanes.of(recording(steering, **more))
 
 
@@ -105,7 +105,7 @@ def test_the_lane_is_as_far_from_the_human_as_was_estimated(monkeypatch, bend, o
 
 def test_where_most_is_not_trusted_the_humans_path_is_the_lane(monkeypatch):
     reading = LanePosition(np.ones(N), np.ones(N), np.arange(N) % 2 == 0)
-    monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
+    monkeypatch.setattr(robust, "lane_position", lambda *_: reading)
     found = Lanes.of(recording(0.2))
     assert not found.offset.any()
     assert found.steering(found.offset, found.yaw)[found.known] == pytest.approx(0.2, abs=1e-3)
@@ -406,7 +406,7 @@ def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monk
 def test_the_label_is_the_recovery_steering_and_not_the_drivers(monkeypatch):
     """Rows whose lane is 1 m to the left of a car that a human drives straight on."""
     reading = LanePosition(np.full(N, 1.0), np.zeros(N), np.ones(N, bool))
-    monkeypatch.setattr(robust, "estimate_lane_position", lambda *_: reading)
+    monkeypatch.setattr(robust, "lane_position", lambda *_: reading)
     monkeypatch.setattr(robust, "center_digests", lambda _, rows: np.zeros(len(rows), np.uint64))
     selected = RobustObservations.select(recording(0.0), model.Arguments(robust=True))
     assert (selected.steering < -0.1).all()
