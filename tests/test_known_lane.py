@@ -76,6 +76,15 @@ def test_rows_that_it_does_not_name_are_not_trusted(lane):
     assert np.abs(position.lateral_offset).max() < 2
 
 
+def test_a_last_line_that_is_cut_is_left_out(lane):
+    """A process that is killed writes no row of the log for it."""
+    expected, lines = known(lane.parent), lane.read_bytes().splitlines(keepends=True)
+    lane.write_bytes(b"".join(lines) + b"center_2018_01_01_13_00_00_000.jpg,0.1")
+    assert np.array_equal(known(lane.parent).lateral_offset, expected.lateral_offset)
+    lane.write_bytes(b"".join(lines[:11])[:-3])
+    assert known(lane.parent).trusted.sum() == 9
+
+
 def test_training_says_so(lane, tmp_path):
     short = ("--epochs", 1, "--samples-per-epoch", 64)
     done = run_here(lane.parent, "--robust", "--output", tmp_path / "model.pt", *short)

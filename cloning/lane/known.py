@@ -6,6 +6,7 @@ units of `LanePosition`.
 """
 
 import csv
+import io
 import os
 from pathlib import Path
 
@@ -49,28 +50,28 @@ def known_position(recording: Recording) -> LanePosition | None:
 def read_known(path: Path) -> dict[bytes, tuple[float, float]]:
     """Return the lateral offset and heading error of each centre image in a `lane.csv`.
 
-    Raises RecordingError, with the line, for anything that is not as `LANE_COLUMNS` says, and for two lines of an image
-    that differ.
+    A last line without an end is left out: a process that was killed has not written all of it, nor the row in the log.
+    Raises RecordingError, with the line, for anything else that is not as `LANE_COLUMNS` says, and for two lines of an
+    image that differ.
     """
-    known: dict[bytes, tuple[float, float]] = {}
     try:
-        with open(path, encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
-            lines = csv.reader(file, strict=True)
-            if tuple(next(lines, ())) != LANE_COLUMNS:
-                raise RecordingError(f"{path}: line 1: not {','.join(LANE_COLUMNS)}; {_remedy(path)}")
-            for fields in lines:
-                name, position = _parse(fields)
-                if known.setdefault(name, position) != position:
-                    raise ValueError(f"another position for {os.fsdecode(name)}")
-    except (ValueError, csv.Error) as error:
-        raise RecordingError(f"{path}: line {lines.line_num}: {error}; {_remedy(path)}") from None
+        data = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}; make it a readable file, or delete it") from None
+    text = data[: data.rfind(b"\n") + 1].decode("utf-8-sig", "surrogateescape")
+    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+    known: dict[bytes, tuple[float, float]] = {}
+    try:
+        if tuple(next(lines, ())) != LANE_COLUMNS:
+            raise ValueError(f"not {','.join(LANE_COLUMNS)}")
+        for fields in lines:
+            name, position = _parse(fields)
+            if known.setdefault(name, position) != position:
+                raise ValueError(f"another position for {os.fsdecode(name)}")
+    except (ValueError, csv.Error) as error:
+        remedy = f"correct it, or delete {path.name}, and the lane is estimated from the frames"
+        raise RecordingError(f"{path}: line {max(lines.line_num, 1)}: {error}; {remedy}") from None
     return known
-
-
-def _remedy(path: Path) -> str:
-    return f"correct it, or delete {path.name}, and the lane is estimated from the frames"
 
 
 def _parse(fields: list[str]) -> tuple[bytes, tuple[float, float]]:

@@ -65,7 +65,6 @@ class RecordingWriter:
             self.images.mkdir(parents=True, exist_ok=True)
             self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
             self.lane = open(self.folder / LANE_FILE, "wb", buffering=0)  # noqa: SIM115 - likewise
-            self.lane.write((",".join(LANE_COLUMNS) + "\n").encode())
         except OSError as error:
             raise RecordingError(f"{self.folder}: {error.strerror}; name a folder that can be written") from error
         self.start = start
@@ -89,7 +88,8 @@ class RecordingWriter:
         stamp = time_stamp(self.start + timedelta(seconds=time))
         paths = [self.images / f"{name}_{stamp}.jpg" for name in CAMERAS]
         row = ",".join([*map(str, paths), *map(csharp_number, (steering, throttle, brake, speed))]) + "\n"
-        lane_row = f"{paths[0].name},{lane[0]:.4f},{lane[1]:.5f}\n"
+        header = "" if self.rows else ",".join(LANE_COLUMNS) + "\n"
+        lane_row = f"{header}{paths[0].name},{lane[0]:.4f},{lane[1]:.5f}\n"
         sizes = {file: os.fstat(file.fileno()).st_size for file in (self.log, self.lane)}
         try:
             for path, image in zip(paths, images, strict=True):

@@ -25,6 +25,11 @@ class ForkedDrives:
         self.results: dict[int, Drive] = {}
         # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        # Another thread may still receive it, and an exception from Python's own code around a fork would be ignored.
+        received: list[int] = []
+        handler = signal.getsignal(signal.SIGINT)
+        if callable(handler):
+            signal.signal(signal.SIGINT, lambda number, _: received.append(number))
         try:
             for number, drive in enumerate(drives):
                 receiver, sender = context.Pipe(duplex=False)
@@ -35,6 +40,11 @@ class ForkedDrives:
                 self.pending[receiver] = number
         finally:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+            if callable(handler):
+                signal.signal(signal.SIGINT, handler)
+        if received:
+            self.__exit__()
+            raise KeyboardInterrupt
 
     def __enter__(self) -> Self:
         return self
