@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from conftest import run_here
 
+from cloning.browse import analyse, analyses
 from cloning.errors import RecordingError
 from cloning.lane.known import lane_position
 from cloning.lane.place import estimate_lane_position
@@ -59,6 +60,14 @@ def test_the_simulator_tells_where_its_car_is(drive):
     assert np.corrcoef(position.heading_error[rolling], estimate.heading_error[rolling])[0, 1] > 0.9  # measured: 0.97
     (line,) = reference_lines(load_recording(folder))
     assert line.is_lane_centre and line.offset == pytest.approx(position.lateral_offset[line.rows], abs=1e-6)
+
+
+def test_the_browser_shows_the_known_offset(drive, lane):
+    recording, (_, true) = read_recording(lane.parent), drive
+    result, stamp = analyse.lane(recording), analyses.stamp(lane.parent, analyses.LANE)
+    assert result.column("offset", recording.images[:, 0]) == pytest.approx(true, abs=1e-4)
+    lane.unlink()
+    assert analyses.stamp(lane.parent, analyses.LANE) != stamp, "then it is analysed again"
 
 
 def test_without_it_the_lane_is_estimated(drive, lane):

@@ -73,6 +73,7 @@ def lane(recording: Recording) -> Result:
     `lane.csv` tells the offset, but not the track.
     """
     n = len(recording)
+    known = known_position(recording)  # first, since the rest takes long
 
     def detect(network: LaneNetwork) -> np.ndarray:
         of_parts = [detect_centres(part, network) for part in parts(recording)]
@@ -82,7 +83,7 @@ def lane(recording: Recording) -> Result:
         return read_strips(recording, rows)
 
     position, placed = place(recording, stretches(recording), detect, strips, shipped_networks())
-    position = known_position(recording) or position
+    position = known or position
     x, y = np.full((2, n), np.nan, np.float32)
     road, roads = np.full(n, -1, np.float32), []
     for rows, localisation in placed:

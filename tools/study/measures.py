@@ -14,7 +14,7 @@ from cloning.replay.command import drive_at_limits
 from cloning.replay.drift import drifts, held_out
 from cloning.replay.drivers import ModelDriver
 from cloning.replay.replay import ReferenceLine
-from cloning.road.motion import MPH, wrap_angle
+from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras
@@ -125,8 +125,8 @@ class Simulator:
         while run.time < until:
             if not run.advance(steering, 1.0):
                 return False
-            yaw = abs(wrap_angle(run.car.heading - self.track.at(run.s).heading))
-            if abs(run.offset) < RECOVERED[0] and math.degrees(yaw) < RECOVERED[1]:
+            offset, heading_error = run.lane
+            if abs(offset) < RECOVERED[0] and math.degrees(abs(heading_error)) < RECOVERED[1]:
                 return True
             if clock.due(run.time):
                 steering = self.steering(run)
