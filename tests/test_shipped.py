@@ -14,13 +14,15 @@ from cloning.road.generated import road_number
 from simulator.scenery.looks import SHADOWED
 from tools import shipped
 from tools.lane_frames import FIRST_ROAD, scenes
-from tools.shipped import Lap, laps, render, repeat
+from tools.shipped import FIRST_LOOK, Lap, laps, render, repeat
 
 
 def test_what_is_left_to_measure_with_is_not_trained_on():
-    for rendered in (laps(101, 101), scenes(101, 101, 10)):
-        assert all(lap.look % SHADOWED <= 100 for lap in rendered)
+    chosen, taught = laps(101, 1000), scenes(101, 101, 10)
+    for rendered in (chosen, taught):
         assert all((road_number(lap.track) or FIRST_ROAD) >= FIRST_ROAD for lap in rendered)
+    assert {lap.look % SHADOWED for lap in chosen}.isdisjoint(range(1, FIRST_LOOK))
+    assert all(scene.look % SHADOWED <= 100 for scene in taught)
     assert len(set(laps(21, 40))) == len(laps(21, 40)) == 2 * (2 * 3 + 20) + 40
 
 

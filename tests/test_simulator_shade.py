@@ -109,7 +109,7 @@ def test_the_car_throws_a_shadow_before_itself_with_the_sun_behind_it_and_none_i
 def test_looks_have_many_kinds_of_shadows():
     assert make_shade_style(SHADOWED - 1) is None
     styles = [make_shade_style(SHADOWED * edition + look) for edition in (1, 2) for look in range(60)]
-    for name, low, high in (("depth", 1, 5), ("softness", 0.08, 0.6), ("elevation", 0.8, 1.1)):
+    for name, low, high in (("depth", 1, 2.5), ("softness", 0.08, 0.6), ("elevation", 0.8, 1.1)):
         values = [getattr(style, name) for style in styles]
         assert min(values) < low
         assert max(values) > high

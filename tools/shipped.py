@@ -4,8 +4,8 @@
     python -m tools.shipped data/lake-ccw data/lake-cw data/jungle data/jungle-shadows
 
 Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
-The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Looks from 101
-on and roads up to 1000 are left to measure with: shipped/scoreboard.md has the results.
+The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Roads and
+looks 1 to 1000 are left to measure with, and so are these looks' shadowed twins: shipped/scoreboard.md has the results.
 
 The network that comes with the project was made so; cloning/pilot/shipped.md, its model card, has the recordings and
 what came out.
@@ -38,8 +38,10 @@ ROOT = Path(__file__).resolve().parent.parent
 REPEATS = 20  # how often each real recording counts, because the rendered ones are many
 LEARNING_RATE = 2e-3  # half of --robust's: this training is longer
 DIRECTIONS = ("ccw", "cw")
-# What is driven in the end: both tracks and ten roads that were not trained on, in a look that was trained on and, with
-# shadows, in one that was not.
+FIRST_LOOK = 1001  # the first look, besides look 0, that is trained on
+LAPS = 0.5  # of a generated road: of so many images, more roads teach more than whole laps
+# What is driven in the end: both tracks in look 0, ten roads that were not trained on in looks that were not either,
+# and all of them in one more such look, with shadows.
 MEASURED = ("--tracks", *ROADS, *(f"road-{k}" for k in range(1, 11)), "--looks", "own", "10101")
 
 
@@ -52,20 +54,23 @@ class Lap(NamedTuple):
 
 
 def laps(looks: int, roads: int) -> list[Lap]:
-    """Return the laps to render: of both tracks in so many looks, and of so many generated roads.
+    """Return the laps to render: of both tracks in so many looks, and of so many generated roads, each in its own.
 
     Look 0, which resembles the real simulator, is driven in both directions, without and with both kinds of shadows,
     any other look in one direction; every second one has shadows.
     """
     twins = (0, SHADOWED, 2 * SHADOWED)
     chosen = [Lap(track, direction, look) for track in ROADS for direction in DIRECTIONS for look in twins]
-    for look in range(1, looks):
-        twin = shadowed(look) if look % 4 < 2 else look
-        chosen += [Lap(track, DIRECTIONS[look % 2], twin) for track in ROADS]
-    for k in range(roads):
-        twin = shadowed(k) if k % 4 < 2 else k
-        chosen.append(Lap(f"road-{FIRST_ROAD + k}", DIRECTIONS[k % 2], twin))
+    for look in range(FIRST_LOOK, FIRST_LOOK + looks - 1):
+        chosen += [Lap(track, DIRECTIONS[look % 2], every_second_shadowed(look)) for track in ROADS]
+    for road in range(FIRST_ROAD, FIRST_ROAD + roads):
+        chosen.append(Lap(f"road-{road}", DIRECTIONS[road % 2], every_second_shadowed(road)))
     return chosen
+
+
+def every_second_shadowed(look: int) -> int:
+    """Return the look or its twin with shadows, so that looks in a row, in alternating directions, have all kinds."""
+    return shadowed(look) if look % 4 < 2 else look
 
 
 def render(folder: Path, chosen: list[Lap]) -> list[Path]:
@@ -80,7 +85,8 @@ def render(folder: Path, chosen: list[Lap]) -> list[Path]:
         unfinished = folder / "unfinished"
         shutil.rmtree(unfinished, ignore_errors=True)
         begin = time.perf_counter()
-        run, rows = record(unfinished, Track(lap.track, lap.direction), laps=1, seed=i, look=lap.look)
+        length = 1 if lap.track in ROADS else LAPS
+        run, rows = record(unfinished, Track(lap.track, lap.direction), laps=length, seed=i, look=lap.look)
         if run.departures:
             raise RecordingError(f"{recording}: the expert left the road")
         unfinished.rename(recording)
@@ -119,7 +125,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--looks", type=number(int, 1, 101), default=15, help="looks of each track (default %(default)s)"
     )
-    parser.add_argument("--roads", type=number(int, 0, 101), default=100, help="generated roads (default %(default)s)")
+    parser.add_argument("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
     parser.add_argument("--epochs", type=number(int, 1), default=17, help="of 60,000 images (default %(default)s)")
     parser.add_argument("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
     parser.add_argument("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
