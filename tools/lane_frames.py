@@ -41,6 +41,14 @@ def shadowed(look: int) -> int:
     return look + SHADOWED * (1 + look % 2)
 
 
+def every_second_shadowed(look: int) -> int:
+    """Return the look or its twin with shadows: of looks in a row, two have shadows and two have none.
+
+    So laps in alternating directions come with and without shadows in both.
+    """
+    return shadowed(look) if look % 4 < 2 else look
+
+
 def scenes(looks: int, roads: int, frames: int) -> list[RenderedScene]:
     """Return what the lane network is trained on: both tracks in so many looks, and so many generated roads.
 
@@ -53,8 +61,7 @@ def scenes(looks: int, roads: int, frames: int) -> list[RenderedScene]:
         for track, share in FRAME_SHARES.items()
         for twin in (look, shadowed(look))
     ]
-    chosen = (shadowed(number) if number % 4 < 2 else number for number in range(roads))
-    return tracks + [RenderedScene(f"road-{FIRST_ROAD + k}", look, frames) for k, look in enumerate(chosen)]
+    return tracks + [RenderedScene(f"road-{FIRST_ROAD + k}", every_second_shadowed(k), frames) for k in range(roads)]
 
 
 def render_strips(scene: RenderedScene, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -53,7 +53,7 @@ from tools.server_process import start_server
 ROOT = Path(__file__).resolve().parent.parent
 
 DIRECTIONS = ("ccw", "cw")
-UNSEEN_LOOKS = (101, 102)  # no model was trained on looks from 101 on
+UNSEEN_LOOKS = (101, 102)  # no model was trained on looks 101 to 1000
 ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 

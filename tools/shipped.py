@@ -32,7 +32,7 @@ from cloning.recordings.log import find_folders
 from cloning.road.track import ROADS, Track
 from simulator.record import record
 from simulator.scenery.looks import SHADOWED
-from tools.lane_frames import FIRST_ROAD, shadowed
+from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 
 ROOT = Path(__file__).resolve().parent.parent
 REPEATS = 20  # how often each real recording counts, because the rendered ones are many
@@ -66,11 +66,6 @@ def laps(looks: int, roads: int) -> list[Lap]:
     for road in range(FIRST_ROAD, FIRST_ROAD + roads):
         chosen.append(Lap(f"road-{road}", DIRECTIONS[road % 2], every_second_shadowed(road)))
     return chosen
-
-
-def every_second_shadowed(look: int) -> int:
-    """Return the look or its twin with shadows, so that looks in a row, in alternating directions, have all kinds."""
-    return shadowed(look) if look % 4 < 2 else look
 
 
 def render(folder: Path, chosen: list[Lap]) -> list[Path]:

@@ -14,8 +14,9 @@ SHADOWED = 10_000  # look n + SHADOWED is look n with shadows; with n + 2 * SHAD
 # (0.20, 0.22, 0.25).
 REAL_STYLES = (ShadeStyle(depth=1.35, softness=0.08), ShadeStyle(depth=1.75, softness=0.08))
 # The least and the greatest depth of random ones. In the darkest of 135 real frames the road's median value is 31 of
-# 255, and hardly a pixel is black. With a depth of 3 a shaded road has at least a twelfth of its light; with 6 it was
-# black in one shadowed look of ten, and nothing could be seen of it.
+# 255, and hardly a pixel is black. With depths of up to 6 the jungle's road came out black in the shade in one of ten
+# looks, of 400, so that nothing could be seen of it; with these it keeps at least a twelfth of its light, and comes out
+# black in one of fifty, because of the camera's colours.
 DEPTHS = (0.8, 3)
 
 
