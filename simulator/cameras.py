@@ -25,7 +25,7 @@ from simulator.world import INSIDE, Scene
 JPEG_QUALITY = 75  # with colour at half resolution, as the tables in the real simulator's images show
 NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m, as for the real simulator's cameras
 ROWS, COLUMNS = FRAME[:2]
-SUPERSAMPLING = 2  # rows rendered for each row of a frame; with 1, the road far ahead flickers, unlike the real one
+SUPERSAMPLING = 2  # rows rendered and averaged for each row of a frame; with 1, the road far ahead flickers
 
 # The transform cache is off, because it replaces transforms by nearly equal earlier ones: a frame would depend on the
 # frames before it.
@@ -89,8 +89,8 @@ class Buffer:
     def render(self) -> np.ndarray:
         """Render the regions and return them: uint8 (regions, rows, columns, 3), RGB."""
         self.engine.render_frame()
-        pixels = np.frombuffer(self.image.get_ram_image_as("RGB"), np.uint8)
-        return np.ascontiguousarray(pixels.reshape(-1, self.shape[2], 3)[::-1]).reshape(self.shape)
+        pixels = np.frombuffer(self.image.get_ram_image(), np.uint8).reshape(-1, self.shape[2], 4)  # bottom row first
+        return cv2.flip(cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB), 0).reshape(self.shape)
 
 
 class Cameras:
@@ -111,7 +111,7 @@ class Cameras:
     def frames(self, transform: TransformState) -> np.ndarray:
         """Render the frames with the car at the transform: uint8 (cameras, 160, 320, 3), RGB, in the names' order."""
         self.scene.move_car(transform)
-        fine = self.buffer.render()
-        tall = cv2.resize(fine.reshape(-1, COLUMNS, 3), (COLUMNS, len(fine) * ROWS), interpolation=cv2.INTER_AREA)
+        rows = self.buffer.render().reshape(-1, COLUMNS, 3)
+        tall = cv2.addWeighted(rows[0::2], 0.5, rows[1::2], 0.5, 0)  # as cv2.resize by area, in a sixteenth of its time
         tone = self.scene.scenery.tone
         return (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)
