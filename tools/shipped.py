@@ -40,9 +40,9 @@ LEARNING_RATE = 2e-3  # half of --robust's: this training is longer
 DIRECTIONS = ("ccw", "cw")
 FIRST_LOOK = 1001  # the first look, besides look 0, that is trained on
 LAPS = 0.5  # of a generated road: of so many images, more roads teach more than whole laps
-# What is driven in the end: both tracks in look 0, ten roads that were not trained on in looks that were not either,
-# and all of them in one more such look, with shadows.
-MEASURED = ("--tracks", *ROADS, *(f"road-{k}" for k in range(1, 11)), "--looks", "own", "10101")
+# What is driven in the end: both tracks and ten generated roads that were not trained on, in looks with shadows that
+# were not either.
+MEASURED = ("--tracks", *ROADS, *(f"road-{k}" for k in range(1, 11)), "--looks", "own+10100")
 
 
 class Lap(NamedTuple):
