@@ -5,6 +5,7 @@ import csv
 import io
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from datetime import datetime, timedelta
@@ -21,6 +22,12 @@ from cloning.recordings.images import decode
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
 HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from another folder
+
+
+def pytest_configure():
+    """Ctrl-C reaches the commands that tests start, even if the tests run in a shell's background, which ignores it."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
