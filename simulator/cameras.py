@@ -25,7 +25,8 @@ from simulator.world import INSIDE, Scene
 JPEG_QUALITY = 75  # with colour at half resolution, as the tables in the real simulator's images show
 NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m, as for the real simulator's cameras
 ROWS, COLUMNS = FRAME[:2]
-SUPERSAMPLING = 2  # rows rendered and averaged for each row of a frame; with 1, the road far ahead flickers
+# For each row of a frame two are rendered and averaged; with one, the road far ahead flickers, unlike the real one.
+FINE_ROWS = 2 * ROWS
 
 # The transform cache is off, because it replaces transforms by nearly equal earlier ones: a frame would depend on the
 # frames before it.
@@ -106,7 +107,7 @@ class Cameras:
             camera.set_pos(*CAMERA_POSITIONS[name])
             camera.set_hpr(-CAMERA_YAW, -MOUNT_PITCH, -CAMERA_ROLL)
             mounted.append(camera)
-        self.buffer = Buffer(SUPERSAMPLING * ROWS, COLUMNS, mounted)
+        self.buffer = Buffer(FINE_ROWS, COLUMNS, mounted)
 
     def frames(self, transform: TransformState) -> np.ndarray:
         """Render the frames with the car at the transform: uint8 (cameras, 160, 320, 3), RGB, in the names' order."""
