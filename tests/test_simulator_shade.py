@@ -14,7 +14,7 @@ from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.run import Run
 from simulator.scenery import textures
-from simulator.scenery.looks import SHADOWED, make_shade_style
+from simulator.scenery.looks import DARKEST, SHADOWED, expose, make_shade_style, tone_matrix
 from simulator.scenery.shade import HALF_WIDTH, LENGTH, OVERLAP, PICTURE_SHAPE, STRETCH, Shade, ShadeStyle
 from simulator.scenery.shapes import Light, box, plants
 from simulator.world import Scene
@@ -113,3 +113,16 @@ def test_looks_have_many_kinds_of_shadows():
         values = [getattr(style, name) for style in styles]
         assert min(values) < low
         assert max(values) > high
+
+
+def test_no_look_makes_the_road_darker_than_the_darkest_real_frame():
+    dark = np.array([60.0, 50.0, 40.0])
+    for tone in (None, tone_matrix(1.25, 0.5, np.array([-22.0, -18.0, -20.0]))):
+        lifted = expose(tone, dark / 5)
+        assert (lifted @ np.r_[dark / 5, 1]).mean() == pytest.approx(DARKEST, abs=0.01)
+        if tone is not None:
+            np.testing.assert_array_equal(lifted[:, :3], tone[:, :3])
+    assert expose(None, dark) is None
+    for look in (SHADOWED + 104, SHADOWED + 111):  # black before, all across the frame
+        road = view("jungle", look, 1413.0)[85:130, 100:220]
+        assert 0.7 * DARKEST < np.median(road) < 2 * DARKEST

@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 
+import numpy as np
+
 from cloning.road.generated import road_number
 from cloning.road.track import Track
 from simulator.scenery import generated, jungle, lake
-from simulator.scenery.looks import SHADOWED, make_shade_style
+from simulator.scenery.looks import SHADOWED, expose, make_shade_style
 from simulator.scenery.parts import Scenery
 from simulator.scenery.shade import Shade
 
@@ -14,7 +16,8 @@ def build(track: str, look: int = 0) -> Scenery:
     """Return the scenery of a track that `cloning.road.track.Track` knows.
 
     Look 0 resembles the real simulator, or is a generated road's own; any other number gives other light, textures and
-    plants on the same road. Look n + SHADOWED is look n with shadows.
+    plants on the same road. Look n + SHADOWED is look n with shadows, and brighter if
+    its road would otherwise be darker than in any real frame.
     """
     number, base = road_number(track), look % SHADOWED
     if number is None:
@@ -25,4 +28,8 @@ def build(track: str, look: int = 0) -> Scenery:
     style = make_shade_style(look)
     if style is None:
         return scenery
-    return replace(scenery, shade=Shade(Track(track), scenery.meshes, scenery.light, style, elevation))
+    shade = Shade(Track(track), scenery.meshes, scenery.light, style, elevation)
+    road = max((mesh for mesh in scenery.meshes if mesh.road is not None), key=lambda mesh: len(mesh.points))
+    # The 2 % leave out single spots, but not a cliff's shade, which is part of the road's colours.
+    darkest = np.quantile(road.colours, 0.02, axis=0) * shade.factor * road.texture.mean()
+    return replace(scenery, shade=shade, tone=expose(scenery.tone, darkest))

@@ -13,11 +13,12 @@ SHADOWED = 10_000  # look n + SHADOWED is look n with shadows; with n + 2 * SHAD
 # in the shade is (0.26, 0.30, 0.39) and (0.18, 0.22, 0.30) of that in the sun; in these it is (0.29, 0.31, 0.34) and
 # (0.20, 0.22, 0.25).
 REAL_STYLES = (ShadeStyle(depth=1.35, softness=0.08), ShadeStyle(depth=1.75, softness=0.08))
-# The least and the greatest depth of random ones. In the darkest of 135 real frames the road's median value is 31 of
-# 255, and hardly a pixel is black. With depths of up to 6 the jungle's road came out black in the shade in one of ten
-# looks, of 400, so that nothing could be seen of it; with these it keeps at least a twelfth of its light, and comes out
-# black in one of fifty, because of the camera's colours.
+# The least and the greatest depth of random ones. With depths of up to 6 the jungle's road came out black in the shade
+# in one of ten looks, of 400, so that nothing could be seen of it; with these it keeps at least a twelfth of its light.
 DEPTHS = (0.8, 3)
+# The least mean value, of 255, of the road where it is darkest. In the darkest of 135 real frames its median value is
+# 29, and hardly a pixel is black; without this limit it came out black in one of fifty looks with shadows.
+DARKEST = 29
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,16 @@ def make_shade_style(number: int) -> ShadeStyle | None:
         softness=float(np.exp(random.uniform(*np.log((0.05, 0.8))))),
         elevation=random.uniform(0.7, 1.2),
     )
+
+
+def expose(tone: np.ndarray | None, darkest: np.ndarray) -> np.ndarray | None:
+    """Return a tone as in `Look`, brighter where it would make the road darker than DARKEST.
+
+    darkest: the road's colour where it is darkest, (3,), 0..255.
+    """
+    matrix = np.eye(3, 4, dtype=np.float32) if tone is None else tone
+    lacking = DARKEST - float((matrix @ np.r_[darkest, 1]).mean())
+    return tone if lacking <= 0 else np.c_[matrix[:, :3], matrix[:, 3] + lacking].astype(np.float32)
 
 
 def vary(random: np.random.Generator, colour: np.ndarray) -> Colour:
