@@ -16,8 +16,8 @@ def build(track: str, look: int = 0) -> Scenery:
     """Return the scenery of a track that `cloning.road.track.Track` knows.
 
     Look 0 resembles the real simulator, or is a generated road's own; any other number gives other light, textures and
-    plants on the same road. Look n + SHADOWED is look n with shadows, and brighter if
-    its road would otherwise be darker than in any real frame.
+    plants on the same road. Look n + SHADOWED is look n with shadows, and brighter if its road would be darker than in
+    any real frame.
     """
     number, base = road_number(track), look % SHADOWED
     if number is None:

@@ -94,7 +94,7 @@ def make_shade_style(number: int) -> ShadeStyle | None:
 
 
 def expose(tone: np.ndarray | None, darkest: np.ndarray) -> np.ndarray | None:
-    """Return a tone as in `Look`, brighter where it would make the road darker than DARKEST.
+    """Return a tone as in `Look`, brighter if it would make the road darker than DARKEST.
 
     darkest: the road's colour where it is darkest, (3,), 0..255.
     """
