@@ -29,7 +29,8 @@ def build(track: str, look: int = 0) -> Scenery:
     if style is None:
         return scenery
     shade = Shade(Track(track), scenery.meshes, scenery.light, style, elevation)
+    # Of the meshes along the road the asphalt has the most points. Its darkest 2 % are left out as single spots; the
+    # shade of cliffs, where it is part of the colours, covers more.
     road = max((mesh for mesh in scenery.meshes if mesh.road is not None), key=lambda mesh: len(mesh.points))
-    # The 2 % leave out single spots, but not a cliff's shade, which is part of the road's colours.
     darkest = np.quantile(road.colours, 0.02, axis=0) * shade.factor * road.texture.mean()
     return replace(scenery, shade=shade, tone=expose(scenery.tone, darkest))
