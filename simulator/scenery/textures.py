@@ -12,6 +12,8 @@ from numpy.random import Generator
 
 from simulator.scenery.shapes import Colour
 
+ASPHALT_LEVEL = 0.72  # mean of the asphalt's texture, 0..1
+
 
 def noise(random: Generator, shape: tuple[int, int], blur: float) -> np.ndarray:
     """Return Gaussian noise of unit variance, smoothed over `blur` pixels, that tiles seamlessly."""
@@ -38,7 +40,7 @@ def asphalt(random: Generator, size: int = 512, grain: float = 0.15, spots: floa
     """Return asphalt; grain and spots scale the contrast of its fine and its coarse structure."""
     stones = noise(random, (size, size), 0.8)
     return grey(
-        0.72,
+        ASPHALT_LEVEL,
         grain * stones,
         spots * 0.12 * np.maximum(noise(random, (size, size), 0.9) - 1, 0),
         spots * 0.06 * noise(random, (size, size), 6),
