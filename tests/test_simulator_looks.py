@@ -16,6 +16,8 @@ from simulator.cameras import Cameras, jpeg
 from simulator.expert import Recovery
 from simulator.film import MAX_BITS, ChaseFilm
 from simulator.run import Run
+from simulator.scenery import jungle
+from simulator.scenery.looks import make_look
 from simulator.world import Scene
 
 
@@ -34,6 +36,15 @@ def test_another_look_is_another_image_of_the_same_road(track):
     assert np.array_equal(same, again)
     assert np.abs(same.astype(int) - other).mean() > 25
     assert run.track.points.shape == Track(track).points.shape
+
+
+def test_no_look_has_lines_darker_than_their_road():
+    for number in (0, *range(100, 150)):
+        look = make_look(number, jungle.LIGHT, jungle.PALETTE)
+        road = jungle.road_texture(np.random.default_rng(0), look) * np.array(look.palette["asphalt"])
+        columns = (np.arange(road.shape[1]) + 0.5) / road.shape[1] * 2 * jungle.ASPHALT_EDGE - jungle.ASPHALT_EDGE
+        line, lane = np.abs(columns - jungle.EDGE_LINE) < 0.08, (columns > 1) & (columns < 4)
+        assert road[:, line].mean() > 1.15 * road[:, lane].mean(), number
 
 
 def test_horizon_and_vanishing_point_lie_where_the_real_frames_have_them():
