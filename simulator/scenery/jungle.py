@@ -82,7 +82,7 @@ class JungleTerrain:
         self.positions = ground_grid(track, GROUND_MARGIN, GRID_SPACING)
         on_ground = np.ones(len(track.points), bool)
         on_ground[np.round(distances(*ROAD.bridge) / track.step).astype(int)] = False
-        points = track.points[on_ground]
+        self.bridge, points = track.points[~on_ground], track.points[on_ground]
         away, near = cKDTree(points[:, :2]).query(self.positions, k=24)
         weight = 1 / np.maximum(away, 1.0) ** 3
         level = (weight * points[near, 2]).sum(axis=-1) / weight.sum(axis=-1)
@@ -97,6 +97,12 @@ class JungleTerrain:
         self.height = level + cliff + 0.35 * rough * np.clip((self.distance - 6) / 8, 0, 1)
         lowest = np.where(away < CLEAR_DISTANCE, points[near, 2], np.inf).min(axis=-1)
         self.height = np.minimum(self.height, np.where(np.isfinite(lowest), lowest - 0.7, np.inf))
+        self.height = np.minimum(self.height, self.deck_at(self.positions) - 0.7)  # cliffs would stand on the bridge
+
+    def deck_at(self, positions: np.ndarray) -> np.ndarray:
+        """Return the height of the bridge's deck, (...), at positions (..., 2), in m; infinite beside the bridge."""
+        away, nearest = cKDTree(self.bridge[:, :2]).query(positions)
+        return np.where(away < CLEAR_DISTANCE, self.bridge[nearest, 2], np.inf)
 
     def grid_coordinates(self, positions: np.ndarray) -> np.ndarray:
         """Return the column and the row on the grid, (2, n), fractions included, of positions (n, 2)."""
@@ -219,11 +225,12 @@ def palms(terrain: JungleTerrain, random: Generator, light: Light, palette: Pale
     feet = np.c_[positions, terrain.height_at(positions) - 0.2][keep]
     sunlit = terrain.sunlit(feet + np.array([0, 0, 4]), light)[:, None]
     heights = random.uniform(4.5, 9.0, len(feet))
+    fits = feet[:, 2] + heights < terrain.deck_at(feet[:, :2])  # others would grow through the bridge
     brightness = random.uniform(0.8, 1.5, (len(feet), 1))
     colours = np.clip(np.array(palette["palm"]) * brightness * (0.55 + 0.75 * sunlit), 0, 1)
     meshes = []
     for kind in range(4):
-        chosen = np.arange(len(feet)) % 4 == kind
+        chosen = fits & (np.arange(len(feet)) % 4 == kind)
         bush = kind == 3
         texture = textures.bush(random) if bush else textures.palm(random)
         height = heights[chosen] * (0.3 if bush else 1.0)
