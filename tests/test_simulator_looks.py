@@ -7,6 +7,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from cloning.errors import OutputError
 from cloning.film import DriveFilm
@@ -45,6 +46,18 @@ def test_no_look_has_lines_darker_than_their_road():
         columns = (np.arange(road.shape[1]) + 0.5) / road.shape[1] * 2 * jungle.ASPHALT_EDGE - jungle.ASPHALT_EDGE
         line, lane = np.abs(columns - jungle.EDGE_LINE) < 0.08, (columns > 1) & (columns < 4)
         assert road[:, line].mean() > 1.15 * road[:, lane].mean(), number
+
+
+def test_in_no_look_cliffs_or_palms_stand_on_the_jungles_road():
+    track = Track("jungle")
+    for look in (0, 100, 104, 135):  # in the last three they did, on the bridge
+        terrain = jungle.JungleTerrain(track, np.random.default_rng(look))
+        for right in (-4.5, -2.0, 0.0, 2.0, 4.5):
+            positions = track.points[:, :2] + right * track.rightward
+            assert np.all(terrain.height_at(positions) < track.points[:, 2] - 0.4)
+        for mesh in jungle.palms(terrain, np.random.default_rng(look), jungle.LIGHT, jungle.PALETTE):
+            away, nearest = cKDTree(terrain.bridge[:, :2]).query(mesh.points[:, :2])
+            assert not np.any((away < jungle.ASPHALT_EDGE) & (mesh.points[:, 2] > terrain.bridge[nearest, 2]))
 
 
 def test_horizon_and_vanishing_point_lie_where_the_real_frames_have_them():
