@@ -73,8 +73,9 @@ class JungleTerrain:
     """The height of the ground around the road, on a grid, and the shadows that it casts.
 
     positions  float64 (rows, columns, 2): m
-    distance   float64 (rows, columns): m to the centre line
+    distance   float64 (rows, columns): m to the centre line on the ground
     height     float64 (rows, columns): m
+    bridge     float64 (n, 3): the centre line's points on the bridge, m; `distance` leaves them out
     """
 
     def __init__(self, track: Track, random: Generator):
@@ -100,7 +101,7 @@ class JungleTerrain:
         self.height = np.minimum(self.height, self.deck_at(self.positions) - 0.7)  # cliffs would stand on the bridge
 
     def deck_at(self, positions: np.ndarray) -> np.ndarray:
-        """Return the height of the bridge's deck, (...), at positions (..., 2), in m; infinite beside the bridge."""
+        """Return the height of the bridge, (...), above positions (..., 2), in m; inf beyond CLEAR_DISTANCE from it."""
         away, nearest = cKDTree(self.bridge[:, :2]).query(positions)
         return np.where(away < CLEAR_DISTANCE, self.bridge[nearest, 2], np.inf)
 
