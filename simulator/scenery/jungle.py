@@ -97,8 +97,8 @@ class JungleTerrain:
         cliff = rise * np.round(tall / 4) * 4 + crest  # in terraces of 4 m
         self.height = level + cliff + 0.35 * rough * np.clip((self.distance - 6) / 8, 0, 1)
         lowest = np.where(away < CLEAR_DISTANCE, points[near, 2], np.inf).min(axis=-1)
-        self.height = np.minimum(self.height, np.where(np.isfinite(lowest), lowest - 0.7, np.inf))
-        self.height = np.minimum(self.height, self.deck_at(self.positions) - 0.7)  # cliffs would stand on the bridge
+        lowest = np.minimum(lowest, self.deck_at(self.positions))  # otherwise cliffs would stand on the bridge
+        self.height = np.minimum(self.height, lowest - 0.7)
 
     def deck_at(self, positions: np.ndarray) -> np.ndarray:
         """Return the height of the bridge, (...), above positions (..., 2), in m; inf beyond CLEAR_DISTANCE from it."""

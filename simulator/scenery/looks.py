@@ -22,7 +22,7 @@ DEPTHS = (0.8, 3)
 DARKEST = 29
 # Paint on a road is at least so many times as bright as its asphalt, by the brightest of red, green and blue; on the
 # real tracks it is 1.45 to 1.8 times as bright. Without this limit, one random look in six had lines darker than the
-# road, as no road has, and there the network steered restlessly.
+# road, as neither of these has, and there the network steered restlessly.
 PAINT = ("line", "outer line", "white", "yellow")
 PAINT_CONTRAST = 1.35
 
