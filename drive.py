@@ -18,7 +18,7 @@ from collections import deque
 from pathlib import Path
 from wsgiref.types import WSGIEnvironment
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("drive.py")  # also while the libraries below are loaded
@@ -26,20 +26,19 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from cloning.arguments import MAX_PORT, address, number
-from cloning.errors import UserError
-from cloning.pilot.network import SHIPPED_MODEL, Network, load_model, steer
+from cloning.base.arguments import MAX_PORT, address, number
+from cloning.base.errors import UserError
+from cloning.base.frame import FRAME
+from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
-from cloning.recordings.format import FRAME
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.wire.protocol import PORT
 
 try:
-    from cloning.pilot import page
-    from cloning.pilot.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
-    from cloning.wire import connections
-    from cloning.wire import server as wire
-    from cloning.wire.libraries import socketio
+    from cloning.server import connections, page
+    from cloning.server import server as wire
+    from cloning.server.libraries import socketio
+    from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
 except UserError as error:  # wrong versions of the socket libraries
     sys.exit(program.failed("drive.py", error))
 

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Self, TypeVar
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("model.py")  # also while the libraries below are loaded
@@ -35,12 +35,13 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from cloning.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable, threads
-from cloning.errors import RecordingError, UserError, message_of
-from cloning.files import write
-from cloning.pilot.network import CROP, UNITS, Network, load_model
+from cloning.base.errors import RecordingError, UserError, message_of
+from cloning.base.files import write
+from cloning.base.frame import FRAME
+from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable, threads
+from cloning.network.network import CROP, UNITS, Network, load_model
 from cloning.recordings.check import check_images
-from cloning.recordings.format import CAMERAS, FRAME
+from cloning.recordings.format import CAMERAS
 from cloning.recordings.frames import KEPT_FRAMES, FrameCache
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts

@@ -14,7 +14,7 @@ from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("video.py", "stopped; no film was written")  # also while the libraries below are loaded
@@ -22,12 +22,13 @@ if __name__ == "__main__":
 import numpy as np
 from tqdm import tqdm
 
-from cloning.arguments import number, ratio
-from cloning.errors import UserError
-from cloning.film import FilmWriter, frame_rate
+from cloning.base.arguments import number, ratio
+from cloning.base.errors import UserError
+from cloning.base.film import FilmWriter, frame_rate
 from cloning.recordings import saved_frames
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import decode, read_jpeg
+from cloning.road.overlay import overlay
 
 FPS_RANGE = 0.01, 1000.0  # frames/s that can be given
 
@@ -71,10 +72,10 @@ def print_note(message: str) -> None:
     print(f"video.py: {message}", file=sys.stderr)
 
 
-def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None = None) -> int:
+def make_film(folder: Path, fps: Fraction | None = None, draw: Overlay | None = None) -> int:
     """Write `folder`.mp4 next to the folder, and return how many unreadable frames were left out.
 
-    fps: frames/s; None: from the frames' times. overlay: makes each frame's picture; all pictures must have one size.
+    fps: frames/s; None: from the frames' times. draw: makes each frame's picture; all pictures must have one size.
     A frame is readable if training could read it: a whole JPEG of 320x160 pixels. Raises FilmError, OSError.
     """
     frames = find_frames(folder)
@@ -91,7 +92,7 @@ def make_film(folder: Path, fps: Fraction | None = None, overlay: Overlay | None
                 unreadable.append(frame_path.name)
                 reason = reason or error
                 continue
-            writer.add(overlay(frame) if overlay else frame)
+            writer.add(draw(frame) if draw else frame)
         writer.close()
     finally:
         writer.discard()
@@ -109,19 +110,19 @@ def load_overlay(model_file: Path) -> Overlay:
     """Return the overlay that shows a model's steering and what it looks at. Raises ModelError."""
     import torch  # takes longer to import than a short film to make
 
-    from cloning.pilot import attention
-    from cloning.pilot.network import load_model
+    from cloning.network.attention import visual_backprop
+    from cloning.network.network import load_model
 
     torch.set_num_threads(1)  # more threads are slower for single frames, and the encoder uses the other cores
     network = load_model(model_file)
 
-    def overlay(frame: np.ndarray) -> np.ndarray:
+    def picture(frame: np.ndarray) -> np.ndarray:
         try:
-            return attention.overlay(frame, *attention.visual_backprop(network, frame))
+            return overlay(frame, *visual_backprop(network, frame))
         except ArithmeticError as error:
             raise FilmError(f"{model_file}: {error}; train the model again with `python model.py`") from None
 
-    return overlay
+    return picture
 
 
 def main() -> int:

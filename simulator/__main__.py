@@ -6,17 +6,17 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     # Also while the libraries below are loaded.
     program.end_on_interrupt("simulator", "stopped; the files that it has written are complete")
 
-from cloning.arguments import MAX_PORT, address, number
-from cloning.errors import UserError
-from cloning.outputs import check_folders, run_all, write_json
+from cloning.base.arguments import MAX_PORT, address, number
+from cloning.base.errors import UserError
+from cloning.base.outputs import check_folders, run_all, write_json
 from cloning.recordings.format import PROBLEM_AREAS
-from cloning.replay.autonomy import LIMITS
+from cloning.road.autonomy import LIMITS
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.road.track import ROADS, Track
 from cloning.wire.protocol import PORT

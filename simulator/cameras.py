@@ -17,8 +17,9 @@ from panda3d.core import (
     load_prc_file_data,
 )
 
-from cloning.errors import SimulatorError
-from cloning.recordings.format import CAMERAS, FRAME
+from cloning.base.errors import SimulatorError
+from cloning.base.frame import FRAME
+from cloning.recordings.format import CAMERAS
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, MOUNT_PITCH, VERTICAL_FIELD
 from simulator.world import INSIDE, Scene
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from tqdm import tqdm
 
-from cloning.errors import SimulatorError
+from cloning.base.errors import SimulatorError
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
 from cloning.wire.client import (

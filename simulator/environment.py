@@ -1,7 +1,7 @@
 """The stand-in simulator as a Gymnasium environment; importing this module registers it.
 
     import gymnasium, numpy, simulator.environment, torch
-    from cloning.pilot.network import SHIPPED_MODEL, load_model, steer
+    from cloning.network.network import SHIPPED_MODEL, load_model, steer
 
     env = gymnasium.make("behavioral-cloning/Drive-v0", track="lake", speed=15)
     network = load_model(SHIPPED_MODEL)
@@ -25,8 +25,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from cloning.errors import SimulatorError
-from cloning.recordings.format import FRAME, SAMPLE_RATE
+from cloning.base.errors import SimulatorError
+from cloning.base.frame import FRAME
+from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from panda3d.core import Camera, NodePath, TransformState, Vec3
 
-from cloning.film import DriveFilm
+from cloning.base.film import DriveFilm
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
 from simulator.cameras import Buffer, lens

@@ -14,8 +14,8 @@ from typing import NamedTuple
 from panda3d.core import TransformState
 from tqdm import tqdm
 
-from cloning.cores import threads
-from cloning.errors import SimulatorError
+from cloning.base.cores import threads
+from cloning.base.errors import SimulatorError
 from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track

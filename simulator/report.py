@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 import numpy as np
 
-from cloning.outputs import write_output
+from cloning.base.outputs import write_output
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import STEP

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cloning.replay.autonomy import autonomy
+from cloning.road.autonomy import autonomy
 from cloning.road.motion import MPH, wrap_angle
 from cloning.road.track import Track
 from simulator.car import STEP, WHEELS, Car
@@ -159,7 +159,7 @@ class Run:
         return ""
 
     def autonomy(self) -> float:
-        """Return NVIDIA's autonomy, with each departure as an intervention; see `cloning.replay.autonomy`."""
+        """Return NVIDIA's autonomy, with each departure as an intervention; see `cloning.road.autonomy`."""
         return autonomy(len(self.departures), self.time)
 
     def roughness(self) -> float:

@@ -17,7 +17,7 @@ from panda3d.core import (
     WindowProperties,
 )
 
-from cloning.errors import SimulatorError
+from cloning.base.errors import SimulatorError
 from cloning.recordings.writer import RecordingWriter, SampleClock, check_name_of_corrections
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
 from cloning.road.motion import MPH

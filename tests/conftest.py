@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from cloning.pilot.network import Network, load_model, save_model
+from cloning.network.network import Network, load_model, save_model
 from cloning.recordings.images import decode
 
 ROOT = Path(__file__).parent.parent

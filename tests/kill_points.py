@@ -146,7 +146,7 @@ def main() -> None:
     # Imported, never used here: a library that has started threads would not survive a fork.
     for name in (
         *("model", "video", "drive", "torch._dynamo", "av", "pandas", "matplotlib.backends.backend_agg"),
-        *("matplotlib.figure", "PIL.PngImagePlugin", "cloning.replay.command", "cloning.pilot.attention"),
+        *("matplotlib.figure", "PIL.PngImagePlugin", "cloning.replay.command", "cloning.network.attention"),
         *("simulator.record", "simulator.report", "simulator.client", "simulator.film", "simulator.run"),
     ):
         importlib.import_module(name)

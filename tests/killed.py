@@ -19,7 +19,7 @@ import torch
 from kill_points import Ended, Warm
 from PIL import Image
 
-from cloning.files import TEMPORARY_NAME
+from cloning.base.files import TEMPORARY_NAME
 
 ALL = bool(os.environ.get("ALL_KILL_POINTS"))  # see `chosen`
 KILLED = -signal.SIGKILL

@@ -4,7 +4,7 @@ import argparse
 
 import pytest
 
-from cloning.arguments import address, number, ratio
+from cloning.base.arguments import address, number, ratio
 from simulator.__main__ import parse_arguments
 
 IMPOSSIBLE = ["nan", "inf", "-inf", "1e400", "", "x", "1,5", "9" * 5000]

@@ -13,11 +13,11 @@ import pytest
 from drive_process import serving
 
 import drive
-from cloning.pilot import page
-from cloning.pilot.network import Network
-from cloning.wire.libraries import eventlet
-from cloning.wire.server import MAX_CLIENTS, QUIET
-from cloning.wire.turns import Account, Turns
+from cloning.network.network import Network
+from cloning.server import page
+from cloning.server.libraries import eventlet
+from cloning.server.server import MAX_CLIENTS, QUIET
+from cloning.server.turns import Account, Turns
 from tools import attack
 from tools.attacks import GET, all_attacks, frame
 from tools.simulator_client import Simulator, telemetry

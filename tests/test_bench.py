@@ -6,7 +6,7 @@ import sys
 import torch
 from conftest import ROOT, run_model
 
-from cloning.pilot.network import Network
+from cloning.network.network import Network
 from cloning.training.pieces import converted
 from tools import bench_layers
 

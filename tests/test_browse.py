@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses, summary
 from cloning.browse.analyses import LANE, Analysis, Result, read_result, stamp, write_result
 from cloning.browse.library import Library, UnknownError
-from cloning.errors import RecordingError
 from cloning.lane.place import Localisation
-from cloning.pilot.network import load_model, steer
+from cloning.network.network import load_model, steer
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import read_recording
 from cloning.road.track import Track

@@ -14,19 +14,20 @@ from browse_process import browsing, placed, replayed, written_run
 from conftest import HERE, run_here
 from test_excluded import center
 
+from cloning.base.errors import ModelError
 from cloning.browse import analyse, analyses, attend, runs
 from cloning.browse.analyses import Analysis, stamp, write_result
 from cloning.browse.attention import Attention
 from cloning.browse.library import Library
 from cloning.browse.replays import NotReplayedError
-from cloning.errors import ModelError
-from cloning.pilot.attention import MAGENTA, overlay, visual_backprop
-from cloning.pilot.network import load_model, steer
+from cloning.network.attention import visual_backprop
+from cloning.network.network import load_model, steer
 from cloning.recordings.excluded import Cut, add_cut
 from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
-from cloning.replay.drivers import ModelDriver
+from cloning.replay.model_driver import ModelDriver
+from cloning.road.overlay import MAGENTA, overlay
 from cloning.training.run_files import RunFiles
 
 # ----------------------------------------------------------------------------------------------------------------------

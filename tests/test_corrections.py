@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from steer_server import STEER, Server, ahead
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.format import DRIVE_GAP, DRIVING_LOG
 from cloning.recordings.log import read_recording
 from cloning.road.motion import stretches

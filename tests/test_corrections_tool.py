@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cloning.errors import UserError
+from cloning.base.errors import UserError
 from tools import corrections
 from tools.corrections import CORRECTIONS, LAPS, START, Measured, main, means, picture
 

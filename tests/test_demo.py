@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloning import program
+from cloning.base import program
 from tools import demo
 
 REPORT = {"distance_m": 1137.9, "mean_speed_mph": 29.6, "departures": [], "offset_mean_m": 0.074, "offset_max_m": 0.281}

@@ -10,8 +10,8 @@ from conftest import render_recording
 from test_generator import recording as without_images
 
 import model
-from cloning.errors import SimulatorError
-from cloning.pilot.network import Network
+from cloning.base.errors import SimulatorError
+from cloning.network.network import Network
 from cloning.recordings.images import read_frame
 from cloning.replay import drift
 from cloning.replay.drift import MOST_PIECES, ROWS, drifts, held_out, still_drifts

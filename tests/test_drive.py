@@ -13,11 +13,12 @@ from conftest import render_frame
 from PIL import Image
 
 import drive
-from cloning.errors import UserError
-from cloning.pilot import attention
-from cloning.pilot.network import SHIPPED_MODEL, Network
+from cloning.base.errors import UserError
+from cloning.network import attention
+from cloning.network.network import SHIPPED_MODEL, Network
 from cloning.recordings import saved_frames as frames
 from cloning.recordings.images import decode
+from cloning.road.overlay import overlay
 
 
 def jpeg_of(frame: np.ndarray) -> bytes:
@@ -375,7 +376,7 @@ def middle(picture: np.ndarray) -> float:
 
 def test_the_line_bends_to_the_side_of_the_steering():
     frame = np.zeros((160, 320, 3), np.uint8)
-    left, straight, right = (middle(attention.overlay(frame, steering)) for steering in (-0.3, 0.0, 0.3))
+    left, straight, right = (middle(overlay(frame, steering)) for steering in (-0.3, 0.0, 0.3))
     assert left < 300 < 340 < right
     assert abs(straight - 320) < 6  # the camera is turned by 0.7 degrees and rolled by 1.2
 
@@ -390,4 +391,4 @@ def test_the_overlay_shows_the_steering_that_is_sent(output, jpeg):
     frame = np.zeros((160, 320, 3), np.uint8)
     steering, _ = attention.visual_backprop(network, frame)
     assert steering == sent == np.sign(output)
-    assert np.sign(middle(attention.overlay(frame, steering)) - 320) == np.sign(output)
+    assert np.sign(middle(overlay(frame, steering)) - 320) == np.sign(output)

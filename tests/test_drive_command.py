@@ -14,10 +14,10 @@ import torch
 from conftest import HERE
 from drive_process import STOP, script, serving
 
-from cloning.errors import UserError
-from cloning.pilot.network import SHIPPED_MODEL, load_model, steer
+from cloning.base.errors import UserError
+from cloning.network.network import SHIPPED_MODEL, load_model, steer
 from cloning.recordings.images import decode
-from cloning.wire.versions import check_versions
+from cloning.server.versions import check_versions
 from tools.simulator_client import Simulator, telemetry
 
 

@@ -16,8 +16,8 @@ from drive_process import serving
 from test_drive import Car
 
 import drive
-from cloning.pilot import page as drive_page
-from cloning.pilot.network import Network
+from cloning.network.network import Network
+from cloning.server import page as drive_page
 from tools import bench_driving
 from tools.simulator_client import Simulator, telemetry
 

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from cloning.errors import SimulatorError, TrackError
+from cloning.base.errors import SimulatorError, TrackError
 from cloning.recordings.format import SAMPLE_RATE
 from simulator import environment, scenery
 from simulator.cameras import Cameras

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import ROOT, SHORT, run_here
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.excluded import MAX_REASON, Cut, add_cut, delete_cut, one_line, read_cuts
 from cloning.recordings.log import print_findings, read_recording, read_uncut
 from cloning.replay.replay import load_recording

@@ -10,12 +10,12 @@ import torch
 from conftest import ROOT
 from real_recordings import FOLDERS, MISSING
 
-from cloning.pilot.network import SHIPPED_MODEL, load_model
+from cloning.network.network import SHIPPED_MODEL, load_model
 from cloning.recordings.images import read_frame
 
 
 def run(*arguments) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "cloning.export", *map(str, arguments)]
+    command = [sys.executable, "-m", "cloning.network.export", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 

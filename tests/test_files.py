@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from cloning.errors import OutputError
-from cloning.files import write, written_whole
-from cloning.outputs import check_folders
+from cloning.base.errors import OutputError
+from cloning.base.files import write, written_whole
+from cloning.base.outputs import check_folders
 
 
 @pytest.mark.parametrize("name", ["runs", "."])

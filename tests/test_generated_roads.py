@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from cloning.errors import TrackError
+from cloning.base.errors import TrackError
 from cloning.recordings.log import read_recording
 from cloning.road.generated import MARKINGS, generate
 from cloning.road.motion import MPH

@@ -15,8 +15,8 @@ from PIL import Image
 
 import model
 import simulator.__main__ as simulator
-from cloning.errors import RecordingError
-from cloning.pilot.network import SHIPPED_MODEL
+from cloning.base.errors import RecordingError
+from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings import check
 from cloning.recordings.check import check_images
 from cloning.recordings.images import MAX_BYTES, decode, jpeg_size, read_frame, read_jpeg

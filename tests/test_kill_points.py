@@ -20,7 +20,7 @@ from kill_points import Warm
 from killed import ALL, KILLED, Place, check_whole, chosen, is_temporary, spread
 from steer_server import STEER, Server
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.check import check_images
 from cloning.recordings.excluded import Cut, add_cut, read_cuts
 from cloning.recordings.log import read_recording

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from conftest import run_here
 
+from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses
-from cloning.errors import RecordingError
 from cloning.lane.known import lane_position
 from cloning.lane.place import estimate_lane_position
 from cloning.recordings.log import read_recording

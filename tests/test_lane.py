@@ -17,7 +17,8 @@ import real_recordings
 import torch
 from conftest import HERE, ROOT, render_recording
 
-from cloning.errors import ModelError, RecordingError
+from cloning.base.errors import ModelError, RecordingError
+from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import place, reader
 from cloning.lane.ahead import centre_ahead
 from cloning.lane.place import MIN_LOG_LIKELIHOOD, estimate_lane_position, localise
@@ -37,7 +38,7 @@ from cloning.lane.reader import (
     normalize,
     read_strips,
 )
-from cloning.recordings.format import FRAME, ROAD_ROWS, SAMPLE_RATE
+from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, camera_position
 from cloning.road.motion import MIN_TRUSTED, REAR_AXLE, Stretch, stretches
@@ -50,7 +51,7 @@ from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
 SHORT_TRAINING = ("--looks", "1", "--roads", "1", "--frames", "3", "--steps", "2")
-PILOT = ROOT / "cloning" / "pilot" / "shipped.pt"
+PILOT = ROOT / "cloning" / "network" / "shipped.pt"
 UNSEEN = 1003  # a look that the network was not trained on
 
 

@@ -13,11 +13,11 @@ import torch
 from conftest import ROOT
 from torch import nn
 
-from cloning import tensors
-from cloning.errors import ModelError
-from cloning.files import write
-from cloning.pilot import network as network_module
-from cloning.pilot.network import SHIPPED_MODEL, Network, OverPairs, layer_table, load_model, save_model, steer
+from cloning.base.errors import ModelError
+from cloning.base.files import write
+from cloning.network import fast_conv, tensors
+from cloning.network.fast_conv import OverPairs
+from cloning.network.network import SHIPPED_MODEL, Network, layer_table, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.training.pieces import LOSSES, PIECE, SquaredErrors, converted, pieces, squared_errors
 from model import Batch
@@ -75,7 +75,7 @@ def test_convolution_in_blocks_is_torchs(size):
     torch.manual_seed(0)
     plain = nn.Conv2d(24, 36, 5, 2).double()
     images = torch.randn(3, 24, *size, dtype=torch.float64, requires_grad=True)
-    blocks = nn.functional.conv2d(network_module.in_blocks(images), network_module.in_blocks(plain.weight), plain.bias)
+    blocks = nn.functional.conv2d(fast_conv.in_blocks(images), fast_conv.in_blocks(plain.weight), plain.bias)
     expected, direction = plain(images), torch.randn_like(blocks)
     torch.testing.assert_close(blocks, expected, rtol=1e-12, atol=1e-12)
     inputs = (images, *plain.parameters())
@@ -100,12 +100,12 @@ def test_the_gradients_over_pairs_of_columns_are_those_of_the_convolution(shape)
 
 
 def test_only_training_in_bfloat16_computes_in_blocks_or_over_pairs(network, frames, monkeypatch):
-    calls, in_blocks, over_pairs = [], network_module.in_blocks, OverPairs.apply
-    monkeypatch.setattr(network_module, "in_blocks", lambda x: calls.append(x.shape[1:]) or in_blocks(x))
+    calls, in_blocks, over_pairs = [], fast_conv.in_blocks, OverPairs.apply
+    monkeypatch.setattr(fast_conv, "in_blocks", lambda x: calls.append(x.shape[1:]) or in_blocks(x))
     monkeypatch.setattr(OverPairs, "apply", lambda *inputs: calls.append("pairs") or over_pairs(*inputs))
     half = converted(network, torch.bfloat16)
     for amx, expected in ((False, ["pairs"]), (True, [(24, 36, 158), (24, 5, 5)])):
-        monkeypatch.setattr(network_module, "has_amx", lambda amx=amx: amx)
+        monkeypatch.setattr(fast_conv, "has_amx", lambda amx=amx: amx)
         with torch.inference_mode():
             half(frames)
         network(frames).sum().backward()  # float32

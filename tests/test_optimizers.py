@@ -6,7 +6,7 @@ import sys
 import torch
 from conftest import ROOT
 
-from cloning.pilot.network import Network
+from cloning.network.network import Network
 from cloning.training.adam import Adam
 from cloning.training.muon import WEIGHT_DECAY, Muon, orthogonal
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from cloning.pilot.network import Network
+from cloning.network.network import Network
 from cloning.replay.replay import load_recording
 from tools import pose_errors
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 from conftest import ROOT
 
-from cloning.program import FAILED
+from cloning.base.program import FAILED
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there SIGINT goes to a whole console")
 
@@ -29,7 +29,7 @@ TOOLS = [
 
 INTERRUPTED_MAIN = """
 import os, signal
-from cloning import program
+from cloning.base import program
 program.end_on_interrupt("test", "stopped")
 def main():
     try:
@@ -86,7 +86,7 @@ def test_ctrl_c_in_a_command_lets_it_clean_up():
 
 ENDING_MAIN = """
 import atexit, sys, threading, time
-from cloning import program
+from cloning.base import program
 def main():
     atexit.register(print, "at exit", end="")
     if "thread" in sys.argv:

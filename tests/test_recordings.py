@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import render_recording
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.check import check_images
 from cloning.recordings.images import decode, jpeg_size
 from cloning.recordings.log import find_folders, read_recording

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.columns import Shape, UnclearColumns, by_camera, camera_of, check_numbers, check_places, number
 from cloning.recordings.log import read_recording
 

@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings import log, plain
 from cloning.recordings.frames import FrameCache
 from cloning.recordings.log import read_recording

@@ -21,17 +21,17 @@ import torch
 from conftest import ROOT, render_recording
 from drive_process import serving
 
-from cloning.errors import SimulatorError, UserError
+from cloning.base.errors import SimulatorError, UserError
 from cloning.lane.reader import LanePosition
 from cloning.lane.recovery import LaneAhead
-from cloning.pilot.network import CROP, Network, load_model, save_model, steer
+from cloning.network.network import CROP, Network, load_model, save_model, steer
 from cloning.recordings.images import compress, compressed_rows, decode, encode
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
-from cloning.replay.autonomy import LIMITS
-from cloning.replay.drivers import ModelDriver
+from cloning.replay.model_driver import ModelDriver
 from cloning.replay.processes import CAN_FORK
 from cloning.replay.score import ReplayFilm, driving_metrics, steering_metrics
+from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
 
 ORACLE_DRIVER = replay.ReplayFrame.recovery_steering
@@ -446,7 +446,7 @@ def test_ctrl_c_ends_a_drive_that_waits_for_a_server(recording):
 
 
 def test_all_outputs_are_tried_and_every_failure_is_reported():
-    from cloning.outputs import run_all
+    from cloning.base.outputs import run_all
 
     done = []
 

@@ -13,10 +13,10 @@ import torch
 from conftest import ROOT, SHORT, finished_run, render_recording, run_here, run_model, weights
 
 import model
+from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
-from cloning.pilot.network import CROP, Network
-from cloning.recordings.format import FRAME, ROAD_ROWS
+from cloning.network.network import CROP, Network
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for

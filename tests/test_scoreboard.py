@@ -9,8 +9,8 @@ import pytest
 import torch
 from conftest import ROOT, render_recording
 
-from cloning.errors import UserError
-from cloning.pilot.network import Network, save_model
+from cloning.base.errors import UserError
+from cloning.network.network import Network, save_model
 from tools import score_table, scoreboard
 from tools.score_table import drive_in_sample, replay_in_sample, table
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import IMAGE_FOLDER, PROBLEM_AREAS
 from cloning.recordings.log import read_recording, read_uncut

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import RecordingWriter, csharp_number
 from cloning.road.motion import MPH

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from steer_server import STEER, Server, ahead, drive
 
-from cloning.errors import OutputError
-from cloning.outputs import write_json
+from cloning.base.errors import OutputError
+from cloning.base.outputs import write_json
 from cloning.road.track import Track
 from simulator import report
 from simulator.__main__ import main

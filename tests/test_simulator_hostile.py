@@ -12,8 +12,8 @@ import tracemalloc
 import pytest
 from steer_server import STEER, Blank, Server, accept_websocket
 
-from cloning.errors import SimulatorError
-from cloning.replay.drivers import ServerDriver
+from cloning.base.errors import SimulatorError
+from cloning.replay.server_driver import ServerDriver
 from cloning.road.track import Track
 from cloning.wire.client import parse_answer
 from simulator.__main__ import main

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cloning.errors import OutputError
-from cloning.film import DriveFilm
+from cloning.base.errors import OutputError
+from cloning.base.film import DriveFilm
 from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg

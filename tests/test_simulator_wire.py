@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from steer_server import STEER, Blank, Server, ahead, drive
 
-from cloning.errors import SimulatorError
+from cloning.base.errors import SimulatorError
 from cloning.road.track import Track
 from cloning.wire.client import Answer, parse_answer
 from cloning.wire.protocol import FRAGMENT

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cloning.pilot.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_number, parse_telemetry
+from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_number, parse_telemetry
 
 # -12.3456 with the format "N4", as Mono 6.8 writes it (ar-SA … sv-SE) or a newer runtime does.
 WRITTEN = {

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import model
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.training import options, pictures, summary
 from cloning.training.checkpoint import Progress
 from cloning.training.distributed import FirstRankFailed
@@ -303,7 +303,7 @@ def test_a_given_value_counts_as_given_also_when_it_is_the_default():
 
 def test_importing_does_nothing(tmp_path):
     done = run_model(
-        command=[sys.executable, "-c", "import model, cloning.recordings.log, cloning.pilot.network"],
+        command=[sys.executable, "-c", "import model, cloning.recordings.log, cloning.network.network"],
         cwd=tmp_path,
         env=HERE,
     )

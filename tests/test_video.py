@@ -14,8 +14,8 @@ import torch
 from conftest import ROOT
 
 import video
-from cloning.film import FilmWriter, frame_rate
-from cloning.pilot.network import Network, save_model
+from cloning.base.film import FilmWriter, frame_rate
+from cloning.network.network import Network, save_model
 
 FILMED = "run.1.mp4: 10 frames at 60 frames/s\n"
 

@@ -18,16 +18,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("attack")  # also while the libraries below are loaded
 
 import numpy as np
 
-from cloning.arguments import number
-from cloning.errors import UserError
-from cloning.pilot.network import SHIPPED_MODEL
+from cloning.base.arguments import number
+from cloning.base.errors import UserError
+from cloning.network.network import SHIPPED_MODEL
 from tools.attacks import Attack, all_attacks, frames
 from tools.server_process import start_server
 from tools.simulator_client import Simulator, telemetry

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from cloning.recordings.format import FRAME
+from cloning.base.frame import FRAME
 from cloning.recordings.images import encode
 from tools.simulator_client import fragments, telemetry
 

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("bench_driving")  # also while the libraries below are loaded
@@ -28,11 +28,11 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from cloning.arguments import number
-from cloning.errors import UserError
-from cloning.pilot.network import Network, load_model
-from cloning.pilot.page import DrivenFrame
+from cloning.base.arguments import number
+from cloning.base.errors import UserError
+from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
+from cloning.server.page import DrivenFrame
 from tools.server_process import start_server
 from tools.simulator_client import Simulator, fragments, telemetry
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from cloning.compute import threads
-from cloning.pilot.network import Network
+from cloning.network.compute import threads
+from cloning.network.network import Network
 from cloning.training.observations import SEEN_SHAPE
 from cloning.training.pieces import PIECE, converted, squared_errors
 

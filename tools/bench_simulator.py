@@ -21,13 +21,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("bench_simulator")  # also while the libraries below are loaded
 
-from cloning.arguments import number
-from cloning.errors import SimulatorError, UserError
+from cloning.base.arguments import number
+from cloning.base.errors import SimulatorError, UserError
 from cloning.recordings.format import DRIVING_LOG, SAMPLE_RATE
 from cloning.road.track import ROADS, Track
 from simulator import scenery

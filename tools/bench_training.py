@@ -29,14 +29,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from unittest import mock
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("bench_training")  # also while the libraries below are loaded
 
-from cloning.arguments import number
-from cloning.compute import keep_freed_memory, threads
-from cloning.errors import UserError
+from cloning.base.arguments import number
+from cloning.base.errors import UserError
+from cloning.network.compute import keep_freed_memory, threads
 from cloning.road.track import Track
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import torch
 
     import model
-    from cloning.pilot.network import Network
+    from cloning.network.network import Network
 
 PARTS = ("limit", "ab", "c", "k")  # that measure rates
 BATCH_IMAGES = 474  # images in a batch of 128 observations, at 3.7 images each on average
@@ -123,7 +123,7 @@ def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray",
     """
     import numpy as np
 
-    from cloning.recordings.format import FRAME
+    from cloning.base.frame import FRAME
     from model import CROP, augment, kind_inputs
 
     choices, images, angles = generator.sample(number), [], []

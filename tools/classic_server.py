@@ -17,7 +17,7 @@ import socketio
 import torch
 from PIL import Image
 
-from cloning.pilot.network import Network, load_model
+from cloning.network.network import Network, load_model
 
 SET_SPEED, PROPORTIONAL = 9.0, 0.1  # mph, throttle per mph
 

@@ -26,14 +26,14 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("corrections")  # also while the libraries below are loaded
 
-from cloning.arguments import number
-from cloning.errors import UserError
-from cloning.outputs import write_json, write_output
+from cloning.base.arguments import number
+from cloning.base.errors import UserError
+from cloning.base.outputs import write_json, write_output
 from cloning.recordings.format import DRIVING_LOG, PROBLEM_AREAS
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.track import Track

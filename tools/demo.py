@@ -21,16 +21,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("demo", "stopped; start it again to continue")  # also while the libraries below are loaded
 
-from cloning.cores import threads
-from cloning.errors import SimulatorError, UserError
-from cloning.files import write
-from cloning.pilot.network import SHIPPED_MODEL
-from cloning.pilot.site import STYLE
+from cloning.base.cores import threads
+from cloning.base.errors import SimulatorError, UserError
+from cloning.base.files import write
+from cloning.network.network import SHIPPED_MODEL
+from cloning.server.site import STYLE
 from simulator.report import LapReport
 from tools.server_process import start_server
 from tools.shipped import ROOT, Lap, render

@@ -11,7 +11,7 @@ this shows how similar rendered and real roads are.
 import argparse
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("follow_driver")  # also while the libraries below are loaded
@@ -19,8 +19,8 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from cloning.errors import UserError
-from cloning.pilot.network import Network, load_model
+from cloning.base.errors import UserError
+from cloning.network.network import Network, load_model
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_recording
 

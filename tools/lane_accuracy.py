@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("lane_accuracy")  # also while the libraries below are loaded
@@ -22,9 +22,9 @@ if __name__ == "__main__":
 import cv2
 import numpy as np
 
-from cloning.arguments import number
-from cloning.errors import UserError
-from cloning.files import write
+from cloning.base.arguments import number
+from cloning.base.errors import UserError
+from cloning.base.files import write
 from cloning.lane import marking
 from cloning.lane.place import (
     MIN_LOCALISED_ROWS,

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from panda3d.core import Point3, TransformState, Vec3
 
-from cloning.compute import threads
 from cloning.lane.ahead import centre_ahead
 from cloning.lane.reader import DISTANCES_AHEAD, STRIP_SHAPE, extract_strip
+from cloning.network.compute import threads
 from cloning.recordings.images import decode
 from cloning.road.motion import CAMERA_FORWARD
 from cloning.road.track import Track

@@ -10,7 +10,7 @@ where they would be on flat ground.
 import argparse
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("likeness")  # also while the libraries below are loaded
@@ -18,11 +18,12 @@ if __name__ == "__main__":
 import cv2
 import numpy as np
 
-from cloning.arguments import number
-from cloning.errors import RecordingError, UserError
+from cloning.base.arguments import number
+from cloning.base.errors import RecordingError, UserError
+from cloning.base.frame import FRAME
 from cloning.lane.place import localise_all
 from cloning.lane.reader import estimate_centres, read_strips
-from cloning.recordings.format import CAMERAS, FRAME
+from cloning.recordings.format import CAMERAS
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_OFFSETS, camera_position, project_ground

@@ -13,7 +13,7 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("pose_errors")  # also while the libraries below are loaded
@@ -21,9 +21,9 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from cloning.arguments import number
-from cloning.errors import RecordingError, UserError
-from cloning.pilot.network import Network, load_model
+from cloning.base.arguments import number
+from cloning.base.errors import RecordingError, UserError
+from cloning.network.network import Network, load_model
 from cloning.recordings.log import Recording
 from cloning.replay.replay import load_recording
 from cloning.training.options import Arguments

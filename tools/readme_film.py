@@ -10,7 +10,7 @@ import argparse
 import io
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("readme_film")
@@ -21,11 +21,12 @@ import torch
 from PIL import Image
 
 import simulator.environment as environment
-from cloning.errors import UserError
-from cloning.outputs import check_folders, write_output
-from cloning.pilot.attention import overlay, visual_backprop
-from cloning.pilot.network import SHIPPED_MODEL, Network, load_model
+from cloning.base.errors import UserError
+from cloning.base.outputs import check_folders, write_output
+from cloning.network.attention import visual_backprop
+from cloning.network.network import SHIPPED_MODEL, Network, load_model
 from cloning.recordings.format import SAMPLE_RATE
+from cloning.road.overlay import overlay
 from simulator.scenery.looks import SHADOWED
 
 FILM = Path(__file__).resolve().parent.parent / "diagnostic_images" / "report" / "driving.gif"

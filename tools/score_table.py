@@ -7,7 +7,7 @@ from itertools import accumulate
 from typing import TypedDict, TypeVar
 
 from cloning.recordings.format import PROBLEM_AREAS
-from cloning.replay.autonomy import LIMITS, autonomy
+from cloning.road.autonomy import LIMITS, autonomy
 from cloning.road.generated import road_number
 from cloning.road.track import ROADS
 from simulator.report import LapReport

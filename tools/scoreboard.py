@@ -31,21 +31,21 @@ from itertools import pairwise
 from pathlib import Path, PureWindowsPath
 from queue import SimpleQueue
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("scoreboard")  # also while the libraries below are loaded
 
-from cloning.arguments import number
-from cloning.cores import threads
-from cloning.errors import UserError
-from cloning.outputs import write_json, write_output
-from cloning.pilot.network import load_checkpoint
+from cloning.base.arguments import number
+from cloning.base.cores import threads
+from cloning.base.errors import UserError
+from cloning.base.outputs import write_json, write_output
+from cloning.network.network import load_checkpoint
 from cloning.recordings.log import find_folders
 from cloning.replay.score import ORACLE, DrivingMetrics, ReplayReport
 from cloning.road.generated import road_number
 from cloning.road.track import ROADS, find_road
-from cloning.wire.server import MAX_CLIENTS
+from cloning.server.server import MAX_CLIENTS
 from simulator.report import LapReport
 from tools.score_table import Board, Driven, NetworkResults, RealRecording, Replayed, course, driven, table
 from tools.server_process import start_server

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from cloning.errors import UserError
+from cloning.base.errors import UserError
 
 
 def start_server(

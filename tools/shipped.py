@@ -7,7 +7,7 @@ Everything is written to the folder shipped/, which git ignores; an interrupted 
 The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Roads and
 looks 1 to 1000 are left to measure with, and so are these looks' shadowed twins: shipped/scoreboard.md has the results.
 
-The network that comes with the project was made so; cloning/pilot/shipped.md, its model card, has the recordings and
+The network that comes with the project was made so; cloning/network/shipped.md, its model card, has the recordings and
 what came out.
 """
 
@@ -19,13 +19,13 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("shipped")  # also while the libraries below are loaded
 
-from cloning.arguments import number
-from cloning.errors import RecordingError, UserError
+from cloning.base.arguments import number
+from cloning.base.errors import RecordingError, UserError
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE, PROBLEM_AREAS
 from cloning.recordings.log import find_folders

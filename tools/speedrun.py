@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("speedrun")
@@ -26,12 +26,12 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from cloning.arguments import number
-from cloning.errors import UserError
+from cloning.base.arguments import number
+from cloning.base.errors import UserError
 from cloning.recordings.log import Recording, find_folders
-from cloning.replay.autonomy import autonomy
-from cloning.replay.drivers import ModelDriver
+from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import ReferenceLine, drive, load_recording, reference_lines
+from cloning.road.autonomy import autonomy
 from cloning.training.options import ROBUST_DEFAULTS
 
 ROOT = Path(__file__).resolve().parent.parent

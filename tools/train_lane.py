@@ -16,7 +16,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("train_lane")  # also while the libraries below are loaded
@@ -25,9 +25,8 @@ import cv2
 import numpy as np
 import torch
 
-from cloning.arguments import number
-from cloning.compute import choose_precision, in_precision, one_thread
-from cloning.errors import UserError
+from cloning.base.arguments import number
+from cloning.base.errors import UserError
 from cloning.lane.reader import (
     DIRECTION_TO_STRIP,
     DISTANCES_AHEAD,
@@ -39,6 +38,7 @@ from cloning.lane.reader import (
     read_strips,
     save_network,
 )
+from cloning.network.compute import choose_precision, in_precision, one_thread
 from cloning.recordings.log import find_folders, read_recording
 from cloning.road.camera import LEVEL_CAMERA_MATRIX, camera_position, homographies
 from cloning.road.motion import MAX_GAP, Stretch, components, forward_vector

@@ -12,21 +12,21 @@ import argparse
 import sys
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("browse")
 
-from cloning.arguments import MAX_PORT, number
+from cloning.base.arguments import MAX_PORT, number
+from cloning.base.errors import UserError
 from cloning.browse.library import Library
 from cloning.browse.runs import Runs
-from cloning.errors import UserError
 from cloning.recordings.log import find_folders
 
 try:
     from cloning.browse.page import create_app
-    from cloning.wire import connections
-    from cloning.wire.server import refuse_other_sites
+    from cloning.server import connections
+    from cloning.server.server import refuse_other_sites
 except UserError as error:  # wrong versions of the socket libraries
     sys.exit(program.failed("browse", error))
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("analyse")
@@ -20,18 +20,18 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
+from cloning.base.cores import threads
+from cloning.base.errors import ModelError, UserError
 from cloning.browse.analyses import PROGRESS, Analysis, Result, stamp, write_result
-from cloning.compute import one_thread
-from cloning.cores import threads
-from cloning.errors import ModelError, UserError
 from cloning.lane.known import known_position
 from cloning.lane.place import place, shipped_networks
 from cloning.lane.reader import LaneNetwork, detect_centres, read_strips
-from cloning.pilot.network import load_model, steer
+from cloning.network.compute import one_thread
+from cloning.network.network import load_model, steer
 from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_uncut
-from cloning.replay.drivers import ModelDriver
+from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import Drive, ReplayFrame, drive, load_recording, reference_lines
 from cloning.replay.score import driving_metrics
 from cloning.road.motion import stretches

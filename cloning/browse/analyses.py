@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from cloning.errors import RecordingError
-from cloning.files import written_whole
+from cloning.base.errors import RecordingError
+from cloning.base.files import written_whole
 from cloning.recordings.check import cache_file
 from cloning.recordings.excluded import read_cuts
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE

@@ -15,10 +15,11 @@ import cv2
 import numpy as np
 import torch
 
-from cloning.errors import ModelError, UserError, message_of
-from cloning.pilot.attention import MAGENTA, opacity, visual_backprop
-from cloning.pilot.network import Network, load_model
+from cloning.base.errors import ModelError, UserError, message_of
+from cloning.network.attention import visual_backprop
+from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
+from cloning.road.overlay import MAGENTA, opacity
 
 IDLE = 120.0  # s without a question after which the process ends, and frees its memory
 

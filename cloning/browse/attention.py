@@ -6,7 +6,7 @@ import sys
 import threading
 from contextlib import suppress
 
-from cloning.errors import ModelError
+from cloning.base.errors import ModelError
 
 COMMAND = (sys.executable, "-m", "cloning.browse.attend")
 

@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from cloning.base.errors import RecordingError, UserError, message_of
+from cloning.base.frame import FRAME
 from cloning.browse import replays, summary
 from cloning.browse.analyses import LANE, Analyses, Analysis, Result, file_stamp, read_result, stamp
 from cloning.browse.attention import Attention
-from cloning.errors import RecordingError, UserError, message_of
 from cloning.recordings.excluded import Cut, add_cut, cut_rows, delete_cut, one_line, read_cuts
-from cloning.recordings.format import CAMERAS, DRIVING_LOG, FRAME
+from cloning.recordings.format import CAMERAS, DRIVING_LOG
 from cloning.recordings.images import jpeg_size, read_jpeg
 from cloning.recordings.log import Recording, read_uncut
-from cloning.replay.autonomy import LIMITS
+from cloning.road.autonomy import LIMITS
 
 OPEN = 2  # recordings that are kept in memory: 100,000 rows take 20 MB
 COLUMNS = ("steering", "throttle", "speed", "seconds")  # of the log; the analyses add to them

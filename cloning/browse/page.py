@@ -5,13 +5,13 @@ from typing import Any
 import flask
 import numpy as np
 
+from cloning.base.errors import UserError, message_of
 from cloning.browse.library import Library, UnknownError
 from cloning.browse.replays import NotReplayedError
 from cloning.browse.runs import Runs
-from cloning.errors import UserError, message_of
-from cloning.pilot import site
-from cloning.replay.autonomy import LIMITS
-from cloning.wire.libraries import eventlet
+from cloning.road.autonomy import LIMITS
+from cloning.server import site
+from cloning.server.libraries import eventlet
 
 KEPT = 600  # s for which a browser does not ask again for a frame
 

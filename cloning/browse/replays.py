@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
+from cloning.base.errors import UserError
 from cloning.browse.analyses import Result
-from cloning.errors import UserError
-from cloning.pilot.path import draw_path
 from cloning.recordings.images import encode
 from cloning.recordings.log import Recording
 from cloning.replay.views import StretchViews
 from cloning.road.camera import VIEW_JPEG_QUALITY
 from cloning.road.motion import Stretch
+from cloning.road.overlay import draw_path
 
 
 class NotReplayedError(UserError):

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from cloning.base.errors import UserError, message_of
 from cloning.browse.library import UnknownError
-from cloning.errors import UserError, message_of
 from cloning.training.run_files import RunFiles
 
 PICTURE = re.compile(r"training_generator_(LRC_|augmented-)([0-9]{1,12})\.png")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.lane.place import estimate_lane_position
 from cloning.lane.reader import LanePosition
 from cloning.recordings.columns import NUMBER

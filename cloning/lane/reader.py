@@ -22,10 +22,10 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from cloning import tensors
-from cloning.compute import choose_precision, in_precision, one_thread, threads
-from cloning.errors import ModelError
-from cloning.recordings.format import FRAME, ROAD_ROWS
+from cloning.base.errors import ModelError
+from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.network import tensors
+from cloning.network.compute import choose_precision, in_precision, one_thread, threads
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_MATRIX, CAMERA_OFFSETS, LEVEL_CAMERA_MATRIX
 from cloning.road.motion import AXLE_TO_CAMERA, MAX_GAP, REAR_AXLE, Stretch

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from cloning.errors import RecordingError
-from cloning.files import written_whole
+from cloning.base.errors import RecordingError
+from cloning.base.files import written_whole
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
 from cloning.recordings.frames import FrameCache
 from cloning.recordings.images import RULES, decode, read_jpeg

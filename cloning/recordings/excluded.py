@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.errors import RecordingError
-from cloning.files import write
+from cloning.base.errors import RecordingError
+from cloning.base.files import write
 from cloning.recordings.format import DRIVING_LOG
 
 if os.name != "nt":

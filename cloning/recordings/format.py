@@ -16,8 +16,6 @@ SAMPLE_RATE = 15  # rows a second
 DRIVE_GAP = 1.0  # s: rows further apart are of different drives
 # Training repeats a recording whose name ends like this, as the report does with problem areas.
 PROBLEM_AREAS = "-repetitive", "-corrections"
-FRAME = (160, 320, 3)  # rows, columns, RGB of a camera's image
-ROAD_ROWS = slice(45, 135)  # of a frame: all to which the networks and their warped views look; below is the bonnet
 TIME_STAMP = "%Y_%m_%d_%H_%M_%S_%f"  # in the names of images, with milliseconds in place of microseconds
 MAX_NAME = 255  # bytes of a file's name
 

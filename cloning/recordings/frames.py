@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.recordings.format import FRAME, ROAD_ROWS
+from cloning.base.frame import FRAME, ROAD_ROWS
 
 ROAD_SHAPE = (ROAD_ROWS.stop - ROAD_ROWS.start, *FRAME[1:])  # (90, 320, 3)
 KEPT_FRAMES = 5_000  # by a training run: 432 MB

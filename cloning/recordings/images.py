@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cloning.errors import RecordingError
-from cloning.recordings.format import FRAME
+from cloning.base.errors import RecordingError
+from cloning.base.frame import FRAME
 
 RULES = 2  # of what a usable image is: counted up when they change, because `check_images` keeps its results
 MAX_BYTES = 1 << 20  # of a frame's JPEG; noise at quality 100 takes a fifth of it

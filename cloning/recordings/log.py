@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.excluded import EXCLUDED, Cut, cut_rows, read_cuts
 from cloning.recordings.format import COLUMNS, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE
 from cloning.recordings.frames import FrameCache

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.format import CAMERAS, COLUMNS, MAX_NAME, NUMBERS, RANGES
 
 BLOCK = 2 << 20  # bytes read at a time, about 10,000 lines: so much that the 1 ms of each call of pandas hardly counts

@@ -11,8 +11,8 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
-from cloning.errors import FolderError
-from cloning.files import TEMPORARY_NAME, written_whole
+from cloning.base.errors import FolderError
+from cloning.base.files import TEMPORARY_NAME, written_whole
 from cloning.recordings.format import parse_time_stamp, time_stamp
 
 # The prefix is that of a recording's centre frames, which video.py films, too.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.recordings.columns import (
     NUMBER,
     Shape,

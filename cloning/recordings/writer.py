@@ -9,8 +9,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Self
 
-from cloning.errors import RecordingError
-from cloning.files import written_whole
+from cloning.base.errors import RecordingError
+from cloning.base.files import written_whole
 from cloning.recordings.format import (
     CAMERAS,
     DRIVE_GAP,

@@ -4,13 +4,13 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 from tqdm import tqdm
 
-from cloning.outputs import check_folders, run_all, write_json
+from cloning.base.outputs import check_folders, run_all, write_json
 from cloning.recordings.log import Recording, find_folders
-from cloning.replay.drivers import ModelDriver, ServerDriver
 from cloning.replay.processes import CAN_FORK, ForkedDrives
 from cloning.replay.replay import (
     Drive,
@@ -23,6 +23,10 @@ from cloning.replay.replay import (
     reference_lines,
 )
 from cloning.replay.score import ReplayFilm, ReplayReport, replay_report, report_text, write_plot
+
+if TYPE_CHECKING:
+    from cloning.replay.model_driver import ModelDriver
+    from cloning.replay.server_driver import ServerDriver
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ def run(options: Options) -> None:
     check_folders(options.report, options.picture, options.film)
     folders = find_folders(options.folders)
     in_process = options.model is not None
-    driver = ModelDriver(options.model) if options.model else ServerDriver(options.host, options.port, options.wait)
+    driver = _driver(options)
     limits = list(dict.fromkeys(options.limits))  # each once
     film = ReplayFilm(options.film) if options.film else None
     reports: list[ReplayReport] = []
@@ -83,6 +87,17 @@ def run(options: Options) -> None:
         report = options.report
         steps.append(lambda: write_json(report, reports) if reports else None)
     run_all(*steps)
+
+
+def _driver(options: Options) -> "ModelDriver | ServerDriver":
+    """Return the driver; each needs a library of its own, PyTorch or wsproto. Raises ModelError."""
+    if options.model:
+        from cloning.replay.model_driver import ModelDriver
+
+        return ModelDriver(options.model)
+    from cloning.replay.server_driver import ServerDriver
+
+    return ServerDriver(options.host, options.port, options.wait)
 
 
 def drive_at_limits(

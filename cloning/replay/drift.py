@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cloning.errors import SimulatorError
+from cloning.base.errors import SimulatorError
 from cloning.lane.recovery import LaneAhead
-from cloning.pilot.network import Network
+from cloning.network.network import Network
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
-from cloning.replay.drivers import ModelDriver
+from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import Driver, ReferenceLine, drive
 from cloning.road.motion import Stretch, stretch_rows
 

@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Self
 
-from cloning.errors import SimulatorError, UserError
+from cloning.base.errors import SimulatorError, UserError
 from cloning.replay.replay import Drive
 
 CAN_FORK = sys.platform == "linux"  # elsewhere there is no fork, or libraries do not survive it

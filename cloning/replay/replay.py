@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.errors import RecordingError
+from cloning.base.errors import RecordingError
 from cloning.lane.recovery import LaneAhead
 from cloning.recordings.check import check_images
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.images import compress, compressed_rows, encode
 from cloning.recordings.log import Recording, print_findings, read_recording
-from cloning.replay.autonomy import autonomy
 from cloning.replay.views import StretchViews
+from cloning.road.autonomy import autonomy
 from cloning.road.camera import VIEW_JPEG_QUALITY
 from cloning.road.motion import (
     MIN_STRETCH_ROWS,

@@ -7,12 +7,13 @@ from typing import TypedDict
 import cv2
 import numpy as np
 
-from cloning.film import DriveFilm, frame_rate
-from cloning.outputs import write_output
+from cloning.base.film import DriveFilm, frame_rate
+from cloning.base.outputs import write_output
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, drive
 from cloning.road.camera import FIRST_BONNET_ROW
+from cloning.road.overlay import overlay
 
 SMOOTHED_ROWS = 9  # rows (0.6 s) over which steering is averaged before it is correlated
 CAPTION_ROWS = 28  # of the film, above each frame
@@ -266,8 +267,6 @@ def captioned(frame: np.ndarray, steering: float, caption: str) -> np.ndarray:
 
     frame: uint8 (160, 320, 3), RGB; returns uint8 (298, 640, 3), RGB.
     """
-    from cloning.pilot.attention import overlay  # imports torch, which only films need
-
     shown = overlay(frame, steering)[: 2 * FIRST_BONNET_ROW]
     shown = cv2.copyMakeBorder(shown, CAPTION_ROWS, 0, 0, 0, cv2.BORDER_CONSTANT)
     cv2.putText(shown, caption, (10, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)

@@ -5,7 +5,7 @@ import functools
 import cv2
 import numpy as np
 
-from cloning.recordings.format import FRAME
+from cloning.base.frame import FRAME
 from cloning.recordings.images import read_image
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, FIRST_BONNET_ROW, camera_position, homographies

@@ -7,7 +7,7 @@ section 6). A camera's pose relative to another is (right, forward, yaw): metres
 import cv2
 import numpy as np
 
-from cloning.recordings.format import FRAME, ROAD_ROWS
+from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.road.motion import AXLE_TO_CAMERA, CAMERA_FORWARD, right_of
 
 # Fitted by warping real centre frames to the side cameras; recordings of both tracks agree within 0.01 m, 0.05 degrees

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.errors import TrackError
+from cloning.base.errors import TrackError
 from cloning.road.generated import generate, road_number
 from cloning.road.motion import right_of, wrap_angle
 

@@ -5,7 +5,7 @@ import functools
 import cv2
 import numpy as np
 
-from cloning.recordings.format import FRAME, ROAD_ROWS
+from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.road.camera import (
     CAMERA_MATRIX,
     FAR_SLOPE,

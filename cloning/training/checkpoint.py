@@ -21,10 +21,10 @@ from typing import Any
 
 import torch
 
-from cloning.errors import ModelError
-from cloning.files import write
-from cloning.pilot.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
-from cloning.tensors import matching, shown
+from cloning.base.errors import ModelError
+from cloning.base.files import write
+from cloning.network.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
+from cloning.network.tensors import matching, shown
 from cloning.training.adam import Adam
 from cloning.training.muon import OPTIMIZERS
 from cloning.training.observations import Observations

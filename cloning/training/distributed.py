@@ -11,8 +11,8 @@ from typing import TypeVar, cast
 import torch
 import torch.distributed as dist
 
-from cloning.compute import choose_device
-from cloning.errors import UserError
+from cloning.base.errors import UserError
+from cloning.network.compute import choose_device
 
 Result = TypeVar("Result")
 

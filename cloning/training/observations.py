@@ -11,9 +11,10 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from cloning.errors import RecordingError
-from cloning.pilot.network import CROP
-from cloning.recordings.format import DRIVE_GAP, FRAME, PROBLEM_AREAS, ROAD_ROWS
+from cloning.base.errors import RecordingError
+from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.network.network import CROP
+from cloning.recordings.format import DRIVE_GAP, PROBLEM_AREAS
 from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.log import Recording
 from cloning.training.options import Arguments

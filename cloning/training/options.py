@@ -4,8 +4,8 @@ import argparse
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from cloning.arguments import number
-from cloning.compute import DEVICES, is_available
+from cloning.base.arguments import number
+from cloning.network.compute import DEVICES, is_available
 from cloning.recordings.format import DRIVING_LOG, PROBLEM_AREAS
 
 MAX_SEED = 2**63 - 1  # torch takes no larger one

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from cloning.compute import in_precision
+from cloning.network.compute import in_precision
 
 PIECE = 28  # images at most: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
 Module = TypeVar("Module", bound=nn.Module)

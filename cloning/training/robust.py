@@ -17,7 +17,7 @@ import numpy as np
 
 from cloning.lane.known import lane_position
 from cloning.lane.recovery import LOOKAHEAD, LaneAhead
-from cloning.pilot.network import CROP
+from cloning.network.network import CROP
 from cloning.recordings.format import CAMERAS, LANE_FILE
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position

@@ -5,8 +5,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from cloning.errors import OutputError
-from cloning.outputs import check_folders
+from cloning.base.errors import OutputError
+from cloning.base.outputs import check_folders
 
 if os.name != "nt":
     import fcntl

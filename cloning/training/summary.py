@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from cloning.compute import threads
-from cloning.errors import RecordingError
-from cloning.files import write
-from cloning.pilot.network import Network, layer_table
+from cloning.base.errors import RecordingError
+from cloning.base.files import write
+from cloning.network.compute import threads
+from cloning.network.network import Network, layer_table
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
 from cloning.training.checkpoint import EpochMetrics, Progress, best_epoch

@@ -5,7 +5,7 @@ import time
 
 from tqdm import tqdm
 
-from cloning.errors import SimulatorError
+from cloning.base.errors import SimulatorError
 from cloning.wire.client import (
     CONNECT,
     CONNECT_TIMEOUT,

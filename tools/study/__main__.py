@@ -24,15 +24,15 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("study")  # also while the libraries below are loaded
 
-from cloning.arguments import number
-from cloning.cores import threads
-from cloning.errors import RecordingError, UserError
-from cloning.outputs import write_json, write_output
+from cloning.base.arguments import number
+from cloning.base.cores import threads
+from cloning.base.errors import RecordingError, UserError
+from cloning.base.outputs import write_json, write_output
 from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record

@@ -5,15 +5,15 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from cloning.pilot.network import Network, steer
+from cloning.network.network import Network, steer
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 from cloning.recordings.writer import SampleClock
-from cloning.replay.autonomy import LIMITS
 from cloning.replay.command import drive_at_limits
 from cloning.replay.drift import drifts, held_out
-from cloning.replay.drivers import ModelDriver
+from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import ReferenceLine
+from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import scenery

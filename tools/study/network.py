@@ -4,16 +4,16 @@ import argparse
 import csv
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("study")
 
 import torch
 
-from cloning.errors import UserError
-from cloning.outputs import write_json
-from cloning.replay.drivers import ModelDriver
+from cloning.base.errors import UserError
+from cloning.base.outputs import write_json
+from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import load_recording, reference_lines
 from tools.study.measures import Simulator, laps, offline, replayed
 from tools.study.networks import TRACKS, plan, train

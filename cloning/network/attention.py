@@ -1,17 +1,13 @@
-"""Visualise what the network looks at, by VisualBackProp (arXiv 1611.05418), and its steering, for page and films."""
+"""Visualise what the network looks at, by VisualBackProp (arXiv 1611.05418)."""
 
 import math
 
-import cv2
 import numpy as np
 import torch
 from torch import nn
 
-from cloning.pilot.network import Network, steer
-from cloning.pilot.path import draw_path
-from cloning.recordings.format import FRAME
-
-MAGENTA = (255, 0, 200)  # RGB
+from cloning.base.frame import FRAME
+from cloning.network.network import Network, steer
 
 
 def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndarray]:
@@ -56,22 +52,3 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
 def _binomial(size: int) -> torch.Tensor:
     """Return so many binomial coefficients: 1 4 6 4 1."""
     return torch.tensor([float(math.comb(size - 1, at)) for at in range(size)])
-
-
-def overlay(frame: np.ndarray, steering: float, mask: np.ndarray | None = None) -> np.ndarray:
-    """Return a frame at twice its size, uint8 (320, 640, 3), RGB, with the path ahead at this steering in green.
-
-    frame: uint8 (160, 320, 3), RGB; steering: -1..1; mask: of `visual_backprop`, shown in magenta, or None.
-    """
-    picture = frame.astype(np.float32)
-    if mask is not None:
-        strength = opacity(mask)[..., None]
-        picture = picture * (1 - strength) + np.asarray(MAGENTA, np.float32) * strength
-    enlarged = cv2.resize(picture.astype(np.uint8), None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-    draw_path(enlarged, steering)
-    return enlarged
-
-
-def opacity(mask: np.ndarray) -> np.ndarray:
-    """Return how strongly MAGENTA covers a frame, 0..1, where the network looks at it; mask: of `visual_backprop`."""
-    return np.sqrt(mask) * 0.7  # the square root makes weak attention visible

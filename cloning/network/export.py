@@ -1,7 +1,7 @@
 """Export a model to ONNX, which other programs and languages can run, and check the result with ONNX Runtime.
 
     pip install -r requirements-export.txt
-    python -m cloning.export model.pt model.onnx
+    python -m cloning.network.export model.pt model.onnx
 
 The file takes `frames`, uint8 (n, 160, 320, 3), RGB, as the simulator sends them, and returns `steering`, float32 (n,),
 -1..1, positive to the right; values outside must be clipped, as drive.py does. Cropping and scaling are part of it.
@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from cloning import program
+from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("export")
@@ -23,11 +23,11 @@ if __name__ == "__main__":
 import numpy as np
 import torch
 
-from cloning.errors import ModelError, UserError
-from cloning.files import written_whole
-from cloning.outputs import check_folders
-from cloning.pilot.network import Network, load_model
-from cloning.recordings.format import FRAME
+from cloning.base.errors import ModelError, UserError
+from cloning.base.files import written_whole
+from cloning.base.frame import FRAME
+from cloning.base.outputs import check_folders
+from cloning.network.network import Network, load_model
 
 try:
     import onnx
@@ -99,7 +99,9 @@ def milliseconds(call: Callable[[], object]) -> float:
 def main() -> int:
     """Export a model and print what the file contains; return the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m cloning.export", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m cloning.network.export",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, help="model file to read")
     parser.add_argument("output", type=Path, help="ONNX file to write")

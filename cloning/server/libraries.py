@@ -2,7 +2,7 @@
 
 import warnings
 
-from cloning.wire.versions import check_versions
+from cloning.server.versions import check_versions
 
 check_versions()  # before the imports below, which fail with some versions
 

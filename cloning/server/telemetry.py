@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cloning.recordings.images import decode
-from cloning.wire.server import UNREADABLE
-from cloning.wire.websocket import MAX_MESSAGE
+from cloning.server.server import UNREADABLE
+from cloning.server.websocket import MAX_MESSAGE
 
 NUMERIC_FIELDS = ("steering_angle", "throttle", "speed")  # degrees, -1..1, mph; the first two as applied at the moment
 

@@ -5,8 +5,8 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from cloning.errors import OutputError, UserError
-from cloning.files import write
+from cloning.base.errors import OutputError, UserError
+from cloning.base.files import write
 
 
 def check_folders(*paths: str | None) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 from urllib.parse import parse_qs
 from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
-from cloning.wire.connections import refuse
-from cloning.wire.libraries import engineio, socketio
+from cloning.server.connections import refuse
+from cloning.server.libraries import engineio, socketio
+from cloning.server.turns import TURNS, Account
+from cloning.server.websocket import MAX_MESSAGE, SOCKET_IO_PACKET, WebSocket, WebSocketWSGI
 from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
-from cloning.wire.turns import TURNS, Account
-from cloning.wire.websocket import MAX_MESSAGE, SOCKET_IO_PACKET, WebSocket, WebSocketWSGI
 
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other

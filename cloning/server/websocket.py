@@ -7,8 +7,8 @@ import time
 from typing import Any
 from wsgiref.types import WSGIEnvironment
 
-from cloning.wire.libraries import engineio, eventlet
-from cloning.wire.turns import TURNS, Account
+from cloning.server.libraries import engineio, eventlet
+from cloning.server.turns import TURNS, Account
 
 MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
 UNREADABLE_LENGTH = 23  # bytes that are kept of a longer one: enough to see that it is a telemetry

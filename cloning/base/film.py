@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloning.errors import OutputError
-from cloning.files import written_whole
+from cloning.base.errors import OutputError
+from cloning.base.files import written_whole
 
 if TYPE_CHECKING:
     from av.video.stream import VideoStream

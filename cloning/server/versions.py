@@ -4,7 +4,7 @@ import importlib.metadata
 import re
 from pathlib import Path
 
-from cloning.errors import UserError
+from cloning.base.errors import UserError
 
 SOCKET_LIBRARIES = ("python-socketio", "python-engineio", "eventlet")
 # Missing in an installed package, but there pip has installed the same versions.

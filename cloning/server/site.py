@@ -8,7 +8,7 @@ STYLE = Path(__file__).with_name("static") / "style.css"  # of every page
 
 
 def prepare(app: flask.Flask, *sources: str) -> None:
-    """Serve `cloning/pilot/static/` at /site/, and give all answers the headers that keep other sites out.
+    """Serve `cloning/server/static/` at /site/, and give all answers the headers that keep other sites out.
 
     sources: of the Content-Security-Policy, besides scripts, styles and answers of the same address.
     """

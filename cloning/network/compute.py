@@ -8,7 +8,7 @@ import sys
 
 import torch
 
-from cloning.cores import threads as threads  # re-exported
+from cloning.base.cores import threads as threads  # re-exported
 
 DEVICES = ("auto", "cpu", "cuda", "mps")  # cuda: an NVIDIA GPU; mps: Apple's
 

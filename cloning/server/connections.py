@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable
 from typing import Any
 from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
-from cloning.errors import UserError
-from cloning.wire.libraries import eventlet
-from cloning.wire.turns import STRANGERS, TURNS
+from cloning.base.errors import UserError
+from cloning.server.libraries import eventlet
+from cloning.server.turns import STRANGERS, TURNS
 
 MAX_CONNECTIONS = 192  # at once: macOS lets a process open 256 files
 MAX_BODY = 1 << 17  # bytes of a request: over HTTP polling, about 8 telemetries

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import NoReturn
 
-from cloning.errors import UserError, message_of
+from cloning.base.errors import UserError, message_of
 
 DONE = 0
 INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film, a car that left the road

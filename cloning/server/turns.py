@@ -7,7 +7,7 @@ them, several times for each telemetry.
 import time
 from typing import Any
 
-from cloning.wire.libraries import eventlet
+from cloning.server.libraries import eventlet
 
 
 class Account:

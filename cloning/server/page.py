@@ -13,14 +13,16 @@ from typing import Any, NamedTuple, Protocol
 import flask
 import numpy as np
 
-from cloning.arguments import number
-from cloning.pilot import attention, site
-from cloning.pilot.network import Network
+from cloning.base.arguments import number
+from cloning.network.attention import visual_backprop
+from cloning.network.network import Network
 from cloning.recordings.images import encode
 from cloning.recordings.saved_frames import FrameSaver, SessionFolder
 from cloning.road.motion import TOP_SPEED_MPH
-from cloning.wire.libraries import eventlet
-from cloning.wire.turns import STRANGERS, TURNS
+from cloning.road.overlay import overlay
+from cloning.server import site
+from cloning.server.libraries import eventlet
+from cloning.server.turns import STRANGERS, TURNS
 
 SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
@@ -223,6 +225,6 @@ def frames_since(history: deque[DrivenFrame], first: float) -> list[DrivenFrame]
 def image(server: Server, session: Session, with_attention: bool) -> str:
     """Return the session's last frame with its overlay, as a data URL."""
     assert session.frame is not None, "a session with driven frames has a last one"
-    mask = attention.visual_backprop(server.network, session.frame)[1] if with_attention else None
-    picture = attention.overlay(session.frame, session.history[-1].steering, mask)
+    mask = visual_backprop(server.network, session.frame)[1] if with_attention else None
+    picture = overlay(session.frame, session.history[-1].steering, mask)
     return "data:image/jpeg;base64," + base64.b64encode(encode(picture, JPEG_QUALITY)).decode()

@@ -1,0 +1,1 @@
+"""The base: arguments, errors, files and films, for every other package."""

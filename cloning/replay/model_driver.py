@@ -1,0 +1,29 @@
+"""The driver of a replay that is a model in this process."""
+
+import torch
+
+from cloning.base.errors import SimulatorError
+from cloning.base.frame import FRAME
+from cloning.network.network import Network, load_model, steer
+from cloning.replay.replay import ReplayFrame
+
+
+class ModelDriver:
+    """Steers by a model in this process, with the same arithmetic as drive.py."""
+
+    def __init__(self, model: str | Network):
+        """Load the model; model: its file, or the network itself. Raises ModelError."""
+        torch.set_num_threads(1)  # other drives run at the same time
+        self.network = load_model(model) if isinstance(model, str) else model
+        top, bottom = self.network.crop
+        self.rows = slice(top, FRAME[0] - bottom)  # of a frame, which the network sees
+
+    def __call__(self, frame: ReplayFrame) -> float:
+        """Return the steering, -1..1. Raises SimulatorError if the network computes no finite number."""
+        try:
+            return float(steer(self.network, frame.received(self.rows)))
+        except ArithmeticError as error:
+            raise SimulatorError(f"{error}: train the model again") from None
+
+    def close(self) -> None:
+        """Do nothing: no connection is open."""

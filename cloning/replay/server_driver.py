@@ -1,0 +1,32 @@
+"""The driver of a replay that is a running drive.py."""
+
+from cloning.replay.replay import ReplayFrame
+from cloning.wire.client import ConnectionLost, telemetry_packet
+from cloning.wire.session import ClientSession
+
+
+class ServerDriver(ClientSession):
+    """Sends drive.py the telemetry that the simulator would send, and returns the steering of its answers."""
+
+    def __init__(self, host: str, port: int, wait: float):
+        """wait: see ClientSession."""
+        super().__init__(host, port, wait)
+        self.steering = self.throttle = 0.0  # as last commanded
+
+    def __call__(self, frame: ReplayFrame) -> float:
+        """Return the steering, -1..1. Raises SimulatorError if the server is missing, or silent, for too long."""
+        packet = telemetry_packet(self.steering, self.throttle, frame.speed, frame.jpeg())
+        while True:
+            try:
+                if not self.connected:
+                    self.connect()
+                    self.receive_greeting()
+                self.receive_unasked()
+                answer = self.request_answer(packet)
+                break
+            except ConnectionLost as error:
+                self.count_reconnection(error)
+                self.close()
+        if answer.steering is not None and answer.throttle is not None:
+            self.steering, self.throttle = answer.steering, answer.throttle
+        return self.steering
