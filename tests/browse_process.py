@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from conftest import ROOT
+from commands import ROOT
 
 from cloning.browse.analyses import LANE, Analysis, Result, stamp, write_result
 from cloning.recordings.log import read_recording

@@ -9,7 +9,7 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from conftest import HERE, ROOT
+from commands import HERE, ROOT
 
 # What Ctrl-C sends; Windows sends it to a whole console, and Ctrl-Break to one process group.
 STOP = signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGINT

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from conftest import ROOT
+from commands import ROOT
 
 from cloning.recordings.log import logs_below
 

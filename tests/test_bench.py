@@ -4,7 +4,7 @@ import re
 import sys
 
 import torch
-from conftest import ROOT, run_model
+from commands import ROOT, run_model
 
 from cloning.network.network import Network
 from cloning.training.pieces import converted

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from browse_process import browsing, placed, replayed, written_run
-from conftest import HERE, run_here
+from commands import HERE, run_here
 from test_excluded import center
 
 from cloning.base.errors import ModelError

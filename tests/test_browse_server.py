@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 from browse_process import browsing, placed
-from conftest import ROOT
+from commands import ROOT
 from test_excluded import center
 
 from cloning.browse import __main__ as browse

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from conftest import render_recording
+from rendered import render_recording
 from test_generator import recording as without_images
 
 import model

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import render_frame
 from PIL import Image
+from rendered import render_frame
 
 import drive
 from cloning.base.errors import UserError

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from conftest import HERE
+from commands import HERE
 from drive_process import STOP, script, serving
 
 from cloning.base.errors import UserError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT, SHORT, run_here
+from commands import ROOT, SHORT, run_here
 
 from cloning.base.errors import RecordingError
 from cloning.recordings.excluded import MAX_REASON, Cut, add_cut, delete_cut, one_line, read_cuts

@@ -7,7 +7,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from conftest import ROOT
+from commands import ROOT
 from real_recordings import FOLDERS, MISSING
 
 from cloning.network.network import SHIPPED_MODEL, load_model

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 import torch
-from conftest import SHORT, run_here, same, weights
+from commands import SHORT, run_here, same, weights
 
 import model
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import render_recording
+from rendered import render_recording
 
 import model
 from cloning.recordings.check import check_images

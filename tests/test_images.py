@@ -10,8 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import HERE, ROOT, SHORT, render_frame, run_here, same, weights
+from commands import HERE, ROOT, SHORT, run_here, same, weights
 from PIL import Image
+from rendered import render_frame
 
 import model
 import simulator.__main__ as simulator

@@ -15,9 +15,9 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import render_recording
 from kill_points import Warm
 from killed import ALL, KILLED, Place, check_whole, chosen, is_temporary, spread
+from rendered import render_recording
 from steer_server import STEER, Server
 
 from cloning.base.errors import RecordingError

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from conftest import run_here
+from commands import run_here
 
 from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
-from conftest import HERE, ROOT, render_recording
+from commands import HERE, ROOT
+from rendered import render_recording
 
 from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
+from commands import ROOT
 from torch import nn
 
 from cloning.base.errors import ModelError

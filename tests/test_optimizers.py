@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 import torch
-from conftest import ROOT
+from commands import ROOT
 
 from cloning.network.network import Network
 from cloning.training.adam import Adam

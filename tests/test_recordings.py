@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import render_recording
+from rendered import render_recording
 
 from cloning.base.errors import RecordingError
 from cloning.recordings.check import check_images

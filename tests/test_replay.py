@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
-from conftest import ROOT, render_recording
+from commands import ROOT
 from drive_process import serving
+from rendered import render_recording
 
 from cloning.base.errors import SimulatorError, UserError
 from cloning.lane.reader import LanePosition

@@ -12,7 +12,8 @@ import time
 
 import pytest
 import torch
-from conftest import HERE, ROOT, SHORT, finished_run, log, render_recording, run_here, run_model, same, weights
+from commands import HERE, ROOT, SHORT, finished_run, log, run_here, run_model, same, weights
+from rendered import render_recording
 
 import model
 

@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, SHORT, finished_run, render_recording, run_here, run_model, weights
+from commands import ROOT, SHORT, finished_run, run_here, run_model, weights
+from rendered import render_recording
 
 import model
 from cloning.base.frame import FRAME, ROAD_ROWS

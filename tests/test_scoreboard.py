@@ -7,7 +7,8 @@ import sys
 
 import pytest
 import torch
-from conftest import ROOT, render_recording
+from commands import ROOT
+from rendered import render_recording
 
 from cloning.base.errors import UserError
 from cloning.network.network import Network, save_model

@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from commands import ROOT
 
 from cloning.road.track import LEFT, Track
 from simulator import scenery

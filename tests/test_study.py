@@ -8,7 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import pytest
-from conftest import ROOT, render_recording
+from commands import ROOT
+from rendered import render_recording
 from test_generator import loaded, observations
 
 import model

@@ -13,9 +13,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from conftest import HERE, ROOT, SHORT, finished_run, log, render_recording, run_here, run_model, same, weights
+from commands import HERE, ROOT, SHORT, finished_run, log, run_here, run_model, same, weights
 from matplotlib.figure import Figure
 from PIL import Image
+from rendered import render_recording
 
 import model
 from cloning.base.errors import RecordingError

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
+from commands import ROOT
 
 import video
 from cloning.base.film import FilmWriter, frame_rate

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from conftest import ROOT, SHORT
+from commands import ROOT, SHORT
 
 TAKEN_AWAY = """
 import importlib.abc, runpy, sys

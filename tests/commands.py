@@ -1,0 +1,64 @@
+"""Helpers that run model.py and other commands, and read what a run of training has written."""
+
+import contextlib
+import csv
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).parent.parent
+SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
+HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from another folder
+
+
+def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
+    """model.py, or another command, in a process of its own, with its output."""
+    command = command or [sys.executable, str(ROOT / "model.py")]
+    return subprocess.run(
+        [*command, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, **more.pop("env", {})},
+        **more,
+    )
+
+
+def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
+    """The same as `run_model`, in this process: it saves two seconds of imports."""
+    import model
+
+    command = list(map(str, arguments))
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
+        try:
+            status = model.main(command)
+        except SystemExit as error:  # argparse's
+            status = error.code
+    return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
+
+
+def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.CompletedProcess, Path]:
+    """A run that was never interrupted: what it printed, and its folder."""
+    done = run_here(recording, *arguments, "--output", folder / "model.pt")
+    assert done.returncode == 0, done.stderr
+    return done, folder
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return torch.load(path, weights_only=True)["network"]
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    """Whether two networks have equal weights."""
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def log(folder: Path) -> list[dict[str, str]]:
+    """The rows of a run's training_log.csv."""
+    with open(folder / "training_log.csv", encoding="utf-8") as file:
+        return list(csv.DictReader(file))

@@ -1,0 +1,44 @@
+"""A tiny rendered recording in the simulator's own format."""
+
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+
+def render_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarray:
+    """A grey road to the horizon, bent by -1..1 and seen from `offset` metres right of its centre: uint8 RGB."""
+    frame = np.zeros((160, 320, 3), np.uint8)
+    frame[:60] = (90, 140, 210)
+    frame[60:] = (120, 130, 60)
+    rows = np.arange(60, 160)
+    far = (160 - rows) / 100
+    middle = 160 + 120 * bend * far**2 - offset * (rows - 60) * 1.2
+    half = 3.5 * (rows - 60) * 1.2 + 4
+    for row, centre, width in zip(rows, middle, half, strict=True):
+        left, right = int(centre - width), int(centre + width)
+        frame[row, max(left, 0) : max(right, 0)] = (110, 110, 105)
+        for edge in (left, right):
+            frame[row, max(edge - 3, 0) : max(edge + 3, 0)] = (210, 180, 60)
+    return np.clip(frame + rng.normal(0, 6, frame.shape), 0, 255).astype(np.uint8)
+
+
+def render_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/Users/driver/data/IMG/") -> Path:
+    """A folder as the simulator records it: no header, absolute paths, 15 rows a second, throttle 0 in every tenth."""
+    rng = np.random.default_rng(seed)
+    (folder / "IMG").mkdir(parents=True)
+    clock, lines = datetime(2018, 7, 16, 17, 11, 43) + timedelta(days=seed), []
+    for row in range(rows):
+        clock += timedelta(milliseconds=67)
+        stamp = clock.strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
+        bend = float(np.sin(row / 5))
+        names = []
+        for camera, offset in (("center", 0), ("left", -0.8), ("right", 0.8)):
+            names.append(f"{camera}_{stamp}.jpg")
+            frame = render_frame(bend, offset, rng)
+            cv2.imwrite(str(folder / "IMG" / names[-1]), frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 75])
+        throttle = 0 if row % 10 == 9 else 1
+        lines.append(",".join([prefix + name for name in names] + [f"{0.4 * bend:.6g}", str(throttle), "0", "30.19"]))
+    (folder / "driving_log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder
