@@ -8,154 +8,126 @@
     torchrun --nproc_per_node=2 model.py data/lake-ccw  # two processes that share every batch
 
 "The report" is the writeup of the Behavioral Cloning project that is reproduced here; this file follows it from top to
-bottom. A run writes model.pt (the last epoch's model, as in the report), model-best.pt (the epoch that drives best),
-model-resume.pt, training_loss.png, training_log.csv, training_arguments.json and pictures in diagnostic_images/.
+bottom, and REPORT has all its figures. A run writes model.pt (the last epoch's model, as in the report), model-best.pt
+(the epoch that drives best), model-resume.pt, training_loss.png, training_log.csv, training_arguments.json and pictures
+in diagnostic_images/. From a program: `train(replace(REPORT, flip=0.0), ["data"], "runs/a/model.pt")`.
 """
 
 import functools
 import itertools
 import math
-import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import ClassVar, Self, TypeVar
+from typing import Any, NamedTuple
 
 from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("model.py")  # also while the libraries below are loaded
 
-import cv2
 import numpy as np
-import torch
-from torch import nn
+from torch import channels_last, manual_seed, nn
 from tqdm import tqdm
 
-from cloning.base.errors import RecordingError, UserError, message_of
+from cloning.base.cores import threads
+from cloning.base.errors import RecordingError
 from cloning.base.files import write
-from cloning.base.frame import FRAME
-from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable, threads
-from cloning.network.network import CROP, UNITS, Network, load_model
+from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
+from cloning.network.network import CROP, SEEN_SHAPE, UNITS, Network, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.frames import KEPT_FRAMES, FrameCache
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts
-from cloning.training import summary
-from cloning.training.checkpoint import Checkpoint, Progress, RunFiles, fingerprint, resumed_arguments
-from cloning.training.distributed import from_first_rank, join_processes, leave_processes, rank, summed, world
+from cloning.training import options, summary
+from cloning.training.batch import Batch, Choices
+from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, fingerprint, resumed
+from cloning.training.distributed import Ranks
+from cloning.training.lanes import Lanes
+from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
 from cloning.training.muon import OPTIMIZERS
-from cloning.training.observations import SEEN_SHAPE, Augmented, Choices, Example, Observations, Views, center_digests
-from cloning.training.options import Arguments, parse
+from cloning.training.observations import CameraViews, Observations, centre_images
+from cloning.training.options import Command, Process, Run
 from cloning.training.pictures import batch_pictures, loss_picture
-from cloning.training.pieces import Batch, SquaredErrors, pieces, predict
-from cloning.training.robust import RobustObservations
-from cloning.training.stop import SIGNALS, Interrupted, StopSignals
+from cloning.training.pieces import SquaredErrors, pieces, predict
+from cloning.training.recipe import Augmentation, Recipe, Words
+from cloning.training.robust import robust
+from cloning.training.run_files import RunFiles
+from cloning.training.stop import SIGNALS, Interrupted, StopSignals, status_of
 
-# The numbers of the report's recipe that are not options.
-STRAIGHT, KEEP_STRAIGHT = 0.02, 0.8  # below this |steering| an observation is kept with this probability
-TURN, JITTER = (0.2, 0.5), 0.01  # within this range of |steering| a copy is added, its angle changed by up to 1 %
-BLOCK_SECONDS, FOLDS = 2.0, 5  # every fifth block of two seconds is for validation
-FLIP, SHADOW = 0.9, 0.8  # probabilities of these images; the unaltered and the brightened image are always made
-BRIGHTNESS, DARKNESS = (0.4, 1.2), (0.2, 0.5)  # ranges of the factors of HSV value and HLS lightness
 PICTURE_EVERY = 6400  # observations between two diagnostic pictures
-SAVE_SECONDS = 30  # between two saved states: the most work that a killed run loses
-
-Kind = TypeVar("Kind", bound=Observations)  # the report's or those of --robust
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Data preprocessing: recordings -> observations
 
 
-def read_observations(kind: type[Kind], folders: list[Path], arguments: Arguments, rejected_file: Path) -> Kind:
+def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, strict: bool) -> Observations:
     """Read and filter the recordings (steps 2 to 4 of the report), and print the numbers of rows.
 
-    Unusable rows are listed in `rejected_file`. Raises RecordingError if too few rows are left,
-    and with --strict if a row is unusable.
+    Unusable rows are listed in `rejected_file`. Raises RecordingError if too few rows are left, and if `strict` if a
+    row is unusable.
     """
     parts, counts, frames = [], [], FrameCache(KEPT_FRAMES)
     for folder in folders:
         recording = read_recording(folder)
         check_images(recording, threads(), frames)
-        parts.append(kind.select(recording, arguments))
+        parts.append(recipe.select(recording, recipe))
         counts.append(summary.Counts.of(recording, len(parts[-1])))
         print_findings(recording)
-    observations, rows = kind.joined(parts), summary.total(counts)
-    summary.list_rejected(observations.recordings, rejected_file, arguments.strict)
-    print(summary.recordings_table(counts, kind.dropped(arguments)))
-    if len(observations) < FOLDS:
-        why = kind.too_few if rows.dropped > rows.unusable else f"see {rejected_file}"
+    observations, rows = Observations.of_recordings(parts), summary.total(counts)
+    summary.list_rejected(observations.recordings, rejected_file, strict)
+    print(summary.recordings_table(counts, recipe.words.dropped.format(recipe=recipe)))
+    if len(observations) < recipe.folds:
+        why = recipe.words.too_few if rows.dropped > rows.unusable else f"see {rejected_file}"
         left = f"{len(observations)} of {rows.rows_read} rows are left"
-        raise RecordingError(f"{left}, at least {FOLDS} are needed: {why}")
+        raise RecordingError(f"{left}, at least {recipe.folds} are needed: {why}")
     return observations
 
 
-@dataclass
-class ReportObservations(Observations):
-    """Observations for the report's training; with --robust, RobustObservations takes its place."""
+def select_driven(recording: Recording, recipe: Recipe) -> Observations:
+    """Step 3: discard observations with little or no throttle; the label is the driver's steering."""
+    rows = np.flatnonzero(recording.throttle >= recipe.throttle_threshold)
+    return Observations.of_rows(recording, rows, recording.steering[rows], Lanes.unknown(len(rows)))
 
-    label_source: ClassVar[str] = "driver"
-    too_few: ClassVar[str] = "--throttle-threshold drops most of them"
-    dropout: ClassVar[bool] = True
-    best_by: ClassVar[str] = "val_drift"
-    aimed_at: ClassVar[str] = "the driver's path"
-    remedy: ClassVar[str] = "train longer, record more, or use --robust"
 
-    @staticmethod
-    def dropped(arguments: Arguments) -> str:
-        """Return what step 3 drops, as the title of a column."""
-        return f"throttle < {arguments.throttle_threshold:g}"
+def balance(observations: Observations, recipe: Recipe, seed: int) -> Observations:
+    """Steps 5 to 7: undersample straight driving, oversample turns with jitter, repeat problem areas."""
+    rng, size = np.random.default_rng([seed, 1]), np.abs(observations.steering)
+    kept = np.flatnonzero((size >= recipe.straight) | (rng.random(len(size)) < recipe.keep_straight))
+    turns = np.flatnonzero((size > recipe.turn[0]) & (size <= recipe.turn[1]))
+    jittered = observations.steering[turns] * (1 + recipe.jitter * rng.uniform(-1, 1, len(turns)))
+    rows = np.concatenate([kept, turns])
+    labels = np.concatenate([observations.steering[kept], jittered.astype(np.float32)])
+    counts = observations.counts(recipe.repeats)[rows]
+    return observations.take(np.repeat(rows, counts), steering=np.repeat(labels, counts))
 
-    @classmethod
-    def select(cls, recording: Recording, arguments: Arguments) -> Self:
-        """Step 3: discard observations with little or no throttle; the label is the driver's steering."""
-        rows = np.flatnonzero(recording.throttle >= arguments.throttle_threshold).astype(np.int32)
-        number, digests = np.zeros(len(rows), np.int16), center_digests(recording, rows)
-        return cls([recording], number, rows, recording.steering[rows], digests, recording.time[rows])
 
-    def resample(self, seed: int, repeats: int) -> Self:
-        """Steps 5 to 7: undersample straight driving, oversample turns with jitter, repeat problem areas."""
-        rng, size = np.random.default_rng([seed, 1]), np.abs(self.steering)
-        kept = np.flatnonzero((size >= STRAIGHT) | (rng.random(len(size)) < KEEP_STRAIGHT))
-        turns = np.flatnonzero((size > TURN[0]) & (size <= TURN[1]))
-        jittered = self.steering[turns] * (1 + JITTER * rng.uniform(-1, 1, len(turns)))
-        rows = np.concatenate([kept, turns])
-        labels = np.concatenate([self.steering[kept], jittered.astype(np.float32)])
-        counts = self.counts(repeats)[rows]
-        return self.take(np.repeat(rows, counts), np.repeat(labels, counts))
-
-    def shuffle(self, rng: np.random.Generator, repeats: int) -> np.ndarray:
-        """Step 8: return the indices of all observations in random order, int (n,)."""
-        return rng.permutation(len(self))
-
-    def sample_views(
-        self, rows: np.ndarray, cameras: np.ndarray, side_correction: float, rng: np.random.Generator
-    ) -> Views:
-        """Return the given camera's image for each observation; the labels of side cameras are corrected."""
-        return CameraViews(self, rows, cameras, side_correction)
+def shuffle(observations: Observations, recipe: Recipe, rng: np.random.Generator) -> np.ndarray:
+    """Step 8: return the indices of all observations in random order, int (n,)."""
+    return rng.permutation(len(observations))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Data subdivision
 
 
-def split(observations: Observations, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def split(observations: Observations, recipe: Recipe, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices for training (80 %) and validation (20 %), in blocks of two seconds of each recording.
 
     Neighbouring frames are nearly equal, so a random split would validate on what was trained on. If several rows have
     the same frame, all are in the set of the first. Raises RecordingError if there are too few frames.
     """
-    n = len(observations)
+    n, folds = len(observations), recipe.folds
     drive, second = observations.drives()
-    block = np.unique(np.stack([drive, second // BLOCK_SECONDS]), axis=1, return_inverse=True)[1].ravel()
-    if block[-1] + 1 < FOLDS:  # less than ten seconds in all
-        block = np.arange(n) * FOLDS // n
-    validation = (block + np.random.default_rng([seed, 0]).integers(FOLDS)) % FOLDS == 0
+    block = np.unique(np.stack([drive, second // recipe.block_seconds]), axis=1, return_inverse=True)[1].ravel()
+    if block[-1] + 1 < folds:  # less than ten seconds in all
+        block = np.arange(n) * folds // n
+    validation = (block + np.random.default_rng([seed, 0]).integers(folds)) % folds == 0
     _, first, frame = np.unique(observations.frame, return_index=True, return_inverse=True)
     validation = validation[first][frame]
     if validation.all() or not validation.any():
@@ -164,88 +136,63 @@ def split(observations: Observations, seed: int) -> tuple[np.ndarray, np.ndarray
 
 
 # ----------------------------------------------------------------------------------------------------------------------
+# The recipe
+
+
+REPORT = Recipe(
+    name="report",
+    words=Words(
+        dropped="throttle < {recipe.throttle_threshold:g}",
+        too_few="--throttle-threshold drops most of them",
+        label_source="driver",
+        aimed_at="the driver's path",
+        remedy="train longer, record more, or use --robust",
+    ),
+    # Data preprocessing
+    select=select_driven,
+    throttle_threshold=0.25,
+    side_correction=0.2,
+    resample=balance,
+    straight=0.02,
+    keep_straight=0.8,
+    turn=(0.2, 0.5),
+    jitter=0.01,
+    repeats=4,
+    order=shuffle,
+    # Data subdivision: every fifth block of two seconds is for validation
+    block_seconds=2.0,
+    folds=5,
+    validation_sets=centre_images,
+    # Augmentation: the unaltered and the brightened image are always made
+    views=CameraViews,
+    augmentations=(
+        Augmentation("unaltered"),
+        Augmentation("flipped", mirrors=True, share=lambda recipe: recipe.flip),
+        Augmentation("brightened", brighten, choose_brightness, caption="brightness x {:.2f}"),
+        Augmentation("shadowed", shade, choose_shadow, lambda recipe: recipe.shadow, caption="shadow x {:.2f}"),
+    ),
+    flip=0.9,
+    brightness=(0.4, 1.2),
+    shadow=0.8,
+    darkness=(0.2, 0.5),
+    # Training: Keras's Adam and mean squared error
+    dropout=True,
+    optimizer="adam",
+    learning_rate=1e-4,
+    cosine_decay=False,
+    momentum=0.9,
+    weight_decay=0.0,
+    huber=None,
+    batch_size=128,
+    samples_per_epoch=20224,
+    epochs=10,
+    best_by="val_drift",
+)
+ROBUST = robust(REPORT)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
 # Augmentation: from each observation an unaltered, a flipped, a brightened and a shadowed image may be made.
-
-
-class CameraViews(Views):
-    """One camera's image of each observation of a batch, from which all four kinds of image are made."""
-
-    def __init__(self, observations: Observations, rows: np.ndarray, cameras: np.ndarray, side_correction: float):
-        """rows, cameras: int (n,); side_correction: added to left, subtracted from right labels."""
-        self.observations, self.rows, self.cameras = observations, rows, cameras
-        self.corrections = np.array([0, side_correction, -side_correction], np.float32)  # centre, left, right
-        label = observations.steering[rows] + self.corrections[cameras]
-        self.labels = np.stack([label, -label, label, label], axis=1)
-
-    def images(self, part: np.ndarray) -> list[np.ndarray]:
-        """Return the images of some observations, int (k,), for each of the four kinds: uint8 (k, 75, 320, 3)."""
-        chosen = zip(self.rows[part], self.cameras[part], strict=True)
-        return kind_inputs(np.stack([self.observations.read_cropped(row, camera) for row, camera in chosen]))
-
-    def example(self, i: int) -> Example:
-        """Return the batch's observation number i for the diagnostic pictures."""
-        row, camera = self.rows[i], self.cameras[i]
-        frames = [self.observations.read(row, number) for number in range(len(CAMERAS))]
-        labels, name = self.observations.steering[row] + self.corrections, f"{CAMERAS[camera]} camera"
-        return Example(frames, labels, kind_inputs(frames[camera][None]), 0, [name, f"{name}, flipped", name, name])
-
-
-def kind_inputs(images: np.ndarray) -> list[np.ndarray]:
-    """Return the four kinds of image before brightening and shadowing: uint8 (n, rows, columns, 3) each."""
-    flipped = cv2.flip(images.reshape(-1, *images.shape[2:]), 1).reshape(images.shape)
-    return [images, flipped, images, images]
-
-
-def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, to: int, back: int) -> np.ndarray:
-    """Multiply one channel of another colour space, rounded and clipped at 255.
-
-    images: uint8 (n, rows, columns, 3), as the result; factors: (n,); to, back: OpenCV's codes of the conversions.
-    OpenCV is given all images as one tall image, so that other Python threads can run during one long call.
-    """
-    if not len(images):
-        return images
-    tall = cv2.cvtColor(images.reshape(-1, *images.shape[2:]), to)
-    values = cv2.extractChannel(tall, channel).reshape(len(images), -1)
-    values = np.minimum(np.multiply(values, factors[:, None], dtype=np.float32) + np.float32(0.5), 255).astype(np.uint8)
-    cv2.insertChannel(values.reshape(tall.shape[:2]), tall, channel)
-    return cv2.cvtColor(tall, back, dst=tall).reshape(images.shape)
-
-
-def brighten(images: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Multiply the HSV value of RGB images, uint8 (n, rows, columns, 3), clipped at 255; factors: (n,)."""
-    return multiply_channel(images, 2, factors, cv2.COLOR_RGB2HSV, cv2.COLOR_HSV2RGB)
-
-
-def shade(images: np.ndarray, lines: np.ndarray, left: np.ndarray, factors: np.ndarray, first_row: int) -> np.ndarray:
-    """Multiply the HLS lightness of RGB images, uint8 (n, rows, columns, 3), on one side of a line.
-
-    lines: (n, 2), the columns at which the line meets the top and bottom of the full frame of 160 rows; left: bool
-    (n,), the side; factors: (n,); first_row: the row of the full frame that is the images' first.
-    """
-    rows = np.arange(first_row, first_row + images.shape[1])
-    edges = (lines[:, :1] + (lines[:, 1:] - lines[:, :1]) * rows / FRAME[0]).astype(np.float32)
-    lit = (np.arange(images.shape[2], dtype=np.float32) < edges[:, :, None]) != left[:, None, None]
-    shaded = multiply_channel(images, 1, factors, cv2.COLOR_RGB2HLS, cv2.COLOR_HLS2RGB)
-    np.copyto(shaded.view("V3"), images.view("V3"), where=lit[..., None])  # by pixels: takes a tenth of the time
-    return shaded
-
-
-def augment(choices: Choices, part: np.ndarray, images: list[np.ndarray], first_row: int) -> list[Augmented]:
-    """Return the images of the four kinds (unaltered, flipped, brightened, shadowed) that a batch is to have.
-
-    part: int (k,), indices into the batch; images: the four kinds before brightening and shadowing, uint8
-    (k, rows, 320, 3) each; first_row: the row of the full frame that is the images' first.
-    """
-    unaltered, flipped, bright, dark = images
-    flips, shadows = (np.flatnonzero(choices.places[part, kind] >= 0) for kind in (1, 3))
-    shadowed = part[shadows]
-    shadow = choices.line[shadowed], choices.left[shadowed], choices.darkness[shadowed]
-    return [
-        Augmented(part, unaltered),
-        Augmented(part[flips], flipped[flips]),
-        Augmented(part, brighten(bright, choices.brightness[part])),
-        Augmented(shadowed, shade(dark[shadows], *shadow, first_row)),
-    ]
 
 
 class Generator:
@@ -255,50 +202,59 @@ class Generator:
     the same batches. The pool's threads make the images, up to `ahead` batches before they are needed.
     """
 
-    def __init__(self, observations: Observations, arguments: Arguments, pool: ThreadPoolExecutor, ahead: int):
-        """pool: makes the images; ahead: number of batches that are made at the same time."""
-        self.observations, self.arguments, self.pool, self.ahead = observations, arguments, pool, ahead
-        seed, repeats, shuffle = arguments.seed, arguments.repeats, observations.shuffle
-        self.shuffled = functools.lru_cache(2)(lambda n: shuffle(np.random.default_rng([seed, 2, n]), repeats))
+    def __init__(
+        self,
+        observations: Observations,
+        recipe: Recipe,
+        seed: int,
+        pool: ThreadPoolExecutor,
+        ahead: int = 1,
+        first: int = 0,
+        ranks: Ranks | None = None,
+    ):
+        """pool: makes the images; ahead: number of batches that are made at the same time; first: the next batch."""
+        self.observations, self.recipe, self.seed, self.pool = observations, recipe, seed, pool
+        self.ahead, self.ranks = ahead, ranks or Ranks()
+        self.numbers, self.started = itertools.count(first), deque[Callable[[], Batch]]()
+        self.shuffled = functools.lru_cache(2)(
+            lambda n: recipe.order(observations, recipe, np.random.default_rng([seed, 2, n]))
+        )
 
     def sample(self, number: int) -> Choices:
         """Return the random choices for batch `number`, counted from 0."""
-        rng, n = np.random.default_rng([self.arguments.seed, 3, number]), self.arguments.batch_size
+        recipe, rng, n = self.recipe, np.random.default_rng([self.seed, 3, number]), self.recipe.batch_size
         at = np.arange(number * n, (number + 1) * n)
         passes = at // len(self.observations)  # over all observations, each in another order
         parts = [self.shuffled(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
-        chosen = np.concatenate(parts)
-        camera = rng.integers(len(CAMERAS), size=n)
-        kinds = np.stack([np.ones(n, bool), rng.random(n) < FLIP, np.ones(n, bool), rng.random(n) < SHADOW], axis=1)
-        total_images = int(kinds.sum())
-        places = np.full(kinds.shape, -1)
-        places[kinds] = rng.permutation(total_images)  # the batch is shuffled
+        chosen, camera = np.concatenate(parts), rng.integers(len(CAMERAS), size=n)
+        shares = [augmentation.share(recipe) for augmentation in recipe.augmentations]
+        made = np.stack([rng.random(n) < share if share < 1 else np.ones(n, bool) for share in shares], axis=1)
+        total_images = int(made.sum())
+        slots = np.full(made.shape, -1)
+        slots[made] = rng.permutation(total_images)  # the batch is shuffled
         bits = np.unpackbits(np.frombuffer(rng.bytes(total_images * UNITS // 8), np.uint8))
-        keep = bits.view(bool).reshape(total_images, UNITS) if self.observations.dropout else None
-        return Choices(
-            observation=chosen,
-            camera=camera,
-            places=places,
-            keep=keep,
-            brightness=rng.uniform(*BRIGHTNESS, n),
-            darkness=rng.uniform(*DARKNESS, n),
-            line=rng.uniform(0, FRAME[1], (n, 2)),
-            left=rng.random(n) < 0.5,
-            views=self.observations.sample_views(chosen, camera, self.arguments.side_correction, rng),
-        )
+        keep = bits.view(bool).reshape(total_images, UNITS) if recipe.dropout else None
+        augmenting = [augmentation.choose(recipe, rng, n) for augmentation in recipe.augmentations]
+        views = recipe.views(self.observations, chosen, camera, recipe, rng)
+        return Choices(chosen, camera, slots, keep, augmenting, views)
 
     def start_batch(self, number: int) -> Callable[[], Batch]:
         """Start making this process's share of batch `number`; return a function that waits for it and returns it."""
         choices = self.sample(number)
-        mine = np.arange(self.arguments.batch_size)[rank() :: world()]
-        places = choices.places[mine]
-        order = np.sort(places[places >= 0])  # the places of this process's images among those of the whole batch
+        mine = np.arange(self.recipe.batch_size)[self.ranks.share]
+        slots = choices.slots[mine]
+        order = np.sort(slots[slots >= 0])  # the slots of this process's images among those of the whole batch
         images, labels = np.empty((len(order), *SEEN_SHAPE), np.uint8), np.empty(len(order), np.float32)
 
         def make(part: np.ndarray) -> None:
-            for kind, (which, augmented) in enumerate(augment(choices, part, choices.views.images(part), CROP[0])):
-                at = np.searchsorted(order, choices.places[which, kind])
-                images[at], labels[at] = augmented, choices.views.labels[which, kind]
+            for kind, (augmentation, seen) in enumerate(
+                zip(self.recipe.augmentations, choices.views.images(part), strict=True)
+            ):
+                has = choices.slots[part, kind] >= 0
+                which, seen = (part, seen) if has.all() else (part[has], seen[has])
+                at = np.searchsorted(order, choices.slots[which, kind])
+                chosen = (column[which] for column in choices.augmenting[kind])
+                images[at], labels[at] = augmentation.change(seen, CROP[0], *chosen), choices.views.labels[which, kind]
 
         parts = [self.pool.submit(make, mine[piece]) for piece in pieces(len(mine))]
 
@@ -306,195 +262,200 @@ class Generator:
             for part in parts:
                 part.result()
             keep = None if choices.keep is None else choices.keep[order]
-            return Batch(images, labels, keep, int((choices.places >= 0).sum()))
+            return Batch(images, labels, keep, int((choices.slots >= 0).sum()))
 
         return wait
 
-    def batches(self, number: int) -> Iterator[Batch]:
-        """Yield the batches from this number on."""
-        started: deque[Callable[[], Batch]] = deque()
-        numbers = itertools.count(number)
+    def start_next(self) -> None:
+        """Start making one more batch."""
+        self.started.append(self.start_batch(next(self.numbers)))
 
-        def start_next() -> None:
-            started.append(self.start_batch(next(numbers)))
-
-        while True:
-            while len(started) < self.ahead:
-                start_next()
-            batch = started.popleft()()
-            batch.start_next = start_next
-            yield batch
+    def next_batch(self) -> Batch:
+        """Return the next batch, and see that enough others are started."""
+        while len(self.started) < self.ahead:
+            self.start_next()
+        return self.started.popleft()()
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Training and validation
 
 
+class Prepared(NamedTuple):
+    """What a run needs: its observations, and with what it begins, None for random weights."""
+
+    run: Run
+    training: Observations
+    validation: Observations
+    begin: SavedRun | FirstWeights | None
+
+
 class TrainingRun:
     """A training run: network, optimizer, generator and progress; rank 0 writes its files."""
 
-    def __init__(
-        self, arguments: Arguments, training: Observations, validation: Observations, resumed: dict | None = None
-    ):
-        """resumed: a checkpoint to continue or begin with, or None. Raises ModelError if its data are others."""
-        self.arguments, self.training, self.validation = arguments, training, validation
-        self.device = choose_device(arguments.device)
+    def __init__(self, prepared: Prepared, process: Process, ranks: Ranks):
+        """Raises ModelError if the run is resumed and its data are others."""
+        run, self.training, self.validation, begin = prepared
+        self.recipe, self.seed, self.process, self.ranks = run.recipe, run.seed, process, ranks
+        self.device, self.files = choose_device(process.device), RunFiles(process.output)
         self.precision = choose_precision(self.device)
-        self.files = RunFiles(arguments.output)
-        torch.manual_seed(arguments.seed)
-        self.network = Network().to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        manual_seed(run.seed)
+        self.network = Network().to(self.device, memory_format=channels_last)  # type: ignore[call-overload]
         repeatable(self.device)
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
-        self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, arguments.loss)
-        if world() > 1:
+        self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, self.recipe.huber)
+        if ranks.world > 1:
             self.errors = nn.parallel.DistributedDataParallel(self.errors)
-        self.optimizer = OPTIMIZERS[arguments.optimizer](self.network.parameters())
-        self.generator = Generator(training, arguments, self.pool, ahead=2 if self.device.type == "cpu" else 4)
-        self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
-        data = fingerprint(training, validation)
-        self.checkpoint = Checkpoint(self.files, arguments, self.network, self.optimizer, data)
-        self.validation_sets = validation.validation_sets(arguments.seed)
-        self.held_out = held_out(validation.recordings, validation.recording, validation.row, validation.aim())
-        self.progress = self.checkpoint.restore(resumed) if resumed else Progress()
-        self.pace, self.stop, self.saved_at = summary.Pace(arguments), StopSignals(), time.monotonic()
+        optimizer = OPTIMIZERS[self.recipe.optimizer]
+        self.optimizer = optimizer(self.network.parameters(), self.recipe.momentum, self.recipe.weight_decay)
+        data = fingerprint(self.training, self.validation)
+        self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, data)
+        self.progress, ahead = self.checkpoint.restore(begin), 2 if self.device.type == "cpu" else 4
+        self.generator = Generator(self.training, run.recipe, run.seed, self.pool, ahead, self.progress.number, ranks)
+        self.validation_sets = self.recipe.validation_sets(self.validation, self.recipe, run.seed)
+        lane = self.validation.lanes.from_middle()
+        self.held_out = held_out(self.validation.recordings, self.validation.recording, self.validation.row, lane)
+        self.pace, self.stop, self.saved_at = summary.Pace(self.recipe, ranks.first), StopSignals(), time.monotonic()
 
     def train(self) -> None:
         """Train the remaining epochs. Raises Interrupted, after saving the state, if a signal stops the run."""
-        batches, progress = self.generator.batches(self.progress.number), self.progress
-        while len(progress.history) < self.arguments.epochs:
-            self.epoch(batches)
+        progress, history = self.progress, self.progress.history
+        while len(history) < self.recipe.epochs:
+            self.epoch()
             started = time.monotonic()
             figures = self.validate()
             progress.seconds += time.monotonic() - started
-            is_best, history = progress.finish_epoch(*figures, self.validation.best_by), progress.history
-            if rank() == 0:  # first: a run killed before `save` repeats this
+            is_best = progress.finish_epoch(*figures, self.recipe.best_by)
+            if self.ranks.first:  # first: a run killed before `save` repeats this
                 write(self.files.log, summary.history_csv(history))
-                write(self.files.losses, loss_picture(history, self.training.dropout))
+                write(self.files.losses, loss_picture(history, self.recipe.dropout))
             self.save(self.files.last, *[self.files.best] * is_best)
-            if rank() == 0:
+            if self.ranks.first:
                 print(summary.epoch_line(history[-1]), flush=True)
 
-    def epoch(self, batches: Iterator[Batch]) -> None:
+    def epoch(self) -> None:
         """Train on whole batches until the epoch has at least `samples_per_epoch` images, as Keras 1 counts."""
-        progress, samples = self.progress, self.arguments.samples_per_epoch
-        started = time.monotonic() - progress.seconds
-        if rank() == 0:
-            print(f"Epoch {len(progress.history) + 1}/{self.arguments.epochs}", flush=True)
-        hidden = None if rank() == 0 else True  # None: only on a terminal
-        with tqdm(total=samples, initial=progress.images, unit="image", leave=False, disable=hidden) as bar:
-            while progress.images < samples:
+        recipe, progress, ranks, started = self.recipe, self.progress, self.ranks, time.monotonic()
+        started -= progress.seconds
+        if ranks.first:
+            print(f"Epoch {len(progress.history) + 1}/{recipe.epochs}", flush=True)
+        hidden = None if ranks.first else True  # None: only on a terminal
+        images, total = progress.images, recipe.samples_per_epoch
+        with tqdm(total=total, initial=images, unit="image", leave=False, disable=hidden) as bar:
+            while progress.images < total:
                 self.write_pictures()
-                batch = next(batches)
-                loss = self.errors(batch)
+                batch = self.generator.next_batch()
+                # While the pool's threads compute the batch, the next one is begun, to be made after it.
+                loss = self.errors(batch, self.generator.start_next)
                 # DistributedDataParallel takes the mean over the processes, each of which has a share of the sum.
-                (loss * (world() / batch.total)).backward()
-                done = (len(progress.history) + progress.images / samples) / self.arguments.epochs
-                self.optimizer.step(self.training.learning_rate(self.arguments, done))
+                (loss * (ranks.world / batch.total)).backward()
+                self.optimizer.step(recipe.rate(progress.done(recipe)))
                 self.optimizer.zero_grad()
-                progress.number += 1
-                progress.images += batch.total
-                local = torch.tensor([float(loss.detach()), float(self.stop.received)], dtype=torch.float64)
-                squared_error, stopped = summed(local, self.device).tolist()
-                progress.loss += squared_error
+                error, stopped = ranks.summed([float(loss.detach()), float(self.stop.received)], self.device)
+                progress.add(batch.total, error)
                 progress.seconds = time.monotonic() - started
                 bar.update(batch.total)
                 bar.set_postfix_str(self.pace.after_batch(batch.total, progress))
                 if stopped:
                     self.save()
                     raise Interrupted(self.stop.received or SIGNALS[-1])
-                if time.monotonic() - self.saved_at > SAVE_SECONDS:
+                if time.monotonic() - self.saved_at > self.process.save_seconds:
                     self.save()
 
     def validate(self) -> tuple[float, float]:
         """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m."""
-        count = min(len(self.validation), self.arguments.samples_per_epoch // 5)
-        chosen = np.random.default_rng([self.arguments.seed, 4]).permutation(len(self.validation))[: max(count, 1)]
-        mine, sets = chosen[rank() :: world()], self.validation_sets
+        n, share = len(self.validation), self.ranks.share
+        chosen = np.random.default_rng([self.seed, 4]).permutation(n)[: max(self.recipe.samples_per_epoch // 5, 1)]
+        mine, sets = chosen[share], self.validation_sets
         error = sum(float(((self.predict(self.network, x, mine) - y[mine]) ** 2).sum()) for x, y in sets)
-        far = drifts(self.held_out[rank() :: world()], self.network, self.pool)
-        error, metres, n = summed(torch.tensor([error, far.sum(), len(far)], dtype=torch.float64), self.device).tolist()
-        return error / len(sets) / len(chosen), metres / n if n else math.nan
+        far = drifts(self.held_out[share], self.network, self.pool)
+        error, metres, pieces_driven = self.ranks.summed([error, float(far.sum()), float(len(far))], self.device)
+        return error / len(sets) / len(chosen), metres / pieces_driven if pieces_driven else math.nan
+
+    def predict(self, network: Network, images: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
+        """Return a network's steering for these observations: float32 (k,); see `pieces.predict`."""
+        return predict(network, images, rows, self.device, self.precision, self.pool)
 
     def save(self, *models: Path) -> None:
         """Write the network to these files, and the state that --resume needs."""
-        if rank() == 0:
+        if self.ranks.first:
             self.checkpoint.save(self.progress, *models)
         self.saved_at = time.monotonic()
 
     def write_pictures(self) -> None:
         """Write the diagnostic pictures of the batch's first observation, if 6,400 more observations are done."""
-        before, now = (n * self.arguments.batch_size for n in (self.progress.number - 1, self.progress.number))
-        if rank() or before // PICTURE_EVERY == now // PICTURE_EVERY:
-            return
-        for name, png in batch_pictures(self.generator.sample(self.progress.number), augment).items():
-            write(self.files.pictures / name.format(now // PICTURE_EVERY * PICTURE_EVERY), png)
+        before, now = (
+            n * self.recipe.batch_size // PICTURE_EVERY for n in (self.progress.number - 1, self.progress.number)
+        )
+        if self.ranks.first and before != now:
+            for name, png in batch_pictures(self.generator.sample(self.progress.number), self.recipe).items():
+                write(self.files.pictures / name.format(now * PICTURE_EVERY), png)
 
     def summary(self) -> str:
         """Return a table of the errors of the last and the best epoch's models, and in words how they will drive."""
         labels, mean, models = self.validation.steering, self.training.steering.mean(), {}
         for path in (self.files.last, self.files.best):
             network = load_model(path, self.device)
-            models[path.name] = self.predict(network, self.validation.center, np.arange(len(labels)))
-        table = summary.error_table(labels, mean, models, (0, STRAIGHT, *TURN, 1), self.validation.label_source)
-        return table + summary.driving(self.progress.history, type(self.validation), still_drifts(self.held_out))
+            models[path] = self.predict(network, self.validation.center, np.arange(len(labels)))
+        table = summary.error_table(labels, mean, models, self.recipe)
+        return table + summary.driving(self.progress.history, self.recipe, still_drifts(self.held_out), self.files)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Main
 
 
-def prepare(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, Observations, Observations, dict | None]:
-    """Return the arguments, the training and validation observations, and what `resumed_arguments` returns."""
-    arguments, checkpoint = resumed_arguments(arguments, given)
-    kind: type[Observations] = RobustObservations if arguments.robust else ReportObservations
-    folders = find_folders(arguments.recordings)
-    arguments = replace(arguments, recordings=[str(folder.resolve()) for folder in folders])
-    observations = read_observations(kind, folders, arguments, RunFiles(arguments.output).rejected)
-    train, validation = split(observations, arguments.seed)
-    training = observations.take(train).resample(arguments.seed, arguments.repeats)
+def prepare(command: Command) -> Prepared:
+    """Read the data of the run that a command is about. Raises UserError, OSError."""
+    run, begin = resumed(command)
+    folders = find_folders(list(run.recordings))
+    run = replace(run, recordings=tuple(str(folder.resolve()) for folder in folders))
+    rejected_file = RunFiles(command.process.output).rejected
+    observations = read_observations(run.recipe, folders, rejected_file, command.process.strict)
+    train, validation = split(observations, run.recipe, run.seed)
+    training = run.recipe.resample(observations.take(train), run.recipe, run.seed)
     sizes = f"training: {len(train):,} rows, {len(training):,} observations after resampling"
     print(f"\n{sizes}; validation: {len(validation):,} rows\n")
-    return arguments, training, observations.take(validation), checkpoint
+    return Prepared(run, training, observations.take(validation), begin)
 
 
-def run(arguments: Arguments, given: frozenset[str]) -> None:
+def run(command: Command, ranks: Ranks) -> None:
     """Read the data, train, and print the summary. Raises UserError, OSError, Interrupted, KeyboardInterrupt."""
-    arguments, training, validation, checkpoint = from_first_rank(lambda: prepare(arguments, given))
-    training_run = TrainingRun(arguments, training, validation, checkpoint)
-    if rank() == 0:
-        print(summary.run_header(training_run.network, training_run.device, training_run.precision))
+    training_run = TrainingRun(ranks.from_first(lambda: prepare(command)), command.process, ranks)
+    if ranks.first:
+        print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks))
         training_run.checkpoint.begin(training_run.progress, training_run.precision)
     try:
         with training_run.stop:
             training_run.train()
-        if rank() == 0:
+        if ranks.first:
             print(f"{training_run.summary()}\n\nnext: python drive.py {training_run.files.last}")
     finally:
         training_run.pool.shutdown(cancel_futures=True)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return 0, 2 after an error, 128 + signal if stopped."""
-    arguments, given = parse(argv)
+def execute(command: Command) -> int:
+    """Do what the command asks; return the exit status: 0, 2 after an error, 128 + signal if stopped."""
     keep_freed_memory()
-    join_processes(arguments.device)
-    status, message, files = 0, "", RunFiles(arguments.output)
-    try:
-        with files.claimed():
-            run(arguments, given)
-    except UserError as error:
-        status, message = 2, str(error)
-    except OSError as error:
-        remedy = f"all earlier files are intact. Remove the cause and {files.next_step(arguments.resume)}"
-        status, message = 2, f"{message_of(error)}; {remedy}"
-    except Interrupted as error:
-        status, message = 128 + error.args[0], "stopped and saved; continue with --resume"
-    except KeyboardInterrupt:
-        status, message = 128 + SIGNALS[0], f"stopped at once; {files.next_step(arguments.resume)}"
-    if message and (rank() == 0 or status == 2):  # the other ranks' errors are their own
-        print(f"model.py: {message}", file=sys.stderr)
-    return leave_processes(status)
+    ranks = Ranks.join(command.process.device)
+    files, resume = RunFiles(command.process.output), command.process.resume
+    return ranks.leave(status_of(lambda: run(command, ranks), files, resume, ranks))
+
+
+def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, seed: int = 0, **process: Any) -> int:
+    """Train a network by any recipe, as the command does; return the exit status.
+
+    recordings, output, process: as for the options; a run is resumed only if its recipe is this one.
+    """
+    given = frozenset(field.name for of in (Run, Recipe) for field in fields(of)) - {"recordings"}
+    run = Run(recipe, tuple(map(str, recordings)), seed)
+    return execute(Command(run, Process(str(output), **process), given, {recipe.name: recipe}))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit status."""
+    return execute(options.parse(argv, REPORT, ROBUST))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ MAX_LABEL_OFFSET = 1.0  # m: from a larger lateral offset the car returns at the
 HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far behind to so far ahead
 
 
-@dataclass
+@dataclass(frozen=True)
 class LaneAhead:
     """The lane ahead at each of n rows of recordings.
 

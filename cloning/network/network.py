@@ -18,6 +18,8 @@ FORMAT, VERSION = "behavioral-cloning", 1  # of the model file
 SHIPPED_MODEL = Path(__file__).with_name("shipped.pt")  # comes with the project
 COLOUR = "RGB"  # order of a frame's colours
 CROP = (60, 25)  # rows cut off the top and the bottom of a frame
+SEEN_ROWS = slice(CROP[0], FRAME[0] - CROP[1])  # the rows of a frame that the network sees
+SEEN_SHAPE = (SEEN_ROWS.stop - SEEN_ROWS.start, *FRAME[1:])  # (75, 320, 3)
 UNITS = 4224  # of the flattened layer; dropout keeps half of them
 
 

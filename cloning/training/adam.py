@@ -14,14 +14,17 @@ AVERAGES = ("step", "exp_avg", "exp_avg_sq")  # torch.optim's names: steps done,
 
 
 class Adam:
-    """Adam (arXiv 1412.6980) with torch's defaults; weights and state are those of torch.optim.Adam, bit for bit.
+    """Adam (arXiv 1412.6980); weights and state are those of torch.optim.Adam, bit for bit.
 
-    state: the tensors named AVERAGES for each parameter, by its number; empty before the first step
+    state: the tensors named AVERAGES for each parameter, by its index; empty before the first step
     """
 
-    def __init__(self, parameters: Iterable[nn.Parameter]):
-        """parameters: those to optimise, all on one device; each has a gradient when `step` is called."""
-        self.parameters = list(parameters)
+    def __init__(self, parameters: Iterable[nn.Parameter], momentum: float = 0.9, weight_decay: float = 0.0):
+        """parameters: those to optimise, all on one device; each has a gradient when `step` is called.
+
+        momentum, weight_decay: of torch's Adam, which calls the first one of the two betas.
+        """
+        self.parameters, self.momentum, self.weight_decay = list(parameters), momentum, weight_decay
         self.state: dict[int, dict[str, torch.Tensor]] = {}
 
     def zeros(self, number: int) -> dict[str, torch.Tensor]:
@@ -50,10 +53,10 @@ class Adam:
             steps,
             fused=True,
             amsgrad=False,
-            beta1=0.9,
+            beta1=self.momentum,
             beta2=0.999,
             lr=learning_rate,
-            weight_decay=0,
+            weight_decay=self.weight_decay,
             eps=1e-8,
             maximize=False,
         )

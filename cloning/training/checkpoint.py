@@ -15,9 +15,10 @@ import itertools
 import json
 import math
 import uuid
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -26,19 +27,18 @@ from cloning.base.files import write
 from cloning.network.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
 from cloning.network.tensors import matching, shown
 from cloning.training.adam import Adam
-from cloning.training.muon import OPTIMIZERS
 from cloning.training.observations import Observations
-from cloning.training.options import Arguments, option
-from cloning.training.pieces import LOSSES
+from cloning.training.options import Command, Process, Run
+from cloning.training.recipe import Recipe, option_name
 from cloning.training.run_files import RunFiles
 
 EpochMetrics = dict[str, float]  # a row of training_log.csv: epoch, images, seconds, loss, val_loss, val_drift
 NEW_RUN = "start a new run without --resume"
-PLACE = ("number", "images", "loss", "seconds")  # of Progress
+POSITION = ("number", "images", "loss", "seconds")  # of Progress
 METRICS = ("epoch", "images", "seconds", "loss", "val_loss", "val_drift")  # of EpochMetrics
 COUNTS = {"number", "images", "epoch"}
-NEVER_RESUMED = {"output", "device", "strict", "resume"}  # they belong to one process, not to the run
-MAY_CHANGE = NEVER_RESUMED | {"recordings", "epochs"}  # with --resume; a fingerprint checks the recordings' contents
+MAY_CHANGE = {"recordings", "epochs"}  # with --resume; a fingerprint checks the recordings' contents
+HUBER = {"squared": None, "huber": 0.1}  # the loss, in checkpoints of earlier versions
 
 
 @dataclass
@@ -58,8 +58,8 @@ class Progress:
     history: list[EpochMetrics] = field(default_factory=list)
     run: str | None = field(default_factory=lambda: uuid.uuid4().hex)
 
-    def told(self) -> dict[str, Any]:
-        """Return what training_progress.json tells: the run, finished epochs, and the place in the next one.
+    def as_json(self) -> dict[str, Any]:
+        """Return the contents of training_progress.json: the run, finished epochs, and the position in the next one.
 
         loss is the mean squared error so far in this epoch, None before its first batch.
         """
@@ -72,6 +72,16 @@ class Progress:
             "seconds": round(self.seconds, 3),
             "loss": loss if loss is None or math.isfinite(loss) else None,
         }
+
+    def add(self, images: int, loss: float) -> None:
+        """Count a batch; loss: its sum of squared errors."""
+        self.number += 1
+        self.images += images
+        self.loss += loss
+
+    def done(self, recipe: Recipe) -> float:
+        """Return the finished share of the run, 0..1 or, in the last batch, a little more."""
+        return (len(self.history) + self.images / recipe.samples_per_epoch) / recipe.epochs
 
     def finish_epoch(self, val_loss: float, val_drift: float, by: str = "val_loss") -> bool:
         """Add the epoch to the history and begin the next one; return whether its model is the best so far.
@@ -102,49 +112,111 @@ def best_epoch(history: list[EpochMetrics], by: str) -> EpochMetrics:
     return min(history, key=lambda row: math.inf if math.isnan(row[by]) else row[by])
 
 
-def resumed_arguments(arguments: Arguments, given: frozenset[str]) -> tuple[Arguments, dict[str, Any] | None]:
-    """Return a run's arguments and, with --resume, its checkpoint, which supplies arguments that are not given.
+class SavedRun(NamedTuple):
+    """A checkpoint of a run, which is to be continued.
 
-    given: the names of the arguments on the command line. For a new run the checkpoint is None, or with --from the
-    weights to begin with, without a state of training. Raises ModelError.
+    contents  of the file, of which network and optimizer are not looked at yet
     """
-    files = RunFiles(arguments.output)
-    path = files.resume
-    if not arguments.resume or not path.exists():
-        if arguments.resume:
-            print(f"{path}: nothing to resume yet; starting a new run")
-        return arguments, _first_weights(arguments.from_) if arguments.from_ else None
-    saved = load_checkpoint(path, NEW_RUN)
-    if "training" not in saved:
-        raise ModelError(f"{path}: contains no state to resume; give the --output of the run")
-    try:
-        initial, history = _initial_arguments(saved), _progress(saved).history
-    except ValueError as error:
-        raise _unusable(path, error) from None
-    for name in sorted(given - MAY_CHANGE):
-        began = initial.get(name, getattr(Arguments(), name))  # an earlier version had no such option
-        if began != getattr(arguments, name):
-            raise ModelError(
-                f"{path}: the run began with {option(name)} {began!r}, not {getattr(arguments, name)!r}; "
-                f"leave the option out, or {NEW_RUN}"
-            )
-    for model in (files.last, files.best):
-        if history and model.exists() and _run_of(model) != saved.get("run"):
-            raise ModelError(
-                f"{model}: damaged, or of another run than {path.name}, which would replace it; move it away first"
-            )
-    return replace(arguments, **{name: value for name, value in initial.items() if name not in given}), saved
+
+    path: Path
+    run: Run
+    progress: Progress
+    contents: dict[str, Any]
 
 
-def _first_weights(path: str) -> dict[str, Any]:
-    """Return what `Checkpoint.restore` needs of a model file with whose weights a new run begins. Raises ModelError."""
+class FirstWeights(NamedTuple):
+    """The weights with which a new run begins; contents: of the model file, which fit this program's network."""
+
+    contents: dict[str, Any]
+
+
+def read_first_weights(path: str) -> FirstWeights:
+    """Return the weights of a model file. Raises ModelError."""
     saved = load_checkpoint(path, "name a model file of model.py")
     weights = {name: saved.get(name) for name in ("recipe", "network")}
     try:
         _restore_network(Network(), weights)
     except ValueError as error:
         raise ModelError(f"{path}: its contents do not fit this program: {error}; name another model file") from None
-    return weights
+    return FirstWeights(weights)
+
+
+def read_saved_run(path: Path, recipes: Mapping[str, Recipe]) -> SavedRun:
+    """Return the run of a checkpoint; recipes: those that may have trained it, by name. Raises ModelError."""
+    contents = load_checkpoint(path, NEW_RUN)
+    if "training" not in contents:
+        raise ModelError(f"{path}: contains no state to resume; give the --output of the run")
+    try:
+        return SavedRun(path, _saved_run(contents, recipes), _progress(contents), contents)
+    except ValueError as error:
+        raise _unusable(path, error) from None
+
+
+def resumed(command: Command) -> tuple[Run, SavedRun | FirstWeights | None]:
+    """Return the run that a command is about, and with what it begins, if not with random weights.
+
+    A run that is resumed has the arguments of its checkpoint, where they are not given. Raises ModelError.
+    """
+    run, process, given, recipes = command
+    files = RunFiles(process.output)
+    if not process.resume or not files.resume.exists():
+        if process.resume:
+            print(f"{files.resume}: nothing to resume yet; starting a new run")
+        return run, read_first_weights(run.from_model) if run.from_model else None
+    saved = read_saved_run(files.resume, recipes)
+    began, wanted = _values(saved.run), _values(run)
+    for name in sorted(given & began.keys() - MAY_CHANGE):
+        if began[name] != wanted[name]:
+            raise ModelError(
+                f"{files.resume}: the run began with {option_name(name)} {began[name]!r}, not {wanted[name]!r}; "
+                f"leave the option out, or {NEW_RUN}"
+            )
+    for model in (files.last, files.best):
+        if saved.progress.history and model.exists() and _run_of(model) != saved.progress.run:
+            raise ModelError(
+                f"{model}: damaged, or of another run than {files.resume.name}, which would replace it; move it away "
+                "first"
+            )
+    epochs = run.recipe.epochs if "epochs" in given else saved.run.recipe.epochs
+    recordings = run.recordings if "recordings" in given else saved.run.recordings
+    return replace(saved.run, recordings=recordings, recipe=replace(saved.run.recipe, epochs=epochs)), saved
+
+
+def _values(run: Run) -> dict[str, Any]:
+    """Return all that a user may give of a run, by name."""
+    values = run.saved()
+    return {**values.pop("recipe"), **values, "robust": run.recipe.name == "robust"}
+
+
+def _saved_run(contents: dict[str, Any], recipes: Mapping[str, Recipe]) -> Run:
+    """Return the run that a checkpoint contains. Raises ValueError."""
+    saved = contents.get("arguments")
+    if not isinstance(saved, dict):
+        raise ValueError("it has no arguments")
+    if "recipe" not in saved:
+        saved = _of_earlier_version(saved)
+    figures = saved["recipe"]
+    name = figures.get("name") if isinstance(figures, dict) else None
+    if not isinstance(name, str) or name not in recipes:
+        raise ValueError(f"its recipe is {shown(name)}, not {' or '.join(recipes)}")
+    plain = {"recordings": list, "seed": int, "from_model": str}
+    for key, kind in plain.items():
+        value = saved.get(key)
+        if type(value) is not kind or (kind is list and not all(type(part) is str for part in value)):
+            raise ValueError(f"its {option_name(key)} is of type {type(value).__name__}")
+    recordings = tuple(saved["recordings"])
+    return Run(recipes[name].restored(figures), recordings, saved["seed"], saved["from_model"])
+
+
+def _of_earlier_version(saved: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments of an earlier version, which were one flat dict, as `Run.saved` does. Raises ValueError."""
+    loss, optimizer = saved.get("loss", "squared"), saved.get("optimizer", "adam")
+    if not isinstance(loss, str) or loss not in HUBER:
+        raise ValueError(f"its loss is {shown(loss)}, not {' or '.join(HUBER)}")
+    figures = {**saved, "name": "robust" if saved.get("robust") is True else "report", "huber": HUBER[loss]}
+    figures |= {"optimizer": optimizer} | ({"momentum": 0.9, "weight_decay": 0.0} if optimizer == "adam" else {})
+    run = {"recordings": saved.get("recordings", ["data"]), "seed": saved.get("seed", 0)}
+    return {**run, "from_model": saved.get("from_", ""), "recipe": figures}
 
 
 def _restore_network(network: Network, saved: dict[str, Any]) -> None:
@@ -154,28 +226,12 @@ def _restore_network(network: Network, saved: dict[str, Any]) -> None:
     restore_weights(network, saved)
 
 
-def _initial_arguments(saved: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments that a checkpoint supplies. Raises ValueError."""
-    initial, known = saved.get("arguments"), {}
-    if not isinstance(initial, dict):
-        raise ValueError("it has no arguments")
-    for name, default in asdict(Arguments()).items():
-        if name not in NEVER_RESUMED:
-            value = known[name] = initial.get(name, default)  # an earlier version may have had no such argument
-            if type(value) is not type(default) or (name == "recordings" and not all(type(it) is str for it in value)):
-                raise ValueError(f"its {option(name)} is of type {type(value).__name__}")
-    for name, values in (("optimizer", OPTIMIZERS), ("loss", LOSSES)):
-        if known[name] not in values:
-            raise ValueError(f"its {name} is {shown(known[name])}, not {' or '.join(values)}")
-    return known
-
-
 def _progress(saved: dict[str, Any]) -> Progress:
     """Return the progress that a checkpoint contains. Raises ValueError."""
     state, history, run = saved["training"], saved.get("history"), saved.get("run")
     if not isinstance(state, dict) or not isinstance(history, list) or type(run) not in (str, type(None)):
         raise ValueError("it has no state, history or identifier of its run")
-    values = [(name, state.get(name)) for name in PLACE]
+    values = [(name, state.get(name)) for name in POSITION]
     for row in history:
         if isinstance(row, dict) and tuple(row) == METRICS[:-1]:
             row["val_drift"] = math.nan  # an earlier version did not measure it
@@ -185,8 +241,8 @@ def _progress(saved: dict[str, Any]) -> Progress:
     for name, value in values:
         if not (type(value) is int and 0 <= value <= 10**12 if name in COUNTS else type(value) is float):
             raise ValueError(f"its {name} is {shown(value)}")
-    place: dict[str, Any] = {name: state[name] for name in PLACE}
-    return Progress(**place, history=history, run=run)
+    position: dict[str, Any] = {name: state[name] for name in POSITION}
+    return Progress(**position, history=history, run=run)
 
 
 def _unusable(path: Path, error: ValueError) -> ModelError:
@@ -204,17 +260,10 @@ def fingerprint(*observations: Observations) -> str:
 class Checkpoint:
     """Writes the model files of a run, and restores the run from them."""
 
-    def __init__(
-        self,
-        files: RunFiles,
-        arguments: Arguments,
-        network: Network,
-        optimizer: Adam,
-        data_fingerprint: str,
-    ):
+    def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data_fingerprint: str):
         """network, optimizer: whose state is saved and restored; data_fingerprint: of `fingerprint`."""
-        self.files, self.arguments, self.network, self.optimizer = files, arguments, network, optimizer
-        self.fingerprint = data_fingerprint
+        self.run, self.process, self.network, self.optimizer = run, process, network, optimizer
+        self.files, self.fingerprint = RunFiles(process.output), data_fingerprint
         self.resumed = False  # whether `restore` found a state of this run
 
     def begin(self, progress: Progress, precision: torch.dtype) -> None:
@@ -223,20 +272,20 @@ class Checkpoint:
             if _has_finished_epoch(self.files.resume):
                 self.set_aside(self.files.resume)
             self.save(progress)
-        settings = {**asdict(self.arguments), "precision": str(precision), "versions": versions()}
+        settings = {**self.run.saved(), **asdict(self.process), "precision": str(precision), "versions": versions()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if self.resumed:
-            self._tell(progress)  # a killed run may not have come so far
+            self._write_progress(progress)  # a killed run may not have come so far
             print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
-        elif self.arguments.from_:
-            print(f"begins with the weights of {self.arguments.from_}")
+        elif self.run.from_model:
+            print(f"begins with the weights of {self.run.from_model}")
 
     def save(self, progress: Progress, *models: Path) -> None:
         """Write the network to these files, then model-resume.pt with all that --resume needs, then how far it is.
 
         Raises OSError.
         """
-        more = {"arguments": asdict(self.arguments), "history": progress.history, "run": progress.run}
+        more = {"arguments": self.run.saved(), "history": progress.history, "run": progress.run}
         if models and len(progress.history) == 1:
             for path in (self.files.last, self.files.best):
                 if path.exists() and _run_of(path) != progress.run:  # its own if it was killed in `save`
@@ -249,33 +298,33 @@ class Checkpoint:
             **more,
             training={
                 "optimizer": {"state": self.optimizer.state},
-                **{name: getattr(progress, name) for name in PLACE},
+                **{name: getattr(progress, name) for name in POSITION},
                 "fingerprint": self.fingerprint,
             },
         )
-        self._tell(progress)  # last, so that it never tells of more than --resume continues with
+        self._write_progress(progress)  # last, so that it never tells of more than --resume continues with
 
-    def _tell(self, progress: Progress) -> None:
-        write(self.files.progress, json.dumps(progress.told()).encode())
+    def _write_progress(self, progress: Progress) -> None:
+        write(self.files.progress, json.dumps(progress.as_json()).encode())
 
-    def restore(self, saved: dict[str, Any]) -> Progress:
-        """Load a checkpoint of `resumed_arguments` into network and optimizer, and return its progress.
+    def restore(self, begin: SavedRun | FirstWeights | None) -> Progress:
+        """Load weights and, of a saved run, the optimizer's state, and return the run's progress.
 
         Raises ModelError if the run was trained on other data.
         """
-        if "training" not in saved:  # with --from, a new run
-            _restore_network(self.network, saved)
+        if isinstance(begin, FirstWeights):
+            _restore_network(self.network, begin.contents)
+        if not isinstance(begin, SavedRun):
             return Progress()
-        path, self.resumed = self.files.resume, True
+        state, self.resumed = begin.contents["training"], True
+        if state.get("fingerprint") != self.fingerprint:
+            raise ModelError(f"{begin.path}: the run began with other recordings; restore them, or {NEW_RUN}")
         try:
-            progress, state = _progress(saved), saved["training"]
-            if state.get("fingerprint") != self.fingerprint:
-                raise ModelError(f"{path}: the run began with other recordings; restore them, or {NEW_RUN}")
-            _restore_network(self.network, saved)
-            self._restore_optimizer(state.get("optimizer"), has_begun=progress.number > 0)
+            _restore_network(self.network, begin.contents)
+            self._restore_optimizer(state.get("optimizer"), has_begun=begin.progress.number > 0)
         except ValueError as error:
-            raise _unusable(path, error) from None
-        return progress
+            raise _unusable(begin.path, error) from None
+        return begin.progress
 
     def _restore_optimizer(self, saved: object, has_begun: bool) -> None:
         """Load the averages of a checkpoint into the optimizer; its settings follow from the arguments."""

@@ -1,7 +1,4 @@
-"""The processes that torchrun started for a run, each with its share of every batch.
-
-Without torchrun there is one process, of rank 0.
-"""
+"""The processes that torchrun started for a run, each with its share of every batch."""
 
 import os
 import sys
@@ -17,62 +14,73 @@ from cloning.network.compute import choose_device
 Result = TypeVar("Result")
 
 
-def rank() -> int:
-    """Return this process's number; rank 0 reads the recordings, prints, and writes the files."""
-    return dist.get_rank() if dist.is_initialized() else 0
-
-
-def world() -> int:
-    """Return the number of processes."""
-    return dist.get_world_size() if dist.is_initialized() else 1
-
-
-def join_processes(device_name: str) -> None:
-    """Join the other processes, if torchrun started this one."""
-    if "RANK" not in os.environ:
-        return
-    device = choose_device(device_name)
-    if device.type == "cuda":
-        torch.cuda.set_device(device)
-    dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-
-
 class FirstRankFailed(UserError):
     """The error of rank 0 on the other ranks; rank 0 reports it."""
 
 
-def from_first_rank(make: Callable[[], Result]) -> Result:
-    """Call `make` on rank 0 and return its result on every rank.
+class Ranks:
+    """The processes of a run, one for each rank; without torchrun there is one, of rank 0.
 
-    Raises its UserError or OSError on rank 0, FirstRankFailed on the others.
+    rank   of this process; rank 0 reads the recordings, prints, and writes the files
+    world  number of processes
     """
-    outcome: list[Result | UserError | OSError | None] = [None]
-    if rank() == 0:
-        try:
-            outcome = [make()]
-        except (UserError, OSError) as error:
-            outcome = [error]
-    if dist.is_initialized():
-        dist.broadcast_object_list(outcome)
-    if isinstance(outcome[0], (UserError, OSError)):
-        raise outcome[0] if rank() == 0 else FirstRankFailed
-    return cast(Result, outcome[0])
 
+    def __init__(self, rank: int = 0, world: int = 1):
+        """Know a rank among so many, of which nothing is started; `join` finds those that torchrun started."""
+        self.rank, self.world = rank, world
 
-def summed(values: torch.Tensor, device: torch.device) -> torch.Tensor:
-    """Return the sum of the values of all processes."""
-    if dist.is_initialized():
-        values = values.to(device)
-        dist.all_reduce(values)
-    return values
+    @classmethod
+    def join(cls, device_name: str) -> "Ranks":
+        """Join the other processes, if torchrun started this one; device_name: see `choose_device`."""
+        if "RANK" not in os.environ:
+            return cls()
+        device = choose_device(device_name)
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+        return cls(dist.get_rank(), dist.get_world_size())
 
+    @property
+    def first(self) -> bool:
+        """Whether this is the process that prints and writes."""
+        return self.rank == 0
 
-def leave_processes(status: int) -> int:
-    """Return the exit status; if there are other processes, leave them and exit with it at once."""
-    if dist.is_initialized():
-        dist.destroy_process_group()
-        # No normal exit: if a thread of gloo frees its last tensor while Python shuts down, the process aborts.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
-    return status
+    @property
+    def share(self) -> slice:
+        """This process's share of anything that has one entry for each piece of work."""
+        return slice(self.rank, None, self.world)
+
+    def from_first(self, make: Callable[[], Result]) -> Result:
+        """Call `make` on rank 0 and return its result on every rank.
+
+        Raises its UserError or OSError on rank 0, FirstRankFailed on the others.
+        """
+        outcome: list[Result | UserError | OSError | None] = [None]
+        if self.first:
+            try:
+                outcome = [make()]
+            except (UserError, OSError) as error:
+                outcome = [error]
+        if self.world > 1:
+            dist.broadcast_object_list(outcome)
+        if isinstance(outcome[0], (UserError, OSError)):
+            raise outcome[0] if self.first else FirstRankFailed
+        return cast(Result, outcome[0])
+
+    def summed(self, values: list[float], device: torch.device) -> list[float]:
+        """Return the sum of each value over all processes; device: of the run."""
+        if self.world == 1:
+            return values
+        total = torch.tensor(values, dtype=torch.float64).to(device)
+        dist.all_reduce(total)
+        return total.tolist()
+
+    def leave(self, status: int) -> int:
+        """Return the exit status; if there are other processes, leave them and exit with it at once."""
+        if self.world > 1:
+            dist.destroy_process_group()
+            # No normal exit: if a thread of gloo frees its last tensor while Python shuts down, the process aborts.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
+        return status

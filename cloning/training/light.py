@@ -1,4 +1,4 @@
-"""Changes of the light in a training image: saturation, tint, brightness, and shadows across the road.
+"""Changes of the light in training images: the report's brightness and shadow, and those of --robust.
 
 The simulator casts shadows at its higher graphics qualities, and recordings at the lower ones have none. The recipe's
 augmentation darkens one polygon; here the shade's edges are hard or soft, straight or ragged, and it is bluish, as
@@ -6,35 +6,80 @@ measured in real recordings: the road's median colour in the shade is (0.26, 0.3
 """
 
 import functools
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from cloning.training.observations import SEEN_SHAPE
+from cloning.base.frame import FRAME
+from cloning.network.network import SEEN_SHAPE
 
-TINTED_SHARE = 0.5  # of the images whose colours are changed
-SHADED_SHARE = 0.4  # of the images with shadows
-# Ranges of the factors of saturation, of red, green and blue each, and of all three.
-SATURATION, TINT, BRIGHTNESS = (0.1, 1.5), (0.85, 1.15), (0.5, 1.15)
+if TYPE_CHECKING:
+    from cloning.training.recipe import Recipe
+
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour
 WIDTHS, SOFTNESS, RAGGED = (4, 400), (0.3, 4), (0, 25)  # pixels: of a shadow, of its edges' blur, of their displacement
 
 
-def tints(rng: np.random.Generator, n: int) -> np.ndarray:
+def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, to: int, back: int) -> np.ndarray:
+    """Multiply one channel of another colour space, rounded and clipped at 255.
+
+    images: uint8 (n, rows, columns, 3), as the result; factors: (n,); to, back: OpenCV's codes of the conversions.
+    OpenCV is given all images as one tall image, so that other Python threads can run during one long call.
+    """
+    if not len(images):
+        return images
+    tall = cv2.cvtColor(images.reshape(-1, *images.shape[2:]), to)
+    values = cv2.extractChannel(tall, channel).reshape(len(images), -1)
+    values = np.minimum(np.multiply(values, factors[:, None], dtype=np.float32) + np.float32(0.5), 255).astype(np.uint8)
+    cv2.insertChannel(values.reshape(tall.shape[:2]), tall, channel)
+    return cv2.cvtColor(tall, back, dst=tall).reshape(images.shape)
+
+
+def choose_brightness(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray]:
+    """Return the factors of `brighten`."""
+    return (rng.uniform(*recipe.brightness, n),)
+
+
+def brighten(images: np.ndarray, first_row: int, factors: np.ndarray) -> np.ndarray:
+    """Multiply the HSV value of RGB images, uint8 (n, rows, columns, 3), clipped at 255; factors: (n,)."""
+    return multiply_channel(images, 2, factors, cv2.COLOR_RGB2HSV, cv2.COLOR_HSV2RGB)
+
+
+def choose_shadow(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the factors, lines and sides of `shade`."""
+    return rng.uniform(*recipe.darkness, n), rng.uniform(0, FRAME[1], (n, 2)), rng.random(n) < 0.5
+
+
+def shade(images: np.ndarray, first_row: int, factors: np.ndarray, lines: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Multiply the HLS lightness of RGB images, uint8 (n, rows, columns, 3), on one side of a line.
+
+    first_row: the row of the full frame that is the images' first; factors: (n,); lines: (n, 2), the columns at which
+    the line meets the top and bottom of the full frame of 160 rows; left: bool (n,), the side.
+    """
+    rows = np.arange(first_row, first_row + images.shape[1])
+    edges = (lines[:, :1] + (lines[:, 1:] - lines[:, :1]) * rows / FRAME[0]).astype(np.float32)
+    lit = (np.arange(images.shape[2], dtype=np.float32) < edges[:, :, None]) != left[:, None, None]
+    shaded = multiply_channel(images, 1, factors, cv2.COLOR_RGB2HLS, cv2.COLOR_HLS2RGB)
+    np.copyto(shaded.view("V3"), images.view("V3"), where=lit[..., None])  # by pixels: takes a tenth of the time
+    return shaded
+
+
+def tints(recipe: "Recipe", rng: np.random.Generator, n: int) -> np.ndarray:
     """Sample changes of saturation, tint and brightness: float32 (n, 3, 3), matrices by which RGB is multiplied.
 
-    Only TINTED_SHARE of them change anything.
+    Only the recipe's share of them changes anything.
     """
-    saturation = rng.uniform(*SATURATION, n)[:, None, None]
-    tint = rng.uniform(*TINT, (n, 3, 1)) * rng.uniform(*BRIGHTNESS, (n, 1, 1))
-    changed = (rng.random(n) < TINTED_SHARE)[:, None, None]
+    saturation = rng.uniform(*recipe.saturation, n)[:, None, None]
+    tint = rng.uniform(*recipe.tint, (n, 3, 1)) * rng.uniform(*recipe.dimmed, (n, 1, 1))
+    changed = (rng.random(n) < recipe.tinted)[:, None, None]
     return np.where(changed, tint * (saturation * np.eye(3) + (1 - saturation) / 3), np.eye(3)).astype(np.float32)
 
 
-def sample_shades(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Sample shadows: int16 (n,), a number below SHADES for SHADED_SHARE of them, else -1."""
-    return np.where(rng.random(n) < SHADED_SHARE, rng.integers(0, SHADES, n), -1).astype(np.int16)
+def sample_shades(share: float, rng: np.random.Generator, n: int) -> np.ndarray:
+    """Sample shadows: int16 (n,), a number below SHADES for this share of them, else -1."""
+    return np.where(rng.random(n) < share, rng.integers(0, SHADES, n), -1).astype(np.int16)
 
 
 def relight(image: np.ndarray, colours: np.ndarray, shade: int) -> np.ndarray:

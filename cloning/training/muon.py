@@ -8,20 +8,16 @@ decay. Biases, and the last layer's single row, are moved by Adam.
 torch.optim.Muon does the same for matrices, in bfloat16 and not for the kernels of convolutions.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
+from torch import nn
 
 from cloning.training.adam import Adam
 
-MOMENTUM = 0.95
 # With this factor and the root of a matrix's longer side, weights move about as far as with Adam at the same learning
 # rate (arXiv 2502.16982, section 2.2).
 SIZE_OF_ADAMS_STEP = 0.2
-# Per step and unit of learning rate. Each step adds a matrix of full rank, so without it the weights keep growing: at
-# 4e-3 the largest layer's spectral norm was 0.7 at first, 4.8 after 10,000 images and 13 after 60,000, and a training
-# on 72 recordings broke down after 120,000. With it, the norm stays at 4.
-WEIGHT_DECAY = 1.0
 NEWTON_SCHULZ_STEPS, COEFFICIENTS = 5, (3.4445, -4.7750, 2.0315)  # Jordan's: singular values end between 0.7 and 1.2
 
 
@@ -50,6 +46,14 @@ class Muon(Adam):
     state: as Adam's, but a matrix's is its average gradient alone, "momentum"
     """
 
+    def __init__(self, parameters: Iterable[nn.Parameter], momentum: float = 0.95, weight_decay: float = 1.0):
+        """parameters: see Adam, whose defaults are used for all that is no matrix.
+
+        momentum: of the average gradient; weight_decay: of matrices, per step and unit of learning rate.
+        """
+        super().__init__(parameters)
+        self.matrix_momentum, self.matrix_decay = momentum, weight_decay
+
     def is_matrix(self, number: int) -> bool:
         """Return whether a parameter, by its number, is a layer's weights with several outputs."""
         parameter = self.parameters[number]
@@ -67,10 +71,10 @@ class Muon(Adam):
         for number in filter(self.is_matrix, numbers):
             parameter, average = self.parameters[number], self.state[number]["momentum"]
             assert parameter.grad is not None
-            average.lerp_(parameter.grad, 1 - MOMENTUM)
-            ahead = parameter.grad.lerp(average, MOMENTUM).flatten(1)  # Nesterov's
+            average.lerp_(parameter.grad, 1 - self.matrix_momentum)
+            ahead = parameter.grad.lerp(average, self.matrix_momentum).flatten(1)  # Nesterov's
             far = SIZE_OF_ADAMS_STEP * max(ahead.shape) ** 0.5
-            parameter.mul_(1 - learning_rate * WEIGHT_DECAY)
+            parameter.mul_(1 - learning_rate * self.matrix_decay)
             parameter.sub_(orthogonal(ahead).reshape(parameter.shape), alpha=learning_rate * far)
 
 

@@ -1,17 +1,15 @@
 """Make the pictures of a training run: frames with their steering, and the losses by epoch."""
 
 import io
-from collections.abc import Callable
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from cloning.recordings.format import CAMERAS
 from cloning.road.motion import FULL_LOCK
+from cloning.training.batch import Choices
 from cloning.training.checkpoint import EpochMetrics
-from cloning.training.observations import Augmented, Choices
-
-Augment = Callable[[Choices, np.ndarray, list[np.ndarray], int], list[Augmented]]
+from cloning.training.recipe import Recipe
 
 SCALE = 3  # of a frame's pixels: three frames in a row are 25 cm wide at 300 dpi
 FONT, MARGIN = 44, 12  # pixels: of the captions, which stay legible at a third of the size; between panels
@@ -44,7 +42,8 @@ def panel(frame: np.ndarray, title: str, steering: float) -> Image.Image:
 def grid(panels: list[Image.Image], columns: int) -> bytes:
     """Return a PNG of panels of equal size, row by row, with margins."""
     width, height = panels[0].width + MARGIN, panels[0].height + MARGIN
-    whole = Image.new("RGB", (columns * width + MARGIN, len(panels) // columns * height + MARGIN), "white")
+    rows = -(-len(panels) // columns)
+    whole = Image.new("RGB", (columns * width + MARGIN, rows * height + MARGIN), "white")
     for i, picture in enumerate(panels):
         whole.paste(picture, (MARGIN + i % columns * width, MARGIN + i // columns * height))
     file = io.BytesIO()
@@ -52,25 +51,25 @@ def grid(panels: list[Image.Image], columns: int) -> bytes:
     return file.getvalue()
 
 
-def batch_pictures(choices: Choices, augment: Augment) -> dict[str, bytes]:
+def batch_pictures(choices: Choices, recipe: Recipe) -> dict[str, bytes]:
     """Return the report's two pictures of a batch's first observation: file name, with {} for the count, -> PNG.
 
-    One shows the left, centre and right image, the other the four kinds of image, each with its label.
-    augment: model.augment.
+    One shows the left, centre and right image, the other an image of each augmentation, each with its label.
     """
-    choices.places[0] = 0  # so that all four kinds of image are made
     example = choices.views.example(0)
     center, left, right = (
         panel(frame, camera, label)
         for frame, camera, label in zip(example.frames, CAMERAS, example.camera_labels, strict=True)
     )
-    images = [kind.images[0] for kind in augment(choices, np.array([0]), example.images, example.first_row)]
-    changes = ["", "", f", brightness x {choices.brightness[0]:.2f}", f", shadow x {choices.darkness[0]:.2f}"]
-    titles = [title + change for title, change in zip(example.titles, changes, strict=True)]
-    kinds = [panel(*column) for column in zip(images, titles, choices.views.labels[0], strict=True)]
+    panels = []
+    for kind, augmentation in enumerate(recipe.augmentations):
+        chosen = [column[:1] for column in choices.augmenting[kind]]
+        image = augmentation.change(example.images[kind], example.first_row, *chosen)[0]
+        caption = f", {augmentation.caption.format(*(column[0] for column in chosen))}" if augmentation.caption else ""
+        panels.append(panel(image, example.titles[kind] + caption, choices.views.labels[0, kind]))
     return {
         "training_generator_LRC_{}.png": grid([left, center, right], columns=3),
-        "training_generator_augmented-{}.png": grid(kinds, columns=2),
+        "training_generator_augmented-{}.png": grid(panels, columns=2),
     }
 
 

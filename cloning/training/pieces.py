@@ -5,7 +5,6 @@ import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,30 +12,10 @@ import torch
 from torch import nn
 
 from cloning.network.compute import in_precision
+from cloning.training.batch import Batch
 
 PIECE = 28  # images at most: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
 Module = TypeVar("Module", bound=nn.Module)
-# The loss -> the largest error that the gradient knows. Huber's loss grows linearly beyond it, so that the few views
-# that are warped beyond recognition do not decide what is learned from all the others.
-LOSSES = {"squared": math.inf, "huber": 0.1}
-
-
-@dataclass
-class Batch:
-    """One process's share of a batch.
-
-    images      uint8 (n, 75, 320, 3), RGB, cropped
-    labels      float32 (n,): steering, -1..1
-    keep        bool (n, 4224): the units of the flattened layer that dropout keeps; None: all
-    total       images in the whole batch, of all processes
-    start_next  starts making a later batch; called when this batch's work is in the pool's queue, to be done before it
-    """
-
-    images: np.ndarray
-    labels: np.ndarray
-    keep: np.ndarray | None
-    total: int
-    start_next: Callable[[], None] = lambda: None
 
 
 def pieces(images: int) -> list[slice]:
@@ -55,24 +34,19 @@ def converted(network: Module, precision: torch.dtype) -> Module:
     return network if same else copy.deepcopy(network).to(precision)
 
 
-def squared_errors(
-    network: nn.Module,
-    images: np.ndarray,
-    labels: np.ndarray,
-    keep: np.ndarray | None = None,
-    loss: str = "squared",
-) -> torch.Tensor:
-    """Return the sum over the images of (predicted - label)², a scalar, float32; arrays as in Batch.
+def squared_errors(network: nn.Module, batch: Batch, huber: float | None = None) -> torch.Tensor:
+    """Return the sum over the images of (predicted - label)², a scalar, float32.
 
-    loss: one of LOSSES, whose gradient the result has, whatever its value.
+    huber: error beyond which the gradient is that of Huber's loss, which grows linearly; None: at no error. The value
+    is the squared errors' nevertheless.
     """
     device = next(network.parameters()).device
-    frames, wanted = torch.from_numpy(images).to(device), torch.from_numpy(labels).to(device)
-    predicted = network(frames, None if keep is None else torch.from_numpy(keep).to(device))
-    error = predicted - wanted
+    keep = None if batch.keep is None else torch.from_numpy(batch.keep).to(device)
+    predicted = network(torch.from_numpy(batch.images).to(device), keep)
+    error = predicted - torch.from_numpy(batch.labels).to(device)
     known = error.detach()
-    limit = LOSSES[loss]
-    return (known**2 + 2 * known.clamp(-limit, limit) * (error - known)).sum()
+    slope = 2 * (known if huber is None else known.clamp(-huber, huber))
+    return (known**2 + slope * (error - known)).sum()  # the second term is 0, and has the gradient
 
 
 class PieceByPiece(torch.autograd.Function):
@@ -87,23 +61,24 @@ class PieceByPiece(torch.autograd.Function):
         network: nn.Module,
         pool: ThreadPoolExecutor,
         batch: Batch,
-        loss: str,
+        huber: float | None,
+        meanwhile: Callable[[], None],
         *parameters: nn.Parameter,
     ) -> torch.Tensor:
         """Return the sum of squared errors; the gradients are computed, too, and kept for `backward`.
 
-        network: computes, with the values of the parameters, which are float32; it may have them in bfloat16.
+        network: computes, with the values of the parameters, which are float32; it may have them in bfloat16;
+        huber: see `squared_errors`; meanwhile: called when all pieces are in the pool's queue.
         """
         weights = list(network.parameters())
 
         def piece(part: slice) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-            keep = None if batch.keep is None else batch.keep[part]
             with torch.enable_grad():
-                errors = squared_errors(network, batch.images[part], batch.labels[part], keep, loss)
+                errors = squared_errors(network, batch.part(part), huber)
             return errors.detach(), torch.autograd.grad(errors, weights)
 
         done = pool.map(piece, pieces(len(batch.labels)))
-        batch.start_next()
+        meanwhile()
         total, gradients = torch.zeros(()), [torch.zeros_like(parameter) for parameter in parameters]
         for piece_errors, piece_gradients in done:
             total += piece_errors
@@ -113,32 +88,38 @@ class PieceByPiece(torch.autograd.Function):
 
     @staticmethod
     def backward(context: Any, scale: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Return the gradients of the parameters, times `scale`; the first four inputs have none."""
-        return None, None, None, None, *torch._foreach_mul(context.gradients, scale)
+        """Return the gradients of the parameters, times `scale`; the first five inputs have none."""
+        return None, None, None, None, None, *torch._foreach_mul(context.gradients, scale)
 
 
 class SquaredErrors(nn.Module):
     """Sums a batch's squared errors; a module, so that DistributedDataParallel can wrap it."""
 
-    def __init__(self, network: nn.Module, precision: torch.dtype, pool: ThreadPoolExecutor, loss: str):
-        """pool: its threads compute the pieces on a CPU; loss: one of LOSSES, whose gradient is taken."""
+    def __init__(
+        self, network: nn.Module, precision: torch.dtype, pool: ThreadPoolExecutor, huber: float | None = None
+    ):
+        """pool: its threads compute the pieces on a CPU; huber: see `squared_errors`."""
         super().__init__()
-        self.network, self.precision, self.pool, self.loss = network, precision, pool, loss
+        self.network, self.precision, self.pool, self.huber = network, precision, pool, huber
         self.device = next(network.parameters()).device
         on_cpu = self.device.type == "cpu"
         # In a tuple, because the weights of the copy are not this module's parameters.
         self.converted = (converted(network, precision) if on_cpu else network,)
 
-    def forward(self, batch: Batch) -> torch.Tensor:
-        """Return the sum over this process's images: a scalar, float32."""
+    def forward(self, batch: Batch, meanwhile: Callable[[], None] = lambda: None) -> torch.Tensor:
+        """Return the sum over this process's images: a scalar, float32.
+
+        meanwhile: called while the batch is being computed, when its work is in the pool's queue: what it gives to the
+        pool is done later.
+        """
         if self.device.type == "cpu":
             (network,) = self.converted  # once for a batch: converting the weights for each piece would take longer
             with torch.no_grad():
                 torch._foreach_copy_(list(network.parameters()), list(self.network.parameters()))
-            return PieceByPiece.apply(network, self.pool, batch, self.loss, *self.network.parameters())
-        batch.start_next()
+            return PieceByPiece.apply(network, self.pool, batch, self.huber, meanwhile, *self.network.parameters())
+        meanwhile()
         with in_precision(self.precision, self.device):
-            return squared_errors(self.network, batch.images, batch.labels, batch.keep, self.loss)
+            return squared_errors(self.network, batch, self.huber)
 
 
 def predict(

@@ -4,12 +4,16 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cloning.base.errors import OutputError
 from cloning.base.outputs import check_folders
 
 if os.name != "nt":
     import fcntl
+
+if TYPE_CHECKING:
+    from cloning.training.distributed import Ranks
 
 
 class RunFiles:
@@ -26,16 +30,13 @@ class RunFiles:
         self.progress = self.last.with_name("training_progress.json")
         self.rejected = self.last.with_name("rejected_rows.csv")
         self.pictures = self.last.with_name("diagnostic_images")
-        self._state_at_start = self._state()
 
     @contextlib.contextmanager
-    def claimed(self) -> Iterator[None]:
+    def claimed(self, ranks: "Ranks") -> Iterator[None]:
         """Make the folders and keep other runs out of them until the block ends, or this process.
 
         On Windows, and on a file system without locks, other runs are not kept out. Raises OutputError, OSError.
         """
-        from cloning.training.distributed import from_first_rank  # imports torch
-
         with contextlib.ExitStack() as stack:
 
             def claim() -> None:
@@ -55,7 +56,7 @@ class RunFiles:
                 except OSError as error:  # a network's file system, for example
                     print(f"{self.last.parent}: cannot be locked ({error.strerror}); start no other run in it")
 
-            from_first_rank(claim)
+            ranks.from_first(claim)
             yield
 
     def is_claimed(self) -> bool | None:
@@ -79,16 +80,17 @@ class RunFiles:
             os.close(folder)
         return False
 
-    def next_step(self, resumed: bool) -> str:
-        """Return what the user can do after an error; resumed: whether --resume was given.
+    def next_step(self, before: tuple[int, int] | None, resumed: bool) -> str:
+        """Return what the user can do after an error.
 
-        Until a new run has saved a state, --resume would continue an earlier run.
+        before: what `state` was when the run began: until it has saved a state, --resume would continue an earlier
+        run; resumed: whether --resume was given.
         """
-        begun = resumed or self._state() != self._state_at_start
+        begun = resumed or self.state() != before
         return "continue with --resume" if begun else "start the run again"
 
-    def _state(self) -> tuple[int, int] | None:
-        """Return what tells whether model-resume.pt was replaced."""
+    def state(self) -> tuple[int, int] | None:
+        """Return what tells whether model-resume.pt was replaced; None if there is none."""
         if not os.path.exists(self.resume):
             return None
         now = self.resume.stat()

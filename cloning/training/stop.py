@@ -1,7 +1,13 @@
-"""Stop a run by a signal: the run can save its state before it ends."""
+"""How a run ends: stopped by a signal, after it has saved its state, or by an error, with what the user can do."""
 
 import signal
+import sys
+from collections.abc import Callable
 from types import FrameType
+
+from cloning.base.errors import UserError, message_of
+from cloning.training.distributed import Ranks
+from cloning.training.run_files import RunFiles
 
 # Windows cannot send SIGTERM, and other systems may lack it.
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM") if hasattr(signal, name)]
@@ -33,3 +39,26 @@ class StopSignals:
         if self.received:
             raise KeyboardInterrupt
         self.received = number
+
+
+def status_of(work: Callable[[], None], files: RunFiles, resume: bool, ranks: Ranks) -> int:
+    """Do the work of a run, and return the exit status: 0, 2 after an error, 128 + signal if it was stopped.
+
+    Says what ended it and what to do, on stderr. resume: whether the run is to be resumed.
+    """
+    status, message, before = 0, "", files.state()
+    try:
+        with files.claimed(ranks):
+            work()
+    except UserError as error:
+        status, message = 2, str(error)
+    except OSError as error:
+        remedy = f"all earlier files are intact. Remove the cause and {files.next_step(before, resume)}"
+        status, message = 2, f"{message_of(error)}; {remedy}"
+    except Interrupted as error:
+        status, message = 128 + error.args[0], "stopped and saved; continue with --resume"
+    except KeyboardInterrupt:
+        status, message = 128 + SIGNALS[0], f"stopped at once; {files.next_step(before, resume)}"
+    if message and (ranks.first or status == 2):  # the other ranks' errors are their own
+        print(f"model.py: {message}", file=sys.stderr)
+    return status

@@ -20,9 +20,9 @@ from cloning.network.network import Network, layer_table
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
 from cloning.training.checkpoint import EpochMetrics, Progress, best_epoch
-from cloning.training.distributed import rank, world
-from cloning.training.observations import Observations
-from cloning.training.options import Arguments
+from cloning.training.distributed import Ranks
+from cloning.training.recipe import Recipe
+from cloning.training.run_files import RunFiles
 
 MIN_CORRELATION = 0.3  # with the labels; below it, the model has hardly learned anything
 # By val_drift in m, how networks drove in the stand-in simulator: see the study in writeup_report.md.
@@ -35,7 +35,7 @@ TIMED_BATCHES, TIMED_SECONDS = 10, 5.0  # at least, before the time of the whole
 
 
 class Counts(NamedTuple):
-    """Counts of a recording's rows: read from the csv, cut, unusable, dropped by `Observations.select`, and kept."""
+    """Counts of a recording's rows: read from the csv, cut, unusable, dropped by `Recipe.select`, and kept."""
 
     recording: str
     rows_read: int
@@ -95,9 +95,9 @@ def history_csv(history: list[EpochMetrics]) -> bytes:
     return csv_bytes(history[0], [["" if math.isnan(value) else value for value in row.values()] for row in history])
 
 
-def run_header(network: Network, device: torch.device, precision: torch.dtype) -> str:
+def run_header(network: Network, device: torch.device, precision: torch.dtype, ranks: Ranks) -> str:
     """Return the table of layers, and what computes them: device, precision, threads and processes."""
-    processes = f", {world()} processes" if world() > 1 else ""
+    processes = f", {ranks.world} processes" if ranks.world > 1 else ""
     name = str(precision).removeprefix("torch.")
     return f"{layer_table(network)}\n\n{device}, {name}, {threads()} threads{processes}"
 
@@ -114,12 +114,12 @@ def epoch_line(row: EpochMetrics) -> str:
 class Pace:
     """Measures how fast this process trains, and tells how long the rest of the run will take on this machine."""
 
-    def __init__(self, arguments: Arguments):
-        """arguments: of the run."""
-        self.epochs, self.samples = arguments.epochs, arguments.samples_per_epoch
+    def __init__(self, recipe: Recipe, prints: bool = True):
+        """prints: whether this process tells how long the run will take."""
+        self.epochs, self.samples = recipe.epochs, recipe.samples_per_epoch
         self.batches = self.images = 0  # timed so far
         self.started: float | None = None  # time.monotonic() at the end of the first batch, which is slower
-        self.told, self.rest = False, ""
+        self.to_print, self.rest = prints, ""
 
     def after_batch(self, images: int, progress: Progress) -> str:
         """Return the mean loss of the epoch and the time left for the whole run, for a progress bar.
@@ -135,8 +135,8 @@ class Pace:
         seconds = time.monotonic() - self.started
         done = len(progress.history) * self.samples + progress.images
         left = max(0, self.epochs * self.samples - done) * seconds / self.images
-        if not self.told and rank() == 0 and self.batches >= TIMED_BATCHES and seconds >= TIMED_SECONDS:
-            self.told = True
+        if self.to_print and self.batches >= TIMED_BATCHES and seconds >= TIMED_SECONDS:
+            self.to_print = False
             epochs = "1 epoch" if self.epochs == 1 else f"{self.epochs} epochs"
             tqdm.write(f"about {duration(seconds + left)} for {self.rest}{epochs} on this machine")
         return f"{loss}, {duration(left)} left in all"
@@ -149,15 +149,15 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} minutes" if seconds < 90 * 60 else f"{seconds / 3600:.1f} hours"
 
 
-def error_table(
-    labels: np.ndarray, mean: float, models: Mapping[str, np.ndarray], edges: tuple[float, ...], label_source: str
-) -> str:
+def error_table(labels: np.ndarray, mean: float, models: Mapping[Path, np.ndarray], recipe: Recipe) -> str:
     """Return a table of mean squared error by range of |label|, and correlation, for constant steering and for models.
 
-    labels: steering, float32 (n,); mean: of the training labels; models: name -> predictions, float32 (n,), the last
-    epoch's model first; edges: of the ranges, ascending; label_source: whose steering the label is, for the text.
+    labels: steering, float32 (n,); mean: of the training labels; models: file -> predictions, float32 (n,), the last
+    epoch's model first.
     """
-    predictions = {"steer 0": np.zeros_like(labels), "steer mean": np.full_like(labels, mean), **models}
+    edges, label_source = (0, recipe.straight, *recipe.turn, 1), recipe.words.label_source
+    predictions = {"steer 0": np.zeros_like(labels), "steer mean": np.full_like(labels, mean)}
+    predictions |= {path.name: guess for path, guess in models.items()}
     lines = [f"\n{'validation: mean squared error':32} {'rows':>6}" + "".join(f"{name:>15}" for name in predictions)]
     size = np.abs(labels)
     for low, high in [*itertools.pairwise(edges), (edges[0], edges[-1])]:
@@ -169,34 +169,34 @@ def error_table(
     values = "".join(f"{'-' if np.isnan(value) else f'{value:.2f}':>15}" for value in correlations.values())
     lines.append(f"{f'correlation with the {label_source}':39}{values}")
     lines.append("\nsteer 0 and steer mean, constant steering, are for comparison; they have no correlation (-).")
-    last = next(iter(models))
-    worse = np.mean((models[last] - labels) ** 2) > np.mean(labels**2)
+    path, guess = next(iter(models.items()))
+    last, worse = path.name, np.mean((guess - labels) ** 2) > np.mean(labels**2)
     if not correlations[last] > MIN_CORRELATION:
         lines.append(f"{last} hardly follows the {label_source}: train longer, or record more turns.")
     elif worse:
         lines.append(
             f"{last} has a larger error than steer 0, because on straights, most of the rows, 0 is nearly right.\n"
             f"It follows the {label_source} nevertheless. How well it drives, a replay tells:\n"
-            f"python -m simulator replay RECORDING --model {last}"
+            f"python -m simulator replay RECORDING --model {path}"
         )
     return "\n".join(lines)
 
 
-def driving(history: list[EpochMetrics], kind: type[Observations], still: np.ndarray) -> str:
+def driving(history: list[EpochMetrics], recipe: Recipe, still: np.ndarray, files: RunFiles) -> str:
     """Return in words how the last and the best epoch's models will drive, "" if no piece of a drive is held out.
 
-    kind: of the observations; still: float64 (n,), m, of `drift.still_drifts`.
+    still: float64 (n,), m, of `drift.still_drifts`.
     """
-    last, best = history[-1], best_epoch(history, kind.best_by)
+    last, best = history[-1], best_epoch(history, recipe.best_by)
     if math.isnan(last["val_drift"]) or not len(still):
         return ""
-    verdict = next(words for limit, words in VERDICTS if last["val_drift"] <= limit).format(remedy=kind.remedy)
+    verdict = next(words for limit, words in VERDICTS if last["val_drift"] <= limit).format(remedy=recipe.words.remedy)
     others = f"{still.mean():.2f} m with the wheels straight ahead"
     if best is not last and not math.isnan(best["val_drift"]):
-        others = f"{best['val_drift']:.2f} m by model-best.pt of epoch {best['epoch']:.0f}, {others}"
+        others = f"{best['val_drift']:.2f} m by {files.best.name} of epoch {best['epoch']:.0f}, {others}"
     return (
-        f"\n\nSteered by model.pt for two seconds, from where the driver was, a car is {last['val_drift']:.2f} m "
-        f"from {kind.aimed_at}\n(mean of {len(still)} held-out stretches; {others}).\n{verdict}"
+        f"\n\nSteered by {files.last.name} for two seconds, from where the driver was, a car is {last['val_drift']:.2f} m "
+        f"from {recipe.words.aimed_at}\n(mean of {len(still)} held-out stretches; {others}).\n{verdict}"
     )
 
 

@@ -1,0 +1,183 @@
+"""The lane next to the recorded car, and poses from which a recording's frames are seen with --robust.
+
+Poses and the lane's frame are those of `cloning/lane/recovery.py`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Self
+
+import cv2
+import numpy as np
+
+from cloning.base.table import Column, Table
+from cloning.lane.known import lane_position
+from cloning.lane.recovery import LOOKAHEAD, LaneAhead
+from cloning.network.network import CROP
+from cloning.recordings.log import Recording
+from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
+from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, components, forward_vector, stretches
+from cloning.road.warp import CroppedView, fill_ground
+from cloning.training import light
+
+if TYPE_CHECKING:
+    from cloning.training.recipe import Recipe
+
+VIEW = CroppedView(CROP)
+
+
+@dataclass(frozen=True)
+class Lanes(LaneAhead):
+    """The lane ahead at each of n rows of recordings, and an earlier row that shows what a warped frame lacks.
+
+    earlier  int32 (n,): the recording's row EARLIER_FRAME metres earlier, or the first one of the stretch
+    moved    float32 (n, 3): the rear axle in the earlier row, relative to this one: m right, m forward, radians
+    """
+
+    earlier: Column
+    moved: Column
+
+    @classmethod
+    def unknown(cls, n: int) -> Self:
+        """Return n rows whose lane ahead is unknown, with the values of a car centred on a straight."""
+        return cls(
+            np.zeros(n, np.float32),
+            np.zeros(n, np.float32),
+            np.tile(np.array([0, LOOKAHEAD], np.float32), (n, 1)),
+            np.zeros(n, bool),
+            np.arange(n, dtype=np.int32),
+            np.zeros((n, 3), np.float32),
+        )
+
+    @classmethod
+    def of(cls, recording: Recording) -> Self:
+        """Return the lane at every row of a recording, known or estimated from its frames.
+
+        Raises OSError, and the errors of `lane_position`.
+        """
+        whole = stretches(recording)
+        position = lane_position(recording, whole)
+        lanes = cls.unknown(len(recording))
+        for stretch in whole:
+            lanes._fill(stretch, position.lateral_offset[stretch.rows], position.trusted[stretch.rows])
+        return lanes
+
+    def _fill(self, stretch: Stretch, offset: np.ndarray, trusted: np.ndarray) -> None:
+        """Set the rows of a stretch, as `of` does once.
+
+        offset: of the car's middle, m; trusted: rows where it can be relied on.
+        """
+        rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
+        ahead = LaneAhead.of_stretch(stretch, offset, trusted)
+        for column in fields(LaneAhead):
+            getattr(self, column.name)[rows] = getattr(ahead, column.name)
+        earlier = np.maximum(np.searchsorted(driven, driven - EARLIER_FRAME, "right") - 1, 0)
+        self.earlier[rows] = rows.start + earlier
+        axle = np.stack([stretch.right, stretch.forward], axis=1)
+        back = components(axle[earlier] - axle, forward_vector(heading))
+        self.moved[rows] = np.column_stack([back, heading[earlier] - heading])
+
+    def from_middle(self) -> np.ndarray:
+        """Return how far right of the recorded car's middle the lane's centre is: float (n,), m; 0 where unknown."""
+        return -(self.offset + REAR_AXLE * np.sin(self.yaw))
+
+    def weights(self, straight: float) -> np.ndarray:
+        """Return the probability of sampling each row: float64 (n,), sum 1; straight: `Recipe.straight_weight`."""
+        centred = np.zeros(len(self))
+        weights = straight + np.abs(self.steering(centred, centred).astype(float))
+        return weights / weights.sum()
+
+    def camera_labels(self, row: int) -> np.ndarray:
+        """Return the recovery steering if the centre camera were where each of the three cameras is: float32 (3,)."""
+        lane = self.take(np.array([row]))
+        return lane.steering(lane.offset + np.array(list(CAMERA_OFFSETS.values())), lane.yaw)
+
+    def sample_poses(self, recipe: "Recipe", rng: np.random.Generator, mirrored: np.ndarray) -> "Poses":
+        """Sample a pose for each row, and a camera near it whose frame will be warped; mirrored: bool (n,).
+
+        The camera is random, so that traces of warping in an image do not tell the side from which it was taken.
+        """
+        n = len(self)
+        offset = np.clip(
+            rng.triangular(-recipe.pose_offset, 0, recipe.pose_offset, n),
+            self.offset - recipe.max_shift,
+            self.offset + recipe.max_shift,
+        )
+        yaw = np.clip(rng.normal(0, recipe.pose_yaw, n), -recipe.max_pose_yaw, recipe.max_pose_yaw)
+        eye = offset - self.offset + AXLE_TO_CAMERA * (np.sin(yaw) - np.sin(self.yaw))
+        distance = np.abs(eye[:, None] - list(CAMERA_OFFSETS.values()))
+        near = distance <= np.maximum(recipe.camera_reach, distance.min(1, keepdims=True))
+        camera = np.argmax(near * rng.uniform(1, 2, (n, 3)), axis=1)
+        colours = light.tints(recipe, rng, n)
+        return Poses.of(self, offset, yaw, camera, mirrored, colours, light.sample_shades(recipe.shaded, rng, n))
+
+
+@dataclass(frozen=True)
+class Poses(Table):
+    """The poses from which n rows are seen, with everything that is needed to make their images.
+
+    offset    float (n,): lateral offset from the lane's centre, m; as the next, before the world is mirrored
+    yaw       float (n,): heading error, radians
+    camera    int (n,): the camera whose frame is warped: 0 centre, 1 left, 2 right
+    mirrored  bool (n,): whether the image shows the mirrored world, as seen by the same, slightly rolled camera
+    warps     float64 (n, 2, 2, 3, 3): homographies from a frame's `ROAD_ROWS` to what the network sees: from the
+              row's own frame and from the earlier one, for the ground and for the sky
+    steering  float32 (n,): the label, -1..1
+    colours   float32 (n, 3, 3): matrices by which (red, green, blue) is multiplied, see `light.tints`
+    shade     int16 (n,): shadows, see `light.sample_shades`
+    """
+
+    offset: Column
+    yaw: Column
+    camera: Column
+    mirrored: Column
+    warps: Column
+    steering: Column
+    colours: Column
+    shade: Column
+
+    @classmethod
+    def of(
+        cls,
+        lanes: Lanes,
+        offset: np.ndarray,
+        yaw: np.ndarray,
+        camera: np.ndarray,
+        mirrored: np.ndarray,
+        colours: np.ndarray | None = None,
+        shade: np.ndarray | None = None,
+    ) -> Self:
+        """Return the poses at the rows of `lanes`; arguments: the columns; without the last two, in unchanged light."""
+        turn = yaw - lanes.yaw
+        # The pose relative to the recorded rear axle, in the recorded car's frame: m right, m forward.
+        away = offset - lanes.offset
+        axle = np.stack([away * np.cos(lanes.yaw), away * np.sin(lanes.yaw)], axis=1)
+        eye = camera_position(axle, forward_vector(turn))
+        side = np.array(list(CAMERA_OFFSETS.values()))[camera]
+        own_frame = np.zeros_like(lanes.moved)
+        warps = [VIEW.homographies(eye, turn, moved, side, mirrored) for moved in (own_frame, lanes.moved)]
+        steering = lanes.steering(offset, yaw)
+        labels = np.where(mirrored, -steering, steering)
+        if colours is None:
+            colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
+        if shade is None:
+            shade = np.full(len(turn), -1, np.int16)
+        return cls(offset, yaw, camera, mirrored, np.stack(warps, axis=1), labels, colours, shade)
+
+    def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:
+        """Return what the network sees of one row: uint8 (75, 320, 3), RGB.
+
+        at: index of the row; read(camera, earlier): returns the `ROAD_ROWS` of the camera's frame in the row or in the
+        earlier one, uint8 (90, 320, 4), RGBA, which is warped faster.
+        """
+        camera, mirrored = int(self.camera[at]), bool(self.mirrored[at])
+        image, seen = VIEW.warp(read(camera, False), self.warps[at, 0], mirrored)
+        if not seen.all():  # only ground can be missing
+            fill_ground(image, cv2.bitwise_not(seen), read(camera, True), self.warps[at, 1, 0])
+        return light.relight(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), self.colours[at], int(self.shade[at]))
+
+    def title(self, at: int) -> str:
+        """Return the pose that an image shows in words, such as `0.8 m left, turned 5° right`; at: index of the row."""
+        seen = (-1 if self.mirrored[at] else 1) * np.array([self.offset[at], np.degrees(self.yaw[at])])
+        sides = ["left" if value < 0 else "right" for value in seen]
+        return f"{abs(seen[0]):.1f} m {sides[0]}, turned {abs(seen[1]):.0f}° {sides[1]}"

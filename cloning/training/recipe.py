@@ -1,0 +1,183 @@
+"""A recipe: every figure of a training, and the few functions in which trainings differ.
+
+`model.py` has the report's, REPORT, and makes that of --robust from it, which names what it changes (`robust.py`). Any
+other is made in the same way: `dataclasses.replace(REPORT, flip=0.0)`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cloning.network.tensors import shown
+from cloning.recordings.log import Recording
+from cloning.training.muon import OPTIMIZERS
+from cloning.training.observations import Observations, ValidationSet, Views
+
+
+def always(recipe: "Recipe") -> float:
+    """Return 1, the share of an augmentation that every observation has."""
+    return 1.0
+
+
+def no_choices(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
+    """Return the choices of an augmentation that has none."""
+    return ()
+
+
+def unchanged(images: np.ndarray, first_row: int) -> np.ndarray:
+    """Return the images, as an augmentation does that changes none."""
+    return images
+
+
+class Augmentation(NamedTuple):
+    """A kind of image that batches contain of their observations.
+
+    name     identifies it
+    change   (images, first_row, *choices) -> the changed images, uint8 (k, rows, 320, 3), RGB, as `images`, which is
+             not to be changed itself; first_row: the row of the full frame that is the images' first; choices: those of
+             these k images
+    choose   (recipe, rng, n) -> the random choices for n observations: arrays of n entries each
+    share    (recipe) -> the share of the observations that have such an image, 0..1
+    mirrors  whether it begins with the mirrored image, and the negative label
+    caption  of the diagnostic picture: a format for the choices, such as "brightness x {:.2f}"
+    """
+
+    name: str
+    change: Callable[..., np.ndarray] = unchanged
+    choose: Callable[["Recipe", np.random.Generator, int], tuple[np.ndarray, ...]] = no_choices
+    share: Callable[["Recipe"], float] = always
+    mirrors: bool = False
+    caption: str = ""
+
+
+class Words(NamedTuple):
+    """What a run prints of its recipe.
+
+    dropped       what `select` drops, as the title of a column; a format for `recipe`
+    too_few       the reason if it leaves too few rows
+    label_source  whose steering the label is
+    aimed_at      where the car should be
+    remedy        what helps a network that drives badly
+    """
+
+    dropped: str
+    too_few: str
+    label_source: str
+    aimed_at: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a network is trained. Shares and probabilities are 0..1, steering is -1..1, ranges are (least, most).
+
+    Functions, of which a checkpoint contains the names:
+
+    select           (recording, recipe) -> the observations of a checked recording that are used, with their labels
+    resample         (observations, recipe, seed) -> those for training, some left out and others repeated
+    order            (observations, recipe, rng) -> that of one pass over them: int (n,), indices
+    views            (observations, rows, cameras, recipe, rng) -> images and labels of these rows, int (k,), before
+                     augmentation; cameras: int (k,), 0 centre, 1 left, 2 right
+    validation_sets  (observations, recipe, seed) -> the sets to validate with
+    """
+
+    name: str
+    words: Words
+    # Data preprocessing
+    select: Callable[[Recording, "Recipe"], Observations]
+    throttle_threshold: float  # rows with less throttle are dropped
+    side_correction: float  # steering added to the label of left images, subtracted from that of right ones
+    resample: Callable[[Observations, "Recipe", int], Observations]
+    straight: float  # |steering| below which an observation is straight driving
+    keep_straight: float  # probability that it is kept
+    turn: tuple[float, float]  # range of |steering| in which a copy is added
+    jitter: float  # by up to this share the copy's steering is changed
+    repeats: int  # how often a recording of problem areas counts
+    order: Callable[[Observations, "Recipe", np.random.Generator], np.ndarray]
+    # Data subdivision
+    block_seconds: float  # of driving that are together for training or for validation
+    folds: int  # one block of so many is for validation
+    # Augmentation
+    views: Callable[[Observations, np.ndarray, np.ndarray, "Recipe", np.random.Generator], Views]
+    augmentations: tuple[Augmentation, ...]
+    flip: float  # share of the observations with a flipped image
+    brightness: tuple[float, float]  # factor of the HSV value
+    shadow: float  # share with a shadowed image
+    darkness: tuple[float, float]  # factor of the HLS lightness in the shadow
+    # Training
+    dropout: bool  # whether half of the units of the flattened layer are dropped
+    optimizer: str  # key of OPTIMIZERS
+    momentum: float  # of its average gradient
+    weight_decay: float  # per step and unit of learning rate
+    huber: float | None  # error beyond which the loss grows linearly, as Huber's; None: squared error
+    learning_rate: float
+    cosine_decay: bool  # of the learning rate, to zero at the end
+    batch_size: int  # observations; each gives 3.7 images on average
+    samples_per_epoch: int  # images at least; a fifth as many observations validate an epoch
+    epochs: int
+    validation_sets: Callable[[Observations, "Recipe", int], list[ValidationSet]]
+    best_by: str  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
+    # Recovery steering from other poses, in other light (--robust); the report has neither.
+    straight_weight: float = 1.0  # sampling weight on a straight; elsewhere |steering along the lane| is added
+    mirrored: float = 0.0  # share of the poses seen in a mirrored world
+    pose_offset: float = 0.0  # m: poses are at most this far from the lane's centre, most often near it
+    pose_yaw: float = 0.0  # radians: standard deviation of their heading errors, which are normally distributed
+    max_pose_yaw: float = 0.0  # radians
+    max_shift: float = 0.0  # m from the recorded trajectory: further away the frames show too little of the road
+    camera_reach: float = 0.0  # m: a camera this near to a pose may supply its image
+    tinted: float = 0.0  # share of the images whose colours are changed
+    saturation: tuple[float, float] = (1.0, 1.0)  # factors of the saturation,
+    tint: tuple[float, float] = (1.0, 1.0)  # of red, green and blue each,
+    dimmed: tuple[float, float] = (1.0, 1.0)  # and of all three
+    shaded: float = 0.0  # share of the images with shadows
+
+    def saved(self) -> dict[str, Any]:
+        """Return the recipe as plain values for a checkpoint: functions and augmentations by their names."""
+        return {item.name: _plain(getattr(self, item.name)) for item in fields(self) if item.name != "words"}
+
+    def restored(self, saved: dict[str, Any]) -> "Recipe":
+        """Return this recipe with the figures of `saved`; what an earlier version did not save is as it is.
+
+        Raises ValueError for a figure that is unusable, and for other functions than this recipe's.
+        """
+        figures = {name: saved[name] for name in self.saved() if name in saved}
+        for name, found in figures.items():
+            own = getattr(self, name)
+            if name == "optimizer":
+                if not isinstance(found, str) or found not in OPTIMIZERS:
+                    raise ValueError(f"its optimizer is {shown(found)}, not {' or '.join(OPTIMIZERS)}")
+            elif isinstance(own, str) or callable(own) or name == "augmentations":
+                if found != _plain(own):
+                    raise ValueError(f"its {name} is {shown(found)}, not {_plain(own)}")
+                figures[name] = own
+            elif name == "huber":
+                if not (found is None or type(found) is float):
+                    raise ValueError(f"its huber is of type {type(found).__name__}")
+            elif isinstance(own, tuple):
+                if not isinstance(found, (list, tuple)) or [*map(type, found)] != [*map(type, own)]:
+                    raise ValueError(f"its {name} is {shown(found)}, not {len(own)} numbers")
+                figures[name] = tuple(found)
+            elif type(found) is not type(own):
+                raise ValueError(f"its {option_name(name)} is of type {type(found).__name__}")
+        return replace(self, **figures)
+
+    def rate(self, done: float) -> float:
+        """Return the learning rate of the next step; done: the finished share of the run, 0..1."""
+        return self.learning_rate * ((1 + math.cos(math.pi * done)) / 2) if self.cosine_decay else self.learning_rate
+
+
+def option_name(name: str) -> str:
+    """Return the option that sets a field: batch_size -> --batch-size; from_model -> --from."""
+    return f"--{name.removesuffix('_model').replace('_', '-')}"
+
+
+def _plain(value: Any) -> Any:
+    """Return a field's value as a checkpoint contains it."""
+    if isinstance(value, Augmentation):
+        return value.name
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    return value.__name__ if callable(value) else value
