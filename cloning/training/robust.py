@@ -15,6 +15,7 @@ from typing import ClassVar, Self
 import cv2
 import numpy as np
 
+from cloning.base.table import Column
 from cloning.lane.known import lane_position
 from cloning.lane.recovery import LOOKAHEAD, LaneAhead
 from cloning.network.network import CROP
@@ -48,7 +49,7 @@ VIEW = CroppedView(CROP)
 # The lane next to the recorded car
 
 
-@dataclass
+@dataclass(frozen=True)
 class Lanes(LaneAhead):
     """The lane ahead at each of n rows of recordings, and an earlier row that shows what a warped frame lacks.
 
@@ -56,8 +57,8 @@ class Lanes(LaneAhead):
     moved    float32 (n, 3): the rear axle in the earlier row, relative to this one: m right, m forward, radians
     """
 
-    earlier: np.ndarray
-    moved: np.ndarray
+    earlier: Column
+    moved: Column
 
     @staticmethod
     def unknown(n: int) -> "Lanes":
@@ -95,11 +96,6 @@ class Lanes(LaneAhead):
         axle = np.stack([stretch.right, stretch.forward], axis=1)
         back = components(axle[earlier] - axle, forward_vector(heading))
         self.moved[rows] = np.column_stack([back, heading[earlier] - heading])
-
-    @staticmethod
-    def joined(parts: list["Lanes"]) -> "Lanes":
-        """Return the rows of all parts, one part after the other."""
-        return Lanes(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(Lanes)))
 
     def weights(self) -> np.ndarray:
         """Return the probability of sampling each row, higher in bends: float64 (n,), sum 1."""
