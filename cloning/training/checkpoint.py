@@ -23,7 +23,7 @@ import torch
 
 from cloning.base.errors import ModelError
 from cloning.base.files import write
-from cloning.network.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
+from cloning.network.network import Network, load_checkpoint, read_preprocessing, restore_weights, save_model, versions
 from cloning.network.tensors import matching, shown
 from cloning.training.adam import Adam
 from cloning.training.muon import OPTIMIZERS
@@ -149,7 +149,7 @@ def _first_weights(path: str) -> dict[str, Any]:
 
 def _restore_network(network: Network, saved: dict[str, Any]) -> None:
     """Give the network the weights of a checkpoint. Raises ValueError if they, or their recipe, do not fit."""
-    if read_recipe(saved) != (network.crop, network.scale, network.offset):
+    if read_preprocessing(saved) != (network.crop, network.scale, network.offset):
         raise ValueError("its recipe is not that of this program's training")
     restore_weights(network, saved)
 
