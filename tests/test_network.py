@@ -17,7 +17,8 @@ from cloning.base.errors import ModelError
 from cloning.base.files import write
 from cloning.network import fast_conv, tensors
 from cloning.network.fast_conv import OverPairs
-from cloning.network.network import SHIPPED_MODEL, Network, layer_table, load_model, save_model, steer
+from cloning.network.layer_table import layer_table
+from cloning.network.network import SHIPPED_MODEL, Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.training.pieces import LOSSES, PIECE, SquaredErrors, converted, pieces, squared_errors
 from model import Batch
@@ -56,7 +57,7 @@ def test_layer_table_is_the_reports(network):
     assert layer_table(network).endswith("559,419")
 
 
-def test_forward_is_the_recipes(network, frames):
+def test_forward_is_the_reports(network, frames):
     """Against a Sequential of torch's own layers, on an image transposed by numpy (`view` would scramble it)."""
     layers = []
     for convolution in network.convolutions:
@@ -289,8 +290,8 @@ NAME = "dense.3.weight"  # (1, 10)
 @pytest.mark.parametrize(
     "part, value, words",
     [
-        ("recipe", None, "no recipe"),
-        ("recipe", [1], "no recipe"),
+        ("recipe", None, "no preprocessing"),
+        ("recipe", [1], "no preprocessing"),
         ("frame", (120, 320, 3), "frame"),
         ("frame", torch.zeros(3), "frame"),
         ("colour", "BGR", "colour 'BGR'"),

@@ -229,11 +229,11 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     assert alone.stdout == served.stdout
     [report] = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert set(report["limits"]) == {"1", "2.5"} and report["rows_driven"] == 300
-    assert report["reference"] == {"lane centre": 0, "human's way": 300} and "cannot be estimated" not in alone.stdout
+    assert report["reference"] == {"lane_centre": 0, "human_way": 300} and "cannot be estimated" not in alone.stdout
     one = report["limits"]["1"]
     assert one["interventions"] == len(one["where"]) and one["autonomy_percent"] < 100
     assert (folder[-1] / "IMG" / one["where"][0]["image"]).is_file()
-    assert one["compared"]["the human"] == {
+    assert one["compared"]["human"] == {
         "autonomy_percent": 100,
         "interventions": 0,
         "distance_mean_m": 0,

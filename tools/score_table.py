@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 from typing import TypedDict, TypeVar
 
+from cloning.base.outputs import plural
 from cloning.recordings.format import PROBLEM_AREAS
 from cloning.road.autonomy import LIMITS, autonomy
 from cloning.road.generated import road_number
@@ -276,11 +277,6 @@ def roads_text(drives: Sequence[Driven]) -> str:
     roughness = sum(drive["roughness_per_s"] * drive["distance_km"] for drive in drives) / km if km else 0.0
     roads = plural(len({drive["track"] for drive in drives}), "road")
     return f"{roads}: {laps_text(drives)}, {offset:.2f} m, roughness {roughness:.2f}/s"
-
-
-def plural(count: int, word: str) -> str:
-    """Return a number with its word: 1 road, 2 roads."""
-    return f"{count} {word}" if count == 1 else f"{count} {word}s"
 
 
 def grid(corner: str, columns: Sequence[str], rows: Mapping[str, Mapping[str, str]]) -> list[str]:

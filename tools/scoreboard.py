@@ -88,7 +88,7 @@ def replay(model: Path, folder: Path) -> tuple[RealRecording, dict[str, Replayed
 
     recording: RealRecording = {
         "seconds": report["seconds"],
-        "lane_centre_percent": round(100 * report["reference"]["lane centre"] / report["rows_driven"], 1),
+        "lane_centre_percent": round(100 * report["reference"]["lane_centre"] / report["rows_driven"], 1),
         "oracle": {limit: shown(metrics["compared"][ORACLE]) for limit, metrics in report["limits"].items()},
     }
     return recording, {limit: shown(metrics) for limit, metrics in report["limits"].items()}

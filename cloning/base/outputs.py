@@ -31,6 +31,11 @@ def write_json(path: str | Path, value: Mapping | Sequence) -> None:
     write_output(path, json.dumps(value, indent=1).encode() + b"\n")
 
 
+def plural(count: int, noun: str, several: str = "") -> str:
+    """Return a count with its noun, as `1 lap` or `2 laps`; several: the plural, if it is not the noun with an s."""
+    return f"{count} {noun if count == 1 else several or noun + 's'}"
+
+
 def run_all(*steps: Callable[[], object]) -> None:
     """Run all steps in order, even if an earlier one fails or is interrupted, so that no output is lost.
 

@@ -18,7 +18,6 @@ if __name__ == "__main__":
     program.end_on_interrupt("analyse")
 
 import numpy as np
-import torch
 
 from cloning.base.cores import threads
 from cloning.base.errors import ModelError, UserError
@@ -101,7 +100,7 @@ def lane(recording: Recording) -> Result:
 
 def steering(recording: Recording, model: str) -> Result:
     """Return the column steering, -1..1: with the arithmetic of drive.py. Raises ModelError."""
-    torch.set_num_threads(1)
+    one_thread()
     network = load_model(model)
 
     def steer_frame(path: Path) -> float:
@@ -124,6 +123,7 @@ def replayed(recording: Recording, analysis: Analysis) -> Result:
     yaw, the pose of `ReplayedCar`; steering, the model's, -1..1; line, the number of the reference line. about has the
     metrics, and the interventions as [place in the columns, offset in m].
     """
+    one_thread()
     lines = reference_lines(recording)
     total = sum(len(line.stretch) for line in lines)
     poses: list[tuple[float, float]] = []

@@ -5,11 +5,12 @@ from the lane's centre (m) and heading error (radians), both positive to the rig
 origin on the lane's centre next to the recorded car's rear axle, and its forward axis along the lane.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
+from cloning.base.table import Column, Table
 from cloning.road.motion import (
     MIN_TRUSTED,
     OFF_ROAD,
@@ -27,7 +28,7 @@ HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far be
 
 
 @dataclass(frozen=True)
-class LaneAhead:
+class LaneAhead(Table):
     """The lane ahead at each of n rows of recordings.
 
     offset, yaw  float32 (n,): the recorded car's pose
@@ -35,13 +36,10 @@ class LaneAhead:
     known        bool (n,): whether the lane ahead is known; if not, ignore the other columns
     """
 
-    offset: np.ndarray
-    yaw: np.ndarray
-    goal: np.ndarray
-    known: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.yaw)
+    offset: Column
+    yaw: Column
+    goal: Column
+    known: Column
 
     @staticmethod
     def of_stretch(stretch: Stretch, offset: np.ndarray, trusted: np.ndarray) -> "LaneAhead":
@@ -75,7 +73,7 @@ class LaneAhead:
         goal = np.where(known[:, None], components(goal, along), (0, LOOKAHEAD)).astype(np.float32)
         return LaneAhead(from_centre, yaw, goal, known)
 
-    def extended(self) -> "LaneAhead":
+    def extended(self) -> Self:
         """Return the rows of one stretch, with a goal also where the lane ahead is unknown, as at its two ends.
 
         There the road bends as at the nearest known rows, between which it is interpolated; it is a straight if none is
@@ -84,11 +82,7 @@ class LaneAhead:
         known, goal = np.flatnonzero(self.known), self.goal
         if len(known):
             goal = np.stack([np.interp(np.arange(len(self)), known, goal[known, i]) for i in (0, 1)], axis=1)
-        return LaneAhead(self.offset, self.yaw, goal.astype(np.float32), self.known)
-
-    def take(self, rows: np.ndarray | slice) -> Self:
-        """Return these rows, in this order; rows: indices."""
-        return type(self)(*(getattr(self, column.name)[rows] for column in fields(self)))
+        return replace(self, goal=goal.astype(np.float32))
 
     def steering(self, offset: float | np.ndarray, yaw: float | np.ndarray) -> np.ndarray:
         """Return the recovery steering from a pose at each row, by pure pursuit of the goal: float32 (n,), -1..1."""

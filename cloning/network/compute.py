@@ -80,5 +80,5 @@ def keep_freed_memory() -> None:
 
 
 def one_thread() -> None:
-    """Limit this thread to one intra-op thread, because the threads of its pool already occupy every core."""
+    """Limit torch to one thread for each of this process's own, because these already occupy every core."""
     torch.set_num_threads(1)

@@ -92,8 +92,10 @@ def run(options: Options) -> None:
 def _driver(options: Options) -> "ModelDriver | ServerDriver":
     """Return the driver; each needs a library of its own, PyTorch or wsproto. Raises ModelError."""
     if options.model:
+        from cloning.network.compute import one_thread
         from cloning.replay.model_driver import ModelDriver
 
+        one_thread()  # other drives run at the same time
         return ModelDriver(options.model)
     from cloning.replay.server_driver import ServerDriver
 

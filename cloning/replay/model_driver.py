@@ -1,7 +1,5 @@
 """The driver of a replay that is a model in this process."""
 
-import torch
-
 from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
 from cloning.network.network import Network, load_model, steer
@@ -13,7 +11,6 @@ class ModelDriver:
 
     def __init__(self, model: str | Network):
         """Load the model; model: its file, or the network itself. Raises ModelError."""
-        torch.set_num_threads(1)  # other drives run at the same time
         self.network = load_model(model) if isinstance(model, str) else model
         top, bottom = self.network.crop
         self.rows = slice(top, FRAME[0] - bottom)  # of a frame, which the network sees

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from cloning.base.film import DriveFilm, frame_rate
-from cloning.base.outputs import write_output
+from cloning.base.outputs import plural, write_output
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, drive
@@ -18,8 +18,8 @@ from cloning.road.overlay import overlay
 SMOOTHED_ROWS = 9  # rows (0.6 s) over which steering is averaged before it is correlated
 CAPTION_ROWS = 28  # of the film, above each frame
 LISTED = 10  # interventions that the text lists for each limit
-HUMAN = "the human"  # the report's key of the human driver's own steering
-ORACLE = "oracle"  # that of the recovery steering, the label of `model.py --robust`: the best that the measure allows
+ORACLE = "oracle"  # the report's key of the recovery steering as the driver: the best that the measure allows
+YARDSTICKS = {"steering_zero": "steering 0", "mean_steering": "mean steering", "human": "human driver"}  # key: words
 
 
 class DrivingMetrics(TypedDict):
@@ -60,8 +60,8 @@ class LimitReport(DrivingMetrics):
 class ReplayReport(TypedDict):
     """The report of one recording.
 
-    reference_asked: "lane" or "human"; reference: number of rows measured from the lane centre, and from the human's
-    way (the human driver's path); limits: by the limit in metres; steering_compared: of constant steering.
+    reference_asked: "lane" or "human"; reference: the rows measured from the lane's centre, `lane_centre`, and from the
+    human driver's path, `human_way`; limits: by the limit in metres; steering_compared: of constant steering.
     """
 
     recording: str
@@ -99,17 +99,16 @@ def steering_metrics(steering: np.ndarray, human: np.ndarray) -> SteeringMetrics
 
 
 def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list[Drive], asked: str) -> ReplayReport:
-    """Return the report of a recording's drives, one per limit, with those of four yardsticks.
+    """Return the report of a recording's drives, one per limit, compared with the oracle and the YARDSTICKS.
 
-    The yardsticks are steering 0, the recording's mean steering, the human driver's own steering, and the oracle.
     lines: of `reference_lines`; asked: the reference that the user chose, "lane" or "human".
     """
     human = np.array(drives[0].human_steering)
     mean = float(recording.steering.mean())
-    yardsticks: dict[str, Driver] = {
-        "steering 0": lambda frame: 0.0,
-        "mean steering": lambda frame: mean,
-        HUMAN: lambda frame: frame.human_steering,
+    others: dict[str, Driver] = {
+        "steering_zero": lambda _: 0.0,
+        "mean_steering": lambda _: mean,
+        "human": lambda frame: frame.human_steering,
         ORACLE: ReplayFrame.recovery_steering,
     }
     rows = sum(len(line.stretch) for line in lines)
@@ -128,8 +127,7 @@ def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list
                 for at, offset in done.interventions.items()
             ],
             "compared": {
-                name: driving_metrics(drive(recording, lines, done.limit, driver))
-                for name, driver in yardsticks.items()
+                name: driving_metrics(drive(recording, lines, done.limit, driver)) for name, driver in others.items()
             },
         }
 
@@ -140,21 +138,21 @@ def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list
         "stretches": len(lines),
         "seconds": round(sum(drives[0].seconds), 2),
         "reference_asked": asked,
-        "reference": {"lane centre": by_lane, "human's way": rows - by_lane},
+        "reference": {"lane_centre": by_lane, "human_way": rows - by_lane},
         "limits": {f"{done.limit:g}": limit_report(done) for done in drives},
         "steering_compared": {
-            "steering 0": steering_metrics(np.zeros_like(human), human),
-            "mean steering": steering_metrics(np.full_like(human, mean), human),
+            "steering_zero": steering_metrics(np.zeros_like(human), human),
+            "mean_steering": steering_metrics(np.full_like(human, mean), human),
         },
     }
 
 
 def report_text(report: ReplayReport) -> str:
     """Return a report as lines for a terminal."""
-    by_lane, by_human = report["reference"]["lane centre"], report["reference"]["human's way"]
+    by_lane, by_human = report["reference"]["lane_centre"], report["reference"]["human_way"]
     references = [f"the lane centre in {by_lane} rows"] if by_lane else []
     references += [f"the human driver's path in {by_human} rows"] if by_human else []
-    stretches = "1 stretch" if report["stretches"] == 1 else f"{report['stretches']} stretches"
+    stretches = plural(report["stretches"], "stretch", "stretches")
     lines = [
         f"{report['recording']}: replayed {report['seconds']:.1f} s in {stretches} ({report['rows_driven']} of "
         f"{report['rows']} rows); offsets are measured from {' and '.join(references)}"
@@ -162,28 +160,25 @@ def report_text(report: ReplayReport) -> str:
     if report["reference_asked"] == "lane" and by_human:
         lines.append("  the lane centre cannot be estimated reliably where the human driver's path is used instead")
     for limit, metrics in report["limits"].items():
+        others = {words: metrics["compared"][name] for name, words in YARDSTICKS.items()}
         lines.append(f"limit {limit} m: {_driving(metrics)}")
         lines.append(f"  oracle (the recovery steering itself, driven): {_driving(metrics['compared'][ORACLE])}")
-        yardsticks = (
-            f"{_plain(name)} {other['autonomy_percent']:.0f} % ({other['interventions']})"
-            for name, other in metrics["compared"].items()
-            if name != ORACLE
-        )
+        yardsticks = (f"{words} {o['autonomy_percent']:.0f} % ({o['interventions']})" for words, o in others.items())
         lines.append("  yardsticks, autonomy (interventions): " + ", ".join(yardsticks))
-        lines += [
-            f"  intervention at {at['seconds']:.1f} s: {abs(at['metres']):.2f} m to the "
-            f"{'right' if at['metres'] > 0 else 'left'}, {at['image']}"
-            for at in metrics["where"][:LISTED]
-        ]
-        if len(metrics["where"]) > LISTED:
-            lines.append(f"  … and {len(metrics['where']) - LISTED} more interventions")
+        for at in metrics["where"][:LISTED]:
+            side = "right" if at["metres"] > 0 else "left"
+            lines.append(
+                f"  intervention at {at['seconds']:.1f} s: {abs(at['metres']):.2f} m to the {side}, {at['image']}"
+            )
+        if (more := len(metrics["where"]) - LISTED) > 0:
+            lines.append(f"  … and {plural(more, 'more intervention')}")
     limit, metrics = next(iter(report["limits"].items()))
     steering = metrics["steering"]
-    errors = ", ".join(f"{name} {other['error']:.3f}" for name, other in report["steering_compared"].items())
+    errors = (f"{YARDSTICKS[name]} {other['error']:.3f}" for name, other in report["steering_compared"].items())
     correlation = "undefined (constant steering)" if steering["correlation"] is None else steering["correlation"]
     lines.append(
         f"steering compared with the human driver's, at limit {limit} m: RMS error {steering['error']:.3f} "
-        f"(yardsticks: {errors}); correlation, both smoothed over {SMOOTHED_ROWS} rows: {correlation}"
+        f"(yardsticks: {', '.join(errors)}); correlation, both smoothed over {SMOOTHED_ROWS} rows: {correlation}"
     )
     return "\n".join(lines)
 
@@ -191,14 +186,10 @@ def report_text(report: ReplayReport) -> str:
 def _driving(metrics: DrivingMetrics) -> str:
     """Return the metrics of one drive in the text."""
     return (
-        f"autonomy {metrics['autonomy_percent']:.1f} %, {metrics['interventions']} interventions; distance from the "
-        f"reference: mean {metrics['distance_mean_m']:.2f} m, 95th percentile {metrics['distance_p95_m']:.2f} m"
+        f"autonomy {metrics['autonomy_percent']:.1f} %, {plural(metrics['interventions'], 'intervention')}; "
+        f"distance from the reference: mean {metrics['distance_mean_m']:.2f} m, "
+        f"95th percentile {metrics['distance_p95_m']:.2f} m"
     )
-
-
-def _plain(name: str) -> str:
-    """Return a yardstick's name in the text: the report's keys remain those of earlier versions."""
-    return "human driver" if name == HUMAN else name
 
 
 def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> None:
@@ -216,17 +207,15 @@ def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> N
         ax.plot(seconds, human_offset, linewidth=0.7, color="0.5", label="human driver")
         for at in done.interventions:
             ax.axvline(seconds[at], color="tab:red", linewidth=0.8)
-        ax.set(
-            ylabel="m right of the reference",
-            title=f"limit {done.limit:g} m: autonomy {100 * done.autonomy():.1f} %, "
-            f"{len(done.interventions)} interventions",
-        )
-        ax.legend(loc="upper right", fontsize=8)
+        count = plural(len(done.interventions), "intervention")
+        title = f"limit {done.limit:g} m: autonomy {100 * done.autonomy():.1f} %, {count}"
+        ax.set(ylabel="m right of the reference", title=title)
     seconds = np.cumsum(drives[-1].seconds)
     axes[-1].plot(seconds, drives[-1].steering, linewidth=0.8, label="model")
     axes[-1].plot(seconds, drives[-1].human_steering, linewidth=0.6, color="0.5", label="human driver")
     axes[-1].set(xlabel="s", ylabel="steering")
-    axes[-1].legend(loc="upper right", fontsize=8)
+    for ax in axes:
+        ax.legend(loc="upper right", fontsize=8)
     file = io.BytesIO()
     figure.suptitle(recording.folder.name)
     figure.savefig(file, format="png", dpi=90)
@@ -254,7 +243,7 @@ class ReplayFilm(DriveFilm):
             return
         caption = f"model   steering {done.steering[-1]:+.3f}   {done.offset[-1]:+.2f} m   limit {done.limit:g} m"
         if done.interventions:
-            caption += f"   interventions {len(done.interventions)}"
+            caption += f"   {plural(len(done.interventions), 'intervention')}"
         views = [
             captioned(frame.view, done.steering[-1], caption),
             captioned(frame.recorded, frame.human_steering, f"human driver   steering {frame.human_steering:+.3f}"),

@@ -24,7 +24,7 @@ import torch
 
 from cloning.base.errors import ModelError
 from cloning.base.files import write
-from cloning.network.network import Network, load_checkpoint, read_recipe, restore_weights, save_model, versions
+from cloning.network.network import Network, load_checkpoint, read_preprocessing, restore_weights, save_model, versions
 from cloning.network.tensors import matching, shown
 from cloning.training.adam import Adam
 from cloning.training.observations import Observations
@@ -221,7 +221,7 @@ def _of_earlier_version(saved: dict[str, Any]) -> dict[str, Any]:
 
 def _restore_network(network: Network, saved: dict[str, Any]) -> None:
     """Give the network the weights of a checkpoint. Raises ValueError if they, or their recipe, do not fit."""
-    if read_recipe(saved) != (network.crop, network.scale, network.offset):
+    if read_preprocessing(saved) != (network.crop, network.scale, network.offset):
         raise ValueError("its recipe is not that of this program's training")
     restore_weights(network, saved)
 

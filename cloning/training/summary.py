@@ -16,7 +16,8 @@ from tqdm import tqdm
 from cloning.base.errors import RecordingError
 from cloning.base.files import write
 from cloning.network.compute import threads
-from cloning.network.network import Network, layer_table
+from cloning.network.layer_table import layer_table
+from cloning.network.network import Network
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
 from cloning.training.checkpoint import EpochMetrics, Progress, best_epoch

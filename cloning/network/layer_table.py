@@ -1,0 +1,34 @@
+"""The table of the network's layers that a training run prints, in the format of the report's Keras summary."""
+
+import torch
+from torch import nn
+
+from cloning.base.frame import FRAME
+from cloning.network.network import Network
+
+
+def layer_table(network: Network) -> str:
+    """Return a line for each layer: its name and type, its output's shape, its parameters, and the layer before it."""
+    top, bottom = network.crop
+    layers: list[tuple[str, str, nn.Module]] = [
+        ("lambda_1", "Lambda", nn.Identity()),
+        ("cropping2d_1", "Cropping2D", nn.ZeroPad2d((0, 0, -top, -bottom))),
+        *((f"convolution2d_{i}", "Convolution2D", layer) for i, layer in enumerate(network.convolutions, 1)),
+        ("flatten_1", "Flatten", nn.Flatten()),
+        ("dropout_1", "Dropout", nn.Identity()),
+        *((f"dense_{i}", "Dense", layer) for i, layer in enumerate(network.dense, 1)),
+    ]
+    rows, previous, x = list[str](), "lambda_input_1", torch.zeros(1, FRAME[2], *FRAME[:2])
+    with torch.no_grad():
+        for name, keras_type, layer in layers:
+            x = layer(x)
+            shape = str((None, *x.shape[2:], x.shape[1]))
+            rows.append(f"{f'{name} ({keras_type})':32} {shape:22} {_parameters(layer):<11} {previous}[0][0]")
+            previous = name
+    title = f"{'Layer (type)':32} {'Output Shape':22} {'Param #':11} Connected to"
+    total = f"Total params: {_parameters(network):,}"
+    return "\n".join(["_" * 90, title, "=" * 90, f"\n{'_' * 90}\n".join(rows), "=" * 90, total])
+
+
+def _parameters(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
