@@ -20,7 +20,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ if __name__ == "__main__":
     program.end_on_interrupt("model.py")  # also while the libraries below are loaded
 
 import numpy as np
+from numpy.random import default_rng
 from torch import channels_last, manual_seed, nn
 from tqdm import tqdm
 
@@ -37,7 +38,7 @@ from cloning.base.cores import threads
 from cloning.base.errors import RecordingError
 from cloning.base.files import write
 from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
-from cloning.network.network import CROP, SEEN_SHAPE, UNITS, Network, load_model
+from cloning.network.network import CROP, NETWORKS, SEEN_SHAPE, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.frames import KEPT_FRAMES, FrameCache
@@ -97,7 +98,7 @@ def select_driven(recording: Recording, recipe: Recipe) -> Observations:
 
 def balance(observations: Observations, recipe: Recipe, seed: int) -> Observations:
     """Steps 5 to 7: undersample straight driving, oversample turns with jitter, repeat problem areas."""
-    rng, size = np.random.default_rng([seed, 1]), np.abs(observations.steering)
+    rng, size = default_rng([seed, 1]), np.abs(observations.steering)
     kept = np.flatnonzero((size >= recipe.straight) | (rng.random(len(size)) < recipe.keep_straight))
     turns = np.flatnonzero((size > recipe.turn[0]) & (size <= recipe.turn[1]))
     jittered = observations.steering[turns] * (1 + recipe.jitter * rng.uniform(-1, 1, len(turns)))
@@ -127,7 +128,7 @@ def split(observations: Observations, recipe: Recipe, seed: int) -> tuple[np.nda
     block = np.unique(np.stack([drive, second // recipe.block_seconds]), axis=1, return_inverse=True)[1].ravel()
     if block[-1] + 1 < folds:  # less than ten seconds in all
         block = np.arange(n) * folds // n
-    validation = (block + np.random.default_rng([seed, 0]).integers(folds)) % folds == 0
+    validation = (block + default_rng([seed, 0]).integers(folds)) % folds == 0
     _, first, frame = np.unique(observations.frame, return_index=True, return_inverse=True)
     validation = validation[first][frame]
     if validation.all() or not validation.any():
@@ -136,7 +137,7 @@ def split(observations: Observations, recipe: Recipe, seed: int) -> tuple[np.nda
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# The recipe
+# The recipe, and the generator: it makes an unaltered, a flipped, a brightened and a shadowed image of an observation
 
 
 REPORT = Recipe(
@@ -175,7 +176,8 @@ REPORT = Recipe(
     brightness=(0.4, 1.2),
     shadow=0.8,
     darkness=(0.2, 0.5),
-    # Training: Keras's Adam and mean squared error
+    # Training: NVIDIA's network with dropout, Adam and mean squared error
+    network="nvidia",
     dropout=True,
     optimizer="adam",
     learning_rate=1e-4,
@@ -189,10 +191,6 @@ REPORT = Recipe(
     best_by="val_drift",
 )
 ROBUST = robust(REPORT)
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Augmentation: from each observation an unaltered, a flipped, a brightened and a shadowed image may be made.
 
 
 class Generator:
@@ -216,24 +214,23 @@ class Generator:
         self.observations, self.recipe, self.seed, self.pool = observations, recipe, seed, pool
         self.ahead, self.ranks = ahead, ranks or Ranks()
         self.numbers, self.started = itertools.count(first), deque[Callable[[], Batch]]()
-        self.shuffled = functools.lru_cache(2)(
-            lambda n: recipe.order(observations, recipe, np.random.default_rng([seed, 2, n]))
-        )
+        self.order = functools.lru_cache(2)(lambda n: recipe.order(observations, recipe, default_rng([seed, 2, n])))
 
     def sample(self, number: int) -> Choices:
         """Return the random choices for batch `number`, counted from 0."""
-        recipe, rng, n = self.recipe, np.random.default_rng([self.seed, 3, number]), self.recipe.batch_size
+        recipe, rng, n = self.recipe, default_rng([self.seed, 3, number]), self.recipe.batch_size
         at = np.arange(number * n, (number + 1) * n)
         passes = at // len(self.observations)  # over all observations, each in another order
-        parts = [self.shuffled(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
+        parts = [self.order(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
         chosen, camera = np.concatenate(parts), rng.integers(len(CAMERAS), size=n)
         shares = [augmentation.share(recipe) for augmentation in recipe.augmentations]
         made = np.stack([rng.random(n) < share if share < 1 else np.ones(n, bool) for share in shares], axis=1)
         total_images = int(made.sum())
         slots = np.full(made.shape, -1)
         slots[made] = rng.permutation(total_images)  # the batch is shuffled
-        bits = np.unpackbits(np.frombuffer(rng.bytes(total_images * UNITS // 8), np.uint8))
-        keep = bits.view(bool).reshape(total_images, UNITS) if recipe.dropout else None
+        units = NETWORKS[recipe.network].units
+        bits = np.unpackbits(np.frombuffer(rng.bytes(-(-total_images * units // 8)), np.uint8))
+        keep = bits[: total_images * units].view(bool).reshape(total_images, units) if recipe.dropout else None
         augmenting = [augmentation.choose(recipe, rng, n) for augmentation in recipe.augmentations]
         views = recipe.views(self.observations, chosen, camera, recipe, rng)
         return Choices(chosen, camera, slots, keep, augmenting, views)
@@ -247,14 +244,13 @@ class Generator:
         images, labels = np.empty((len(order), *SEEN_SHAPE), np.uint8), np.empty(len(order), np.float32)
 
         def make(part: np.ndarray) -> None:
-            for kind, (augmentation, seen) in enumerate(
-                zip(self.recipe.augmentations, choices.views.images(part), strict=True)
-            ):
+            for kind, seen in enumerate(choices.views.images(part)):
                 has = choices.slots[part, kind] >= 0
                 which, seen = (part, seen) if has.all() else (part[has], seen[has])
                 at = np.searchsorted(order, choices.slots[which, kind])
-                chosen = (column[which] for column in choices.augmenting[kind])
-                images[at], labels[at] = augmentation.change(seen, CROP[0], *chosen), choices.views.labels[which, kind]
+                chosen = [column[which] for column in choices.augmenting[kind]]
+                images[at] = self.recipe.augmentations[kind].change(seen, CROP[0], *chosen)
+                labels[at] = choices.views.labels[which, kind]
 
         parts = [self.pool.submit(make, mine[piece]) for piece in pieces(len(mine))]
 
@@ -282,7 +278,7 @@ class Generator:
 
 
 class Prepared(NamedTuple):
-    """What a run needs: its observations, and with what it begins, None for random weights."""
+    """A run, its observations, and with what it begins: None for random weights."""
 
     run: Run
     training: Observations
@@ -300,13 +296,15 @@ class TrainingRun:
         self.device, self.files = choose_device(process.device), RunFiles(process.output)
         self.precision = choose_precision(self.device)
         manual_seed(run.seed)
-        self.network = Network().to(self.device, memory_format=channels_last)  # type: ignore[call-overload]
+        network = NETWORKS[self.recipe.network]()
+        self.network = network.to(self.device, memory_format=channels_last)  # type: ignore[call-overload]
         repeatable(self.device)
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
         self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, self.recipe.huber)
         if ranks.world > 1:
             self.errors = nn.parallel.DistributedDataParallel(self.errors)
+        self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
         optimizer = OPTIMIZERS[self.recipe.optimizer]
         self.optimizer = optimizer(self.network.parameters(), self.recipe.momentum, self.recipe.weight_decay)
         data = fingerprint(self.training, self.validation)
@@ -336,8 +334,8 @@ class TrainingRun:
 
     def epoch(self) -> None:
         """Train on whole batches until the epoch has at least `samples_per_epoch` images, as Keras 1 counts."""
-        recipe, progress, ranks, started = self.recipe, self.progress, self.ranks, time.monotonic()
-        started -= progress.seconds
+        recipe, progress, ranks = self.recipe, self.progress, self.ranks
+        started = time.monotonic() - progress.seconds
         if ranks.first:
             print(f"Epoch {len(progress.history) + 1}/{recipe.epochs}", flush=True)
         hidden = None if ranks.first else True  # None: only on a terminal
@@ -366,16 +364,12 @@ class TrainingRun:
     def validate(self) -> tuple[float, float]:
         """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m."""
         n, share = len(self.validation), self.ranks.share
-        chosen = np.random.default_rng([self.seed, 4]).permutation(n)[: max(self.recipe.samples_per_epoch // 5, 1)]
+        chosen = default_rng([self.seed, 4]).permutation(n)[: max(self.recipe.samples_per_epoch // 5, 1)]
         mine, sets = chosen[share], self.validation_sets
         error = sum(float(((self.predict(self.network, x, mine) - y[mine]) ** 2).sum()) for x, y in sets)
         far = drifts(self.held_out[share], self.network, self.pool)
         error, metres, pieces_driven = self.ranks.summed([error, float(far.sum()), float(len(far))], self.device)
         return error / len(sets) / len(chosen), metres / pieces_driven if pieces_driven else math.nan
-
-    def predict(self, network: Network, images: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
-        """Return a network's steering for these observations: float32 (k,); see `pieces.predict`."""
-        return predict(network, images, rows, self.device, self.precision, self.pool)
 
     def save(self, *models: Path) -> None:
         """Write the network to these files, and the state that --resume needs."""
@@ -385,12 +379,10 @@ class TrainingRun:
 
     def write_pictures(self) -> None:
         """Write the diagnostic pictures of the batch's first observation, if 6,400 more observations are done."""
-        before, now = (
-            n * self.recipe.batch_size // PICTURE_EVERY for n in (self.progress.number - 1, self.progress.number)
-        )
-        if self.ranks.first and before != now:
+        done, size = self.progress.number * self.recipe.batch_size, self.recipe.batch_size
+        if self.ranks.first and done % PICTURE_EVERY < size:
             for name, png in batch_pictures(self.generator.sample(self.progress.number), self.recipe).items():
-                write(self.files.pictures / name.format(now * PICTURE_EVERY), png)
+                write(self.files.pictures / name.format(done // PICTURE_EVERY * PICTURE_EVERY), png)
 
     def summary(self) -> str:
         """Return a table of the errors of the last and the best epoch's models, and in words how they will drive."""
@@ -415,8 +407,7 @@ def prepare(command: Command) -> Prepared:
     observations = read_observations(run.recipe, folders, rejected_file, command.process.strict)
     train, validation = split(observations, run.recipe, run.seed)
     training = run.recipe.resample(observations.take(train), run.recipe, run.seed)
-    sizes = f"training: {len(train):,} rows, {len(training):,} observations after resampling"
-    print(f"\n{sizes}; validation: {len(validation):,} rows\n")
+    print(summary.sizes(len(train), len(training), len(validation)))
     return Prepared(run, training, observations.take(validation), begin)
 
 
@@ -439,8 +430,7 @@ def execute(command: Command) -> int:
     """Do what the command asks; return the exit status: 0, 2 after an error, 128 + signal if stopped."""
     keep_freed_memory()
     ranks = Ranks.join(command.process.device)
-    files, resume = RunFiles(command.process.output), command.process.resume
-    return ranks.leave(status_of(lambda: run(command, ranks), files, resume, ranks))
+    return ranks.leave(status_of(lambda: run(command, ranks), command.process, ranks))
 
 
 def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, seed: int = 0, **process: Any) -> int:
@@ -448,9 +438,8 @@ def train(recipe: Recipe, recordings: Sequence[str | Path], output: str | Path, 
 
     recordings, output, process: as for the options; a run is resumed only if its recipe is this one.
     """
-    given = frozenset(field.name for of in (Run, Recipe) for field in fields(of)) - {"recordings"}
     run = Run(recipe, tuple(map(str, recordings)), seed)
-    return execute(Command(run, Process(str(output), **process), given, {recipe.name: recipe}))
+    return execute(Command(run, Process(str(output), **process), options.EVERY_NAME, {recipe.name: recipe}))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from unittest import mock
@@ -61,10 +62,12 @@ NAMES = {
 def begin(folders: list[str], samples: int, output: Path) -> "model.TrainingRun":
     """Prepare a run of model.py on these folders, without training."""
     import model
+    from cloning.training.distributed import Ranks
+    from cloning.training.options import Command, Process, Run
 
-    options = ["--samples-per-epoch", str(samples), "--epochs", "1", "--output", str(output)]
-    arguments, training, validation, _ = model.prepare(*model.parse([*folders, *options]))
-    run = model.TrainingRun(arguments, training, validation)
+    recipe = replace(model.REPORT, samples_per_epoch=samples, epochs=1)
+    command = Command(Run(recipe, tuple(folders)), Process(str(output)), frozenset(), {})
+    run = model.TrainingRun(model.prepare(command), command.process, Ranks())
     run.files.pictures.mkdir()
     return run
 
@@ -104,7 +107,7 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
             run.pool.submit(int).result()  # wait for the next batch's images, whose time belongs to (a)
             started = time.perf_counter()
             (run.errors(fixed_batch) / fixed_batch.total).backward()
-            run.optimizer.step(run.arguments.learning_rate)
+            run.optimizer.step(run.recipe.learning_rate)
             run.optimizer.zero_grad()
             synchronize(run.device)
             spent, steps = spent + time.perf_counter() - started, steps + 1
@@ -121,18 +124,20 @@ def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray",
 
     images: uint8 (n, 75, 320, 3); labels: float32 (n,).
     """
+    import cv2
     import numpy as np
 
-    from cloning.base.frame import FRAME
-    from model import CROP, augment, kind_inputs
+    from cloning.network.network import CROP, SEEN_ROWS
 
     choices, images, angles = generator.sample(number), [], []
     for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
-        cropped = generator.observations.read(at, camera)[None, CROP[0] : FRAME[0] - CROP[1]]
-        augmented = augment(choices, np.array([i]), kind_inputs(cropped), CROP[0])
-        for kind, (rows, kind_images) in enumerate(augmented):
-            images += list(kind_images)
-            angles += [choices.views.labels[i, kind]] * len(rows)
+        seen = generator.observations.read(at, camera)[SEEN_ROWS]
+        for kind, augmentation in enumerate(generator.recipe.augmentations):
+            if choices.slots[i, kind] >= 0:
+                chosen = [column[i : i + 1] for column in choices.augmenting[kind]]
+                image = cv2.flip(seen, 1) if augmentation.mirrors else seen
+                images.append(augmentation.change(image[None], CROP[0], *chosen)[0])
+                angles.append(choices.views.labels[i, kind])
     return np.stack(images), np.array(angles)
 
 

@@ -32,7 +32,7 @@ from cloning.recordings.log import Recording, find_folders
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import ReferenceLine, drive, load_recording, reference_lines
 from cloning.road.autonomy import autonomy
-from cloning.training.options import ROBUST_DEFAULTS
+from model import ROBUST
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES, BATCH = 6_500, 8  # enough for one lap of the lake; tools/experiments.md has what was tried
@@ -106,7 +106,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--learning-rate",
         type=number(float, 1e-9),
-        default=ROBUST_DEFAULTS["learning_rate"],
+        default=ROBUST.learning_rate,
         help="at first (default %(default)s)",
     )
     options = parser.parse_args(argv)

@@ -21,7 +21,6 @@ COLOUR = "RGB"  # order of a frame's colours
 CROP = (60, 25)  # rows cut off the top and the bottom of a frame
 SEEN_ROWS = slice(CROP[0], FRAME[0] - CROP[1])  # the rows of a frame that the network sees
 SEEN_SHAPE = (SEEN_ROWS.stop - SEEN_ROWS.start, *FRAME[1:])  # (75, 320, 3)
-UNITS = 4224  # of the flattened layer; dropout keeps half of them
 
 
 class Network(nn.Module):
@@ -31,8 +30,10 @@ class Network(nn.Module):
 
     forward: frames uint8 (N, 160, 320, 3), RGB, or already cropped (N, 75, 320, 3) -> steering float32 (N,), where
     -1..1 is the simulator's -25°..25°, positive to the right.
-    keep: in training, bool (N, 4224), the units that dropout keeps.
+    keep: in training, bool (N, units), the units of the flattened layer that dropout keeps.
     """
+
+    units = 4224  # of the flattened layer; dropout keeps half of them
 
     def __init__(self, crop: tuple[int, int] = CROP, scale: float = 127.5, offset: float = 1.0):
         """Make the layers with random weights, from torch's generator.
@@ -42,16 +43,18 @@ class Network(nn.Module):
         super().__init__()
         top, bottom = crop
         self.crop, self.scale, self.offset = (top, bottom), scale, offset
-        self.convolutions = nn.ModuleList(
-            [
-                nn.Conv2d(3, 24, kernel_size=5, stride=2),
-                BlockConv2d(24, 36, kernel_size=5, stride=2),  # nn.Conv2d, but trains faster on a CPU
-                nn.Conv2d(36, 48, kernel_size=5, stride=2),
-                nn.Conv2d(48, 64, kernel_size=3),
-                nn.Conv2d(64, 64, kernel_size=3),
-            ]
-        )
-        self.dense = nn.ModuleList([nn.Linear(UNITS, 100), nn.Linear(100, 50), nn.Linear(50, 10), nn.Linear(10, 1)])
+        convolutions, dense = self.layers()
+        self.convolutions, self.dense = nn.ModuleList(convolutions), nn.ModuleList(dense)
+
+    def layers(self) -> tuple[list[nn.Conv2d], list[nn.Linear]]:
+        """Return the convolutions and, after the flattened layer, the dense layers; another network has others."""
+        return [
+            nn.Conv2d(3, 24, kernel_size=5, stride=2),
+            BlockConv2d(24, 36, kernel_size=5, stride=2),  # nn.Conv2d, but trains faster on a CPU
+            nn.Conv2d(36, 48, kernel_size=5, stride=2),
+            nn.Conv2d(48, 64, kernel_size=3),
+            nn.Conv2d(64, 64, kernel_size=3),
+        ], [nn.Linear(self.units, 100), nn.Linear(100, 50), nn.Linear(50, 10), nn.Linear(10, 1)]
 
     def forward(self, frames: torch.Tensor, keep: torch.Tensor | None = None) -> torch.Tensor:
         """Compute the steering for frames; shapes and ranges are in the class's docstring."""
@@ -69,6 +72,9 @@ class Network(nn.Module):
         return self.dense[-1](x).squeeze(1).float()
 
 
+NETWORKS: dict[str, type[Network]] = {"nvidia": Network}  # by the name that a recipe and a model file have
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Model file
 
@@ -82,7 +88,8 @@ def save_model(path: Path, network: Network, **more: object) -> None:
         "scale": network.scale,
         "offset": network.offset,
     }
-    about = {"format": FORMAT, "version": VERSION, PREPROCESSING: preprocessing, "versions": versions()}
+    name = next(name for name, kind in NETWORKS.items() if kind is type(network))
+    about = {"format": FORMAT, "version": VERSION, "layers": name, PREPROCESSING: preprocessing, "versions": versions()}
     tensors.save(path, {**about, "network": network.state_dict(), **more})
 
 
@@ -114,7 +121,7 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> Network:
     """Return the network of a model file, in evaluation mode on the device. Raises ModelError."""
     saved = load_checkpoint(path)
     try:
-        network = Network(*read_preprocessing(saved))
+        network = read_network(saved)(*read_preprocessing(saved))
         restore_weights(network, saved)
     except ValueError as error:
         raise ModelError(
@@ -122,6 +129,14 @@ def load_model(path: str | Path, device: str | torch.device = "cpu") -> Network:
         ) from None
     network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]  # torch's stubs lack it
     return network.eval()
+
+
+def read_network(saved: dict[str, Any]) -> type[Network]:
+    """Return the kind of network that a model file contains, NVIDIA's in an earlier version's. Raises ValueError."""
+    name = saved.get("layers", "nvidia")
+    if not isinstance(name, str) or name not in NETWORKS:
+        raise ValueError(f"its layers are {tensors.shown(name)}, not {' or '.join(NETWORKS)}")
+    return NETWORKS[name]
 
 
 def read_preprocessing(saved: dict[str, Any]) -> tuple[tuple[int, int], float, float]:

@@ -24,7 +24,17 @@ import torch
 
 from cloning.base.errors import ModelError
 from cloning.base.files import write
-from cloning.network.network import Network, load_checkpoint, read_preprocessing, restore_weights, save_model, versions
+from cloning.network.network import (
+    NETWORKS,
+    PREPROCESSING,
+    Network,
+    load_checkpoint,
+    read_network,
+    read_preprocessing,
+    restore_weights,
+    save_model,
+    versions,
+)
 from cloning.network.tensors import matching, shown
 from cloning.training.adam import Adam
 from cloning.training.observations import Observations
@@ -130,15 +140,14 @@ class FirstWeights(NamedTuple):
     contents: dict[str, Any]
 
 
-def read_first_weights(path: str) -> FirstWeights:
-    """Return the weights of a model file. Raises ModelError."""
+def read_first_weights(path: str, recipe: Recipe) -> FirstWeights:
+    """Return the weights of a model file, which the recipe's network can have. Raises ModelError."""
     saved = load_checkpoint(path, "name a model file of model.py")
-    weights = {name: saved.get(name) for name in ("recipe", "network")}
     try:
-        _restore_network(Network(), weights)
+        _restore_network(NETWORKS[recipe.network](), saved)
     except ValueError as error:
         raise ModelError(f"{path}: its contents do not fit this program: {error}; name another model file") from None
-    return FirstWeights(weights)
+    return FirstWeights({name: saved[name] for name in ("layers", PREPROCESSING, "network") if name in saved})
 
 
 def read_saved_run(path: Path, recipes: Mapping[str, Recipe]) -> SavedRun:
@@ -162,7 +171,7 @@ def resumed(command: Command) -> tuple[Run, SavedRun | FirstWeights | None]:
     if not process.resume or not files.resume.exists():
         if process.resume:
             print(f"{files.resume}: nothing to resume yet; starting a new run")
-        return run, read_first_weights(run.from_model) if run.from_model else None
+        return run, read_first_weights(run.from_model, run.recipe) if run.from_model else None
     saved = read_saved_run(files.resume, recipes)
     began, wanted = _values(saved.run), _values(run)
     for name in sorted(given & began.keys() - MAY_CHANGE):
@@ -199,13 +208,14 @@ def _saved_run(contents: dict[str, Any], recipes: Mapping[str, Recipe]) -> Run:
     name = figures.get("name") if isinstance(figures, dict) else None
     if not isinstance(name, str) or name not in recipes:
         raise ValueError(f"its recipe is {shown(name)}, not {' or '.join(recipes)}")
-    plain = {"recordings": list, "seed": int, "from_model": str}
-    for key, kind in plain.items():
-        value = saved.get(key)
-        if type(value) is not kind or (kind is list and not all(type(part) is str for part in value)):
-            raise ValueError(f"its {option_name(key)} is of type {type(value).__name__}")
-    recordings = tuple(saved["recordings"])
-    return Run(recipes[name].restored(figures), recordings, saved["seed"], saved["from_model"])
+    recordings, seed, from_model = (saved.get(key) for key in ("recordings", "seed", "from_model"))
+    if not isinstance(recordings, list) or not all(type(folder) is str for folder in recordings):
+        raise ValueError(f"its --recordings is of type {type(recordings).__name__}")
+    if type(seed) is not int:
+        raise ValueError(f"its --seed is of type {type(seed).__name__}")
+    if type(from_model) is not str:
+        raise ValueError(f"its --from is of type {type(from_model).__name__}")
+    return Run(recipes[name].restored(figures), tuple(recordings), seed, from_model)
 
 
 def _of_earlier_version(saved: dict[str, Any]) -> dict[str, Any]:
@@ -220,7 +230,9 @@ def _of_earlier_version(saved: dict[str, Any]) -> dict[str, Any]:
 
 
 def _restore_network(network: Network, saved: dict[str, Any]) -> None:
-    """Give the network the weights of a checkpoint. Raises ValueError if they, or their recipe, do not fit."""
+    """Give the network the weights of a checkpoint. Raises ValueError if they, or their preprocessing, do not fit."""
+    if read_network(saved) is not type(network):
+        raise ValueError(f"its layers are {shown(saved.get('layers'))}")
     if read_preprocessing(saved) != (network.crop, network.scale, network.offset):
         raise ValueError("its recipe is not that of this program's training")
     restore_weights(network, saved)

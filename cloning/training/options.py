@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,10 +57,13 @@ class Process:
     save_seconds: float = SAVE_SECONDS
 
 
+EVERY_NAME = frozenset(item.name for kind in (Run, Recipe) for item in fields(kind)) - {"recordings"}
+
+
 class Command(NamedTuple):
     """What model.py is asked to do.
 
-    given    the names of the run's and the recipe's fields that the user gave, and "robust"
+    given    the names of the run's and the recipe's fields that the user gave, and "robust"; EVERY_NAME: all
     recipes  those that a checkpoint may have been trained by, by their names
     """
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cloning.network.network import NETWORKS
 from cloning.network.tensors import shown
 from cloning.recordings.log import Recording
 from cloning.training.muon import OPTIMIZERS
@@ -108,6 +109,7 @@ class Recipe:
     shadow: float  # share with a shadowed image
     darkness: tuple[float, float]  # factor of the HLS lightness in the shadow
     # Training
+    network: str  # key of NETWORKS
     dropout: bool  # whether half of the units of the flattened layer are dropped
     optimizer: str  # key of OPTIMIZERS
     momentum: float  # of its average gradient
@@ -146,9 +148,10 @@ class Recipe:
         figures = {name: saved[name] for name in self.saved() if name in saved}
         for name, found in figures.items():
             own = getattr(self, name)
-            if name == "optimizer":
-                if not isinstance(found, str) or found not in OPTIMIZERS:
-                    raise ValueError(f"its optimizer is {shown(found)}, not {' or '.join(OPTIMIZERS)}")
+            if name in ("network", "optimizer"):
+                known = NETWORKS if name == "network" else OPTIMIZERS
+                if not isinstance(found, str) or found not in known:
+                    raise ValueError(f"its {name} is {shown(found)}, not {' or '.join(known)}")
             elif isinstance(own, str) or callable(own) or name == "augmentations":
                 if found != _plain(own):
                     raise ValueError(f"its {name} is {shown(found)}, not {_plain(own)}")

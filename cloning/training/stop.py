@@ -7,6 +7,7 @@ from types import FrameType
 
 from cloning.base.errors import UserError, message_of
 from cloning.training.distributed import Ranks
+from cloning.training.options import Process
 from cloning.training.run_files import RunFiles
 
 # Windows cannot send SIGTERM, and other systems may lack it.
@@ -41,11 +42,12 @@ class StopSignals:
         self.received = number
 
 
-def status_of(work: Callable[[], None], files: RunFiles, resume: bool, ranks: Ranks) -> int:
+def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:
     """Do the work of a run, and return the exit status: 0, 2 after an error, 128 + signal if it was stopped.
 
-    Says what ended it and what to do, on stderr. resume: whether the run is to be resumed.
+    Says what ended it and what to do, on stderr.
     """
+    files, resume = RunFiles(process.output), process.resume
     status, message, before = 0, "", files.state()
     try:
         with files.claimed(ranks):

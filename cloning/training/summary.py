@@ -73,6 +73,12 @@ def recordings_table(counts: list[Counts], dropped: str) -> str:
     return "\n".join(lines)
 
 
+def sizes(rows: int, observations: int, validation: int) -> str:
+    """Return the numbers of rows for training, of observations made from them, and of rows for validation."""
+    resampled = f"training: {rows:,} rows, {observations:,} observations after resampling"
+    return f"\n{resampled}; validation: {validation:,} rows\n"
+
+
 def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> None:
     """Write the unusable rows of all recordings, if any, to a csv file; strict: raise RecordingError instead."""
     rejected = [(recording.folder / DRIVING_LOG, *row) for recording in recordings for row in recording.rejected]
@@ -196,8 +202,9 @@ def driving(history: list[EpochMetrics], recipe: Recipe, still: np.ndarray, file
     if best is not last and not math.isnan(best["val_drift"]):
         others = f"{best['val_drift']:.2f} m by {files.best.name} of epoch {best['epoch']:.0f}, {others}"
     return (
-        f"\n\nSteered by {files.last.name} for two seconds, from where the driver was, a car is {last['val_drift']:.2f} m "
-        f"from {recipe.words.aimed_at}\n(mean of {len(still)} held-out stretches; {others}).\n{verdict}"
+        f"\n\nSteered by {files.last.name} for two seconds, from where the driver was, a car is "
+        f"{last['val_drift']:.2f} m from {recipe.words.aimed_at}\n"
+        f"(mean of {len(still)} held-out stretches; {others}).\n{verdict}"
     )
 
 

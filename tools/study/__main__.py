@@ -4,7 +4,7 @@
     python -m tools.study data --networks 2 --images 200 --laps 0.1 --starts 2  # a trial
 
 `data` holds real recordings by the names lake-ccw, lake-cw, jungle and jungle-shadows (data/README.md says where they
-are from). The networks are trained on lake-ccw or jungle, some on both or on a lap drawn by the stand-in simulator;
+are from). The networks are trained on lake-ccw or jungle, some on both or on a lap in the stand-in simulator;
 lake-cw and jungle-shadows are held out. Each network is measured by its errors on the held-out recording (what a loss
 is made of), by replays of that recording, and by laps in the stand-in simulator, which stand for driving. Some are also
 started next to the lane, and turned: do they come back?
@@ -38,13 +38,13 @@ from cloning.road.track import Track
 from simulator.record import record
 from tools.study.figures import Row, correlation_picture, recovery_picture, report, row, scatter_picture
 from tools.study.network import RESULT
-from tools.study.networks import DRAWN, EPOCH_IMAGES, TRACKS, Variant, plan
+from tools.study.networks import EPOCH_IMAGES, RENDERED, TRACKS, Variant, plan
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
 
 def prepare(args: argparse.Namespace) -> None:
-    """Check the recordings, and draw the one that is drawn. Raises UserError, OSError."""
+    """Check the recordings, and render the one that is rendered. Raises UserError, OSError."""
     names = sorted({name for track in TRACKS.values() for name in (track.train, track.held_out)})
     for name in names:
         if not (args.recordings / name / DRIVING_LOG).exists():
@@ -56,12 +56,12 @@ def prepare(args: argparse.Namespace) -> None:
     if file.exists() and json.loads(file.read_text(encoding="utf-8")) != options:
         raise UserError(f"{file}: the study began with other options; give these, or another --folder")
     write_json(file, options)
-    drawn = args.folder / DRAWN
-    if not drawn.exists():
-        unfinished = drawn.with_name(f"unfinished-{DRAWN}")
+    rendered = args.folder / RENDERED
+    if not rendered.exists():
+        unfinished = rendered.with_name(f"unfinished-{RENDERED}")
         shutil.rmtree(unfinished, ignore_errors=True)
         record(unfinished, Track("lake"), args.laps)
-        unfinished.rename(drawn)
+        unfinished.rename(rendered)
 
 
 def result(variant: Variant, args: argparse.Namespace) -> dict[str, float]:

@@ -11,7 +11,7 @@ from scipy.stats import rankdata
 
 from cloning.road.motion import MPH
 from tools.study.measures import RECOVERY_SECONDS, RECOVERY_SPEED
-from tools.study.networks import TRACKS, Variant, recovering
+from tools.study.networks import RECOVERING, TRACKS, Variant
 
 Row = dict[str, float | str]  # a network: the columns of `row`
 
@@ -59,8 +59,8 @@ COLOURS = {"loss": "tab:orange", "replay": "tab:blue"}
 
 def row(variant: Variant, found: dict[str, float]) -> Row:
     """Return a network's row of study.csv; found: its measures."""
-    about: Row = {"track": variant.track, "kind": variant.kind, "seed": variant.seed}
-    about |= {"recordings": " ".join(variant.recordings), "options": " ".join(variant.options)}
+    about: Row = {"track": variant.track, "method": variant.method, "recipe": variant.recipe.name}
+    about |= {"seed": variant.seed, "recordings": " ".join(variant.recordings)}
     return {**about, "recovered": "", **found}
 
 
@@ -97,7 +97,7 @@ def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """
     found = {track: [each for each in rows if each["track"] == track] for track in TRACKS}
     for track in TRACKS:
-        found[f"{track}, without --robust"] = [row for row in found[track] if "--robust" not in str(row["options"])]
+        found[f"{track}, without --robust"] = [row for row in found[track] if row["recipe"] != "robust"]
     return found
 
 
@@ -125,13 +125,13 @@ def report(rows: Sequence[Row]) -> str:
     seconds, metres = RECOVERY_SECONDS, RECOVERY_SPEED * MPH
     lines += ["", f"## Back in the lane within {seconds:g} s, at {metres:.0f} m/s", ""]
     lines += ["| trained with | of its starts, by seed | mean |", "|---|---|---|"]
-    for kind, shares in recovery(rows).items():
+    for method, shares in recovery(rows).items():
         by_seed = ", ".join(f"{100 * share:.0f} %" for share in shares)
-        lines.append(f"| {kind} | {by_seed} | {100 * np.mean(shares):.0f} % |")
+        lines.append(f"| {method} | {by_seed} | {100 * np.mean(shares):.0f} % |")
     lines += ["", "## All networks", "", "| network | mse | autonomy at 1 m | mean distance | departures per km |"]
     lines.append("|---|---|---|---|---|")
     for each in rows:
-        network = f"{each['track']}, {each['kind']}, seed {each['seed']}"
+        network = f"{each['track']}, {each['method']}, seed {each['seed']}"
         figures = (
             f"{float(each['mse']):.4f} | {100 * float(each['autonomy_1']):.0f} % | {float(each['offset_mean']):.2f} m"
         )
@@ -140,12 +140,10 @@ def report(rows: Sequence[Row]) -> str:
 
 
 def recovery(rows: Sequence[Row]) -> dict[str, list[float]]:
-    """Return the shares recovered by kind of network, in the order of the plan."""
-    kinds = list(dict.fromkeys(variant.kind for variant in recovering()))
-    found = {
-        kind: [float(r["recovered"]) for r in rows if r["kind"] == kind and r["recovered"] != ""] for kind in kinds
-    }
-    return {kind: shares for kind, shares in found.items() if shares}
+    """Return the shares recovered by method, in the order of the plan."""
+    measured = [row for row in rows if row["recovered"] != ""]
+    found = {name: [float(row["recovered"]) for row in measured if row["method"] == name] for name in RECOVERING}
+    return {method: shares for method, shares in found.items() if shares}
 
 
 def png(draw: Callable[[Figure], None], width: float, height: float) -> bytes:
@@ -212,11 +210,11 @@ def recovery_picture(rows: Sequence[Row]) -> bytes:
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        for place, shares in enumerate(recovery(rows).values()):
-            axes.bar(place, 100 * np.mean(shares), color="tab:blue", alpha=0.5)
-            axes.plot([place] * len(shares), 100 * np.array(shares), "o", color="black", markersize=4)
-        kinds = list(recovery(rows))
-        axes.set(xticks=range(len(kinds)), xticklabels=kinds, ylim=(0, 105), ylabel="% of starts")
+        for at, shares in enumerate(recovery(rows).values()):
+            axes.bar(at, 100 * np.mean(shares), color="tab:blue", alpha=0.5)
+            axes.plot([at] * len(shares), 100 * np.array(shares), "o", color="black", markersize=4)
+        methods = list(recovery(rows))
+        axes.set(xticks=range(len(methods)), xticklabels=methods, ylim=(0, 105), ylabel="% of starts")
         axes.set_title(f"back in the lane within {RECOVERY_SECONDS:g} s")
         axes.grid(axis="y", alpha=0.3)
 
