@@ -291,30 +291,29 @@ class TrainingRun:
 
     def __init__(self, prepared: Prepared, process: Process, ranks: Ranks):
         """Raises ModelError if the run is resumed and its data are others."""
-        run, self.training, self.validation, begin = prepared
-        self.recipe, self.seed, self.process, self.ranks = run.recipe, run.seed, process, ranks
+        run, training, validation, begin = prepared
+        recipe, aim = run.recipe, validation.lanes.from_middle()
+        self.training, self.validation = training, validation
+        self.recipe, self.seed, self.process, self.ranks = recipe, run.seed, process, ranks
         self.device, self.files = choose_device(process.device), RunFiles(process.output)
         self.precision = choose_precision(self.device)
         manual_seed(run.seed)
-        network = NETWORKS[self.recipe.network]()
+        network = NETWORKS[recipe.network]()
         self.network = network.to(self.device, memory_format=channels_last)  # type: ignore[call-overload]
         repeatable(self.device)
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
-        self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, self.recipe.huber)
+        self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, recipe.huber)
         if ranks.world > 1:
             self.errors = nn.parallel.DistributedDataParallel(self.errors)
         self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
-        optimizer = OPTIMIZERS[self.recipe.optimizer]
-        self.optimizer = optimizer(self.network.parameters(), self.recipe.momentum, self.recipe.weight_decay)
-        data = fingerprint(self.training, self.validation)
-        self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, data)
+        self.optimizer = OPTIMIZERS[recipe.optimizer](self.network.parameters(), recipe.momentum, recipe.weight_decay)
+        self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, fingerprint(training, validation))
         self.progress, ahead = self.checkpoint.restore(begin), 2 if self.device.type == "cpu" else 4
-        self.generator = Generator(self.training, run.recipe, run.seed, self.pool, ahead, self.progress.number, ranks)
-        self.validation_sets = self.recipe.validation_sets(self.validation, self.recipe, run.seed)
-        lane = self.validation.lanes.from_middle()
-        self.held_out = held_out(self.validation.recordings, self.validation.recording, self.validation.row, lane)
-        self.pace, self.stop, self.saved_at = summary.Pace(self.recipe, ranks.first), StopSignals(), time.monotonic()
+        self.generator = Generator(training, recipe, run.seed, self.pool, ahead, self.progress.number, ranks)
+        self.validation_sets = recipe.validation_sets(validation, recipe, run.seed)
+        self.held_out = held_out(validation.recordings, validation.recording, validation.row, aim)
+        self.pace, self.stop, self.saved_at = summary.Pace(recipe, ranks.first), StopSignals(), time.monotonic()
 
     def train(self) -> None:
         """Train the remaining epochs. Raises Interrupted, after saving the state, if a signal stops the run."""
@@ -368,8 +367,8 @@ class TrainingRun:
         mine, sets = chosen[share], self.validation_sets
         error = sum(float(((self.predict(self.network, x, mine) - y[mine]) ** 2).sum()) for x, y in sets)
         far = drifts(self.held_out[share], self.network, self.pool)
-        error, metres, pieces_driven = self.ranks.summed([error, float(far.sum()), float(len(far))], self.device)
-        return error / len(sets) / len(chosen), metres / pieces_driven if pieces_driven else math.nan
+        error, metres, driven = self.ranks.summed([error, float(far.sum()), float(len(far))], self.device)
+        return error / len(sets) / len(chosen), metres / driven if driven else math.nan
 
     def save(self, *models: Path) -> None:
         """Write the network to these files, and the state that --resume needs."""

@@ -73,7 +73,7 @@ def overview(files: RunFiles) -> dict[str, Any]:
     images/s, and left, s of training from there on, None if unknown; pictures: numbers of observations, ascending.
     Raises RunError, OSError.
     """
-    options, progress = _json(files.arguments, OPTIONS, 1), {}
+    options, progress = _json(files.arguments, OPTIONS, 1, "recipe"), {}
     history = _history(files.log)
     if files.progress.exists():
         progress = _json(files.progress, PROGRESS, 0)
@@ -95,7 +95,7 @@ def overview(files: RunFiles) -> dict[str, Any]:
     return {
         "run": progress.get("run"),
         "state": state,
-        "robust": options.get("robust") is True,
+        "robust": options.get("robust") is True or options.get("name") == "robust",
         "recordings": [str(each) for each in recordings] if isinstance(recordings, list) else [],
         "epochs": epochs,
         "samples_per_epoch": samples,
@@ -113,12 +113,17 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _json(path: Path, kinds: dict[str, Any], least: int) -> dict[str, Any]:
-    """Return a JSON object with values of these types, numbers from `least` on. Raises RunError, OSError."""
+def _json(path: Path, kinds: dict[str, Any], least: int, within: str = "") -> dict[str, Any]:
+    """Return a JSON object with values of these types, numbers from `least` on; they may also be in its part `within`.
+
+    Raises RunError, OSError.
+    """
     try:
         found = json.loads(path.read_bytes())
     except ValueError as error:
         raise RunError(f"{path}: not JSON ({error}); `python model.py` writes it anew") from None
+    if isinstance(found, dict) and isinstance(found.get(within), dict):  # an earlier version's has no such part
+        found |= found[within]
     for name, kind in kinds.items():
         value = found.get(name) if isinstance(found, dict) else None
         if isinstance(value, bool) or not isinstance(value, kind) or (value is not None and not least <= value < 1e12):
