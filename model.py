@@ -168,9 +168,9 @@ REPORT = Recipe(
     views=CameraViews,
     augmentations=(
         Augmentation("unaltered"),
-        Augmentation("flipped", mirrors=True, share=lambda recipe: recipe.flip),
+        Augmentation("flipped", mirrors=True, share="flip"),
         Augmentation("brightened", brighten, choose_brightness, caption="brightness x {:.2f}"),
-        Augmentation("shadowed", shade, choose_shadow, lambda recipe: recipe.shadow, caption="shadow x {:.2f}"),
+        Augmentation("shadowed", shade, choose_shadow, share="shadow", caption="shadow x {:.2f}"),
     ),
     flip=0.9,
     brightness=(0.4, 1.2),
@@ -223,11 +223,10 @@ class Generator:
         passes = at // len(self.observations)  # over all observations, each in another order
         parts = [self.order(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
         chosen, camera = np.concatenate(parts), rng.integers(len(CAMERAS), size=n)
-        shares = [augmentation.share(recipe) for augmentation in recipe.augmentations]
-        made = np.stack([rng.random(n) < share if share < 1 else np.ones(n, bool) for share in shares], axis=1)
-        total_images = int(made.sum())
-        slots = np.full(made.shape, -1)
-        slots[made] = rng.permutation(total_images)  # the batch is shuffled
+        made = [rng.random(n) < share if share < 1 else np.ones(n, bool) for share in recipe.shares()]
+        total_images = int(np.sum(made))
+        slots = np.full((n, len(made)), -1)
+        slots[np.stack(made, axis=1)] = rng.permutation(total_images)  # the batch is shuffled
         units = NETWORKS[recipe.network].units
         bits = np.unpackbits(np.frombuffer(rng.bytes(-(-total_images * units // 8)), np.uint8))
         keep = bits[: total_images * units].view(bool).reshape(total_images, units) if recipe.dropout else None

@@ -64,7 +64,7 @@ def value(path: Path) -> object:
         for row in saved["history"]:
             del row["seconds"]
             row["val_drift"] = str(row["val_drift"])  # nan is not equal to itself
-        for part, name in ((saved, "run"), (saved["arguments"], "resume"), (saved.get("training", {}), "seconds")):
+        for part, name in ((saved, "run"), (saved.get("training", {}), "seconds")):
             part.pop(name, None)
         return plain(saved)
     if path.name == "training_log.csv":

@@ -9,7 +9,6 @@ import torch
 from rendered import render_recording
 from test_generator import recording as without_images
 
-import model
 from cloning.base.errors import SimulatorError
 from cloning.network.network import Network
 from cloning.recordings.images import read_frame
@@ -18,7 +17,9 @@ from cloning.replay.drift import MOST_PIECES, ROWS, drifts, held_out, still_drif
 from cloning.replay.replay import load_recording
 from cloning.road.motion import Stretch, curvature
 from cloning.training.checkpoint import Progress
+from cloning.training.run_files import RunFiles
 from cloning.training.summary import driving
+from model import REPORT, ROBUST
 
 
 @pytest.fixture(scope="module")
@@ -126,14 +127,20 @@ def epoch(number, loss, far):
 
 
 def test_the_last_lines_say_in_words_how_the_network_will_drive():
-    still, report, robust = np.array([2.0, 3.0]), model.ReportObservations, model.RobustObservations
-    text = driving([epoch(1, 0.1, 0.4), epoch(2, 0.2, 1.0)], report, still)
-    assert "from where the driver was, a car is 1.00 m from the driver's path" in text
-    assert "2 held-out stretches; 0.40 m by model-best.pt of epoch 1, 2.50 m with the wheels straight ahead" in text
-    assert text.endswith("leave the road now and then.")
-    assert driving([epoch(1, 0.1, 0.4)], report, still).endswith("stay on the road.")
-    assert "--robust" in driving([epoch(1, 0.1, 4.0)], report, still)
-    assert driving([epoch(1, 0.1, 4.0)], robust, still).endswith("leave the road often: train longer, or record more.")
-    text = driving([epoch(1, 0.2, 1.0), epoch(2, 0.1, 1.2)], robust, still)
-    assert "1.20 m from the lane's centre" in text and "model-best" not in text
-    assert driving([epoch(1, 0.1, math.nan)], robust, still) == ""
+    still, files = np.array([2.0, 3.0]), RunFiles("runs/net.pt")
+
+    def text(recipe, *history):
+        return driving(list(history), recipe, still, files)
+
+    found = text(REPORT, epoch(1, 0.1, 0.4), epoch(2, 0.2, 1.0))
+    assert (
+        "Steered by net.pt for two seconds, from where the driver was, a car is 1.00 m from the driver's path" in found
+    )
+    assert "2 held-out stretches; 0.40 m by net-best.pt of epoch 1, 2.50 m with the wheels straight ahead" in found
+    assert found.endswith("leave the road now and then.")
+    assert text(REPORT, epoch(1, 0.1, 0.4)).endswith("stay on the road.")
+    assert "--robust" in text(REPORT, epoch(1, 0.1, 4.0))
+    assert text(ROBUST, epoch(1, 0.1, 4.0)).endswith("leave the road often: train longer, or record more.")
+    found = text(ROBUST, epoch(1, 0.2, 1.0), epoch(2, 0.1, 1.2))
+    assert "1.20 m from the lane's centre" in found and "net-best" not in found
+    assert text(ROBUST, epoch(1, 0.1, math.nan)) == ""

@@ -8,6 +8,9 @@ import torch
 from commands import SHORT, run_here, same, weights
 
 import model
+from cloning.training.distributed import Ranks
+from cloning.training.options import parse
+from model import REPORT, ROBUST
 
 
 @pytest.fixture
@@ -21,8 +24,9 @@ def files(folder):
 
 
 def test_a_run_begins_with_the_weights_of_the_file_and_nothing_else_of_it(sample_recording, base, tmp_path):
-    options = model.parse([str(sample_recording), "--from", str(base), "--output", str(tmp_path / "run" / "model.pt")])
-    run = model.TrainingRun(*model.prepare(*options))
+    command = [str(sample_recording), "--from", str(base), "--output", str(tmp_path / "run" / "model.pt")]
+    asked = parse(command, REPORT, ROBUST)
+    run = model.TrainingRun(model.prepare(asked), asked.process, Ranks())
     run.pool.shutdown()
     assert same(run.network.state_dict(), weights(base))
     assert run.progress.number == 0 and not run.progress.history and not run.optimizer.state
@@ -40,7 +44,7 @@ def test_it_is_resumed_exactly_without_the_file(sample_recording, base, tmp_path
     assert resumed.returncode == 0 and "resumed in epoch 2" in resumed.stdout
     assert same(weights(whole), weights(parts))
     for output in (whole, parts):
-        assert json.loads(output.with_name("training_arguments.json").read_bytes())["from_"] == str(base)
+        assert json.loads(output.with_name("training_arguments.json").read_bytes())["from_model"] == str(base)
 
 
 def test_a_run_from_its_own_output_keeps_the_earlier_model(sample_recording, base, tmp_path):

@@ -4,6 +4,7 @@ import pickle
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,11 +14,17 @@ import torch
 from rendered import render_recording
 
 import model
+from cloning.base.errors import RecordingError
+from cloning.network.network import Network
 from cloning.recordings.check import check_images
 from cloning.recordings.log import Recording, read_recording
-from cloning.training.observations import center_digests
+from cloning.training.distributed import Ranks
+from cloning.training.lanes import Lanes
+from cloning.training.light import brighten, shade
+from cloning.training.observations import Observations
+from cloning.training.options import parse
 from cloning.training.pieces import SquaredErrors
-from model import Arguments, Generator, ReportObservations, brighten, shade, split
+from model import REPORT, ROBUST, Generator, balance, split
 from tools.bench_training import one_by_one
 
 
@@ -38,34 +45,33 @@ def observations(steering, recordings=None, frame=None):
     n = len(steering)
     recordings = recordings or [recording(n)]
     which = np.repeat(np.arange(len(recordings)), [len(r) for r in recordings])
-    return ReportObservations(
+    return Observations(
         recordings,
         which,
         np.concatenate([np.arange(len(r), dtype=np.int32) for r in recordings]),
         np.asarray(steering, np.float32),
         np.arange(n, dtype=np.uint64) if frame is None else frame,
         np.concatenate([r.time for r in recordings]),
+        Lanes.unknown(n),
     )
 
 
 def loaded(folder):
     found = read_recording(folder)
     check_images(found)
-    rows = np.arange(len(found), dtype=np.int32)
-    return ReportObservations(
-        [found], np.zeros(len(found), int), rows, found.steering, center_digests(found, rows), found.time
-    )
+    n = len(found)
+    return Observations.of_rows(found, np.arange(n), found.steering, Lanes.unknown(n))
 
 
 @pytest.fixture
 def generator(sample_recording):
     with ThreadPoolExecutor(2) as pool:
-        yield Generator(loaded(sample_recording), Arguments(), pool, ahead=1)
+        yield Generator(loaded(sample_recording), REPORT, 0, pool)
 
 
 def test_validation_is_a_fifth_in_stretches_of_two_seconds_over_the_whole_recording():
     everything = observations(np.zeros(2800), [recording(1400), recording(1400, "other", first=7e6)])
-    train, validation = split(everything, seed=3)
+    train, validation = split(everything, REPORT, seed=3)
     assert sorted([*train, *validation]) == list(range(2800))
     assert len(validation) / 2800 == pytest.approx(0.2, abs=0.02)
     for part in np.split(everything.time[validation], np.flatnonzero(np.diff(validation) > 1) + 1):
@@ -77,14 +83,14 @@ def test_copies_of_a_frame_are_all_on_one_side():
     copies = np.tile(np.arange(700, dtype=np.uint64), 3)  # the same folder under three names
     everything = observations(np.zeros(2100), [recording(700, str(i), first=7e6 * i) for i in range(3)], copies)
     for seed in range(5):
-        train, validation = split(everything, seed)
+        train, validation = split(everything, REPORT, seed)
         assert len(validation)
         assert not set(copies[train]) & set(copies[validation])
 
 
 def test_resampling_has_the_recipes_shares():
     steering = np.repeat([0.0, 0.019, -0.02, 0.2, 0.21, -0.5, 0.51, 1], 10000)
-    got = observations(steering).resample(seed=1, repeats=4).steering
+    got = balance(observations(steering), REPORT, seed=1).steering
     straight = (np.abs(got) < 0.0195).sum()
     assert straight / 20000 == pytest.approx(0.8, abs=0.01)
     for once in (-0.02, 0.2, 0.51, 1):
@@ -100,7 +106,8 @@ def test_resampling_has_the_recipes_shares():
 @pytest.mark.parametrize("repeats", [1, 4, 9])
 def test_problem_areas_are_repeated(repeats):
     names = ["lake", "bridge-repetitive", "data-corrections"]
-    got = observations(np.full(30, 0.1), [recording(10, name) for name in names]).resample(0, repeats)
+    everything = observations(np.full(30, 0.1), [recording(10, name) for name in names])
+    got = balance(everything, replace(REPORT, repeats=repeats), 0)
     assert np.bincount(got.recording).tolist() == [10, 10 * repeats, 10 * repeats]
 
 
@@ -110,7 +117,7 @@ def test_the_command_line_says_how_often_problem_areas_count(sample_recording, t
 
     def rows(*options):
         arguments = ["--throttle-threshold", "0", "--output", str(tmp_path / "model.pt"), *options]
-        return len(model.prepare(*model.parse([str(folder), *arguments]))[1])
+        return len(model.prepare(parse([str(folder), *arguments], REPORT, ROBUST)).training)
 
     once = rows("--repeats", "1")
     assert rows("--repeats", "3") == 3 * once
@@ -122,7 +129,7 @@ def test_brightness_is_opencvs_hsv_value_clipped_and_never_wrapped(factor):
     image = np.random.default_rng(0).integers(0, 256, (75, 320, 3), np.uint8)
     image[:20] = 250  # would wrap
     value = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)[..., 2].astype(float)
-    changed, one = brighten(np.stack([image, image]), np.array([factor, 1]))
+    changed, one = brighten(np.stack([image, image]), 0, np.array([factor, 1]))
     got = cv2.cvtColor(changed, cv2.COLOR_RGB2HSV)[..., 2]
     assert np.abs(got - np.minimum(value * factor, 255)).max() <= 1
     exact = image * np.minimum(factor, 255 / np.maximum(image.max(-1, keepdims=True), 1))  # same hue and saturation
@@ -131,7 +138,7 @@ def test_brightness_is_opencvs_hsv_value_clipped_and_never_wrapped(factor):
 
 
 def one_shaded(image, line, left, factor, first_row=0):
-    return shade(image[None], np.array([line]), np.array([left]), np.array([factor]), first_row)[0]
+    return shade(image[None], first_row, np.array([factor]), np.array([line]), np.array([left]))[0]
 
 
 @pytest.mark.parametrize("left", [True, False])
@@ -157,15 +164,18 @@ def test_shadow_of_a_cropped_image_is_the_crop_of_the_shadowed_frame():
 def test_probabilities_and_ranges_over_many_batches(generator):
     draws = [generator.sample(number) for number in range(200)]
     n = 200 * 128
-    kinds = sum((d.places >= 0).sum(0) for d in draws) / n
+    kinds = sum((d.slots >= 0).sum(0) for d in draws) / n
     np.testing.assert_allclose(kinds, [1, 0.9, 1, 0.8], atol=0.01)
     np.testing.assert_allclose(np.bincount(np.concatenate([d.camera for d in draws])) / n, [1 / 3] * 3, atol=0.01)
-    for name, low, high in (("brightness", 0.4, 1.2), ("darkness", 0.2, 0.5), ("line", 0, 320)):
-        values = np.concatenate([getattr(d, name) for d in draws])
+    [brightness], [darkness, line, left] = (
+        [np.concatenate(v) for v in zip(*chosen, strict=True)]
+        for chosen in ([d.augmenting[kind] for d in draws] for kind in (2, 3))
+    )
+    for values, low, high in ((brightness, 0.4, 1.2), (darkness, 0.2, 0.5), (line, 0, 320)):
         assert low <= values.min() and values.max() <= high
         assert values.mean() == pytest.approx((low + high) / 2, rel=0.01)
         assert values.std() == pytest.approx((high - low) / 12**0.5, rel=0.02)
-    assert np.concatenate([d.left for d in draws]).mean() == pytest.approx(0.5, abs=0.01)
+    assert left.mean() == pytest.approx(0.5, abs=0.01)
     assert np.mean([d.keep.mean() for d in draws]) == pytest.approx(0.5, abs=0.001)
     assert np.mean([len(d.keep) for d in draws]) == pytest.approx(473.6, rel=0.005)  # the original log's batches
 
@@ -180,7 +190,7 @@ def test_a_pass_takes_every_observation_once_and_the_next_one_in_another_order(g
 
 def test_images_and_angles_of_an_observation(generator):
     choices, everything = generator.sample(5), generator.observations
-    batch = next(generator.batches(5))
+    batch = generator.start_batch(5)()
     assert (batch.images.shape[1:], batch.images.dtype) == ((75, 320, 3), np.uint8)
     for i in range(0, 128, 9):
         at, camera = choices.observation[i], choices.camera[i]
@@ -188,14 +198,15 @@ def test_images_and_angles_of_an_observation(generator):
         assert Path(everything.path(at, camera)).name.startswith(name)
         jpeg = cv2.imread(str(everything.path(at, camera)))[60:135, :, ::-1]
         angle = everything.steering[at] + {"center": 0, "left": 0.2, "right": -0.2}[name]
-        places = choices.places[i]
-        np.testing.assert_array_equal(batch.images[places[0]], jpeg)
+        slots = choices.slots[i]
+        np.testing.assert_array_equal(batch.images[slots[0]], jpeg)
         np.testing.assert_allclose(
-            batch.labels[places[places >= 0]], np.array([angle, -angle, angle, angle])[places >= 0], rtol=1e-6
+            batch.labels[slots[slots >= 0]], np.array([angle, -angle, angle, angle])[slots >= 0], rtol=1e-6
         )
-        if places[1] >= 0:
-            np.testing.assert_array_equal(cv2.flip(batch.images[places[1]], 1), jpeg)  # twice is the identity
-        np.testing.assert_array_equal(batch.images[places[2]], brighten(jpeg[None], choices.brightness[i : i + 1])[0])
+        if slots[1] >= 0:
+            np.testing.assert_array_equal(cv2.flip(batch.images[slots[1]], 1), jpeg)  # twice is the identity
+        brightness = choices.augmenting[2][0][i : i + 1]
+        np.testing.assert_array_equal(batch.images[slots[2]], brighten(jpeg[None], 60, brightness)[0])
 
 
 def test_the_benchmarks_batch_is_the_generators(generator):
@@ -207,39 +218,44 @@ def test_the_benchmarks_batch_is_the_generators(generator):
 
 
 def test_a_batch_depends_on_seed_and_number_alone(generator):
-    third = next(generator.batches(3))
-    batches = generator.batches(2)
-    next(batches)
-    again = next(batches)
+    third = generator.start_batch(3)()
+    resumed = Generator(generator.observations, REPORT, 0, generator.pool, ahead=2, first=2)
+    resumed.next_batch()
+    again = resumed.next_batch()
     np.testing.assert_array_equal(third.images, again.images)
     np.testing.assert_array_equal(third.keep, again.keep)
-    other = Generator(generator.observations, Arguments(seed=1), generator.pool, ahead=1)
+    other = Generator(generator.observations, REPORT, 1, generator.pool)
     assert not np.array_equal(other.sample(3).camera, generator.sample(3).camera)
 
 
-def test_without_dropout_a_batch_is_the_same_but_keeps_every_unit(generator, monkeypatch):
-    usual = next(generator.batches(3))
-    monkeypatch.setattr(type(generator.observations), "dropout", False)
-    batch = next(generator.batches(3))
+def test_without_dropout_a_batch_is_the_same_but_keeps_every_unit(generator):
+    usual = generator.start_batch(3)()
+    batch = Generator(generator.observations, replace(REPORT, dropout=False), 0, generator.pool).start_batch(3)()
     assert batch.keep is None and batch.total == usual.total
     np.testing.assert_array_equal(batch.images, usual.images)
-    network, pool = model.Network().eval(), generator.pool
-    errors = SquaredErrors(network, torch.float32, pool, "squared")(batch)
+    network, pool = Network().eval(), generator.pool
+    errors = SquaredErrors(network, torch.float32, pool)(batch)
     predicted = network(torch.from_numpy(batch.images)).detach().numpy()
     assert errors.item() == pytest.approx(float(((predicted - batch.labels) ** 2).sum()), rel=1e-4)
 
 
-def test_two_ranks_make_the_batch_that_one_process_makes(generator, monkeypatch):
-    whole = next(generator.batches(7))
-    monkeypatch.setattr(model, "world", lambda: 2)
-    shares = []
-    for number in (0, 1):
-        monkeypatch.setattr(model, "rank", lambda number=number: number)
-        shares.append(generator.start_batch(7)())
+def test_two_ranks_make_the_batch_that_one_process_makes(generator):
+    whole = generator.start_batch(7)()
+    of_ranks = [
+        Generator(generator.observations, REPORT, 0, generator.pool, ranks=Ranks(rank, world=2)) for rank in (0, 1)
+    ]
+    shares = [each.start_batch(7)() for each in of_ranks]
     assert [share.total for share in shares] == [whole.total] * 2
     for name in ("images", "labels", "keep"):
         both = np.concatenate([getattr(share, name) for share in shares])
         assert sorted(map(bytes, both)) == sorted(map(bytes, getattr(whole, name)))
+
+
+@pytest.mark.parametrize(("left_out", "kind"), [("flip", 1), ("shadow", 3)])
+def test_an_augmentation_of_no_share_is_not_made(generator, left_out, kind):
+    without = Generator(generator.observations, replace(REPORT, **{left_out: 0.0}), 0, generator.pool)
+    assert (generator.sample(0).slots >= 0).any(axis=0).all()
+    assert (without.sample(0).slots >= 0).any(axis=0).tolist() == [other != kind for other in range(4)]
 
 
 def test_what_goes_to_other_ranks_is_small(sample_recording):
@@ -254,5 +270,5 @@ def test_a_file_that_changes_during_the_run_is_named(tmp_path):
     everything = loaded(render_recording(tmp_path / "lake", rows=5))
     path = everything.path(2, 0)
     path.write_bytes(b"")
-    with pytest.raises(model.RecordingError, match=re.escape(str(path))):
+    with pytest.raises(RecordingError, match=re.escape(str(path))):
         everything.read(2, 0)

@@ -8,7 +8,7 @@ from commands import ROOT
 
 from cloning.network.network import Network
 from cloning.training.adam import Adam
-from cloning.training.muon import WEIGHT_DECAY, Muon, orthogonal
+from cloning.training.muon import Muon, orthogonal
 
 STEPS = """
 import sys, torch
@@ -99,8 +99,8 @@ def test_weights_move_as_with_torchs_muon_and_biases_as_with_adam():
     ours, torchs = (torch.nn.Sequential(torch.nn.Linear(40, 30), torch.nn.Linear(30, 1)) for _ in "ab")
     torchs.load_state_dict(ours.state_dict())
     begin = ours[0].weight.detach().clone()
-    optimizer = Muon(ours.parameters())
-    muon = torch.optim.Muon([torchs[0].weight], 1e-2, weight_decay=WEIGHT_DECAY, adjust_lr_fn="match_rms_adamw")
+    optimizer = Muon(ours.parameters(), weight_decay=1.0)
+    muon = torch.optim.Muon([torchs[0].weight], 1e-2, weight_decay=1.0, adjust_lr_fn="match_rms_adamw")
     adam = torch.optim.Adam([torchs[0].bias, *torchs[1].parameters()], 1e-2, fused=True)
     for seed in range(4):
         give_gradients((ours, torchs), seed)

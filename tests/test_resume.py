@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -16,9 +17,17 @@ from commands import HERE, ROOT, SHORT, finished_run, log, run_here, run_model, 
 from rendered import render_recording
 
 import model
+from model import REPORT
 
 # The same command, but it saves after every batch: kills then strike at every place of an epoch, and while writing.
-SAVING = [sys.executable, "-c", "import sys, model; model.SAVE_SECONDS = 0; sys.exit(model.main())"]
+SAVING_CODE = """
+import sys
+from dataclasses import replace
+import model
+command = model.options.parse(None, model.REPORT, model.ROBUST)
+sys.exit(model.execute(command._replace(process=replace(command.process, save_seconds=0.0))))
+"""
+SAVING = [sys.executable, "-c", SAVING_CODE]
 
 
 class Killed(BaseException):
@@ -55,7 +64,14 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, sample
     kills = 0
     while True:
         run = subprocess.Popen(
-            [*SAVING, str(sample_recording), *map(str, SHORT), "--output", str(output), "--resume"],
+            [
+                *SAVING,
+                str(sample_recording),
+                *map(str, SHORT),
+                "--output",
+                str(output),
+                "--resume",
+            ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             env={**os.environ, **HERE},
@@ -131,25 +147,52 @@ def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path)
     assert begun.returncode == 0, begun.stderr
     folder = tmp_path / "runs" / "a"
     with edited(folder / "model-resume.pt") as saved:
-        saved["arguments"]["device"] = "cuda"  # as if begun on another machine
+        assert not {"output", "device", "strict", "resume"} & saved["arguments"].keys()
     resumed = run_here("--resume", "--epochs", 2, "--device", "cpu", cwd=folder)
     assert resumed.returncode == 0, resumed.stderr
     assert not (folder / "runs").exists()
     assert same(weights(folder / "model.pt"), weights(finished[1] / "model.pt"))
     arguments = json.loads((folder / "training_arguments.json").read_text(encoding="utf-8"))
     assert (arguments["output"], arguments["device"], arguments["strict"]) == ("model.pt", "cpu", False)
-    assert arguments["batch_size"] == 8
+    assert arguments["recipe"]["batch_size"] == 8
+
+
+EARLIER = (
+    "epochs",
+    "batch_size",
+    "learning_rate",
+    "samples_per_epoch",
+    "throttle_threshold",
+    "side_correction",
+    "repeats",
+)
 
 
 def test_a_checkpoint_of_an_earlier_version_is_resumed(finished, begun):
-    """It has no identifier of its run, and may have an option that is gone."""
+    """Its arguments were flat, with those of the process and one that is gone; its run has no identifier."""
     for name in ("model", "model-best", "model-resume"):
         with edited(begun / f"{name}.pt") as saved:
-            del saved["run"]
-            saved["arguments"]["gone"] = 1
-    assert run_here("--output", begun / "model.pt", "--resume", "--epochs", 2).returncode == 0
+            del saved["run"], saved["layers"]
+            flat = {figure: saved["arguments"]["recipe"][figure] for figure in EARLIER}
+            process = {"output": "elsewhere.pt", "device": "cuda", "strict": True, "resume": False}
+            more = {"recordings": saved["arguments"]["recordings"], "seed": 0, "from_": "", "robust": False, "gone": 1}
+            saved["arguments"] = flat | process | more | {"optimizer": "adam", "loss": "squared"}
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2, "--device", "cpu")
+    assert done.returncode == 0, done.stderr
     assert same(weights(begun / "model.pt"), weights(finished[1] / "model.pt"))
     assert not list(begun.glob("*previous*"))
+
+
+def test_a_run_is_resumed_only_by_its_own_recipe(begun, sample_recording, capsys):
+    short = replace(REPORT, epochs=1, samples_per_epoch=150, batch_size=8)
+    for changed, words in (
+        (replace(short, flip=0.5), "--flip 0.9, not 0.5"),
+        (replace(short, order=lambda *_: None), "order is 'shuffle'"),
+    ):
+        assert model.train(changed, [sample_recording], begun / "model.pt", device="cpu", resume=True) == 2
+        assert words in capsys.readouterr().err
+    more = replace(short, epochs=2)
+    assert model.train(more, [sample_recording], begun / "model.pt", device="cpu", resume=True) == 0
 
 
 def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording):
@@ -307,7 +350,7 @@ def set_average(name, value):
     return lambda saved: saved["training"]["optimizer"]["state"][3].__setitem__(name, value)
 
 
-def set_place(name, value):
+def set_position(name, value):
     return lambda saved: saved["training"].__setitem__(name, value)
 
 
@@ -318,14 +361,14 @@ def set_place(name, value):
         (set_average("exp_avg_sq", torch.zeros(35)), "exp_avg_sq is a tensor (35,)"),
         (set_average("step", 3.0), "step is 3.0"),
         (set_average("more", 3.0), "unknown: 'more'"),
-        (set_place("optimizer", [1]), "optimizer's state"),
-        (set_place("optimizer", {"state": {}}), "optimizer's state"),
-        (set_place("number", 1.5), "number is 1.5"),
-        (set_place("number", -1), "number is -1"),
-        (set_place("images", "4"), "images is '4'"),
-        (set_place("loss", None), "loss is None"),
-        (set_place("seconds", torch.zeros(2)), "seconds is a tensor"),
-        (set_place("fingerprint", torch.zeros(2)), "other recordings"),
+        (set_position("optimizer", [1]), "optimizer's state"),
+        (set_position("optimizer", {"state": {}}), "optimizer's state"),
+        (set_position("number", 1.5), "number is 1.5"),
+        (set_position("number", -1), "number is -1"),
+        (set_position("images", "4"), "images is '4'"),
+        (set_position("loss", None), "loss is None"),
+        (set_position("seconds", torch.zeros(2)), "seconds is a tensor"),
+        (set_position("fingerprint", torch.zeros(2)), "other recordings"),
         (lambda saved: saved.update(training=3), "no state"),
         (lambda saved: saved.update(history={"epoch": 1}), "history"),
         (lambda saved: saved.update(history=[1]), "history"),
@@ -333,10 +376,15 @@ def set_place(name, value):
         (lambda saved: saved["history"][0].pop("images"), "history"),
         (lambda saved: saved.update(run=[1]), "identifier"),
         (lambda saved: saved.update(arguments=None), "no arguments"),
-        (lambda saved: saved["arguments"].update(batch_size="8"), "--batch-size is of type str"),
+        (lambda saved: saved["arguments"]["recipe"].update(batch_size="8"), "--batch-size is of type str"),
         (lambda saved: saved["arguments"].update(recordings=[1]), "--recordings is of type list"),
-        (lambda saved: saved["arguments"].update(optimizer="sgd"), "optimizer is 'sgd', not adam or muon"),
-        (lambda saved: saved["arguments"].update(loss="cubed"), "loss is 'cubed', not squared or huber"),
+        (lambda saved: saved["arguments"]["recipe"].update(optimizer="sgd"), "optimizer is 'sgd', not adam or muon"),
+        (lambda saved: saved["arguments"]["recipe"].update(huber="0.1"), "huber is of type str"),
+        (lambda saved: saved["arguments"]["recipe"].update(turn=(0.2,)), "turn is (0.2,), not 2 numbers"),
+        (lambda saved: saved["arguments"]["recipe"].update(views="Others"), "views is 'Others', not CameraViews"),
+        (lambda saved: saved["arguments"]["recipe"].update(name="mine"), "recipe is 'mine', not report or robust"),
+        (lambda saved: saved["arguments"].pop("recipe") and saved["arguments"].update(loss="cubed"), "loss is 'cubed'"),
+        (lambda saved: saved.update(layers="other"), "layers are 'other', not nvidia"),
         (lambda saved: saved["recipe"].update(crop=(61, 24)), "recipe"),
         (lambda saved: saved["recipe"].update(scale=0), "scale 0"),
         (lambda saved: saved["network"].update({"dense.3.bias": torch.full((1,), torch.inf)}), "not finite"),

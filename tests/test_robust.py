@@ -1,9 +1,9 @@
 """Recovery steering against geometry, warped frames against a rendered plane, and `model.py --robust`."""
 
-import itertools
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,15 +17,21 @@ import model
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
-from cloning.network.network import CROP, Network
+from cloning.network.network import CROP, SEEN_SHAPE, Network
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
 from cloning.road.warp import ground_mask, with_alpha
-from cloning.training import light, robust
+from cloning.training import lanes as lanes_module
+from cloning.training import light
 from cloning.training.adam import Adam
-from cloning.training.observations import SEEN_SHAPE
-from cloning.training.robust import Lanes, Poses, RobustObservations
+from cloning.training.checkpoint import Progress
+from cloning.training.distributed import Ranks
+from cloning.training.lanes import Lanes, Poses
+from cloning.training.observations import Observations
+from cloning.training.options import parse
+from cloning.training.robust import PoseViews, sample_bends_more, select_known_lane
+from model import REPORT, ROBUST
 
 N, SPEED = 300, 20.0  # rows; mph
 
@@ -49,7 +55,7 @@ def recording(steering, pause_after=None):
 
 def lanes(monkeypatch, steering=0.0, offset=0.0, **more) -> Lanes:
     reading = LanePosition(np.full(N, offset), np.zeros(N), np.ones(N, bool))
-    monkeypatch.setattr(robust, "lane_position", lambda *_: reading)
+    monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
     return Lanes.of(recording(steering, **more))
 
 
@@ -106,7 +112,7 @@ def test_the_lane_is_as_far_from_the_human_as_was_estimated(monkeypatch, bend, o
 
 def test_where_most_is_not_trusted_the_humans_path_is_the_lane(monkeypatch):
     reading = LanePosition(np.ones(N), np.ones(N), np.arange(N) % 2 == 0)
-    monkeypatch.setattr(robust, "lane_position", lambda *_: reading)
+    monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
     found = Lanes.of(recording(0.2))
     assert not found.offset.any()
     assert found.steering(found.offset, found.yaw)[found.known] == pytest.approx(0.2, abs=1e-3)
@@ -174,7 +180,7 @@ def test_a_view_shows_what_the_camera_would_see_there(monkeypatch, mirrored, rig
 
 def test_sampled_poses_are_on_both_sides_and_of_every_camera(monkeypatch):
     found = lanes(monkeypatch).take(np.full(4000, 100))
-    poses = found.sample_poses(np.random.default_rng(0), np.zeros(4000, bool))
+    poses = found.sample_poses(ROBUST, np.random.default_rng(0), np.zeros(4000, bool))
     assert np.bincount(poses.camera, minlength=3).min() > 1100
     assert abs(poses.steering.mean()) < 0.002
     for camera in range(3):  # the camera does not tell the side
@@ -191,7 +197,7 @@ def test_sampled_poses_are_near_the_lane_and_near_the_recorded_car(monkeypatch, 
         return of(lanes, offset, yaw, *more)
 
     monkeypatch.setattr(Poses, "of", note)
-    found.sample_poses(np.random.default_rng(0), np.zeros(2000, bool))
+    found.sample_poses(ROBUST, np.random.default_rng(0), np.zeros(2000, bool))
     offset, yaw = sampled
     least, most = max(-2.0, human - 2.4), min(2.0, human + 2.4)  # m from the lane's centre and from the recorded car
     assert abs(offset.min() - least) < 0.1 and abs(offset.max() - most) < 0.1
@@ -203,12 +209,12 @@ def test_sampled_poses_are_near_the_lane_and_near_the_recorded_car(monkeypatch, 
 # --------------------------------------------------------------------------------------------------
 # The command
 
-ROBUST = ("--robust", *SHORT)
+OPTIONS = ("--robust", *SHORT)
 
 
 @pytest.fixture(scope="module")
 def finished(sample_recording, tmp_path_factory):
-    return finished_run(sample_recording, tmp_path_factory.mktemp("robust"), *ROBUST)
+    return finished_run(sample_recording, tmp_path_factory.mktemp("robust"), *OPTIONS)
 
 
 def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording):
@@ -222,8 +228,9 @@ def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording)
     for name in ("training_generator_LRC_0.png", "training_generator_augmented-0.png"):
         assert (folder / "diagnostic_images" / name).exists()
     arguments = torch.load(folder / "model.pt", weights_only=True)["arguments"]
-    assert arguments["robust"]
-    assert (arguments["batch_size"], arguments["learning_rate"]) == (8, 4e-3)  # as given, and as --robust sets it
+    recipe = arguments["recipe"]
+    assert recipe["name"] == "robust"
+    assert (recipe["batch_size"], recipe["learning_rate"]) == (8, 4e-3)  # as given, and as --robust sets it
 
 
 def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_recording, tmp_path):
@@ -231,7 +238,7 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_r
         sys.executable,
         str(ROOT / "model.py"),
         str(sample_recording),
-        *map(str, ROBUST),
+        *map(str, OPTIONS),
         "--output",
         tmp_path / "model.pt",
     ]
@@ -248,47 +255,46 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_r
 def test_a_robust_run_of_an_earlier_version_goes_on_as_it_began(finished, tmp_path):
     shutil.copytree(finished[1], tmp_path, dirs_exist_ok=True)
     saved = torch.load(tmp_path / "model-resume.pt", weights_only=True)
-    del saved["arguments"]["optimizer"], saved["arguments"]["loss"], saved["digest"]
+    figures = ("epochs", "batch_size", "learning_rate", "samples_per_epoch", "repeats")
+    flat = {name: saved["arguments"]["recipe"][name] for name in figures}
+    saved["arguments"] = {"recordings": saved["arguments"]["recordings"], "seed": 0, "robust": True, **flat}
     optimizer = Adam(Network().parameters())
     saved["training"]["optimizer"]["state"] = {number: optimizer.zeros(number) for number in range(18)}
+    del saved["digest"]
     torch.save(saved, tmp_path / "model-resume.pt")
     done = run_here("--output", tmp_path / "model.pt", "--resume", "--epochs", 3)
     assert done.returncode == 0, done.stderr
     after = torch.load(tmp_path / "model-resume.pt", weights_only=True)
-    assert (after["arguments"]["optimizer"], after["arguments"]["loss"]) == ("adam", "squared")
+    recipe = after["arguments"]["recipe"]
+    assert [recipe[name] for name in ("name", "optimizer", "momentum", "huber")] == ["robust", "adam", 0.9, None]
     assert all("exp_avg_sq" in state for state in after["training"]["optimizer"]["state"].values())
 
 
-@pytest.mark.parametrize("options, begins", [([], 1e-4), (["--robust"], 4e-3)])
+@pytest.mark.parametrize("recipe, begins", [(REPORT, 1e-4), (ROBUST, 4e-3)], ids=["report", "robust"])
 def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
-    sample_recording, tmp_path, monkeypatch, options, begins
+    sample_recording, tmp_path, monkeypatch, recipe, begins
 ):
-    rates, steps = [], []  # rates of the steps; (finished epochs, images of this epoch after the step, its rate)
+    rates, done = [], []  # of the steps; the share of the run that is finished before each
+    step, share = Adam.step, Progress.done
 
-    def note(run, *models):
-        if not models:
-            steps.append((len(run.progress.history), run.progress.images, rates[-1]))
+    def note(progress, recipe):
+        done.append(share(progress, recipe))
+        return done[-1]
 
-    step = Adam.step
     monkeypatch.setattr(Adam, "step", lambda optimizer, rate: rates.append(rate) or step(optimizer, rate))
-    monkeypatch.setattr(model, "SAVE_SECONDS", -1)
-    monkeypatch.setattr(model.TrainingRun, "save", note)
-    monkeypatch.setattr(model.TrainingRun, "summary", lambda run: "")  # of model files that are not written
-    done = run_here(sample_recording, *SHORT, *options, "--output", tmp_path / "model.pt")
-    assert done.returncode == 0, done.stderr
-    assert len(steps) > 8
-    shares = [  # of the run that was done before each step
-        (now[0] + (before[1] if now[0] == before[0] else 0) / 150) / 2
-        for before, now in itertools.pairwise([(0, 0, 0), *steps])
-    ]
-    expected = begins * (1 + np.cos(np.pi * np.array(shares))) / 2 if options else np.full(len(steps), begins)
-    np.testing.assert_allclose([rate for *_, rate in steps], expected, rtol=1e-9)
-    assert shares[0] == 0 and shares[-1] > 0.8
+    monkeypatch.setattr(Progress, "done", note)
+    short = replace(recipe, epochs=2, samples_per_epoch=150, batch_size=8)
+    assert model.train(short, [sample_recording], tmp_path / "model.pt", device="cpu") == 0
+    expected = begins * (1 + np.cos(np.pi * np.array(done))) / 2 if recipe is ROBUST else np.full(len(done), begins)
+    np.testing.assert_allclose(rates, expected, rtol=1e-9)
+    assert len(rates) > 8 and done[0] == 0 and 0.8 < done[-1] < 1
+    assert np.diff(done).min() > 0 and np.median(np.diff(done)) == pytest.approx(29 / 300, rel=0.2)  # of images
 
 
 def test_validation_counts_centre_images_and_other_poses_alike(sample_recording, tmp_path):
-    arguments = model.parse([str(sample_recording), *map(str, ROBUST), "--output", str(tmp_path / "model.pt")])
-    run = model.TrainingRun(*model.prepare(*arguments)[:3])
+    command = [str(sample_recording), *map(str, OPTIONS), "--output", str(tmp_path / "model.pt")]
+    asked = parse(command, REPORT, ROBUST)
+    run = model.TrainingRun(model.prepare(asked), asked.process, Ranks())
     with run.pool:
         both, _ = run.validate()
         (center, labels), (warped, other_labels) = run.validation_sets
@@ -305,7 +311,7 @@ def test_a_missing_lane_network_is_named(sample_recording, tmp_path):
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, tmp_path / name)
     (tmp_path / "cloning" / "lane" / "lane.pt").unlink()
-    done = run_model(sample_recording, *ROBUST, command=[sys.executable, "model.py"], cwd=tmp_path)
+    done = run_model(sample_recording, *OPTIONS, command=[sys.executable, "model.py"], cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("model.py: ") and "lane.pt: no such file" in done.stderr
     assert "Traceback" not in done.stderr
@@ -319,17 +325,17 @@ def test_the_reports_options_do_not_go_with_robust(sample_recording, tmp_path):
 
 
 def test_drives_too_short_are_named(tmp_path):
-    done = run_here(render_recording(tmp_path / "short", rows=20), *ROBUST, "--output", tmp_path / "model.pt")
+    done = run_here(render_recording(tmp_path / "short", rows=20), *OPTIONS, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
     assert "too short" in done.stderr
 
 
 def test_tints_keep_grey_nearly_grey():
     grey, red = (np.float32([100, 100, 100]), np.float32([200, 50, 50]))
-    colours = light.tints(np.random.default_rng(0), 2000)
+    colours = light.tints(ROBUST, np.random.default_rng(0), 2000)
     assert colours.shape == (2000, 3, 3) and colours.dtype == np.float32
     plain = (colours == np.eye(3)).all((1, 2))
-    assert plain.mean() == pytest.approx(1 - light.TINTED_SHARE, abs=0.03)
+    assert plain.mean() == pytest.approx(1 - ROBUST.tinted, abs=0.03)
     made = (colours @ grey)[~plain]
     assert made.min() >= 100 * 0.5 * 0.85 - 0.1 and made.max() <= 100 * 1.15 * 1.15 + 0.1
     brightness = made.mean(1, keepdims=True)
@@ -340,8 +346,8 @@ def test_tints_keep_grey_nearly_grey():
 
 
 def test_shadows_darken_parts_of_some_images():
-    shades = light.sample_shades(np.random.default_rng(0), 3000)
-    assert (shades >= 0).mean() == pytest.approx(light.SHADED_SHARE, abs=0.03)
+    shades = light.sample_shades(ROBUST.shaded, np.random.default_rng(0), 3000)
+    assert (shades >= 0).mean() == pytest.approx(ROBUST.shaded, abs=0.03)
     assert shades.min() == -1 and shades.max() == light.SHADES - 1
     image = np.full(SEEN_SHAPE, 200, np.uint8)
     same = np.eye(3, dtype=np.float32)
@@ -356,7 +362,7 @@ def test_shadows_darken_parts_of_some_images():
 
 def test_a_pose_with_a_shadow_is_seen_in_it(monkeypatch):
     many = lanes(monkeypatch, 0.05, offset=0.4).take(np.full(200, 100))
-    poses = many.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
+    poses = many.sample_poses(ROBUST, np.random.default_rng(0), np.zeros(200, bool))
     grey = np.full((90, 320, 4), 150, np.uint8)
     views = np.stack([poses.view(at, lambda camera, earlier: grey) for at in range(200)])
     shaded = np.ptp(views, axis=(1, 2)).max(1) > 20  # of 150 in each colour
@@ -370,21 +376,24 @@ def test_problem_areas_are_sampled_so_many_times_as_often(monkeypatch, repeats):
         rows = np.arange(50)
         known = lanes(monkeypatch, 0.05).take(rows + 50)
         recording = SimpleNamespace(folder=Path(folder))
-        return RobustObservations([recording], np.zeros(50, np.int16), rows, rows * 0.0, rows, rows * 1.0, known)
+        return Observations([recording], np.zeros(50, np.int16), rows, rows * 0.0, rows, rows * 1.0, known)
 
-    both = RobustObservations.joined([part("plain"), part("bend-repetitive")])
-    chosen = np.concatenate([both.shuffle(np.random.default_rng(seed), repeats) for seed in range(100)])
+    both, recipe = (
+        Observations.of_recordings([part("plain"), part("bend-repetitive")]),
+        replace(ROBUST, repeats=repeats),
+    )
+    chosen = np.concatenate([sample_bends_more(both, recipe, np.random.default_rng(seed)) for seed in range(100)])
     assert (chosen >= 50).mean() == pytest.approx(repeats / (repeats + 1), abs=0.02)
 
 
 def test_rows_in_bends_are_sampled_more_often(monkeypatch):
     many = lanes(monkeypatch, 0.4)
     straight, bent = Lanes.unknown(3), many.take(np.array([100]))
-    weights = Lanes.joined([straight, bent]).weights()
+    weights = Lanes.joined([straight, bent]).weights(0.2)
     steering = abs(float(bent.steering(np.zeros(1), np.zeros(1))[0]))
     assert steering > 0.2
     assert weights.sum() == pytest.approx(1)
-    assert weights[3] / weights[0] == pytest.approx((robust.STRAIGHT_WEIGHT + steering) / robust.STRAIGHT_WEIGHT)
+    assert weights[3] / weights[0] == pytest.approx((0.2 + steering) / 0.2)
 
 
 def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monkeypatch):
@@ -393,13 +402,13 @@ def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monk
     n, drive = len(both), recording(0.4)
     rows = np.full(n, 100, np.int32)
     labels = both.steering(both.offset, both.yaw)
-    everything = RobustObservations([drive], np.zeros(n, int), rows, labels, np.arange(n, dtype=np.uint64), rows, both)
-    turn = everything.shuffle(np.random.default_rng(0), repeats=4)
+    everything = Observations([drive], np.zeros(n, int), rows, labels, np.arange(n, dtype=np.uint64), rows, both)
+    turn = sample_bends_more(everything, ROBUST, np.random.default_rng(0))
     assert len(turn) == n
-    expected = both.weights()[2000:].sum()  # of the rows in a bend
+    expected = both.weights(ROBUST.straight_weight)[2000:].sum()  # of the rows in a bend
     assert expected > 0.6
     assert (turn >= 2000).mean() == pytest.approx(expected, abs=0.03)
-    views = everything.sample_views(turn, np.zeros(n, int), 0.2, np.random.default_rng(1))
+    views = PoseViews(everything, turn, np.zeros(n, int), ROBUST, np.random.default_rng(1))
     for poses in views.poses:
         assert poses.mirrored.mean() == pytest.approx(0.5, abs=0.03)
 
@@ -407,9 +416,22 @@ def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monk
 def test_the_label_is_the_recovery_steering_and_not_the_drivers(monkeypatch):
     """Rows whose lane is 1 m to the left of a car that a human drives straight on."""
     reading = LanePosition(np.full(N, 1.0), np.zeros(N), np.ones(N, bool))
-    monkeypatch.setattr(robust, "lane_position", lambda *_: reading)
-    monkeypatch.setattr(robust, "center_digests", lambda _, rows: np.zeros(len(rows), np.uint64))
-    selected = RobustObservations.select(recording(0.0), model.Arguments(robust=True))
+    monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
+    checked = replace(recording(0.0), digests=np.zeros(1, np.uint64))
+    selected = select_known_lane(checked, ROBUST)
     assert (selected.steering < -0.1).all()
     assert selected.steering == pytest.approx(selected.lanes.steering(1.0, 0.0), abs=1e-4)
     assert 0.5 * N < len(selected) < N
+
+
+def test_a_recipe_of_shifts_neither_turns_the_car_nor_changes_the_light():
+    lanes, mirrored = Lanes.unknown(200), np.zeros(200, bool)
+    unlit = replace(ROBUST, tinted=0.0, shaded=0.0)
+    turned, shifted = (
+        lanes.sample_poses(recipe, np.random.default_rng(0), mirrored)
+        for recipe in (unlit, replace(unlit, pose_yaw=0.0))
+    )
+    assert (turned.colours == np.eye(3)).all() and (turned.shade == -1).all()
+    assert not np.allclose(turned.steering, shifted.steering)
+    offsets = np.random.default_rng(0).triangular(-2, 0, 2, 200)
+    assert np.allclose(shifted.steering, lanes.steering(offsets, np.zeros(200)))

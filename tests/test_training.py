@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import fields, replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -22,8 +23,16 @@ import model
 from cloning.base.errors import RecordingError
 from cloning.training import options, pictures, summary
 from cloning.training.checkpoint import Progress
-from cloning.training.distributed import FirstRankFailed
-from cloning.training.robust import Lanes, Poses
+from cloning.training.distributed import FirstRankFailed, Ranks
+from cloning.training.lanes import Lanes, Poses
+from cloning.training.options import FIGURES, Process, Run, build_parser
+from cloning.training.recipe import Recipe, option_name
+from cloning.training.stop import status_of
+from model import REPORT, ROBUST
+
+
+def parse(argv):
+    return options.parse(argv, REPORT, ROBUST)
 
 
 def test_what_a_run_prints(finished, sample_recording):
@@ -44,7 +53,7 @@ def test_a_run_tells_once_how_long_it_will_take_and_then_what_is_left(monkeypatc
     """A batch of 100 images a second, 3 epochs of 3,000 images: 90 seconds in all."""
     now = 1000.0
     monkeypatch.setattr(summary, "time", Mock(monotonic=lambda: now))
-    pace, progress = summary.Pace(options.Arguments(epochs=3, samples_per_epoch=3000)), Progress()
+    pace, progress = summary.Pace(replace(REPORT, epochs=3, samples_per_epoch=3000)), Progress()
     shown = []
     for _ in range(31):
         now, progress.images, progress.loss = now + 1, progress.images + 100, progress.loss + 10
@@ -60,7 +69,7 @@ def test_a_run_tells_once_how_long_it_will_take_and_then_what_is_left(monkeypatc
 
 def test_a_resumed_run_tells_how_long_its_rest_will_take(monkeypatch, capsys):
     monkeypatch.setattr(summary, "time", Mock(monotonic=Mock(side_effect=map(float, range(100)))))
-    pace, progress = summary.Pace(options.Arguments(epochs=1, samples_per_epoch=10_000)), Progress(images=7000)
+    pace, progress = summary.Pace(replace(REPORT, epochs=1, samples_per_epoch=10_000)), Progress(images=7000)
     for _ in range(12):
         progress.images += 100
         pace.after_batch(100, progress)
@@ -69,13 +78,15 @@ def test_a_resumed_run_tells_how_long_its_rest_will_take(monkeypatch, capsys):
 
 def test_an_error_above_that_of_constant_steering_is_explained():
     labels = np.array([0.0] * 9 + [0.5], np.float32)
-    follows, mean = labels + np.float32(0.3), 0.05
-    text = summary.error_table(labels, mean, {"model.pt": follows}, (0, 1), "driver")
-    assert "model.pt has a larger error than steer 0, because on straights" in text and "nan" not in text
-    text = summary.error_table(labels, mean, {"model.pt": labels}, (0, 1), "driver")
-    assert "larger error" not in text and "hardly follows" not in text
-    text = summary.error_table(labels, mean, {"model.pt": np.zeros_like(labels)}, (0, 1), "driver")
-    assert "model.pt hardly follows the driver" in text
+
+    def text(guess):
+        return summary.error_table(labels, 0.05, {Path("runs", "net.pt"): guess}, REPORT)
+
+    larger = text(labels + np.float32(0.3))
+    assert "net.pt has a larger error than steer 0, because on straights" in larger and "nan" not in larger
+    assert larger.endswith(f"replay RECORDING --model {Path('runs', 'net.pt')}")
+    assert "larger error" not in text(labels) and "hardly follows" not in text(labels)
+    assert "net.pt hardly follows the driver" in text(np.zeros_like(labels))
 
 
 def test_the_line_of_a_diagnostic_picture_stays_within_its_image():
@@ -125,7 +136,7 @@ def test_what_a_run_leaves(finished):
     rows = log(folder)
     assert [row["epoch"] for row in rows] == ["1", "2"]
     assert all(int(row["images"]) >= 150 and float(row["loss"]) > 0 < float(row["val_loss"]) for row in rows)
-    assert json.loads((folder / "training_arguments.json").read_text(encoding="utf-8"))["batch_size"] == 8
+    assert json.loads((folder / "training_arguments.json").read_text(encoding="utf-8"))["recipe"]["batch_size"] == 8
     saved = torch.load(folder / "model.pt", weights_only=True)
     assert [row["epoch"] for row in saved["history"]] == [1, 2]
     best = min(rows, key=lambda row: float(row["val_loss"]))
@@ -146,9 +157,9 @@ def test_training_learns(sample_recording, tmp_path):
 
 
 def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_recording, tmp_path):
-    arguments, training, validation, _ = model.prepare(
-        *model.parse([str(sample_recording), "--output", str(tmp_path / "m.pt")])
-    )
+    command = parse([str(sample_recording), "--output", str(tmp_path / "m.pt")])
+    prepared = model.prepare(command)
+    _, training, validation, _ = prepared
     rows = np.loadtxt(sample_recording / "driving_log.csv", delimiter=",", usecols=(3, 4))
     assert not set(training.frame) & set(validation.frame)
     used, driven = {*training.row, *validation.row}, set(np.flatnonzero(rows[:, 1]))  # throttle is 0 in the others
@@ -157,7 +168,7 @@ def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_rec
     times = np.bincount(training.row, minlength=len(rows))[training.row]
     size = np.abs(rows[training.row, 0])
     assert set(times[(size > 0.2) & (size <= 0.5)]) == {2} and set(times[size < 0.2]) == {1}
-    run = model.TrainingRun(arguments, training, validation)
+    run = model.TrainingRun(prepared, command.process, Ranks())
     run.pool.shutdown()
     assert run.generator.observations is training and run.validation is validation
 
@@ -249,7 +260,7 @@ def test_a_folder_is_not_taken_for_the_model_file(sample_recording, tmp_path, ou
 
 
 def test_recordings_may_follow_options():
-    assert options.parse(["a", "--epochs", "3", "b"])[0].recordings == ["a", "b"]
+    assert parse(["a", "--epochs", "3", "b"]).run.recordings == ("a", "b")
 
 
 def test_the_first_epoch_is_the_best_so_far_even_if_it_diverged():
@@ -294,12 +305,22 @@ def test_default_is_every_recording_under_data(tmp_path):
 
 
 def test_a_given_value_counts_as_given_also_when_it_is_the_default():
-    assert model.parse(["--resume", "--epochs", "10"]) == (
-        model.Arguments(resume=True, epochs=10),
-        {"resume", "epochs"},
-    )
-    assert model.parse([]) == (model.Arguments(), set())
-    assert model.parse(["data"]) == (model.Arguments(), {"recordings"})
+    resumed = parse(["--resume", "--epochs", "10"])
+    assert (resumed.run, resumed.process) == (Run(REPORT), Process(resume=True))
+    assert resumed.given == {"resume", "epochs"}
+    assert parse([]).run == Run(REPORT) and not parse([]).given
+    assert parse(["data"]).given == {"recordings"}
+
+
+def test_options_are_fields_of_the_recipe_the_run_and_the_process():
+    """And the recipe of --robust is the report's but for what it names."""
+    actions = build_parser(REPORT, ROBUST)._actions
+    names = {field.name for each in (Recipe, Run, Process) for field in fields(each)}
+    assert {action.dest for action in actions} - {"help", "robust"} <= names
+    for name in FIGURES:
+        value = {"epochs": 3, "batch_size": 5, "samples_per_epoch": 7, "repeats": 2}.get(name, 0.5)
+        assert parse([option_name(name), str(value)]).run.recipe == replace(REPORT, **{name: value})
+    assert parse(["--robust", "--epochs", "1"]).run.recipe == replace(ROBUST, epochs=1)
 
 
 def test_importing_does_nothing(tmp_path):
@@ -376,11 +397,10 @@ def test_two_processes_print_once_and_the_losses_of_both(finished, two_processes
     assert len(logs[0]) == 4 and logs[1] == pytest.approx(logs[0], abs=2e-4)  # the global losses; bfloat16 rounds
 
 
-def test_a_rank_prints_the_error_that_it_alone_meets(monkeypatch, tmp_path):
+def test_a_rank_prints_the_error_that_it_alone_meets(tmp_path, capsys):
     """And not the one that rank 0 meets, which prints it."""
-    monkeypatch.setattr(model, "rank", lambda: 1)
     own = RecordingError("1.jpg: cut short")
     for error, printed in ((own, "model.py: 1.jpg: cut short\n"), (FirstRankFailed(), "")):
-        monkeypatch.setattr(model, "run", Mock(side_effect=error))
-        done = run_here("--output", tmp_path / "model.pt")
-        assert (done.returncode, done.stderr) == (2, printed)
+        ranks = Ranks(rank=1)
+        status = status_of(Mock(side_effect=error), Process(str(tmp_path / "model.pt")), ranks)
+        assert (status, capsys.readouterr().err) == (2, printed)

@@ -18,11 +18,6 @@ from cloning.training.muon import OPTIMIZERS
 from cloning.training.observations import Observations, ValidationSet, Views
 
 
-def always(recipe: "Recipe") -> float:
-    """Return 1, the share of an augmentation that every observation has."""
-    return 1.0
-
-
 def no_choices(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
     """Return the choices of an augmentation that has none."""
     return ()
@@ -41,7 +36,7 @@ class Augmentation(NamedTuple):
              not to be changed itself; first_row: the row of the full frame that is the images' first; choices: those of
              these k images
     choose   (recipe, rng, n) -> the random choices for n observations: arrays of n entries each
-    share    (recipe) -> the share of the observations that have such an image, 0..1
+    share    of the observations that have such an image, 0..1, or the name of the recipe's field that says it
     mirrors  whether it begins with the mirrored image, and the negative label
     caption  of the diagnostic picture: a format for the choices, such as "brightness x {:.2f}"
     """
@@ -49,7 +44,7 @@ class Augmentation(NamedTuple):
     name: str
     change: Callable[..., np.ndarray] = unchanged
     choose: Callable[["Recipe", np.random.Generator, int], tuple[np.ndarray, ...]] = no_choices
-    share: Callable[["Recipe"], float] = always
+    share: float | str = 1.0
     mirrors: bool = False
     caption: str = ""
 
@@ -166,6 +161,11 @@ class Recipe:
             elif type(found) is not type(own):
                 raise ValueError(f"its {option_name(name)} is of type {type(found).__name__}")
         return replace(self, **figures)
+
+    def shares(self) -> list[float]:
+        """Return the share of the observations that have an image of each augmentation, 0..1."""
+        found = [augmentation.share for augmentation in self.augmentations]
+        return [getattr(self, share) if isinstance(share, str) else share for share in found]
 
     def rate(self, done: float) -> float:
         """Return the learning rate of the next step; done: the finished share of the run, 0..1."""
