@@ -303,10 +303,12 @@ def test_a_given_value_counts_as_given_also_when_it_is_the_default():
 
 
 def test_importing_does_nothing(tmp_path):
-    done = run_model(
-        command=[sys.executable, "-c", "import model, cloning.recordings.log, cloning.network.network"],
+    done = subprocess.run(
+        [sys.executable, "-c", "import model, cloning.recordings.log, cloning.network.network"],
         cwd=tmp_path,
-        env=HERE,
+        env={**os.environ, **HERE},
+        capture_output=True,
+        text=True,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert not os.listdir(tmp_path)
