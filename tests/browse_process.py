@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import warm
 from commands import ROOT
 
 from cloning.browse.analyses import LANE, Analysis, Result, stamp, write_result
@@ -26,7 +27,8 @@ class Browse:
         """modules: a folder of modules that go before the installed ones."""
         command = [sys.executable, "-m", "cloning.browse", *map(str, arguments), "--port", "0"]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(modules), str(ROOT)])}
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+        start = warm.Popen if modules == ROOT else subprocess.Popen  # the warm process has loaded the installed ones
+        self.process = start(command, stdout=subprocess.PIPE, text=True, env=environment)
         self.said = self.process.stdout.readline()
         self.port = int(re.search(r"http://127.0.0.1:(\d+)/", self.said)[1])
         self.base = f"http://127.0.0.1:{self.port}/"

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import torch
+import warm
 
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
@@ -16,9 +17,9 @@ HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from 
 
 
 def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
-    """model.py, or another command, in a process of its own, with its output."""
+    """model.py, or another command of this Python, in a process of its own, with its output."""
     command = command or [sys.executable, str(ROOT / "model.py")]
-    return subprocess.run(
+    return warm.run(
         [*command, *map(str, arguments)],
         capture_output=True,
         text=True,

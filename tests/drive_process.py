@@ -9,6 +9,7 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
+import warm
 from commands import HERE, ROOT
 
 # What Ctrl-C sends; Windows sends it to a whole console, and Ctrl-Break to one process group.
@@ -19,7 +20,7 @@ class Process:
     """A drive.py process; first: Python code to run before it."""
 
     def __init__(self, *arguments, port=0, cwd=None, first=""):
-        self.process = subprocess.Popen(
+        self.process = warm.Popen(
             [*script("drive.py", first), *map(str, arguments), "--port", str(port)],
             cwd=cwd,
             env={**os.environ, **HERE},

@@ -1,28 +1,23 @@
-"""Commands in children of a warm process, which are killed, or find the disk full, at a chosen change to their files.
+"""Commands that are killed, or find the disk full, at a chosen change to their files.
 
-`python tests/kill_points.py` imports what the commands need, and then forks a child for each, which costs a tenth of
-what a new process would. Points are counted in the folders that are watched: before each file or folder is opened for
-writing, made, renamed, shortened or deleted, and halfway through each write. A kill is the system's own: SIGKILL.
+`python tests/kill_points.py REQUEST COMMAND` runs a command as `python COMMAND` does. Points are counted in the folders
+that are watched: before each file or folder is opened for writing, made, renamed, shortened or deleted, and halfway
+through each write. A kill is the system's own: SIGKILL.
 """
 
-import contextlib
 import errno
-import functools
-import gc
-import importlib
 import io
 import json
 import os
-import runpy
 import signal
-import subprocess
 import sys
 import threading
-import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+import warm
+from commands import HERE, ROOT
+
 CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate", "os.link", "os.symlink")
 OPEN = io.open
 
@@ -104,13 +99,8 @@ def end() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def child(request: dict) -> None:
-    """Run a command as `python NAME ARGUMENTS` does, and end with its exit status."""
-    os.chdir(request["cwd"])
-    os.environ.update(request["env"])
-    out = os.open(request["output"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    for number, to in ((0, os.open(os.devnull, os.O_RDONLY)), (1, out), (2, out)):
-        os.dup2(to, number)
+def main() -> None:
+    request = json.loads(sys.argv[1])
     if request["bytes"] is not None:
         import resource
 
@@ -120,56 +110,22 @@ def child(request: dict) -> None:
     points = Points(request["watch"], request["trace"], request["kill"], request["full"])
     sys.addaudithook(points.audit)
     io.open = sys.modules["builtins"].open = points.open
-    name, *sys.argv[1:] = request["command"]
-    status = 0
-    try:
-        if name.endswith(".py"):
-            sys.argv[0] = str(ROOT / name)
-            runpy.run_path(sys.argv[0], run_name="__main__")
-        else:
-            runpy.run_module(name, run_name="__main__", alter_sys=True)
-    except SystemExit as error:
-        if isinstance(error.code, str):
-            print(error.code, file=sys.stderr)
-        status = error.code if isinstance(error.code, int) else int(error.code is not None)
-    except BaseException:
-        traceback.print_exc()
-        status = 70
-    with contextlib.suppress(OSError):
-        sys.stdout.flush()
-    os._exit(status)
-
-
-def main() -> None:
-    """The warm process: each line on its standard input is a request, each line on its output an answer."""
-    sys.path[:0] = [str(ROOT)]
-    # Imported, never used here: a library that has started threads would not survive a fork.
-    for name in (
-        *("model", "video", "drive", "torch._dynamo", "av", "pandas", "matplotlib.backends.backend_agg"),
-        *("matplotlib.figure", "PIL.PngImagePlugin", "cloning.replay.command", "cloning.network.attention"),
-        *("simulator.record", "simulator.report", "simulator.client", "simulator.film", "simulator.run"),
-    ):
-        importlib.import_module(name)
-    from simulator import scenery
-
-    scenery.build = functools.cache(scenery.build)
-    scenery.build("lake", 0)
-    gc.freeze()  # the children then share more of their memory
-    for line in sys.stdin:
-        request = json.loads(line)
-        if "alive" in request:  # without reaping it: WNOWAIT
-            answer = os.waitid(os.P_PID, request["alive"], os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
-        elif "wait" in request:
-            answer = os.waitstatus_to_exitcode(os.waitpid(request["wait"], 0)[1])
-        else:
-            answer = os.fork()
-            if not answer:
-                child(request)
-        print(json.dumps(answer), flush=True)
+    warm.run_command(sys.argv[2:])
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # In the test
+
+# Costs a child a tenth of what its own imports and a scenery of its own would.
+PREPARE = f"""
+import functools, sys
+sys.path.append({str(ROOT)!r})
+import av, matplotlib.figure, model, video, drive, simulator.client, simulator.film, simulator.record, simulator.report
+import cloning.network.attention, cloning.replay.command
+from simulator import scenery
+scenery.build = functools.cache(scenery.build)
+scenery.build("lake", 0)
+"""
 
 
 @dataclass
@@ -181,56 +137,37 @@ class Ended:
     points: list[str]
 
 
-class Warm:
-    """The warm process, and the files in which its children write what they print and the points that they pass."""
+class Watched:
+    """A running command whose changes to its files are counted, and the files that it prints and counts in."""
 
-    def __init__(self, folder: Path):
-        """folder: for those files."""
-        self.output, self.trace = folder / "output", folder / "trace"
-        self.process = subprocess.Popen(
-            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT
-        )
+    def __init__(
+        self,
+        command: list,
+        folder: Path,
+        *,
+        kill: int | None = None,
+        full: int | None = None,
+        bytes: int | None = None,
+    ):
+        """command: as behind `python`; folder: where it runs; kill, full: see `Points`; bytes: the longest file's."""
+        self.output, self.trace = folder.with_name("output"), folder.with_name("trace")
+        request = {"watch": [str(folder)], "trace": str(self.trace), "kill": kill, "full": full, "bytes": bytes}
+        with self.output.open("wb") as output:
+            self.process = warm.Popen(
+                [sys.executable, __file__, json.dumps(request), *map(str, command)],
+                cwd=folder,
+                env={**os.environ, **HERE, "XDG_CACHE_HOME": str(folder / "cache")},
+                stdout=output,
+                stderr=output,
+                prepare=PREPARE,
+            )
 
-    def close(self) -> None:
-        """End the warm process."""
-        self.process.communicate()
+    def printed(self) -> str:
+        return self.output.read_text(encoding="utf-8", errors="replace")
 
-    def _ask(self, request: dict) -> int:
-        assert self.process.stdin and self.process.stdout
-        self.process.stdin.write(json.dumps(request) + "\n")
-        self.process.stdin.flush()
-        return json.loads(self.process.stdout.readline())
-
-    def start(self, command, watch, cwd, env=None, *, kill=None, full=None, bytes=None) -> int:
-        """Start a command; return its process id."""
-        self.output.write_bytes(b"")
-        return self._ask(
-            {
-                "command": [str(word) for word in command],
-                "watch": [str(folder) for folder in watch],
-                "cwd": str(cwd),
-                "env": env or {},
-                "output": str(self.output),
-                "trace": str(self.trace),
-                "kill": kill,
-                "full": full,
-                "bytes": bytes,
-            }
-        )
-
-    def alive(self, process: int) -> bool:
-        """Whether a command has not ended yet."""
-        return bool(self._ask({"alive": process}))
-
-    def wait(self, process: int) -> Ended:
-        """Wait until a command has ended."""
-        status = self._ask({"wait": process})
-        printed = self.output.read_text(encoding="utf-8", errors="replace")
-        return Ended(status, printed, self.trace.read_text(encoding="utf-8").splitlines())
-
-    def run(self, *arguments, **more) -> Ended:
-        """Run a command to its end."""
-        return self.wait(self.start(*arguments, **more))
+    def wait(self) -> Ended:
+        status = self.process.wait(300)
+        return Ended(status, self.printed(), self.trace.read_text(encoding="utf-8").splitlines())
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import av
 import numpy as np
 import pytest
 import torch
-from kill_points import Ended, Warm
+from kill_points import Ended, Watched
 from PIL import Image
 
 from cloning.base.files import TEMPORARY_NAME
@@ -113,13 +113,12 @@ class Place:
     failures  what was found, for one message at the end
     """
 
-    warm: Warm
     folder: Path
     command: list
     again: list
     begin: Path | None = None
     checked: Callable[[], None] = lambda: None
-    companion: Callable[[int], None] = lambda process: None  # does its part while the command runs
+    companion: Callable[[Watched], None] = lambda running: None  # does its part while the command runs
     failures: list[str] = field(default_factory=list)
 
     def restore(self) -> None:
@@ -130,10 +129,9 @@ class Place:
             self.folder.mkdir()
 
     def run(self, command: list, **more) -> Ended:
-        env = {"XDG_CACHE_HOME": str(self.folder / "cache")}
-        process = self.warm.start(command, [self.folder], self.folder, env, **more)
-        self.companion(process)
-        return self.warm.wait(process)
+        running = Watched(command, self.folder, **more)
+        self.companion(running)
+        return running.wait()
 
     def age_temporaries(self) -> None:
         """As if the next run came two days later."""

@@ -10,6 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+import warm
 from browse_process import browsing, placed, replayed, written_run
 from commands import HERE, run_here
 from test_excluded import center
@@ -177,7 +178,7 @@ def test_a_run_is_running_while_its_folder_is_claimed_and_then_stopped(tmp_path)
     files = written_run(tmp_path, finished=1, images=500)
     holding = [sys.executable, "-c", HELD, str(files.last)]
     pipe = subprocess.PIPE
-    holder = subprocess.Popen(holding, stdin=pipe, stdout=pipe, text=True, env={**os.environ, **HERE})
+    holder = warm.Popen(holding, stdin=pipe, stdout=pipe, text=True, env={**os.environ, **HERE})
     assert holder.stdout.readline() == "held\n"
     found = runs.overview(files)
     assert found["state"] == "running" and found["robust"] and found["rate"] == 100 and found["loss"] == 0.25

@@ -5,12 +5,12 @@ import re
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 import torch
+import warm
 from commands import HERE
 from drive_process import STOP, script, serving
 
@@ -22,7 +22,7 @@ from tools.simulator_client import Simulator, telemetry
 
 
 def failing(*arguments, first="") -> str:
-    process = subprocess.run(
+    process = warm.run(
         [*script("drive.py", first), *map(str, arguments)],
         env={**os.environ, **HERE},
         timeout=120,
@@ -94,7 +94,7 @@ def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, stee
             assert np.float32(simulator.drive(telemetry(jpegs[n]))["steering_angle"]) == steering[n]
         assert process.stop() == 0
     assert len(list(folder.iterdir())) == 8
-    film = subprocess.run(
+    film = warm.run(
         [*script("video.py", ELSEWHERE), str(folder), "--overlay", str(model_file)],
         env={**os.environ, **HERE},
         capture_output=True,

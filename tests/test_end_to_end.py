@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import warm
 
 from cloning.road.track import Track
 
@@ -19,7 +20,7 @@ SHIPPED = Path("cloning") / "network" / "shipped.pt"
 
 def run(*command: object, cwd: Path) -> str:
     """Run a Python command that must succeed; return its standard output."""
-    done = subprocess.run([sys.executable, *map(str, command)], cwd=cwd, capture_output=True, text=True, timeout=300)
+    done = warm.run([sys.executable, *map(str, command)], cwd=cwd, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -28,7 +29,7 @@ def run(*command: object, cwd: Path) -> str:
 def drive_server(*arguments: object, cwd: Path) -> Iterator[int]:
     """A running drive.py on a free port, which it prints."""
     command = [sys.executable, str(cwd / "drive.py"), *map(str, arguments), "--port", "0"]
-    process = subprocess.Popen(command, cwd=cwd, stderr=subprocess.PIPE, text=True)
+    process = warm.Popen(command, cwd=cwd, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr
         output = []

@@ -7,6 +7,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+import warm
 from commands import ROOT
 from real_recordings import FOLDERS, MISSING
 
@@ -16,7 +17,7 @@ from cloning.recordings.images import read_frame
 
 def run(*arguments) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "cloning.network.export", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    return warm.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")

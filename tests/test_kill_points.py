@@ -15,7 +15,8 @@ import time
 from pathlib import Path
 
 import pytest
-from kill_points import Warm
+from commands import ROOT
+from kill_points import Watched
 from killed import ALL, KILLED, Place, check_whole, chosen, is_temporary, spread
 from rendered import render_recording
 from steer_server import STEER, Server
@@ -32,13 +33,6 @@ TINY = ("--samples-per-epoch", 20, "--batch-size", 8, "--device", "cpu")
 
 
 @pytest.fixture(scope="module")
-def warm(tmp_path_factory):
-    process = Warm(tmp_path_factory.mktemp("warm"))
-    yield process
-    process.close()
-
-
-@pytest.fixture(scope="module")
 def lake(tmp_path_factory) -> Path:
     """A recording of 40 rows, one of which has no image; not to be changed."""
     folder = render_recording(tmp_path_factory.mktemp("data") / "lake", rows=40)
@@ -51,33 +45,33 @@ def lake(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def trained(warm, lake, tmp_path_factory) -> Path:
+def trained(lake, tmp_path_factory) -> Path:
     """The folder of a finished run of one epoch with seed 0, and the cache of checked images; not to be changed."""
     folder = tmp_path_factory.mktemp("earlier") / "place"
-    place = Place(warm, folder, training(lake, "--epochs", 1), [])
+    place = Place(folder, training(lake, "--epochs", 1), [])
     place.whole_run()
     return folder
 
 
 def training(lake: Path, *arguments) -> list:
-    return ["model.py", lake, *TINY, *arguments, "--output", "model.pt"]
+    return [ROOT / "model.py", lake, *TINY, *arguments, "--output", "model.pt"]
 
 
-def test_training_killed_anywhere(warm, lake, tmp_path):
+def test_training_killed_anywhere(lake, tmp_path):
     begin = training(lake, "--epochs", 1)
-    Place(warm, tmp_path / "place", begin, [*begin, "--resume"]).killed_everywhere(3)
+    Place(tmp_path / "place", begin, [*begin, "--resume"]).killed_everywhere(3)
 
 
-def test_resumed_training_killed_anywhere(warm, lake, trained, tmp_path):
+def test_resumed_training_killed_anywhere(lake, trained, tmp_path):
     command = training(lake, "--epochs", 2, "--resume")
-    Place(warm, tmp_path / "place", command, command, trained).killed_everywhere(2)
+    Place(tmp_path / "place", command, command, trained).killed_everywhere(2)
 
 
-def test_training_over_an_earlier_runs_files_killed_anywhere(warm, lake, trained, tmp_path):
+def test_training_over_an_earlier_runs_files_killed_anywhere(lake, trained, tmp_path):
     """The next run finds its way: with --resume or, if the killed one had no state yet, as it tells, without."""
     begin = training(lake, "--epochs", 1, "--seed", 1)
     earlier = {hashlib.sha256(path.read_bytes()).hexdigest() for path in trained.glob("*.pt")}
-    place = Place(warm, tmp_path / "place", begin, [], trained)
+    place = Place(tmp_path / "place", begin, [], trained)
 
     def checked() -> None:
         found = {hashlib.sha256(path.read_bytes()).hexdigest() for path in place.folder.glob("*.pt")}
@@ -95,9 +89,9 @@ def test_training_over_an_earlier_runs_files_killed_anywhere(warm, lake, trained
     place.killed_everywhere(3, next_run)
 
 
-def test_training_on_a_full_disk(warm, lake, tmp_path):
+def test_training_on_a_full_disk(lake, tmp_path):
     begin = training(lake, "--epochs", 1)
-    place = Place(warm, tmp_path / "place", begin, [*begin, "--resume"])
+    place = Place(tmp_path / "place", begin, [*begin, "--resume"])
     place.disk_full_everywhere(3, status=2)
 
 
@@ -106,7 +100,7 @@ def test_training_on_a_full_disk(warm, lake, tmp_path):
 
 
 RECORDED = "recorded-corrections"
-RECORD = ["simulator", "record", RECORDED, "--laps", "0.00002"]
+RECORD = ["-m", "simulator", "record", RECORDED, "--laps", "0.00002"]
 
 
 def rows_of(folder: Path) -> list[tuple]:
@@ -125,13 +119,13 @@ def rows_of(folder: Path) -> list[tuple]:
 
 
 @pytest.fixture(params=["record", "correct"])
-def recording(warm, tmp_path, request):
+def recording(tmp_path, request):
     if request.param == "record":
-        yield Place(warm, tmp_path / "place", RECORD, RECORD)
+        yield Place(tmp_path / "place", RECORD, RECORD)
         return
     with ServerForAll("1") as server:  # so the expert takes over after 4 m
-        command = ["simulator", "correct", RECORDED, "--laps", "0.004", "--port", server.port]
-        yield Place(warm, tmp_path / "place", command, command)
+        command = ["-m", "simulator", "correct", RECORDED, "--laps", "0.004", "--port", server.port]
+        yield Place(tmp_path / "place", command, command)
 
 
 def test_recording_killed_anywhere(recording):
@@ -153,9 +147,9 @@ def test_recording_killed_anywhere(recording):
     place.killed_everywhere(2, next_run)
 
 
-def test_recording_on_a_full_disk(warm, tmp_path):
+def test_recording_on_a_full_disk(tmp_path):
     """The rows before it are complete, also if the process is killed while it takes back the last one."""
-    place = Place(warm, tmp_path / "place", RECORD, RECORD)
+    place = Place(tmp_path / "place", RECORD, RECORD)
     _, points = place.whole_run()
     complete = rows_of(place.folder / RECORDED)
     writes = [number for number, point in enumerate(points, 1) if point.startswith("write")]
@@ -183,12 +177,12 @@ def test_recording_on_a_full_disk(warm, tmp_path):
 # Saving frames
 
 
-def printed_port(place: Place, process: int, pattern: str) -> int | None:
+def printed_port(running: Watched, pattern: str) -> int | None:
     """The port that a server prints, None if it is gone."""
     for _ in range(600):
-        if port := re.search(pattern, place.warm.output.read_text(encoding="utf-8")):
+        if port := re.search(pattern, running.printed()):
             return int(port[1])
-        if not place.warm.alive(process):
+        if running.process.poll() is not None:
             return None
         time.sleep(0.02)
     raise AssertionError("the server never listened")
@@ -197,12 +191,12 @@ def printed_port(place: Place, process: int, pattern: str) -> int | None:
 class Car:
     """A simulator that sends six telemetries, or until the server is gone, and then has the server end."""
 
-    def __init__(self, place: Place, jpegs: list[bytes]):
-        self.place, self.jpegs, self.answers = place, jpegs, 0
+    def __init__(self, jpegs: list[bytes]):
+        self.jpegs, self.answers = jpegs, 0
 
-    def drive(self, process: int) -> None:
+    def drive(self, running: Watched) -> None:
         self.answers = 0
-        if not (port := printed_port(self.place, process, r"Listening on [\d.]+:(\d+)[\s\S]+Watch at")):
+        if not (port := printed_port(running, r"Listening on [\d.]+:(\d+)[\s\S]+Watch at")):
             return
         try:
             with Simulator(port) as simulator:
@@ -212,19 +206,19 @@ class Car:
                     self.answers += 1
         except (ConnectionError, TimeoutError):
             return
-        os.kill(process, signal.SIGINT)
+        running.process.send_signal(signal.SIGINT)
 
 
 @pytest.fixture
-def driving(warm, model_file, jpegs, tmp_path):
+def driving(model_file, jpegs, tmp_path):
     """drive.py, which saves frames in a folder with two old ones, one of them half-written."""
     begin = tmp_path / "begin"
     (begin / "run1").mkdir(parents=True)
     (begin / "run1" / "2018_07_16_17_11_43_382.jpg").write_bytes(jpegs[7])
     (begin / "run1" / ".2018_07_16_17_11_43_383.jpg.0123abcd.part").write_bytes(jpegs[7][:100])
-    command = ["drive.py", model_file, "run1", "--port", 0]
-    place = Place(warm, tmp_path / "place", command, command, begin)
-    car = Car(place, jpegs)
+    command = [ROOT / "drive.py", model_file, "run1", "--port", 0]
+    place = Place(tmp_path / "place", command, command, begin)
+    car = Car(jpegs)
     place.companion = car.drive
     return place, car
 
@@ -246,8 +240,8 @@ def test_driving_killed_anywhere(driving, jpegs):
         frames = [jpeg for jpeg in saved(place.folder / "run1") if jpeg != jpegs[7]]
         assert frames == jpegs[: len(frames)]
         if frames:
-            place.companion = lambda process: None
-            film = place.run(["video.py", "run1"])
+            place.companion = lambda running: None
+            film = place.run([ROOT / "video.py", "run1"])
             place.companion = car.drive
             assert film.status == 0 and f"run1.mp4: {len(frames)} frames" in film.printed
             assert "unreadable" not in film.printed
@@ -281,7 +275,7 @@ def test_driving_on_a_full_disk(driving, jpegs):
 # Browsing
 
 
-def test_a_cut_killed_anywhere(warm, lake, tmp_path):
+def test_a_cut_killed_anywhere(lake, tmp_path):
     """An earlier cut stays; the new one is there or not, and can be made again."""
     names = rows_of(lake)
     recorded = tmp_path / "begin" / "lake"
@@ -289,11 +283,11 @@ def test_a_cut_killed_anywhere(warm, lake, tmp_path):
     shutil.copy(lake / "driving_log.csv", recorded)
     earlier, new = (Cut(*(names[row][0][0].decode() for row in rows), "off") for rows in ((1, 2), (5, 9)))
     add_cut(recorded, earlier)
-    command, answers = ["cloning.browse", "lake", "--port", 0], []
-    place = Place(warm, tmp_path / "place", command, command, tmp_path / "begin")
+    command, answers = ["-m", "cloning.browse", "lake", "--port", 0], []
+    place = Place(tmp_path / "place", command, command, tmp_path / "begin")
 
-    def cut(process: int) -> None:
-        if not (port := printed_port(place, process, r"http://[\d.]+:(\d+)/")):
+    def cut(running: Watched) -> None:
+        if not (port := printed_port(running, r"http://[\d.]+:(\d+)/")):
             return
         try:
             connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
@@ -305,7 +299,7 @@ def test_a_cut_killed_anywhere(warm, lake, tmp_path):
             connection.close()
         except (ConnectionError, http.client.HTTPException):
             return
-        os.kill(process, signal.SIGINT)
+        running.process.send_signal(signal.SIGINT)
 
     def checked() -> None:
         cuts = [each.row() for each in read_cuts(place.folder / "lake")]
@@ -323,9 +317,9 @@ def test_a_cut_killed_anywhere(warm, lake, tmp_path):
         assert sorted(path.name for path in (place.folder / "lake").iterdir()) == sorted(os.listdir(recorded))
 
 
-def test_an_analysis_of_the_lane_killed_anywhere(warm, lake, tmp_path):
-    command = ["cloning.browse.analyse", lake, "lane"]
-    Place(warm, tmp_path / "place", command, command).killed_everywhere(1)
+def test_an_analysis_of_the_lane_killed_anywhere(lake, tmp_path):
+    command = ["-m", "cloning.browse.analyse", lake, "lane"]
+    Place(tmp_path / "place", command, command).killed_everywhere(1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -333,12 +327,12 @@ def test_an_analysis_of_the_lane_killed_anywhere(warm, lake, tmp_path):
 
 
 @pytest.fixture
-def filming(warm, jpegs, tmp_path):
+def filming(jpegs, tmp_path):
     folder = tmp_path / "begin" / "run1"
     folder.mkdir(parents=True)
     for n, jpeg in enumerate(jpegs):
         (folder / f"2018_07_16_17_11_43_{n:03d}.jpg").write_bytes(jpeg)
-    return Place(warm, tmp_path / "place", ["video.py", "run1"], ["video.py", "run1"], tmp_path / "begin")
+    return Place(tmp_path / "place", [ROOT / "video.py", "run1"], [ROOT / "video.py", "run1"], tmp_path / "begin")
 
 
 def test_filming_saved_frames_killed_anywhere(filming):
@@ -350,10 +344,10 @@ OUTPUTS = ("--report", "drive.json", "--picture", "above.png", "--film", "film.m
 
 
 @pytest.fixture
-def simulator_drive(warm, tmp_path):
+def simulator_drive(tmp_path):
     with ServerForAll() as server:
-        command = ["simulator", "drive", "--laps", "0.002", "--port", server.port, *OUTPUTS]
-        yield Place(warm, tmp_path / "place", command, command)
+        command = ["-m", "simulator", "drive", "--laps", "0.002", "--port", server.port, *OUTPUTS]
+        yield Place(tmp_path / "place", command, command)
 
 
 class ServerForAll(Server):
@@ -379,10 +373,10 @@ def test_a_simulated_drive_on_a_full_disk(simulator_drive):
 
 
 @pytest.fixture
-def replaying(warm, lake, model_file, tmp_path):
+def replaying(lake, model_file, tmp_path):
     files = ("--report", "replay.json", "--picture", "replay.png", "--film", "replay.mp4")
-    command = ["simulator", "replay", lake, "--model", model_file, "--limit", 1, "--reference", "human", *files]
-    return Place(warm, tmp_path / "place", command, command)
+    command = ["-m", "simulator", "replay", lake, "--model", model_file, "--limit", 1, "--reference", "human", *files]
+    return Place(tmp_path / "place", command, command)
 
 
 def test_a_replay_killed_anywhere(replaying):

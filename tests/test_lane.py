@@ -6,7 +6,6 @@ Thresholds are about 1.25 times what was measured with bfloat16; with float32 th
 import copy
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
+import warm
 from commands import HERE, ROOT
 from rendered import render_recording
 
@@ -295,7 +295,7 @@ def test_the_network_without_norms_computes_the_same():
 
 def test_training_leaves_weights_that_load(tmp_path, sample_recording):
     shipped = reader.SHIPPED_WEIGHTS.read_bytes()
-    done = subprocess.run(
+    done = warm.run(
         [sys.executable, "-m", "tools.train_lane", sample_recording, *SHORT_TRAINING],
         cwd=tmp_path,
         env={**os.environ, **HERE},

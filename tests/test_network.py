@@ -2,7 +2,6 @@
 
 import copy
 import random
-import subprocess
 import sys
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+import warm
 from commands import ROOT
 from torch import nn
 
@@ -413,7 +413,7 @@ def cameras(request, tmp_path_factory) -> tuple[str, list[np.ndarray]]:
     """The track, and the shipped network's steering for its rendered frames from the centre, left and right camera."""
     folder = tmp_path_factory.mktemp("shipped") / request.param
     command = [sys.executable, "-m", "simulator", "record", str(folder), "--track", request.param, "--laps", "0.1"]
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    warm.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
     network = load_model(SHIPPED_MODEL)
     return request.param, [
         np.array([steer(network, decode(path.read_bytes())) for path in sorted(folder.glob(f"IMG/{camera}_*.jpg"))])

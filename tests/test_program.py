@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+import warm
 from commands import ROOT
 
 from cloning.base.program import FAILED
@@ -74,7 +75,7 @@ def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
 def test_an_error_of_the_user_is_a_line_and_status_2(tmp_path, command):
     command = [ROOT / word if word.endswith(".py") else word for word in command]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, *command], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    done = warm.run([sys.executable, *command], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == FAILED == 2
     assert "nowhere" in done.stderr.splitlines()[-1] and "Traceback" not in done.stderr
 

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
+import warm
 from commands import ROOT
 from drive_process import serving
 from rendered import render_recording
@@ -207,7 +208,7 @@ def test_errors_and_correlations_are_what_they_say():
 
 
 def run(*arguments, **more) -> subprocess.CompletedProcess:
-    return subprocess.run(
+    return warm.run(
         [sys.executable, "-m", "simulator", "replay", *map(str, arguments)],
         cwd=ROOT,
         capture_output=True,
@@ -421,7 +422,7 @@ def test_ctrl_c_ends_drives_in_processes_with_one_message(folder, model, tmp_pat
     with log.open("w") as file:
         command_line = [sys.executable, "-m", "simulator", "replay", folder, "--model", model, "--limit", *"123456789"]
         command_line += ["--reference", "human"]
-        process = subprocess.Popen(command_line, cwd=ROOT, stderr=file, start_new_session=True)
+        process = warm.Popen(command_line, cwd=ROOT, stderr=file, start_new_session=True)
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
         while len(children.read_text().split()) < 8:
             assert process.poll() is None

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+import warm
 from commands import HERE, ROOT, SHORT, finished_run, log, run_here, run_model, same, weights
 from rendered import render_recording
 
@@ -63,15 +64,8 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, sample
     output, chance = tmp_path / "model.pt", random.Random(5)
     kills = 0
     while True:
-        run = subprocess.Popen(
-            [
-                *SAVING,
-                str(sample_recording),
-                *map(str, SHORT),
-                "--output",
-                str(output),
-                "--resume",
-            ],
+        run = warm.Popen(
+            [*SAVING, str(sample_recording), *map(str, SHORT), "--output", str(output), "--resume"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             env={**os.environ, **HERE},
@@ -104,7 +98,7 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, sample
 def test_a_signal_ends_cleanly_with_everything_saved(finished, sample_recording, tmp_path, number):
     output = tmp_path / "model.pt"
     command = [sys.executable, str(ROOT / "model.py"), str(sample_recording), *map(str, SHORT), "--output", str(output)]
-    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    run = warm.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     for line in run.stdout:
         if line.startswith("Epoch"):
             break

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import warm
 from commands import ROOT, SHORT, finished_run, run_here, run_model, weights
 from rendered import render_recording
 
@@ -242,7 +243,7 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_r
         "--output",
         tmp_path / "model.pt",
     ]
-    run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    run = warm.Popen(command, stdout=subprocess.PIPE, text=True)
     assert any(line.startswith("Epoch 2") for line in run.stdout)
     run.kill()
     run.wait()

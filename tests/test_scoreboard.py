@@ -2,11 +2,11 @@
 
 import argparse
 import json
-import subprocess
 import sys
 
 import pytest
 import torch
+import warm
 from commands import ROOT
 from rendered import render_recording
 
@@ -191,7 +191,7 @@ def measured(tmp_path):
 
     def measure(model, name, *more):
         command = [sys.executable, "-m", "tools.scoreboard", model, "--name", name, "--table", tmp_path / "table.md"]
-        return subprocess.run([*command, *more], cwd=ROOT, capture_output=True, text=True, timeout=300)
+        return warm.run([*command, *more], cwd=ROOT, capture_output=True, text=True, timeout=300)
 
     return measure
 

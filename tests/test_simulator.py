@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import warm
 
 from cloning.base.errors import RecordingError
 from cloning.recordings.format import SAMPLE_RATE
@@ -39,7 +40,7 @@ def free(track="lake"):
 
 
 def command(*arguments, **keywords):
-    return subprocess.run(
+    return warm.run(
         [sys.executable, "-m", "simulator", *map(str, arguments)], capture_output=True, text=True, **keywords
     )
 

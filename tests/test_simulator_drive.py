@@ -3,13 +3,13 @@
 import json
 import re
 import socket
-import subprocess
 import sys
 import time
 
 import cv2
 import numpy as np
 import pytest
+import warm
 from steer_server import STEER, Server, ahead, drive
 
 from cloning.base.errors import OutputError
@@ -21,7 +21,7 @@ from simulator.run import Run
 
 
 def test_a_report_that_cannot_be_written_is_reported_before_the_drive(tmp_path):
-    done = subprocess.run(
+    done = warm.run(
         [sys.executable, "-m", "simulator", "drive", "--report", str(tmp_path / "no" / "report.json")],
         capture_output=True,
         text=True,

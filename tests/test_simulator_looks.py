@@ -1,12 +1,12 @@
 """Rendered frames: other looks on the same road, camera positions, recovery recordings, and the film."""
 
 import csv
-import subprocess
 import sys
 
 import cv2
 import numpy as np
 import pytest
+import warm
 from scipy.spatial import cKDTree
 
 from cloning.base.errors import OutputError
@@ -116,7 +116,7 @@ def test_recovery_records_only_the_returns():
 
 def test_recovery_folder_has_gaps_in_time(tmp_path):
     folder = tmp_path / "recovery"
-    done = subprocess.run(
+    done = warm.run(
         [sys.executable, "-m", "simulator", "record", str(folder), "--recovery", "--laps", "0.2"],
         capture_output=True,
         text=True,

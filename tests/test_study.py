@@ -1,13 +1,13 @@
 """tools.study: its plan, what alters the training, its measures against oracles, and the command on tiny recordings."""
 
 import csv
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 import pytest
+import warm
 from commands import ROOT
 from rendered import render_recording
 from test_generator import loaded, observations
@@ -166,7 +166,7 @@ def test_the_command_measures_and_goes_on(tmp_path):
     def study(*more):
         command = [sys.executable, "-m", "tools.study", str(data), "--folder", str(folder), "--jobs", "1", *more]
         trial = ["--images", "30", "--laps", "0.01", "--starts", "1"]
-        return subprocess.run([*command, *trial], cwd=ROOT, capture_output=True, text=True, timeout=300)
+        return warm.run([*command, *trial], cwd=ROOT, capture_output=True, text=True, timeout=300)
 
     done = study("--networks", "1")
     assert (done.returncode, done.stderr) == (0, "")

@@ -324,10 +324,12 @@ def test_options_are_fields_of_the_recipe_the_run_and_the_process():
 
 
 def test_importing_does_nothing(tmp_path):
-    done = run_model(
-        command=[sys.executable, "-c", "import model, cloning.recordings.log, cloning.network.network"],
+    done = subprocess.run(
+        [sys.executable, "-c", "import model, cloning.recordings.log, cloning.network.network"],
         cwd=tmp_path,
-        env=HERE,
+        env={**os.environ, **HERE},
+        capture_output=True,
+        text=True,
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert not os.listdir(tmp_path)

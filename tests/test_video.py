@@ -1,7 +1,6 @@
 """video.py as a user calls it, with the films decoded by OpenCV's own FFmpeg."""
 
 import os
-import subprocess
 import sys
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import warm
 from commands import ROOT
 
 import video
@@ -59,7 +59,7 @@ def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
 
 def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
     save(tmp_path / "run1")
-    result = subprocess.run(
+    result = warm.run(
         [sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
     assert result.returncode == 0 and "run1.mp4: 30 frames at 20 frames/s" in result.stdout
