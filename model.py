@@ -73,7 +73,7 @@ def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, 
     Unusable rows are listed in `rejected_file`. Raises RecordingError if too few rows are left, and if `strict` if a
     row is unusable.
     """
-    parts, counts, frames = [], [], FrameCache(KEPT_FRAMES)
+    parts, counts, frames = list[Observations](), [], FrameCache(KEPT_FRAMES)
     for folder in folders:
         recording = read_recording(folder)
         check_images(recording, threads(), frames)
@@ -245,6 +245,8 @@ class Generator:
         def make(part: np.ndarray) -> None:
             for kind, seen in enumerate(choices.views.images(part)):
                 has = choices.slots[part, kind] >= 0
+                if not has.any():
+                    continue
                 which, seen = (part, seen) if has.all() else (part[has], seen[has])
                 at = np.searchsorted(order, choices.slots[which, kind])
                 chosen = [column[which] for column in choices.augmenting[kind]]
@@ -336,9 +338,8 @@ class TrainingRun:
         started = time.monotonic() - progress.seconds
         if ranks.first:
             print(f"Epoch {len(progress.history) + 1}/{recipe.epochs}", flush=True)
-        hidden = None if ranks.first else True  # None: only on a terminal
-        images, total = progress.images, recipe.samples_per_epoch
-        with tqdm(total=total, initial=images, unit="image", leave=False, disable=hidden) as bar:
+        total, hidden = recipe.samples_per_epoch, not ranks.first or None  # None: shown on a terminal only
+        with tqdm(total=total, initial=progress.images, unit="image", leave=False, disable=hidden) as bar:
             while progress.images < total:
                 self.write_pictures()
                 batch = self.generator.next_batch()

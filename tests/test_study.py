@@ -1,8 +1,10 @@
 """tools.study: its plan, what alters the training, its measures against oracles, and the command on tiny recordings."""
 
 import csv
+import re
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from collections import Counter
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,83 +14,47 @@ from commands import ROOT
 from rendered import render_recording
 from test_generator import loaded, observations
 
-import model
 from cloning.replay.replay import load_recording
-from cloning.training import light, robust
-from cloning.training.options import Arguments, parse
+from model import REPORT, ROBUST, balance
 from tools.study import figures
 from tools.study.measures import Simulator, offline
-from tools.study.networks import ALTERATIONS, TRACKS, plan
+from tools.study.networks import RECIPE, RECOVERING, TRACKS, CentreViews, plan
 
 
 def test_the_plan_has_many_networks_none_of_which_is_trained_on_what_is_held_out():
     variants = plan()
     assert len({variant.name for variant in variants}) == len(variants) >= 40
-    for variant in variants:
-        parse([*variant.options, "data"])  # exits if model.py does not take these options
-        assert TRACKS[variant.track].held_out not in variant.recordings
-        assert variant.alteration in {"", *ALTERATIONS}
-    assert {variant.alteration for variant in variants} == {"", *ALTERATIONS}, "each is used"
-    recovering = [variant for variant in variants if variant.recovers]
-    assert {variant.kind: 5 for variant in recovering} == {
-        kind: sum(variant.kind == kind for variant in recovering) for kind in {variant.kind for variant in recovering}
-    }
+    assert all(TRACKS[variant.track].held_out not in variant.recordings for variant in variants)
+    methods = Counter(variant.method for variant in variants if variant.recovers)
+    assert methods == dict.fromkeys(RECOVERING, 5)
 
 
-@pytest.fixture
-def restored(monkeypatch):
-    """What the alterations change is as before after the test."""
-    for place, name in (
-        (model, "FLIP"),
-        (model, "SHADOW"),
-        (model, "KEEP_STRAIGHT"),
-        (model, "TURN"),
-        (model.ReportObservations, "sample_views"),
-        (light, "TINTED_SHARE"),
-        (light, "SHADED_SHARE"),
-        (robust, "YAW_DEVIATION"),
-    ):
-        monkeypatch.setattr(place, name, getattr(place, name))
+def test_every_recipe_differs_from_the_reports_or_the_robust_one_as_its_name_says():
+    """In the figures that the method names, besides the study's shorter steps."""
+    common = {"report": {"batch_size", "learning_rate", "epochs"}, "robust": {"epochs"}}
+    named = {"side correction": {"side_correction"}, "no flip": {"flip"}, "no shadow": {"shadow"}}
+    named |= {"no resampling": {"keep_straight", "turn"}, "no throttle filter": {"throttle_threshold"}}
+    named |= {"centre camera": {"views"}, "shifts": {"tinted", "shaded", "pose_yaw"}}
+    named |= {"shifts, rotations": {"tinted", "shaded"}}
+    for variant in plan():
+        base = {"report": REPORT, "robust": ROBUST}[variant.recipe.name].saved()
+        changed = {name for name, value in variant.recipe.saved().items() if value != base[name]}
+        method = re.sub(r" [\d.]+$", "", variant.method)
+        assert changed - common[variant.recipe.name] == named.get(method, set()), variant.method
 
 
-@pytest.mark.parametrize(("alteration", "kind"), [("no flip", 1), ("no shadow", 3)])
-def test_a_kind_of_image_is_left_out(restored, sample_recording, alteration, kind):
-    with ThreadPoolExecutor(1) as pool:
-        generator = model.Generator(loaded(sample_recording), Arguments(batch_size=64), pool, ahead=1)
-        made = (generator.sample(0).places >= 0).any(axis=0)
-        assert made.all()
-        ALTERATIONS[alteration]()
-        assert (generator.sample(0).places >= 0).any(axis=0).tolist() == [other != kind for other in range(4)]
-
-
-def test_without_resampling_each_observation_counts_once(restored):
+def test_without_resampling_each_observation_counts_once():
     steering = np.float32([0, 0.01, 0.3, -0.4, 1] * 20)
-    assert len(observations(steering).resample(seed=0, repeats=1)) != len(steering)
-    ALTERATIONS["no resampling"]()
-    assert sorted(observations(steering).resample(seed=0, repeats=1).steering) == sorted(steering)
+    recipe = {variant.method: variant.recipe for variant in plan()}["no resampling"]
+    assert len(balance(observations(steering), replace(REPORT, repeats=1), seed=0)) != len(steering)
+    assert sorted(balance(observations(steering), replace(recipe, repeats=1), seed=0).steering) == sorted(steering)
 
 
-def test_the_centre_camera_alone(restored, sample_recording):
+def test_the_centre_camera_alone(sample_recording):
     found = loaded(sample_recording)
-    ALTERATIONS["centre camera"]()
-    views = found.sample_views(np.arange(3), np.array([0, 1, 2]), 0.2, np.random.default_rng(0))
+    views = CentreViews(found, np.arange(3), np.array([0, 1, 2]), RECIPE, np.random.default_rng(0))
     assert views.labels[:, 0].tolist() == found.steering[:3].tolist()
-    frame = found.read_cropped(2, 0)
-    assert np.array_equal(views.images(np.array([2]))[0][0], frame)
-
-
-def test_shifts_neither_turn_the_car_nor_change_the_light(restored):
-    lanes = robust.Lanes.unknown(200)
-    ALTERATIONS["shifts, rotations"]()
-    poses = lanes.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
-    assert (poses.colours == np.eye(3)).all()
-    assert (poses.shade == -1).all()
-    straight = lanes.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
-    ALTERATIONS["shifts"]()
-    shifted = lanes.sample_poses(np.random.default_rng(0), np.zeros(200, bool))
-    assert not np.allclose(straight.steering, shifted.steering)
-    offsets = np.random.default_rng(0).triangular(-robust.MAX_POSE_OFFSET, 0, robust.MAX_POSE_OFFSET, 200)
-    assert np.allclose(shifted.steering, lanes.steering(offsets, np.zeros(200)))
+    assert np.array_equal(views.images(np.array([2]))[0][0], found.read_cropped(2, 0))
 
 
 def test_correlation_is_of_ranks_and_signed():
@@ -173,7 +139,7 @@ def test_the_command_measures_and_goes_on(tmp_path):
     assert "lake-centre-camera-seed-0 is measured" in done.stdout
     with open(folder / "study.csv", encoding="utf-8", newline="") as file:
         [row] = csv.DictReader(file)
-    assert (row["kind"], row["recordings"]) == ("centre camera", "lake-ccw")
+    assert (row["method"], row["recordings"]) == ("centre camera", "lake-ccw")
     assert {measure.name for measure in figures.MEASURES} | (set(figures.DRIVING) - {"driving"}) <= set(row)
     assert float(row["recovered"]) in (0, 1)
     again = study("--networks", "1")

@@ -5,7 +5,7 @@ Poses and the lane's frame are those of `cloning/lane/recovery.py`.
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import cv2
 import numpy as np
@@ -19,9 +19,7 @@ from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
 from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, components, forward_vector, stretches
 from cloning.road.warp import CroppedView, fill_ground
 from cloning.training import light
-
-if TYPE_CHECKING:
-    from cloning.training.recipe import Recipe
+from cloning.training.recipe import Recipe
 
 VIEW = CroppedView(CROP)
 
@@ -92,7 +90,7 @@ class Lanes(LaneAhead):
         lane = self.take(np.array([row]))
         return lane.steering(lane.offset + np.array(list(CAMERA_OFFSETS.values())), lane.yaw)
 
-    def sample_poses(self, recipe: "Recipe", rng: np.random.Generator, mirrored: np.ndarray) -> "Poses":
+    def sample_poses(self, recipe: Recipe, rng: np.random.Generator, mirrored: np.ndarray) -> "Poses":
         """Sample a pose for each row, and a camera near it whose frame will be warped; mirrored: bool (n,).
 
         The camera is random, so that traces of warping in an image do not tell the side from which it was taken.

@@ -6,16 +6,13 @@ measured in real recordings: the road's median colour in the shade is (0.26, 0.3
 """
 
 import functools
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from cloning.base.frame import FRAME
 from cloning.network.network import SEEN_SHAPE
-
-if TYPE_CHECKING:
-    from cloning.training.recipe import Recipe
+from cloning.training.recipe import Recipe
 
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour
@@ -28,8 +25,6 @@ def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, to: 
     images: uint8 (n, rows, columns, 3), as the result; factors: (n,); to, back: OpenCV's codes of the conversions.
     OpenCV is given all images as one tall image, so that other Python threads can run during one long call.
     """
-    if not len(images):
-        return images
     tall = cv2.cvtColor(images.reshape(-1, *images.shape[2:]), to)
     values = cv2.extractChannel(tall, channel).reshape(len(images), -1)
     values = np.minimum(np.multiply(values, factors[:, None], dtype=np.float32) + np.float32(0.5), 255).astype(np.uint8)
@@ -37,7 +32,7 @@ def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, to: 
     return cv2.cvtColor(tall, back, dst=tall).reshape(images.shape)
 
 
-def choose_brightness(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray]:
+def choose_brightness(recipe: Recipe, rng: np.random.Generator, n: int) -> tuple[np.ndarray]:
     """Return the factors of `brighten`."""
     return (rng.uniform(*recipe.brightness, n),)
 
@@ -47,7 +42,7 @@ def brighten(images: np.ndarray, first_row: int, factors: np.ndarray) -> np.ndar
     return multiply_channel(images, 2, factors, cv2.COLOR_RGB2HSV, cv2.COLOR_HSV2RGB)
 
 
-def choose_shadow(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def choose_shadow(recipe: Recipe, rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the factors, lines and sides of `shade`."""
     return rng.uniform(*recipe.darkness, n), rng.uniform(0, FRAME[1], (n, 2)), rng.random(n) < 0.5
 
@@ -66,7 +61,7 @@ def shade(images: np.ndarray, first_row: int, factors: np.ndarray, lines: np.nda
     return shaded
 
 
-def tints(recipe: "Recipe", rng: np.random.Generator, n: int) -> np.ndarray:
+def tints(recipe: Recipe, rng: np.random.Generator, n: int) -> np.ndarray:
     """Sample changes of saturation, tint and brightness: float32 (n, 3, 3), matrices by which RGB is multiplied.
 
     Only the recipe's share of them changes anything.

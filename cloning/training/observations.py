@@ -6,7 +6,7 @@ From an observation of a batch up to four kinds of image are made, in the report
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import cv2
 import numpy as np
@@ -19,9 +19,7 @@ from cloning.recordings.format import CAMERAS, DRIVE_GAP, PROBLEM_AREAS
 from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.log import Recording
 from cloning.training.lanes import Lanes
-
-if TYPE_CHECKING:
-    from cloning.training.recipe import Recipe
+from cloning.training.recipe import Recipe
 
 
 class ValidationSet(NamedTuple):
@@ -158,7 +156,7 @@ def read_checked(path: Path) -> np.ndarray:
         ) from None
 
 
-def centre_images(observations: Observations, recipe: "Recipe", seed: int) -> list[ValidationSet]:
+def centre_images(observations: Observations, recipe: Recipe, seed: int) -> list[ValidationSet]:
     """Return one set to validate with: the centre images."""
     return [ValidationSet(observations.center, observations.steering)]
 
@@ -171,7 +169,7 @@ class CameraViews:
         observations: Observations,
         rows: np.ndarray,
         cameras: np.ndarray,
-        recipe: "Recipe",
+        recipe: Recipe,
         rng: np.random.Generator,
     ):
         """rows, cameras: int (n,); rng: not needed."""

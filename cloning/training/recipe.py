@@ -13,9 +13,7 @@ import numpy as np
 
 from cloning.network.network import NETWORKS
 from cloning.network.tensors import shown
-from cloning.recordings.log import Recording
 from cloning.training.muon import OPTIMIZERS
-from cloning.training.observations import Observations, ValidationSet, Views
 
 
 def no_choices(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:
@@ -70,7 +68,7 @@ class Words(NamedTuple):
 class Recipe:
     """How a network is trained. Shares and probabilities are 0..1, steering is -1..1, ranges are (least, most).
 
-    Functions, of which a checkpoint contains the names:
+    Functions, of which a checkpoint contains the names; observations, views and sets are those of `observations.py`:
 
     select           (recording, recipe) -> the observations of a checked recording that are used, with their labels
     resample         (observations, recipe, seed) -> those for training, some left out and others repeated
@@ -83,21 +81,21 @@ class Recipe:
     name: str
     words: Words
     # Data preprocessing
-    select: Callable[[Recording, "Recipe"], Observations]
+    select: Callable[..., Any]
     throttle_threshold: float  # rows with less throttle are dropped
     side_correction: float  # steering added to the label of left images, subtracted from that of right ones
-    resample: Callable[[Observations, "Recipe", int], Observations]
+    resample: Callable[..., Any]
     straight: float  # |steering| below which an observation is straight driving
     keep_straight: float  # probability that it is kept
     turn: tuple[float, float]  # range of |steering| in which a copy is added
     jitter: float  # by up to this share the copy's steering is changed
     repeats: int  # how often a recording of problem areas counts
-    order: Callable[[Observations, "Recipe", np.random.Generator], np.ndarray]
+    order: Callable[..., np.ndarray]
     # Data subdivision
     block_seconds: float  # of driving that are together for training or for validation
     folds: int  # one block of so many is for validation
     # Augmentation
-    views: Callable[[Observations, np.ndarray, np.ndarray, "Recipe", np.random.Generator], Views]
+    views: Callable[..., Any]
     augmentations: tuple[Augmentation, ...]
     flip: float  # share of the observations with a flipped image
     brightness: tuple[float, float]  # factor of the HSV value
@@ -115,7 +113,7 @@ class Recipe:
     batch_size: int  # observations; each gives 3.7 images on average
     samples_per_epoch: int  # images at least; a fifth as many observations validate an epoch
     epochs: int
-    validation_sets: Callable[[Observations, "Recipe", int], list[ValidationSet]]
+    validation_sets: Callable[..., list[Any]]
     best_by: str  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
     # Recovery steering from other poses, in other light (--robust); the report has neither.
     straight_weight: float = 1.0  # sampling weight on a straight; elsewhere |steering along the lane| is added

@@ -190,11 +190,11 @@ def scatter_picture(rows: Sequence[Row]) -> bytes:
         for line, track in zip(grid, TRACKS, strict=True):
             part = groups(rows)[track]
             for axes, measure in zip(line, shown, strict=True):
-                for group, colour in (("recipe", "tab:orange"), ("robust", "tab:blue")):
-                    some = [each for each in part if ("--robust" in str(each["options"])) == (group == "robust")]
+                for recipe, colour in (("report", "tab:orange"), ("robust", "tab:blue")):
+                    some = [each for each in part if each["recipe"] == recipe]
                     if some:
                         where = column(some, measure.name), column(some, "offset_mean")
-                        axes.scatter(*where, s=18, color=colour, alpha=0.8, label=group)
+                        axes.scatter(*where, s=18, color=colour, alpha=0.8, label=recipe)
                 axes.set(title=track, xlabel=measure.title, ylabel="m from the centre, in laps")
                 axes.set_xlim(left=0)
                 axes.set_ylim(bottom=0)
