@@ -24,6 +24,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.base.table import Column, Table
 from cloning.network import tensors
 from cloning.network.compute import choose_precision, in_precision, one_thread, threads
 from cloning.recordings.log import Recording
@@ -165,8 +166,8 @@ def estimate_centres(strips: np.ndarray, network: LaneNetwork | None = None) -> 
     return centres.reshape(*strips.shape[:-3], len(DISTANCES_AHEAD))
 
 
-@dataclass
-class LanePosition:
+@dataclass(frozen=True)
+class LanePosition(Table):
     """The car's position in its lane, one value for each row of a recording.
 
     lateral_offset  float32 (n,): m from the lane's centre to the car's middle, right positive
@@ -175,9 +176,9 @@ class LanePosition:
                     each other and over time, or the row was localised on a known track
     """
 
-    lateral_offset: np.ndarray
-    heading_error: np.ndarray
-    trusted: np.ndarray
+    lateral_offset: Column
+    heading_error: Column
+    trusted: Column
 
 
 def read_strips(recording: Recording, rows: slice = slice(None)) -> np.ndarray:
@@ -223,11 +224,11 @@ def fuse_detections(recording: Recording, centres: np.ndarray, stretches: Sequen
     for edges in itertools.pairwise([0, *breaks.tolist(), len(recording)]):
         stretch = known[edges] if edges in known else Stretch.of(recording, slice(*edges))
         parts.append(_fit_centre(stretch, centres[stretch.rows]))
-    return LanePosition(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    return LanePosition.joined(parts)
 
 
-def _fit_centre(stretch: Stretch, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit a centre line next to the car in each row without a break; return offset, heading error and trust.
+def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
+    """Fit a centre line next to the car in each row without a break; return the car's position relative to it.
 
     centres: float32 (n, 3, 5), m to the right of the car's middle line.
     """
@@ -253,7 +254,7 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> tuple[np.ndarray, np.n
         yaw[row] = -np.arctan(b)
         offset[row] = -a * np.cos(yaw[row])
     trusted = (np.abs(camera_error) < MAX_CAMERA_ERROR).all((1, 2)) & (_smooth(residual) < MAX_RESIDUAL)
-    return offset, yaw, trusted
+    return LanePosition(offset, yaw, trusted)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
