@@ -10,7 +10,7 @@ from conftest import run_here
 from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses
 from cloning.lane.known import lane_position
-from cloning.lane.place import estimate_lane_position
+from cloning.lane.localise import estimate_lane_position
 from cloning.recordings.log import read_recording
 from cloning.replay.replay import load_recording, reference_lines
 from cloning.road.motion import stretches

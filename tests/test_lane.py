@@ -19,9 +19,9 @@ from conftest import HERE, ROOT, render_recording
 
 from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
-from cloning.lane import place, reader
+from cloning.lane import reader
 from cloning.lane.ahead import centre_ahead
-from cloning.lane.place import MIN_LOG_LIKELIHOOD, estimate_lane_position, localise
+from cloning.lane.localise import MIN_LOG_LIKELIHOOD, estimate_lane_position, localise
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
@@ -372,7 +372,7 @@ def test_a_damaged_image_is_named(copied):
 def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsys):
     """The table of differences, of a rendered recording against the same places rendered again."""
     recording, _ = drive
-    monkeypatch.setattr(place, "MIN_LOCALISED_ROWS", len(recording) // 2)  # the drive is short
+    monkeypatch.setattr("cloning.lane.localise.MIN_LOCALISED_ROWS", len(recording) // 2)  # the drive is short
     picture = tmp_path / "both.png"
     assert likeness.main([str(recording.folder), "--frames", "8", "--picture", str(picture)]) == 0
     table = capsys.readouterr().out

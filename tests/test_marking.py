@@ -8,7 +8,7 @@ import pytest
 
 from cloning.lane import marking
 from cloning.lane.ahead import centre_ahead, line_ahead
-from cloning.lane.place import place, shipped_networks
+from cloning.lane.localise import localise_recording, shipped_networks
 from cloning.lane.reader import DIRECTION_TO_STRIP, MOUNT_OFFSETS, STRIP_SHAPE, estimate_centres, read_strips
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT
@@ -151,7 +151,7 @@ def test_the_line_corrects_what_the_network_detects(tmp_path, monkeypatch):
         return estimate_centres(strips, network) + 0.3
 
     def error():
-        found, _ = place(recording, driven, biased, strips.__getitem__, shipped_networks())
+        found, _ = localise_recording(recording, driven, biased, strips.__getitem__, shipped_networks())
         assert found.trusted.all()
         return np.abs(found.lateral_offset - true).mean()
 

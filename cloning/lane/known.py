@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.errors import RecordingError
-from cloning.lane.place import estimate_lane_position
+from cloning.lane.localise import estimate_lane_position
 from cloning.lane.reader import LanePosition
 from cloning.recordings.columns import NUMBER
 from cloning.recordings.format import LANE_COLUMNS, LANE_FILE
