@@ -8,14 +8,13 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import real_recordings
 import torch
-from conftest import HERE, ROOT, render_recording
+from conftest import HERE
 
 from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
@@ -38,6 +37,7 @@ from cloning.lane.reader import (
     normalize,
     read_strips,
 )
+from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, camera_position
@@ -51,7 +51,6 @@ from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
 SHORT_TRAINING = ("--looks", "1", "--roads", "1", "--frames", "3", "--steps", "2")
-PILOT = ROOT / "cloning" / "network" / "shipped.pt"
 UNSEEN = 1003  # a look that the network was not trained on
 
 
@@ -75,21 +74,18 @@ def test_a_strip_is_level_and_looks_straight_ahead():
         assert left[1] == pytest.approx(right[1], abs=1e-6)
 
 
-def test_a_strip_is_the_frame_at_half_the_resolution():
-    frame = np.zeros((160, 320, 3), np.uint8)
+def test_a_strip_is_the_frames_road_at_half_the_resolution():
+    frame = np.random.default_rng(0).integers(0, 100, FRAME).astype(np.uint8)
     pixel = STRIP_TO_FRAME @ (80, 16, 1)
-    cv2.circle(frame, np.round(pixel[:2] / pixel[2]).astype(int).tolist(), 4, (255, 0, 0), -1)
+    column, row = np.round(pixel[:2] / pixel[2]).astype(int).tolist()
+    cv2.circle(frame, (column, row), 4, (255, 0, 0), -1)
     found = extract_strip(frame)
     assert found.shape == STRIP_SHAPE and found.dtype == np.uint8
     row, column = np.unravel_index(found[..., 0].argmax(), STRIP_SHAPE[:2])
     assert abs(row - 16) <= 2 and abs(column - 80) <= 2
-
-
-def test_a_strip_shows_only_the_rows_that_are_kept_of_a_frame():
-    frame = np.random.default_rng(0).integers(0, 256, FRAME).astype(np.uint8)
     road = np.zeros_like(frame)
     road[ROAD_ROWS] = frame[ROAD_ROWS]
-    assert np.array_equal(extract_strip(road), extract_strip(frame))
+    assert np.array_equal(extract_strip(road), found), "no other rows matter"
 
 
 def test_brightness_and_contrast_are_normalised():
@@ -195,16 +191,10 @@ def test_the_shipped_network_on_rendered_frames(track, look, error, bias, slope)
         assert np.polyfit(true[:, k], found[:, k], 1)[0] == pytest.approx(1, abs=slope)
 
 
-def test_strips_of_some_rows(drive):
-    recording, _ = drive
-    assert np.array_equal(read_strips(recording, slice(5, 9)), read_strips(recording)[5:9])
-
-
-def test_mirrored_frames_mirror_the_place():
+def test_mirrored_frames_mirror_the_position():
     strips, _ = render_strips(RenderedScene("lake", UNSEEN, 8), 6)
     found, mirrored = estimate_centres(strips), estimate_centres(strips[:, :, ::-1])
     assert mirrored == pytest.approx(-found, abs=0.02)  # two steps of bfloat16 at 3 m
-    assert np.array_equal(estimate_centres(strips), found)
 
 
 def test_a_rendered_drive(drive):
@@ -231,20 +221,12 @@ def test_a_road_that_no_network_was_trained_on(tmp_path):
 
 def test_the_side_cameras_appear_where_they_are_mounted(drive):
     recording, _ = drive
-    centres = detect_centres(recording)[::4]
+    strips = read_strips(recording)
+    assert np.array_equal(read_strips(recording, slice(5, 9)), strips[5:9])
+    centres = estimate_centres(strips[::4])
     for camera in (1, 2):
         appears = (centres[:, 0] - centres[:, camera])[:, :3].mean(0)
         assert appears == pytest.approx(MOUNT_OFFSETS[camera], abs=0.032)  # measured: 0.025
-
-
-def test_a_known_trajectory_is_not_computed_again(sample_recording, monkeypatch):
-    recording = read_recording(sample_recording)
-    centres = np.zeros((len(recording), 3, len(DISTANCES_AHEAD)), np.float32)
-    expected, known = fuse_detections(recording, centres), stretches(recording)
-    assert [stretch.rows for stretch in known] == [slice(0, len(recording))]
-    monkeypatch.setattr(Stretch, "of", lambda *_: pytest.fail("computed again"))
-    found = fuse_detections(recording, centres, known)
-    assert np.array_equal(found.lateral_offset, expected.lateral_offset)
 
 
 def test_cameras_and_rows_are_fused(drive):
@@ -259,18 +241,13 @@ def test_cameras_and_rows_are_fused(drive):
     assert not swapped.trusted.any()
 
 
-def test_noise_is_an_unknown_road(tmp_path):
-    folder = render_recording(tmp_path / "noise", rows=40)
-    rng = np.random.default_rng(0)
-    for path in (folder / "IMG").iterdir():
-        cv2.imwrite(str(path), rng.integers(0, 256, (160, 320, 3)).astype(np.uint8))
-    recording = read_recording(folder)
-    assert not estimate_lane_position(recording, stretches(recording)).trusted.any()
-
-
-def test_frames_of_another_kind_are_an_unknown_road(sample_recording):
-    recording = read_recording(sample_recording)
+def test_noise_and_frames_of_another_look_are_an_unknown_road(copied):
+    recording = read_recording(copied)
     assert estimate_lane_position(recording, stretches(recording)).trusted.mean() < MIN_TRUSTED  # measured: 0.583
+    rng = np.random.default_rng(0)
+    for path in (copied / "IMG").iterdir():
+        cv2.imwrite(str(path), rng.integers(0, 256, (160, 320, 3)).astype(np.uint8))
+    assert not estimate_lane_position(recording, stretches(recording)).trusted.any()
 
 
 @pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)
@@ -311,55 +288,44 @@ def test_training_leaves_weights_that_load(tmp_path, sample_recording):
     assert shape == (2, len(DISTANCES_AHEAD))
 
 
-def test_unusable_weights_are_named_with_the_remedy(tmp_path):
-    with pytest.raises(ModelError, match=r"none\.pt: no such file.*python -m tools.train_lane"):
-        load_network(tmp_path / "none.pt")
-    Path(tmp_path / "bad.pt").write_bytes(b"nothing")
-    with pytest.raises(ModelError, match=r"bad\.pt: .*damaged.*python -m tools.train_lane"):
-        load_network(tmp_path / "bad.pt")
+def test_unusable_weights_are_named_with_the_remedy_and_those_of_earlier_versions_load(tmp_path):
+    path, shipped = tmp_path / "bad.pt", reader.SHIPPED_WEIGHTS.read_bytes()
 
+    def refused(message):
+        load_network.cache_clear()
+        with pytest.raises(ModelError, match=f"bad\\.pt: {message}.*python -m tools.train_lane"):
+            load_network(path)
 
-def test_changed_weights_are_refused_and_those_of_earlier_versions_are_not(tmp_path):
-    flipped, earlier, changed, other = (tmp_path / f"{name}.pt" for name in ("flipped", "earlier", "changed", "other"))
-    data = bytearray(reader.SHIPPED_WEIGHTS.read_bytes())
-    data[len(data) // 2] ^= 1
-    flipped.write_bytes(data)
-    with pytest.raises(ModelError, match=r"flipped\.pt: .*checksum"):
-        load_network(flipped)
+    refused("no such file")
+    path.write_bytes(b"nothing")
+    refused(".*damaged")
+    flipped = bytearray(shipped)
+    flipped[len(flipped) // 2] ^= 1
+    path.write_bytes(flipped)
+    refused(".*checksum")
     weights = torch.load(reader.SHIPPED_WEIGHTS, weights_only=True)
     weights["dense.2.bias"] += 0.01
-    torch.save(weights, changed)
-    with pytest.raises(ModelError, match=r"changed\.pt: .*digest"):
-        load_network(changed)
-    del weights["digest"]
-    torch.save(weights, earlier)
-    assert torch.equal(load_network(earlier).dense[2].bias, weights["dense.2.bias"].float())
+    torch.save(weights, path)
+    refused(".*digest")
+    del weights["digest"]  # as of an earlier version
+    torch.save(weights, path)
+    assert torch.equal(load_network(path).dense[2].bias, weights["dense.2.bias"].float())
     weights["dense.2.bias"][0] = torch.nan
-    torch.save(weights, other)
-    with pytest.raises(ModelError, match=r"other\.pt: holds no weights .*dense\.2\.bias.*not finite.*train_lane"):
-        load_network(other)
+    torch.save(weights, path)
+    refused("holds no weights .*dense\\.2\\.bias.*not finite")
 
 
-@pytest.fixture
-def no_weights(tmp_path, monkeypatch):
-    """The project without `lane.pt`."""
-    monkeypatch.setattr(reader, "SHIPPED_WEIGHTS", tmp_path / "lane.pt")
-    load_network.cache_clear()
-    yield
-    load_network.cache_clear()
-
-
-def test_robust_training_without_weights_reports_it(no_weights, sample_recording, tmp_path, capsys):
+def test_commands_without_weights_report_it(sample_recording, tmp_path, monkeypatch, capsys):
     import model
 
+    monkeypatch.setattr(reader, "SHIPPED_WEIGHTS", tmp_path / "lane.pt")
+    load_network.cache_clear()
     assert model.main([str(sample_recording), "--robust", "--output", str(tmp_path / "model.pt")]) == 2
     assert "lane.pt: no such file" in capsys.readouterr().err
-
-
-def test_a_replay_without_weights_reports_it(no_weights, sample_recording, capsys):
-    assert simulator.main(["replay", str(sample_recording), "--model", str(PILOT)]) == 2
+    assert simulator.main(["replay", str(sample_recording), "--model", str(SHIPPED_MODEL)]) == 2
     error = capsys.readouterr().err
     assert "simulator: " in error and "lane.pt: no such file" in error
+    load_network.cache_clear()
 
 
 def test_a_damaged_image_is_named(copied):
@@ -386,7 +352,7 @@ def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsy
 @pytest.mark.parametrize("tool", [train_lane, lane_accuracy, follow_driver], ids=lambda tool: tool.__name__)
 def test_the_tools_name_what_is_missing(tool, tmp_path, capsys):
     name = tool.__name__.removeprefix("tools.")
-    arguments = {"lane_accuracy": ["--laps", "0"], "follow_driver": [str(PILOT)]}
+    arguments = {"lane_accuracy": ["--laps", "0"], "follow_driver": [str(SHIPPED_MODEL)]}
     assert tool.main([*arguments.get(name, []), str(tmp_path / "nowhere")]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"{name}: ") and "nowhere" in error

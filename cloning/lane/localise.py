@@ -313,7 +313,7 @@ def localise_recording(
     positions = []
     for network in networks:
         centres = detect(network)
-        position = fuse_detections(recording, centres, stretches)
+        position = fuse_detections(recording, centres)
         if localised := list(localise_all(stretches, centres, strips)):
             for rows, localisation in localised:
                 _, offset, heading_error = localisation.states.T

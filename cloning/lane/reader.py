@@ -11,7 +11,6 @@ trained on generated roads and shadows as well, reads any road.
 import copy
 import functools
 import itertools
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,13 +57,8 @@ def extract_strip(frame: np.ndarray) -> np.ndarray:
     The strip has half the resolution and is seen by a camera that looks straight ahead and is not rolled, so that the
     mirror image of a strip is the strip of the mirrored world. Only the frame's `ROAD_ROWS` matter.
     """
-    return cv2.warpPerspective(
-        frame,
-        STRIP_TO_FRAME,
-        STRIP_SHAPE[1::-1],
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    size, flags = STRIP_SHAPE[1::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(frame, STRIP_TO_FRAME, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
 def normalize(strip: np.ndarray) -> np.ndarray:
@@ -84,12 +78,7 @@ class LaneNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        shapes: list[tuple[int, int, int, int | tuple[int, int]]] = [
-            (3, 24, 5, 2),
-            (24, 32, 3, 2),
-            (32, 48, 3, 2),
-            (48, 64, 3, (1, 2)),
-        ]
+        shapes = [(3, 24, 5, (2, 2)), (24, 32, 3, (2, 2)), (32, 48, 3, (2, 2)), (48, 64, 3, (1, 2))]
         layers: list[nn.Module] = []
         for inputs, outputs, kernel, stride in shapes:
             convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
@@ -118,7 +107,7 @@ def save_network(path: str | Path, network: LaneNetwork) -> None:
 @functools.cache
 def load_network(path: str | Path | None = None) -> LaneNetwork:
     """Return the network with the weights of a file, or with the shipped ones. Raises ModelError."""
-    path = SHIPPED_WEIGHTS if path is None else path
+    path = path or SHIPPED_WEIGHTS
     remedy = f"train the lane network with `python -m tools.train_lane --output {path}`"
     weights = tensors.load(path, remedy)
     network = LaneNetwork()
@@ -196,8 +185,7 @@ def read_strips(recording: Recording, rows: slice = slice(None)) -> np.ndarray:
             strips[row - first, camera] = extract_strip(frame)
 
     with ThreadPoolExecutor(threads()) as pool:
-        for _ in pool.map(read, range(first, end)):
-            pass
+        list(pool.map(read, range(first, end)))  # raises what reading a row raised
     return strips
 
 
@@ -210,21 +198,16 @@ def detect_centres(recording: Recording, network: LaneNetwork | None = None) -> 
     return estimate_centres(read_strips(recording), network)
 
 
-def fuse_detections(recording: Recording, centres: np.ndarray, stretches: Sequence[Stretch] = ()) -> LanePosition:
+def fuse_detections(recording: Recording, centres: np.ndarray) -> LanePosition:
     """Estimate the position in the lane from the cameras' detections and the car's motion, on any road.
 
-    Detections before a break in time are not used after it. centres: float32 (n, 3, 5), of `detect_centres`;
-    stretches: of the recording, whose trajectories need not be integrated again.
+    Detections before a break in time are not used after it. centres: float32 (n, 3, 5), of `detect_centres`.
     """
     centres = centres + MOUNT_OFFSETS[:, None]
     pause = np.diff(recording.time)
     breaks = np.flatnonzero((pause <= 0) | (pause > MAX_GAP)) + 1
-    known = {(stretch.rows.start, stretch.rows.stop): stretch for stretch in stretches}
-    parts = []
-    for edges in itertools.pairwise([0, *breaks.tolist(), len(recording)]):
-        stretch = known[edges] if edges in known else Stretch.of(recording, slice(*edges))
-        parts.append(_fit_centre(stretch, centres[stretch.rows]))
-    return LanePosition.joined(parts)
+    parts = [slice(*edges) for edges in itertools.pairwise([0, *breaks.tolist(), len(recording)])]
+    return LanePosition.joined([_fit_centre(Stretch.of(recording, rows), centres[rows]) for rows in parts])
 
 
 def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
