@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from typing import Any
 
 import cv2
 import numpy as np
@@ -152,10 +153,11 @@ def test_two_cameras_agree_on_a_straight_road(pose):
     # The line (offset + slope * z, z) in the second camera's axes, at its DISTANCES_AHEAD.
     z = (DISTANCES_AHEAD - (offset - right) * s + forward * c) / (c + slope * s)
     aside = (offset + slope * z - right) * c - (z - forward) * s
-    seen = [torch.tensor(values, dtype=torch.float32)[None] for values in (offset + slope * DISTANCES_AHEAD, aside)]
+    first = torch.tensor(offset + slope * DISTANCES_AHEAD, dtype=torch.float32)[None]
+    second = torch.tensor(aside, dtype=torch.float32)[None]
     poses = torch.tensor([[*pose, np.inf]], dtype=torch.float32)
-    assert float(consistency_loss(*seen, poses)) == pytest.approx(0, abs=1e-8)
-    assert float(consistency_loss(seen[0], seen[1] + 0.5, poses)) > 0.1
+    assert float(consistency_loss(first, second, poses)) == pytest.approx(0, abs=1e-8)
+    assert float(consistency_loss(first, second + 0.5, poses)) > 0.1
 
 
 def test_the_ground_moves_with_the_camera():
@@ -309,7 +311,7 @@ def test_unusable_weights_are_named_with_the_remedy_and_those_of_earlier_version
     refused(".*digest")
     del weights["digest"]  # as of an earlier version
     torch.save(weights, path)
-    assert torch.equal(load_network(path).dense[2].bias, weights["dense.2.bias"].float())
+    assert torch.equal(load_network(path).state_dict()["dense.2.bias"], weights["dense.2.bias"].float())
     weights["dense.2.bias"][0] = torch.nan
     torch.save(weights, path)
     refused("holds no weights .*dense\\.2\\.bias.*not finite")
@@ -343,9 +345,10 @@ def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsy
     assert likeness.main([str(recording.folder), "--frames", "8", "--picture", str(picture)]) == 0
     table = capsys.readouterr().out
     assert table.startswith(f"lake, ccw, {len(stretches(recording)[0])} rows\n")
-    assert cv2.imread(str(picture)).shape == (8 * FRAME[0], 6 * FRAME[1], 3)
+    shown: Any = cv2.imread(str(picture))
+    assert shown.shape == (8 * FRAME[0], 6 * FRAME[1], 3)
     assert likeness.main([str(recording.folder), "--frames", "8", "--look", "3"]) == 0
-    same, other = (float(re.search(r"mean difference ([\d.]+)", text)[1]) for text in (table, capsys.readouterr().out))
+    same, other = (float(re.findall(r"mean difference ([\d.]+)", text)[0]) for text in (table, capsys.readouterr().out))
     assert same < 5 and other > 2 * same  # not 0, because so short a drive is placed only to some metres
 
 

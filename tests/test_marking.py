@@ -62,6 +62,9 @@ def test_no_line_is_found_where_there_is_none_or_more_than_one():
     assert np.isnan(find_line(paint([2.5]), STRAIGHT)).all()  # out of reach
     assert np.isnan(find_line(paint([-0.5, 0.5]), STRAIGHT)).all()
     assert np.isnan(find_line(paint([0]), np.full_like(STRAIGHT, np.nan))).all()  # behind a crest
+    shadow = paint([])
+    shadow[:, :, 80:] //= 3
+    assert np.isnan(find_line(shadow, STRAIGHT)).all()  # the edge of a shadow
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.4])
@@ -108,12 +111,6 @@ def test_where_a_line_is_seen_where_the_road_falls_or_rises(bend):
     assert found[visible] == pytest.approx(expected[visible], abs=0.02)
     assert factor[visible] == pytest.approx(np.interp(distances, seen[:end], factors[:end])[visible], abs=0.02)
     assert ((factor[visible] - 1) * bend > 0.1).any()
-
-
-def test_the_edge_of_a_shadow_is_no_line():
-    strips = paint([])
-    strips[:, :, 80:] //= 3
-    assert np.isnan(find_line(strips, STRAIGHT)).all()
 
 
 def test_each_row_is_searched_on_its_own():
