@@ -28,7 +28,6 @@ from cloning.lane.reader import (
     STRIP_SHAPE,
     STRIP_TO_FRAME,
     LaneNetwork,
-    LanePosition,
     detect_centres,
     estimate_centres,
     extract_strip,
@@ -38,6 +37,7 @@ from cloning.lane.reader import (
     normalize,
     read_strips,
 )
+from cloning.lane.recovery import LanePosition
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
@@ -102,8 +102,8 @@ def test_where_the_centre_lies_ahead(direction):
     """On a straight: a camera 1 m right of the centre, turned right by 3 degrees."""
     track = Track("lake", direction)
     straight = np.convolve(np.abs(track.curvature), np.ones(60), "same").argmin()
-    place, yaw = track.at(straight * track.step, 1.0), np.radians(3)
-    found = centre_ahead(track, straight * track.step, np.array([place.x, place.y]), place.heading - yaw)
+    pose, yaw = track.at(straight * track.step, 1.0), np.radians(3)
+    found = centre_ahead(track, straight * track.step, np.array([pose.x, pose.y]), pose.heading - yaw)
     assert found == pytest.approx(-1 / np.cos(yaw) - DISTANCES_AHEAD * np.tan(yaw), abs=0.04)
 
 
@@ -129,11 +129,11 @@ def test_no_road_is_taken_for_a_known_one(name):
     """315 m along a road's centre, detected to 0.15 m: the lake fits these roads' detections nearly as well."""
     track, n = Track(name), 700
     driven = 30 + 0.45 * np.arange(n)
-    places = [track.at(s) for s in driven]
-    heading = -np.unwrap([at.heading for at in places])
+    poses = [track.at(s) for s in driven]
+    heading = -np.unwrap([at.heading for at in poses])
     stretch = Stretch(slice(0, n), np.zeros(n), np.zeros(n), heading - heading[0], driven, np.zeros(n - 1))
     centres = []
-    for s, at in zip(driven, places, strict=True):
+    for s, at in zip(driven, poses, strict=True):
         camera = camera_position(np.array([at.x, at.y]), np.array([np.cos(at.heading), np.sin(at.heading)]))
         centres.append(centre_ahead(track, s, camera, at.heading))
     noise = np.random.default_rng(0).normal(0, 0.15, (n, len(DISTANCES_AHEAD)))

@@ -89,20 +89,20 @@ def test_where_a_line_is_seen_where_the_road_falls_or_rises(bend):
     """At the jungle's sharpest crest and dip, against its points, one by one, from a car as steep as the road below."""
     track = Track("jungle")
     s = track.step * (bend * (np.roll(track.grade, -10) - track.grade)).argmax()
-    place, front = track.at(s, right=0.5), track.at(s + WHEELBASE)
-    heading = place.heading - 0.07
+    pose, front = track.at(s, right=0.5), track.at(s + WHEELBASE)
+    heading = pose.heading - 0.07
     level = np.array([np.cos(heading), np.sin(heading), 0])
-    ahead = level * WHEELBASE + [0, 0, front.z - place.z]
+    ahead = level * WHEELBASE + [0, 0, front.z - pose.z]
     ahead /= np.linalg.norm(ahead)
     right = np.array([level[1], -level[0], 0])
     up = np.cross(right, ahead)
-    camera = np.array([place.x, place.y, place.z]) + AXLE_TO_CAMERA * ahead + CAMERA_HEIGHT * up
+    camera = np.array([pose.x, pose.y, pose.z]) + AXLE_TO_CAMERA * ahead + CAMERA_HEIGHT * up
     points = np.array([(at.x, at.y, at.z) for at in map(track.at, np.arange(s + 3, s + 25, 0.1))]) - camera
     factors = -CAMERA_HEIGHT / (points @ up)  # to where the ray to the point meets flat ground
     seen = points @ ahead * factors
     end = (np.diff(seen) <= 0).argmax() + 1 if (np.diff(seen) <= 0).any() else len(seen)
     distances = np.arange(2.0, 6, 0.25)
-    found, factor = line_ahead(track, s, np.array([place.x, place.y]) + AXLE_TO_CAMERA * level[:2], heading, distances)
+    found, factor = line_ahead(track, s, np.array([pose.x, pose.y]) + AXLE_TO_CAMERA * level[:2], heading, distances)
     expected = np.interp(distances, seen[:end], (points @ right * factors)[:end], right=np.nan)
     hidden, beyond = np.isnan(found), np.isnan(expected)
     assert hidden.any() == (bend < 0) and (~hidden).sum() > 5

@@ -21,12 +21,12 @@ from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
     LaneNetwork,
-    LanePosition,
     estimate_centres,
     fuse_detections,
     load_network,
     read_strips,
 )
+from cloning.lane.recovery import LanePosition
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
 from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, wrap_angle

@@ -1,10 +1,10 @@
 """Estimates the car's lateral offset and heading error in its lane from camera frames, with a small network.
 
 The network detects where the lane's centre lies at some distances ahead of a camera. With the car's motion, detections
-from frames that were taken a second earlier tell the centre next to the car, too, where no camera looks.
+from frames that were taken a second earlier show the centre next to the car, too, where no camera looks.
 
 `tools/train_lane.py` trains the network. Two sets of weights come with the project: `lane.pt`, trained on the lake and
-jungle tracks alone, reads these more accurately, also in places where a frame hardly shows the lane; `any_road.pt`,
+jungle tracks alone, reads these more accurately, also where a frame hardly shows the lane; `any_road.pt`,
 trained on generated roads and shadows as well, reads any road.
 """
 
@@ -12,7 +12,6 @@ import copy
 import functools
 import itertools
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -23,7 +22,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME, ROAD_ROWS
-from cloning.base.table import Column, Table
+from cloning.lane.recovery import LanePosition
 from cloning.network import tensors
 from cloning.network.compute import choose_precision, in_precision, one_thread, threads
 from cloning.recordings.log import Recording
@@ -153,21 +152,6 @@ def estimate_centres(strips: np.ndarray, network: LaneNetwork | None = None) -> 
     with ThreadPoolExecutor(threads(), initializer=one_thread) as pool:
         centres = np.concatenate([nothing, *pool.map(detect, range(0, len(flat), STRIPS_PER_PIECE))])
     return centres.reshape(*strips.shape[:-3], len(DISTANCES_AHEAD))
-
-
-@dataclass(frozen=True)
-class LanePosition(Table):
-    """The car's position in its lane, one value for each row of a recording.
-
-    lateral_offset  float32 (n,): m from the lane's centre to the car's middle, right positive
-    heading_error   float32 (n,): radians from the road's direction next to the car to the car's, right positive
-    trusted         bool (n,): whether the other two values can be relied on: the three cameras' detections agree with
-                    each other and over time, or the row was localised on a known track
-    """
-
-    lateral_offset: Column
-    heading_error: Column
-    trusted: Column
 
 
 def read_strips(recording: Recording, rows: slice = slice(None)) -> np.ndarray:

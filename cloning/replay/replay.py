@@ -9,12 +9,11 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cloning.base.errors import RecordingError
-from cloning.lane.recovery import LaneAhead
+from cloning.lane.recovery import LaneAhead, LanePosition
 from cloning.recordings.check import check_images
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.images import compress, compressed_rows, encode
@@ -33,9 +32,6 @@ from cloning.road.motion import (
     lagged_curvature,
     stretches,
 )
-
-if TYPE_CHECKING:
-    from cloning.lane.reader import LanePosition  # which loads PyTorch
 
 MAX_YAW_FROM_HUMAN = 1.2  # radians: views further to the side cannot be warped from the frames
 
@@ -132,16 +128,14 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
     return lines
 
 
-def _lines_of(recording: Recording, stretch: Stretch, lane: "LanePosition") -> list[ReferenceLine]:
+def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> list[ReferenceLine]:
     """Return the reference lines of a stretch; lane: the position in the lane in its rows."""
     if lane.trusted.mean() < MIN_TRUSTED:
         return [ReferenceLine.human_path(stretch)]
     ahead = LaneAhead.of_stretch(stretch, lane.lateral_offset, lane.trusted).extended()
-    known, lines = np.flatnonzero(lane.trusted), []
-    offset, yaw = (
-        np.interp(np.arange(len(lane)), known, values[known].astype(float))
-        for values in (lane.lateral_offset, lane.heading_error)
-    )
+    every, known, sure = np.arange(len(lane)), np.flatnonzero(lane.trusted), lane.take(lane.trusted)
+    offset, yaw = (np.interp(every, known, column) for column in (sure.lateral_offset, sure.heading_error))
+    lines = []
     changes = np.flatnonzero(np.diff(np.r_[False, np.abs(offset) < OFF_ROAD, False]))  # onto the road, and off it
     for start, end in changes.reshape(-1, 2).tolist():
         if end - start >= MIN_STRETCH_ROWS:
