@@ -12,7 +12,7 @@ from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses, summary
 from cloning.browse.analyses import LANE, Analysis, Result, read_result, stamp, write_result
 from cloning.browse.library import Library, UnknownError
-from cloning.lane.place import Localisation
+from cloning.lane.localise import Localisation
 from cloning.network.network import load_model, steer
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import read_recording
@@ -75,7 +75,7 @@ def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
     recording, track = read_recording(sample_recording), Track("lake", "cw")
     s = np.linspace(100, 120, 40)
     placed = Localisation(track, np.stack([s, np.full(40, 1.5), np.zeros(40)], axis=1), 0.0, 0.0)
-    monkeypatch.setattr("cloning.lane.place.localise_all", lambda *_: [(slice(10, 50), placed)])
+    monkeypatch.setattr("cloning.lane.localise.localise_all", lambda *_: [(slice(10, 50), placed)])
     monkeypatch.setattr(analyse, "detect_centres", lambda part, _: np.zeros((len(part), 3, 5), np.float32))
     result = analyse.lane(recording)
     x, y = (result.column(name, recording.images[:, 0]) for name in "xy")

@@ -11,10 +11,9 @@ from cloning.road import camera, motion, warp
 
 def ground_picture(right: float, forward: float, yaw: float) -> np.ndarray:
     """An oracle: what a camera at this pose sees of a ground of smooth stripes, rendered ray by ray."""
-    columns, rows = np.meshgrid(np.arange(320), np.arange(160))
-    rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(camera.CAMERA_MATRIX).T
-    x, y, z = rays[..., 0], np.maximum(rays[..., 1], 1e-3), rays[..., 2]
-    x, z = camera.CAMERA_HEIGHT * x / y, camera.CAMERA_HEIGHT * z / y
+    pixels = np.meshgrid(np.arange(320), np.arange(160))
+    rays = np.stack([*pixels, np.ones((160, 320))], -1) @ np.linalg.inv(camera.CAMERA_MATRIX).T
+    x, z = camera.CAMERA_HEIGHT * rays[..., ::2].transpose(2, 0, 1) / np.maximum(rays[..., 1], 1e-3)
     world_x = right + x * np.cos(yaw) + z * np.sin(yaw)
     world_z = forward - x * np.sin(yaw) + z * np.cos(yaw)
     waves = [np.sin(world_x * 1.1), np.cos(world_z * 0.7), np.sin(world_x * 0.4 + world_z * 0.5)]
@@ -32,9 +31,10 @@ def test_a_warped_frame_is_what_is_seen_from_there(pose):
 
 
 def test_unseen_pixels_are_marked_and_the_bonnet_is_not_road():
-    _, seen = warp.warp(np.zeros((160, 320, 3), np.uint8), 0, 0, 0)
+    frame = np.zeros((160, 320, 3), np.uint8)
+    _, seen = warp.warp(frame, 0, 0, 0)
     assert seen[2:134, 2:-2].all() and not seen[136:].any()
-    _, seen = warp.warp(np.zeros((160, 320, 3), np.uint8), 1.5, 0, 0)  # to the right: its right is unknown
+    _, seen = warp.warp(frame, 1.5, 0, 0)  # to the right: its right is unknown
     assert not seen[120, 300] and seen[120, 20]
 
 
@@ -64,13 +64,10 @@ def test_a_camera_is_where_the_cars_pose_and_its_mounting_put_it():
     assert found == pytest.approx(np.add(axle, [turned.real, turned.imag]))
 
 
-def test_components_undo_a_turn():
+def test_components_undo_a_turn_and_steering_a_curvature():
     forward = motion.forward_vector(np.array([0.4, -2.0]))
     vector = 3 * motion.right_of(forward) + 5 * forward
     assert motion.components(vector, forward) == pytest.approx(np.array([[3, 5], [3, 5]]))
-
-
-def test_steering_and_curvature_are_inverse():
     steering = np.linspace(-1, 1, 21)
     assert motion.steering_for(motion.curvature(steering)) == pytest.approx(steering)
     assert motion.curvature(1.0) == pytest.approx(np.tan(np.radians(25)) / 2.87)

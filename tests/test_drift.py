@@ -2,6 +2,7 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,9 @@ from test_generator import recording as without_images
 
 from cloning.base.errors import SimulatorError
 from cloning.network.network import Network
-from cloning.recordings.images import read_frame
 from cloning.replay import drift
 from cloning.replay.drift import MOST_PIECES, ROWS, drifts, held_out, still_drifts
+from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import load_recording
 from cloning.road.motion import Stretch, curvature
 from cloning.training.checkpoint import Progress
@@ -62,17 +63,14 @@ def test_drift_is_the_distance_between_the_two_cars(recording, monkeypatch):
     found = driven([recording], np.zeros(100, int), np.arange(100))
     assert rows_of(found) == [(0, 30), (30, 60), (60, 90)]
 
-    class Driver:
-        def __init__(self, more):
-            self.more = more
+    monkeypatch.setattr(drift, "ModelDriver", lambda driver: driver)
 
-        def __call__(self, frame):
-            return frame.human_steering + self.more
+    def more(steering) -> Any:
+        return lambda frame: frame.human_steering + steering
 
-    monkeypatch.setattr(drift, "ModelDriver", Driver)
     with ThreadPoolExecutor(2) as pool:
-        assert drifts(found, 0.0, pool) == pytest.approx(np.zeros(3), abs=1e-6)
-        [first, *_] = drifts(found, 0.1, pool)
+        assert drifts(found, more(0.0), pool) == pytest.approx(np.zeros(3), abs=1e-6)
+        [first, *_] = drifts(found, more(0.1), pool)
     line = found[0].line
     other = load_recording(recording.folder)
     other.steering = other.steering + np.float32(0.1)
@@ -98,17 +96,12 @@ def test_straight_ahead_the_car_drifts_by_the_bends_that_the_driver_takes():
 
 def test_a_network_that_diverged_drives_nowhere(recording):
     network = Network()
-    torch.nn.init.constant_(network.dense[-1].bias, math.nan)
+    torch.nn.init.constant_(list(network.parameters())[-1], math.nan)
+    found = driven([recording], np.zeros(100, int), np.arange(100))
     with ThreadPoolExecutor(1) as pool:
-        assert np.isnan(drifts(driven([recording], np.zeros(100, int), np.arange(100)), network, pool)).all()
+        assert np.isnan(drifts(found, network, pool)).all()
     with pytest.raises(SimulatorError, match="train the model again"):
-        drift.ModelDriver(network)(
-            type("Frame", (), {"received": lambda self, rows: recording_frame(recording)[rows]})()
-        )
-
-
-def recording_frame(recording):
-    return read_frame(recording.path(0, 0))
+        found[0].drift(ModelDriver(network))
 
 
 @pytest.mark.parametrize(

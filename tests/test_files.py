@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from cloning.base.errors import OutputError
+from cloning.base.errors import OutputError, UserError
 from cloning.base.files import write, written_whole
-from cloning.base.outputs import check_folders
+from cloning.base.outputs import check_folders, run_all
 
 
 @pytest.mark.parametrize("name", ["runs", "."])
@@ -29,6 +29,8 @@ def test_a_file_appears_only_when_it_is_complete(tmp_path):
         temporary.write_bytes(b"new")
         assert temporary.parent == tmp_path
         assert path.read_bytes() == b"old"
+    with written_whole(path):
+        pass  # a block that writes nothing changes nothing
     assert path.read_bytes() == b"new"
     assert os.listdir(tmp_path) == ["film.mp4"]
 
@@ -64,14 +66,11 @@ def test_a_full_disk_names_the_file_that_the_user_knows(tmp_path, error):
     assert raised.value.errno and os.listdir(tmp_path) == []
 
 
-def test_a_missing_folder_names_the_file_that_the_user_knows(tmp_path):
+def test_a_missing_folder_or_another_file_is_named(tmp_path):
     path = tmp_path / "nowhere" / "model.pt"
     with pytest.raises(FileNotFoundError) as raised:
         write(path, b"data")
     assert raised.value.filename == str(path)
-
-
-def test_an_error_in_another_file_keeps_its_name(tmp_path):
     with pytest.raises(FileNotFoundError) as raised, written_whole(tmp_path / "film.mp4") as temporary:
         temporary.write_bytes(b"half")
         (tmp_path / "frame.jpg").read_bytes()
@@ -94,11 +93,7 @@ def test_several_may_write_a_file_at_the_same_time(tmp_path):
 
 def test_what_killed_processes_left_goes_after_a_day(tmp_path):
     """Each use has its own temporary file, which nobody else would ever write or delete."""
-    old, new, foreign = (
-        tmp_path / ".other.npz.0123abcd.part",
-        tmp_path / ".film.mp4.89ef0123.part",
-        tmp_path / ".a.part",
-    )
+    old, new, foreign = (tmp_path / name for name in (".other.npz.0123abcd.part", ".film.mp4.89ef0123.part", ".a.part"))
     for path, age in ((old, 86_500), (new, 86_300), (foreign, 86_500)):
         path.write_bytes(b"half")
         os.utime(path, (time.time() - age,) * 2)
@@ -107,7 +102,14 @@ def test_what_killed_processes_left_goes_after_a_day(tmp_path):
     assert set(os.listdir(tmp_path)) == left, "another process may still write the new one"
 
 
-def test_a_block_that_writes_nothing_changes_nothing(tmp_path):
-    with written_whole(tmp_path / "film.mp4"):
-        pass
-    assert os.listdir(tmp_path) == []
+def test_all_outputs_are_tried_and_every_failure_is_reported():
+    done = []
+
+    def fails(reason):
+        raise reason
+
+    with pytest.raises(UserError, match="first; second"):
+        run_all(lambda: fails(UserError("first")), lambda: fails(UserError("second")), lambda: done.append("report"))
+    with pytest.raises(KeyboardInterrupt):
+        run_all(lambda: fails(KeyboardInterrupt()), lambda: done.append("film"), lambda: fails(UserError("third")))
+    assert done == ["report", "film"]

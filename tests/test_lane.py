@@ -7,7 +7,7 @@ import copy
 import os
 import re
 import sys
-from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,21 +15,19 @@ import pytest
 import real_recordings
 import torch
 import warm
-from commands import HERE, ROOT
-from rendered import render_recording
+from commands import HERE
 
 from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
-from cloning.lane import place, reader
+from cloning.lane import reader
 from cloning.lane.ahead import centre_ahead
-from cloning.lane.place import MIN_LOG_LIKELIHOOD, estimate_lane_position, localise
+from cloning.lane.localise import MIN_LOG_LIKELIHOOD, estimate_lane_position, localise
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
     STRIP_SHAPE,
     STRIP_TO_FRAME,
     LaneNetwork,
-    LanePosition,
     detect_centres,
     estimate_centres,
     extract_strip,
@@ -39,6 +37,8 @@ from cloning.lane.reader import (
     normalize,
     read_strips,
 )
+from cloning.lane.recovery import LanePosition
+from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, camera_position
@@ -52,7 +52,6 @@ from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
 SHORT_TRAINING = ("--looks", "1", "--roads", "1", "--frames", "3", "--steps", "2")
-PILOT = ROOT / "cloning" / "network" / "shipped.pt"
 UNSEEN = 1003  # a look that the network was not trained on
 
 
@@ -76,21 +75,18 @@ def test_a_strip_is_level_and_looks_straight_ahead():
         assert left[1] == pytest.approx(right[1], abs=1e-6)
 
 
-def test_a_strip_is_the_frame_at_half_the_resolution():
-    frame = np.zeros((160, 320, 3), np.uint8)
+def test_a_strip_is_the_frames_road_at_half_the_resolution():
+    frame = np.random.default_rng(0).integers(0, 100, FRAME).astype(np.uint8)
     pixel = STRIP_TO_FRAME @ (80, 16, 1)
-    cv2.circle(frame, np.round(pixel[:2] / pixel[2]).astype(int).tolist(), 4, (255, 0, 0), -1)
+    column, row = np.round(pixel[:2] / pixel[2]).astype(int).tolist()
+    cv2.circle(frame, (column, row), 4, (255, 0, 0), -1)
     found = extract_strip(frame)
     assert found.shape == STRIP_SHAPE and found.dtype == np.uint8
     row, column = np.unravel_index(found[..., 0].argmax(), STRIP_SHAPE[:2])
     assert abs(row - 16) <= 2 and abs(column - 80) <= 2
-
-
-def test_a_strip_shows_only_the_rows_that_are_kept_of_a_frame():
-    frame = np.random.default_rng(0).integers(0, 256, FRAME).astype(np.uint8)
     road = np.zeros_like(frame)
     road[ROAD_ROWS] = frame[ROAD_ROWS]
-    assert np.array_equal(extract_strip(road), extract_strip(frame))
+    assert np.array_equal(extract_strip(road), found), "no other rows matter"
 
 
 def test_brightness_and_contrast_are_normalised():
@@ -106,8 +102,8 @@ def test_where_the_centre_lies_ahead(direction):
     """On a straight: a camera 1 m right of the centre, turned right by 3 degrees."""
     track = Track("lake", direction)
     straight = np.convolve(np.abs(track.curvature), np.ones(60), "same").argmin()
-    place, yaw = track.at(straight * track.step, 1.0), np.radians(3)
-    found = centre_ahead(track, straight * track.step, np.array([place.x, place.y]), place.heading - yaw)
+    pose, yaw = track.at(straight * track.step, 1.0), np.radians(3)
+    found = centre_ahead(track, straight * track.step, np.array([pose.x, pose.y]), pose.heading - yaw)
     assert found == pytest.approx(-1 / np.cos(yaw) - DISTANCES_AHEAD * np.tan(yaw), abs=0.04)
 
 
@@ -133,11 +129,11 @@ def test_no_road_is_taken_for_a_known_one(name):
     """315 m along a road's centre, detected to 0.15 m: the lake fits these roads' detections nearly as well."""
     track, n = Track(name), 700
     driven = 30 + 0.45 * np.arange(n)
-    places = [track.at(s) for s in driven]
-    heading = -np.unwrap([at.heading for at in places])
+    poses = [track.at(s) for s in driven]
+    heading = -np.unwrap([at.heading for at in poses])
     stretch = Stretch(slice(0, n), np.zeros(n), np.zeros(n), heading - heading[0], driven, np.zeros(n - 1))
     centres = []
-    for s, at in zip(driven, places, strict=True):
+    for s, at in zip(driven, poses, strict=True):
         camera = camera_position(np.array([at.x, at.y]), np.array([np.cos(at.heading), np.sin(at.heading)]))
         centres.append(centre_ahead(track, s, camera, at.heading))
     noise = np.random.default_rng(0).normal(0, 0.15, (n, len(DISTANCES_AHEAD)))
@@ -157,10 +153,11 @@ def test_two_cameras_agree_on_a_straight_road(pose):
     # The line (offset + slope * z, z) in the second camera's axes, at its DISTANCES_AHEAD.
     z = (DISTANCES_AHEAD - (offset - right) * s + forward * c) / (c + slope * s)
     aside = (offset + slope * z - right) * c - (z - forward) * s
-    seen = [torch.tensor(values, dtype=torch.float32)[None] for values in (offset + slope * DISTANCES_AHEAD, aside)]
+    first = torch.tensor(offset + slope * DISTANCES_AHEAD, dtype=torch.float32)[None]
+    second = torch.tensor(aside, dtype=torch.float32)[None]
     poses = torch.tensor([[*pose, np.inf]], dtype=torch.float32)
-    assert float(consistency_loss(*seen, poses)) == pytest.approx(0, abs=1e-8)
-    assert float(consistency_loss(seen[0], seen[1] + 0.5, poses)) > 0.1
+    assert float(consistency_loss(first, second, poses)) == pytest.approx(0, abs=1e-8)
+    assert float(consistency_loss(first, second + 0.5, poses)) > 0.1
 
 
 def test_the_ground_moves_with_the_camera():
@@ -196,16 +193,10 @@ def test_the_shipped_network_on_rendered_frames(track, look, error, bias, slope)
         assert np.polyfit(true[:, k], found[:, k], 1)[0] == pytest.approx(1, abs=slope)
 
 
-def test_strips_of_some_rows(drive):
-    recording, _ = drive
-    assert np.array_equal(read_strips(recording, slice(5, 9)), read_strips(recording)[5:9])
-
-
-def test_mirrored_frames_mirror_the_place():
+def test_mirrored_frames_mirror_the_position():
     strips, _ = render_strips(RenderedScene("lake", UNSEEN, 8), 6)
     found, mirrored = estimate_centres(strips), estimate_centres(strips[:, :, ::-1])
     assert mirrored == pytest.approx(-found, abs=0.02)  # two steps of bfloat16 at 3 m
-    assert np.array_equal(estimate_centres(strips), found)
 
 
 def test_a_rendered_drive(drive):
@@ -232,20 +223,12 @@ def test_a_road_that_no_network_was_trained_on(tmp_path):
 
 def test_the_side_cameras_appear_where_they_are_mounted(drive):
     recording, _ = drive
-    centres = detect_centres(recording)[::4]
+    strips = read_strips(recording)
+    assert np.array_equal(read_strips(recording, slice(5, 9)), strips[5:9])
+    centres = estimate_centres(strips[::4])
     for camera in (1, 2):
         appears = (centres[:, 0] - centres[:, camera])[:, :3].mean(0)
         assert appears == pytest.approx(MOUNT_OFFSETS[camera], abs=0.032)  # measured: 0.025
-
-
-def test_a_known_trajectory_is_not_computed_again(sample_recording, monkeypatch):
-    recording = read_recording(sample_recording)
-    centres = np.zeros((len(recording), 3, len(DISTANCES_AHEAD)), np.float32)
-    expected, known = fuse_detections(recording, centres), stretches(recording)
-    assert [stretch.rows for stretch in known] == [slice(0, len(recording))]
-    monkeypatch.setattr(Stretch, "of", lambda *_: pytest.fail("computed again"))
-    found = fuse_detections(recording, centres, known)
-    assert np.array_equal(found.lateral_offset, expected.lateral_offset)
 
 
 def test_cameras_and_rows_are_fused(drive):
@@ -260,18 +243,13 @@ def test_cameras_and_rows_are_fused(drive):
     assert not swapped.trusted.any()
 
 
-def test_noise_is_an_unknown_road(tmp_path):
-    folder = render_recording(tmp_path / "noise", rows=40)
-    rng = np.random.default_rng(0)
-    for path in (folder / "IMG").iterdir():
-        cv2.imwrite(str(path), rng.integers(0, 256, (160, 320, 3)).astype(np.uint8))
-    recording = read_recording(folder)
-    assert not estimate_lane_position(recording, stretches(recording)).trusted.any()
-
-
-def test_frames_of_another_kind_are_an_unknown_road(sample_recording):
-    recording = read_recording(sample_recording)
+def test_noise_and_frames_of_another_look_are_an_unknown_road(copied):
+    recording = read_recording(copied)
     assert estimate_lane_position(recording, stretches(recording)).trusted.mean() < MIN_TRUSTED  # measured: 0.583
+    rng = np.random.default_rng(0)
+    for path in (copied / "IMG").iterdir():
+        cv2.imwrite(str(path), rng.integers(0, 256, (160, 320, 3)).astype(np.uint8))
+    assert not estimate_lane_position(recording, stretches(recording)).trusted.any()
 
 
 @pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)
@@ -312,55 +290,44 @@ def test_training_leaves_weights_that_load(tmp_path, sample_recording):
     assert shape == (2, len(DISTANCES_AHEAD))
 
 
-def test_unusable_weights_are_named_with_the_remedy(tmp_path):
-    with pytest.raises(ModelError, match=r"none\.pt: no such file.*python -m tools.train_lane"):
-        load_network(tmp_path / "none.pt")
-    Path(tmp_path / "bad.pt").write_bytes(b"nothing")
-    with pytest.raises(ModelError, match=r"bad\.pt: .*damaged.*python -m tools.train_lane"):
-        load_network(tmp_path / "bad.pt")
+def test_unusable_weights_are_named_with_the_remedy_and_those_of_earlier_versions_load(tmp_path):
+    path, shipped = tmp_path / "bad.pt", reader.SHIPPED_WEIGHTS.read_bytes()
 
+    def refused(message):
+        load_network.cache_clear()
+        with pytest.raises(ModelError, match=f"bad\\.pt: {message}.*python -m tools.train_lane"):
+            load_network(path)
 
-def test_changed_weights_are_refused_and_those_of_earlier_versions_are_not(tmp_path):
-    flipped, earlier, changed, other = (tmp_path / f"{name}.pt" for name in ("flipped", "earlier", "changed", "other"))
-    data = bytearray(reader.SHIPPED_WEIGHTS.read_bytes())
-    data[len(data) // 2] ^= 1
-    flipped.write_bytes(data)
-    with pytest.raises(ModelError, match=r"flipped\.pt: .*checksum"):
-        load_network(flipped)
+    refused("no such file")
+    path.write_bytes(b"nothing")
+    refused(".*damaged")
+    flipped = bytearray(shipped)
+    flipped[len(flipped) // 2] ^= 1
+    path.write_bytes(flipped)
+    refused(".*checksum")
     weights = torch.load(reader.SHIPPED_WEIGHTS, weights_only=True)
     weights["dense.2.bias"] += 0.01
-    torch.save(weights, changed)
-    with pytest.raises(ModelError, match=r"changed\.pt: .*digest"):
-        load_network(changed)
-    del weights["digest"]
-    torch.save(weights, earlier)
-    assert torch.equal(load_network(earlier).dense[2].bias, weights["dense.2.bias"].float())
+    torch.save(weights, path)
+    refused(".*digest")
+    del weights["digest"]  # as of an earlier version
+    torch.save(weights, path)
+    assert torch.equal(load_network(path).state_dict()["dense.2.bias"], weights["dense.2.bias"].float())
     weights["dense.2.bias"][0] = torch.nan
-    torch.save(weights, other)
-    with pytest.raises(ModelError, match=r"other\.pt: holds no weights .*dense\.2\.bias.*not finite.*train_lane"):
-        load_network(other)
+    torch.save(weights, path)
+    refused("holds no weights .*dense\\.2\\.bias.*not finite")
 
 
-@pytest.fixture
-def no_weights(tmp_path, monkeypatch):
-    """The project without `lane.pt`."""
-    monkeypatch.setattr(reader, "SHIPPED_WEIGHTS", tmp_path / "lane.pt")
-    load_network.cache_clear()
-    yield
-    load_network.cache_clear()
-
-
-def test_robust_training_without_weights_reports_it(no_weights, sample_recording, tmp_path, capsys):
+def test_commands_without_weights_report_it(sample_recording, tmp_path, monkeypatch, capsys):
     import model
 
+    monkeypatch.setattr(reader, "SHIPPED_WEIGHTS", tmp_path / "lane.pt")
+    load_network.cache_clear()
     assert model.main([str(sample_recording), "--robust", "--output", str(tmp_path / "model.pt")]) == 2
     assert "lane.pt: no such file" in capsys.readouterr().err
-
-
-def test_a_replay_without_weights_reports_it(no_weights, sample_recording, capsys):
-    assert simulator.main(["replay", str(sample_recording), "--model", str(PILOT)]) == 2
+    assert simulator.main(["replay", str(sample_recording), "--model", str(SHIPPED_MODEL)]) == 2
     error = capsys.readouterr().err
     assert "simulator: " in error and "lane.pt: no such file" in error
+    load_network.cache_clear()
 
 
 def test_a_damaged_image_is_named(copied):
@@ -373,21 +340,22 @@ def test_a_damaged_image_is_named(copied):
 def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsys):
     """The table of differences, of a rendered recording against the same places rendered again."""
     recording, _ = drive
-    monkeypatch.setattr(place, "MIN_LOCALISED_ROWS", len(recording) // 2)  # the drive is short
+    monkeypatch.setattr("cloning.lane.localise.MIN_LOCALISED_ROWS", len(recording) // 2)  # the drive is short
     picture = tmp_path / "both.png"
     assert likeness.main([str(recording.folder), "--frames", "8", "--picture", str(picture)]) == 0
     table = capsys.readouterr().out
     assert table.startswith(f"lake, ccw, {len(stretches(recording)[0])} rows\n")
-    assert cv2.imread(str(picture)).shape == (8 * FRAME[0], 6 * FRAME[1], 3)
+    shown: Any = cv2.imread(str(picture))
+    assert shown.shape == (8 * FRAME[0], 6 * FRAME[1], 3)
     assert likeness.main([str(recording.folder), "--frames", "8", "--look", "3"]) == 0
-    same, other = (float(re.search(r"mean difference ([\d.]+)", text)[1]) for text in (table, capsys.readouterr().out))
+    same, other = (float(re.findall(r"mean difference ([\d.]+)", text)[0]) for text in (table, capsys.readouterr().out))
     assert same < 5 and other > 2 * same  # not 0, because so short a drive is placed only to some metres
 
 
 @pytest.mark.parametrize("tool", [train_lane, lane_accuracy, follow_driver], ids=lambda tool: tool.__name__)
 def test_the_tools_name_what_is_missing(tool, tmp_path, capsys):
     name = tool.__name__.removeprefix("tools.")
-    arguments = {"lane_accuracy": ["--laps", "0"], "follow_driver": [str(PILOT)]}
+    arguments = {"lane_accuracy": ["--laps", "0"], "follow_driver": [str(SHIPPED_MODEL)]}
     assert tool.main([*arguments.get(name, []), str(tmp_path / "nowhere")]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"{name}: ") and "nowhere" in error

@@ -8,7 +8,7 @@ import pytest
 
 from cloning.lane import marking
 from cloning.lane.ahead import centre_ahead, line_ahead
-from cloning.lane.place import place, shipped_networks
+from cloning.lane.localise import localise_recording, shipped_networks
 from cloning.lane.reader import DIRECTION_TO_STRIP, MOUNT_OFFSETS, STRIP_SHAPE, estimate_centres, read_strips
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT
@@ -62,6 +62,9 @@ def test_no_line_is_found_where_there_is_none_or_more_than_one():
     assert np.isnan(find_line(paint([2.5]), STRAIGHT)).all()  # out of reach
     assert np.isnan(find_line(paint([-0.5, 0.5]), STRAIGHT)).all()
     assert np.isnan(find_line(paint([0]), np.full_like(STRAIGHT, np.nan))).all()  # behind a crest
+    shadow = paint([])
+    shadow[:, :, 80:] //= 3
+    assert np.isnan(find_line(shadow, STRAIGHT)).all()  # the edge of a shadow
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.4])
@@ -86,20 +89,20 @@ def test_where_a_line_is_seen_where_the_road_falls_or_rises(bend):
     """At the jungle's sharpest crest and dip, against its points, one by one, from a car as steep as the road below."""
     track = Track("jungle")
     s = track.step * (bend * (np.roll(track.grade, -10) - track.grade)).argmax()
-    place, front = track.at(s, right=0.5), track.at(s + WHEELBASE)
-    heading = place.heading - 0.07
+    pose, front = track.at(s, right=0.5), track.at(s + WHEELBASE)
+    heading = pose.heading - 0.07
     level = np.array([np.cos(heading), np.sin(heading), 0])
-    ahead = level * WHEELBASE + [0, 0, front.z - place.z]
+    ahead = level * WHEELBASE + [0, 0, front.z - pose.z]
     ahead /= np.linalg.norm(ahead)
     right = np.array([level[1], -level[0], 0])
     up = np.cross(right, ahead)
-    camera = np.array([place.x, place.y, place.z]) + AXLE_TO_CAMERA * ahead + CAMERA_HEIGHT * up
+    camera = np.array([pose.x, pose.y, pose.z]) + AXLE_TO_CAMERA * ahead + CAMERA_HEIGHT * up
     points = np.array([(at.x, at.y, at.z) for at in map(track.at, np.arange(s + 3, s + 25, 0.1))]) - camera
     factors = -CAMERA_HEIGHT / (points @ up)  # to where the ray to the point meets flat ground
     seen = points @ ahead * factors
     end = (np.diff(seen) <= 0).argmax() + 1 if (np.diff(seen) <= 0).any() else len(seen)
     distances = np.arange(2.0, 6, 0.25)
-    found, factor = line_ahead(track, s, np.array([place.x, place.y]) + AXLE_TO_CAMERA * level[:2], heading, distances)
+    found, factor = line_ahead(track, s, np.array([pose.x, pose.y]) + AXLE_TO_CAMERA * level[:2], heading, distances)
     expected = np.interp(distances, seen[:end], (points @ right * factors)[:end], right=np.nan)
     hidden, beyond = np.isnan(found), np.isnan(expected)
     assert hidden.any() == (bend < 0) and (~hidden).sum() > 5
@@ -108,12 +111,6 @@ def test_where_a_line_is_seen_where_the_road_falls_or_rises(bend):
     assert found[visible] == pytest.approx(expected[visible], abs=0.02)
     assert factor[visible] == pytest.approx(np.interp(distances, seen[:end], factors[:end])[visible], abs=0.02)
     assert ((factor[visible] - 1) * bend > 0.1).any()
-
-
-def test_the_edge_of_a_shadow_is_no_line():
-    strips = paint([])
-    strips[:, :, 80:] //= 3
-    assert np.isnan(find_line(strips, STRAIGHT)).all()
 
 
 def test_each_row_is_searched_on_its_own():
@@ -151,7 +148,7 @@ def test_the_line_corrects_what_the_network_detects(tmp_path, monkeypatch):
         return estimate_centres(strips, network) + 0.3
 
     def error():
-        found, _ = place(recording, driven, biased, strips.__getitem__, shipped_networks())
+        found, _ = localise_recording(recording, driven, biased, strips.__getitem__, shipped_networks())
         assert found.trusted.all()
         return np.abs(found.lateral_offset - true).mean()
 

@@ -23,25 +23,26 @@ from commands import ROOT
 from drive_process import serving
 from rendered import render_recording
 
-from cloning.base.errors import SimulatorError, UserError
-from cloning.lane.reader import LanePosition
-from cloning.lane.recovery import LaneAhead
+from cloning.base.errors import SimulatorError
+from cloning.lane.recovery import LaneAhead, LanePosition
 from cloning.network.network import CROP, Network, load_model, save_model, steer
 from cloning.recordings.images import compress, compressed_rows, decode, encode
 from cloning.recordings.log import read_recording
-from cloning.replay import command, replay
+from cloning.replay import command, replay, score
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.processes import CAN_FORK
-from cloning.replay.score import ReplayFilm, driving_metrics, steering_metrics
+from cloning.replay.score import (
+    ReplayFilm,
+    driving_metrics,
+    replay_report,
+    report_text,
+    steering_metrics,
+    write_plot,
+)
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
 
 ORACLE_DRIVER = replay.ReplayFrame.recovery_steering
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None
 
 
 @pytest.fixture(scope="module")
@@ -67,25 +68,25 @@ def human(recording):
     return replay.reference_lines(recording, by_lane=False)
 
 
+def echo(frame) -> float:
+    return frame.human_steering
+
+
 def test_an_echo_of_the_human_is_exactly_right(recording):
     for limit in LIMITS:
-        done = replay.drive(recording, human(recording), limit, lambda frame: frame.human_steering)
+        done = replay.drive(recording, human(recording), limit, echo)
         assert done.autonomy() == 1 and not done.interventions
         assert not np.any(done.offset) and not np.any(done.offset_from_human)
         assert len(done.row) == 300
 
 
-@pytest.mark.parametrize("driver", ["nothing", "noise", "the other way"])
-def test_bad_drivers_score_badly(recording, driver):
-    random = np.random.default_rng(0)
-    steering = {
-        "nothing": lambda frame: 0.0,
-        "noise": lambda frame: random.uniform(-1, 1),
-        "the other way": lambda frame: -frame.human_steering,
-    }[driver]
-    done = replay.drive(recording, human(recording), 1.0, steering)
-    assert done.autonomy() < 0
-    assert done.autonomy() == pytest.approx(1 - 6 * len(done.interventions) / sum(done.seconds))
+def test_bad_drivers_score_badly(recording):
+    rng = np.random.default_rng(0)
+    drivers = (lambda _: 0.0, lambda _: rng.uniform(-1, 1), lambda frame: -frame.human_steering)
+    for driver in drivers:
+        done = replay.drive(recording, human(recording), 1.0, driver)
+        assert done.autonomy() < 0
+        assert done.autonomy() == pytest.approx(1 - 6 * len(done.interventions) / sum(done.seconds))
 
 
 def test_the_car_goes_where_geometry_says(recording):
@@ -93,7 +94,7 @@ def test_the_car_goes_where_geometry_says(recording):
     recording.steering[:], recording.speed[:] = 0.0, 15
     done = replay.drive(recording, human(recording), 3.0, lambda frame: 0.02)
     at = next(iter(done.interventions))
-    seconds, speed, bend = np.cumsum(done.seconds[:at]), 15 * MPH, curvature(np.float32(0.02))
+    seconds, speed, bend = np.cumsum(done.seconds[:at]), 15 * MPH, curvature(0.02)
     # abreast of the human, on a circle
     yaw = np.arcsin(speed * bend * (seconds - YAW_LAG * (1 - np.exp(-seconds / YAW_LAG))))
     expected = np.r_[0, np.cumsum(np.diff(seconds) * speed * np.tan((yaw[1:] + yaw[:-1]) / 2))]
@@ -105,35 +106,37 @@ def test_in_a_bend_the_inner_path_is_shorter(recording):
     """A driver that steers a little more than the human in a bend drives its own circle."""
     recording.steering[:], recording.speed[:] = 0.3, 20
     done = replay.drive(recording, human(recording)[:1], 30.0, lambda frame: 0.32)
-    r, own = 1 / curvature(np.float32(0.3)), 1 / curvature(np.float32(0.32))
+    r, own = 1 / curvature(0.3), 1 / curvature(0.32)
     # Both start from the same place: the own circle's centre lies r - own nearer, so it comes back after a round.
     assert max(done.offset_from_human) == pytest.approx(2 * (r - own), rel=0.15)
 
 
-def test_the_lane_is_the_reference_where_it_is_trusted(recording, monkeypatch):
-    """The human drives 0.8 m right of the lane's centre: an echo is off by as much, and set back beyond a limit."""
-    offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
-    trusted = np.ones(len(recording), bool)
-    monkeypatch.setattr("cloning.lane.known.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
-    lines = replay.reference_lines(recording)
-    done = replay.drive(recording, lines, 1.0, lambda frame: frame.human_steering)
+@pytest.fixture
+def lane(recording, monkeypatch) -> LanePosition:
+    """What will be estimated: the human drives 0.8 m right of the lane's centre."""
+    n = len(recording)
+    position = LanePosition(np.full(n, 0.8, np.float32), np.zeros(n, np.float32), np.ones(n, bool))
+    monkeypatch.setattr("cloning.lane.known.estimate_lane_position", lambda *_: position)
+    return position
+
+
+def test_the_lane_is_the_reference_where_it_is_trusted(recording, lane):
+    """An echo of the human is off by as much, and set back beyond a limit."""
+    done = replay.drive(recording, replay.reference_lines(recording), 1.0, echo)
     assert not done.interventions and done.offset == pytest.approx(np.full(300, 0.8))
-    offset[150:] = 1.2
-    done = replay.drive(recording, replay.reference_lines(recording), 1.0, lambda frame: frame.human_steering)
+    lane.lateral_offset[150:] = 1.2
+    done = replay.drive(recording, replay.reference_lines(recording), 1.0, echo)
     assert min(done.interventions) == 150 and done.offset[150] == pytest.approx(0, abs=1e-6)
     assert done.offset_from_human[150] == pytest.approx(-1.2)
-    offset[100:200] = 6  # off the road
+    lane.lateral_offset[100:200] = 6  # off the road
     assert [line.rows for line in replay.reference_lines(recording)] == [slice(0, 100), slice(200, 300)]
-    trusted[:] = False
+    lane.trusted[:] = False
     [line] = replay.reference_lines(recording)
     assert not line.is_lane_centre and not line.offset.any()
 
 
-def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, monkeypatch):
-    """From the human's path, 0.8 m right of the lane's centre; where that path is the reference, it stays on it."""
-    offset, yaw = np.full(len(recording), 0.8, np.float32), np.zeros(len(recording), np.float32)
-    trusted = np.ones(len(recording), bool)
-    monkeypatch.setattr("cloning.lane.known.estimate_lane_position", lambda *_: LanePosition(offset, yaw, trusted))
+def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, lane):
+    """From the human's path; where that is the reference, it stays on it."""
     for by_lane, begin in ((True, 0.8), (False, 0.0)):
         done = replay.drive(recording, replay.reference_lines(recording, by_lane), 1.0, ORACLE_DRIVER)
         assert not done.interventions and done.offset[0] == pytest.approx(begin)
@@ -201,10 +204,30 @@ def test_errors_and_correlations_are_what_they_say():
     human = np.sin(np.arange(200) / 9)
     assert steering_metrics(human, human) == {"error": 0, "correlation": 1}
     assert steering_metrics(-human, human)["correlation"] == -1
-    assert steering_metrics(np.zeros(200), human) == {
-        "error": pytest.approx(np.sqrt(np.mean(human**2)), abs=1e-4),
-        "correlation": None,
-    }
+    still = steering_metrics(np.zeros(200), human)
+    assert still == {"error": pytest.approx(np.sqrt(np.mean(human**2)), abs=1e-4), "correlation": None}
+
+
+def test_one_intervention_is_counted_as_one(recording, tmp_path, monkeypatch):
+    """In the text, the plot's title and the film's caption."""
+    titles, captions, lines, frames = list[str](), list[str](), human(recording), []
+    done = replay.drive(recording, lines, 1.0, echo, lambda frame, _: frames.append(frame))
+    done.interventions[100] = 1.2
+    text = report_text(replay_report(recording, lines, [done], "human"))
+    monkeypatch.setattr("matplotlib.axes.Axes.set_title", lambda _, title, **__: titles.append(title))
+    write_plot(tmp_path / "way.png", recording, [done])
+    picture = np.zeros((298, 640, 3), np.uint8)
+
+    def captioned(_, __, caption):
+        captions.append(caption)
+        return picture
+
+    monkeypatch.setattr(score, "captioned", captioned)
+    film = ReplayFilm(str(tmp_path / "seen.mp4"))
+    film.watch(frames[-1], done)
+    film.close()
+    for shown in (text.splitlines()[1], titles[0], captions[0]):
+        assert re.search(r"\b1 intervention\b", shown)
 
 
 def run(*arguments, **more) -> subprocess.CompletedProcess:
@@ -234,12 +257,8 @@ def test_the_command_gives_the_same_figures_over_the_wire(folder, model, tmp_pat
     one = report["limits"]["1"]
     assert one["interventions"] == len(one["where"]) and one["autonomy_percent"] < 100
     assert (folder[-1] / "IMG" / one["where"][0]["image"]).is_file()
-    assert one["compared"]["human"] == {
-        "autonomy_percent": 100,
-        "interventions": 0,
-        "distance_mean_m": 0,
-        "distance_p95_m": 0,
-    }
+    nothing = {"interventions": 0, "distance_mean_m": 0, "distance_p95_m": 0}
+    assert one["compared"]["human"] == {"autonomy_percent": 100, **nothing}
     oracle = one["compared"]["oracle"]
     assert oracle["autonomy_percent"] == 100 and oracle["distance_mean_m"] == pytest.approx(0.11, abs=0.03)
     assert (
@@ -260,18 +279,24 @@ def test_the_film_runs_at_the_recordings_own_rate(recording, tmp_path):
     film.begin(recording)  # of another recording: the film has its rate
     film.close()
     rate = 2 * (len(recording) - 1) / (recording.time[-1] - recording.time[0])
-    assert float(av.open(str(tmp_path / "seen.mp4")).streams.video[0].average_rate) == pytest.approx(rate, rel=1e-3)
+    shown = av.open(str(tmp_path / "seen.mp4")).streams.video[0].average_rate
+    assert shown and float(shown) == pytest.approx(rate, rel=1e-3)
 
 
 def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):
-    folder, random = render_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
+    folder, rng = render_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
     for path in (folder / "IMG").iterdir():
-        cv2.imwrite(str(path), random.integers(0, 255, (160, 320, 3), np.uint8))
+        cv2.imwrite(str(path), rng.integers(0, 255, (160, 320, 3), np.uint8))
     done = run(folder, "--model", model, "--limit", "2", "--report", tmp_path / "r.json")
     assert done.returncode == 0, done.stderr
     assert "from the human driver's path in 60 rows" in done.stdout
     assert "the lane centre cannot be estimated reliably" in done.stdout
     assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == ["2"]
+
+
+def test_a_driver_changes_no_setting_of_the_process(model, monkeypatch):
+    monkeypatch.setattr(torch, "set_num_threads", lambda _: pytest.fail("the caller decides"))
+    ModelDriver(str(model))
 
 
 @pytest.mark.parametrize("crop", [(60, 25), (0, 85), (85, 0)])
@@ -311,22 +336,20 @@ def weaving(frame) -> float:
 
 
 @pytest.mark.parametrize("parallel", [False, True])
-def test_drives_at_several_limits_are_those_at_each_limit(recording, parallel):
+def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, parallel):
+    """Each in a process of its own, but for the last one, if they can be."""
     limits, lines, watched = (2.0, 1.0, 2.5), human(recording), []
     expected = [replay.drive(recording, lines, limit, weaving) for limit in limits]
-    done = command.drive_at_limits(recording, lines, weaving, limits, lambda _, d: watched.append(d.limit), parallel)
-    assert done == expected and len(done[0].interventions) < len(done[1].interventions)
-    assert watched == [2.5] * len(recording)
 
-
-@pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
-def test_each_limit_is_driven_in_a_process_of_its_own(recording, tmp_path):
     def driver(frame):
         (tmp_path / str(os.getpid())).touch()
-        return frame.human_steering
+        return weaving(frame)
 
-    command.drive_at_limits(recording, human(recording), driver, LIMITS, parallel=True)
-    assert len(list(tmp_path.iterdir())) == len(LIMITS) and (tmp_path / str(os.getpid())).exists()
+    done = command.drive_at_limits(recording, lines, driver, limits, lambda _, d: watched.append(d.limit), parallel)
+    assert done == expected and len(done[0].interventions) < len(done[1].interventions)
+    assert watched == [2.5] * len(recording)
+    assert (tmp_path / str(os.getpid())).exists()
+    assert len(list(tmp_path.iterdir())) == (3 if parallel and CAN_FORK else 1)
 
 
 @pytest.mark.parametrize(
@@ -336,10 +359,13 @@ def test_each_limit_is_driven_in_a_process_of_its_own(recording, tmp_path):
         (["FOLDER", "--model", "nothing.pt"], "no such file"),
         (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
         (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
+        (["SHORT", "--model", "MODEL"], "two seconds"),
     ],
 )
-def test_unusable_arguments_are_reported(folder, model, arguments, message):
+def test_unusable_arguments_are_reported(folder, model, tmp_path, arguments, message):
     known = {"FOLDER": folder, "MODEL": model}
+    if "SHORT" in arguments:
+        known["SHORT"] = render_recording(tmp_path / "short", rows=20)
     done = run(*[known.get(argument, argument) for argument in arguments])
     assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
 
@@ -348,18 +374,17 @@ def film_frames(path) -> int:
     return sum(1 for _ in av.open(str(path)).decode(video=0))
 
 
-@pytest.mark.parametrize(("limits", "driven"), [(["1", "1"], ["1"]), (["2", "1", "2"], ["2", "1"])])
-def test_a_limit_given_twice_is_driven_once_and_one_drive_writes_the_film(model, tmp_path, limits, driven):
+def test_a_limit_given_twice_is_driven_once_and_one_drive_writes_the_film(model, tmp_path):
     folder = render_recording(tmp_path / "lake", rows=60)
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json"
-    done = run("--reference", "human", folder, "--model", model, "--limit", *limits, *outputs)
+    done = run("--reference", "human", folder, "--model", model, "--limit", *"212", *outputs)
     assert done.returncode == 0, done.stderr
-    assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == driven
+    assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == ["2", "1"]
     assert film_frames(tmp_path / "x.mp4") == 60
 
 
-@pytest.mark.skipif(not resource, reason="this system has no limit on the size of files")
 def test_a_full_disk_costs_the_film_alone(folder, model, tmp_path):
+    resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json", "--picture", tmp_path / "p.png"
     most = 300_000  # bytes: enough for the plot, a tenth of the film
 
@@ -383,13 +408,16 @@ def fail():
 
 
 @pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
-@pytest.mark.parametrize(("at_fault", "message"), [(fail, "not finite"), (kill_itself, "was killed")])
-def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording, at_fault, message):
-    """At the first limit, while the last one is driven in this process."""
+@pytest.mark.parametrize(
+    ("at_fault", "message", "here"),
+    [(fail, "not finite", False), (kill_itself, "was killed", False), (fail, "not finite", True)],
+)
+def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording, at_fault, message, here):
+    """here: in this process, where the last limit is driven; else in those of the others."""
     rows, this = [], os.getpid()
 
     def driver(frame):
-        if os.getpid() != this and frame.row == 50:
+        if (os.getpid() == this) == here and frame.row == 50:
             at_fault()
         time.sleep(0.01)
         rows.append(frame.row)
@@ -398,21 +426,6 @@ def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording, at_fault
     with pytest.raises(SimulatorError, match=message):
         command.drive_at_limits(recording, human(recording), driver, (1.0, 2.0, 3.0), parallel=True)
     assert len(rows) < 200 and not multiprocessing.active_children()
-
-
-@pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
-def test_an_error_in_this_process_ends_the_others(recording):
-    this = os.getpid()
-
-    def driver(frame):
-        if os.getpid() == this:
-            fail()
-        time.sleep(1)
-        return 0.0
-
-    with pytest.raises(SimulatorError, match="not finite"):
-        command.drive_at_limits(recording, human(recording), driver, LIMITS, parallel=True)
-    assert not multiprocessing.active_children()
 
 
 @pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
@@ -447,28 +460,8 @@ def test_ctrl_c_ends_a_drive_that_waits_for_a_server(recording):
     assert time.monotonic() - begin < 15
 
 
-def test_all_outputs_are_tried_and_every_failure_is_reported():
-    from cloning.base.outputs import run_all
-
-    done = []
-
-    def fails(reason):
-        raise reason
-
-    with pytest.raises(UserError, match="first; second"):
-        run_all(lambda: fails(UserError("first")), lambda: fails(UserError("second")), lambda: done.append("report"))
-    with pytest.raises(KeyboardInterrupt):
-        run_all(lambda: fails(KeyboardInterrupt()), lambda: done.append("film"), lambda: fails(UserError("third")))
-    assert done == ["report", "film"]
-
-
-def test_a_recording_without_two_seconds_of_driving_is_refused(tmp_path, model):
-    done = run(render_recording(tmp_path / "short", rows=20), "--model", model)
-    assert done.returncode == 2 and "two seconds" in done.stderr
-
-
-def test_stretches_are_joined_in_one_report(folder, tmp_path):
+def test_stretches_are_joined_in_one_report(folder):
     recording = read_recording(folder)
     recording.time[150:] += 60
-    done = replay.drive(recording, human(recording), 1.0, lambda frame: frame.human_steering)
+    done = replay.drive(recording, human(recording), 1.0, echo)
     assert len(human(recording)) == 2 and sum(done.seconds) == pytest.approx(298 * 0.067, abs=0.01)

@@ -26,7 +26,7 @@ from cloning.base.arguments import number
 from cloning.base.errors import UserError
 from cloning.base.files import write
 from cloning.lane import marking
-from cloning.lane.place import (
+from cloning.lane.localise import (
     MIN_LOCALISED_ROWS,
     TrackFilter,
     estimate_lane_position,

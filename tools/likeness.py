@@ -2,9 +2,9 @@
 
     python -m tools.likeness data/lake-ccw --picture side_by_side.png
 
-`cloning.lane.place` locates a real recording on a known road, and the stand-in simulator renders the same places. The
-table compares mean colours, mean colours of image rows, and the columns of the lake's inner yellow lines relative to
-where they would be on flat ground.
+`cloning.lane.localise` locates a real recording on a known road, and the stand-in simulator renders the same
+places. The table compares mean colours, mean colours of image rows, and the columns of the lake's inner yellow lines
+relative to where they would be on flat ground.
 """
 
 import argparse
@@ -21,14 +21,14 @@ import numpy as np
 from cloning.base.arguments import number
 from cloning.base.errors import RecordingError, UserError
 from cloning.base.frame import FRAME
-from cloning.lane.place import localise_all
+from cloning.lane.localise import localise_all
 from cloning.lane.reader import estimate_centres, read_strips
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_OFFSETS, camera_position, project_ground
 from cloning.road.motion import REAR_AXLE, stretches
-from cloning.road.track import LEFT, RIGHT, Place, Track
+from cloning.road.track import LEFT, RIGHT, Pose, Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
@@ -40,15 +40,15 @@ LINE_ROWS = (range(76, 82), range(86, 94), range(104, 116))  # image rows that a
 SEARCH = np.arange(-14, 14.1, 0.5)  # columns around the expected one that are searched
 
 
-def rear_axle(track: Track, position: np.ndarray) -> tuple[Place, np.ndarray]:
+def rear_axle(track: Track, position: np.ndarray) -> tuple[Pose, np.ndarray]:
     """Return the pose of the rear axle's middle, with the car's heading, and the unit vector ahead, (2,).
 
-    position: s, metres to the right, heading error, as in `cloning.lane.place.Localisation`.
+    position: s, metres to the right, heading error, as in `cloning.lane.localise.Localisation`.
     """
     s, right, yaw = position
     place = track.at(s, right)
     heading = place.heading - yaw
-    return Place(place.x, place.y, place.z, heading, place.grade), np.array([np.cos(heading), np.sin(heading)])
+    return Pose(place.x, place.y, place.z, heading, place.grade), np.array([np.cos(heading), np.sin(heading)])
 
 
 def line_columns(track: Track, position: np.ndarray, offset: float, camera: str, rows: range) -> np.ndarray:
@@ -92,7 +92,7 @@ def render(track: Track, look: int, positions: np.ndarray) -> np.ndarray:
     for position in positions:
         axle, forward = rear_axle(track, position)
         x, y = (axle.x, axle.y) + REAR_AXLE * forward
-        run.car.place(Place(x, y, axle.z + REAR_AXLE * axle.grade, axle.heading, axle.grade))
+        run.car.place(Pose(x, y, axle.z + REAR_AXLE * axle.grade, axle.heading, axle.grade))
         run.car.settle()
         rendered.append([decode(jpeg(frame)) for frame in cameras.frames(run.car.node.get_transform())])
     return np.array(rendered)

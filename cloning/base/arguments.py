@@ -9,18 +9,18 @@ Number = TypeVar("Number", int, float)
 MAX_PORT = 65535
 
 
-def number(kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf) -> Callable[[str], Number]:
+def number(read: Callable[[str], Number], least: float = -math.inf, most: float = math.inf) -> Callable[[str], Number]:
     """Return a type for argparse: a finite number from `least` to `most`.
 
-    kind: makes the number from the text, and raises ValueError or ArithmeticError if it is none.
+    read: returns the number in the text, such as `int`, and raises ValueError or ArithmeticError if it is none.
     """
     limits = f" of at least {least:g}" if least > -math.inf else ""
     limits += f" and at most {most:g}" if most < math.inf else ""
-    wanted = ("a whole number" if kind is int else "a finite number") + limits
+    wanted = ("a whole number" if read is int else "a finite number") + limits
 
     def parse(text: str) -> Number:
         try:
-            value = kind(text)
+            value = read(text)
         except (ValueError, ArithmeticError):
             value = None
         if value is None or not least <= value <= most or value in (-math.inf, math.inf):

@@ -52,8 +52,8 @@ class FilmWriter:
         if max_bits:
             self.options |= {"maxrate": str(max_bits), "bufsize": str(2 * max_bits)}
         self.stream: VideoStream | None = None
-        self._place = contextlib.ExitStack()  # renames the temporary file when it is closed
-        self.temporary = self._place.enter_context(written_whole(path))
+        self._renaming = contextlib.ExitStack()  # renames the temporary file when it is closed
+        self.temporary = self._renaming.enter_context(written_whole(path))
         try:
             self.temporary.touch()  # PyAV opens the file only for the first frame
         except OSError as error:
@@ -78,14 +78,14 @@ class FilmWriter:
         with self._discarded_on_error():
             self.container.mux(self.stream.encode(None))
             self.container.close()
-        self._place.close()
+        self._renaming.close()
 
     def discard(self) -> None:
         """Delete the unfinished film; a finished one stays."""
         with contextlib.suppress(OSError, self.av.FFmpegError):  # the disk may be too full for the end of the file
             self.container.close()
         self.temporary.unlink(missing_ok=True)
-        self._place.close()
+        self._renaming.close()
 
     @contextlib.contextmanager
     def _discarded_on_error(self) -> Iterator[None]:

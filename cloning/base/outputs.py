@@ -49,9 +49,7 @@ def run_all(*steps: Callable[[], object]) -> None:
         except UserError as error:
             failures.append(error)
 
-    with (
-        contextlib.ExitStack() as stack
-    ):  # runs its callbacks in reverse order, then raises the first exception that is not a UserError
+    with contextlib.ExitStack() as stack:  # runs the last callback first, and the others even if one raises
         for step in reversed(steps):
             stack.callback(attempt, step)
     if len(failures) > 1:

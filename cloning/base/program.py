@@ -33,9 +33,9 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
     An exception would not do: libraries that are interrupted while they load turn it into errors of their own.
     """
 
-    def stop(number: int, _: FrameType | None) -> None:
+    def stop(signal_number: int, _: FrameType | None) -> None:
         print(f"{program}: {message}", file=sys.stderr, flush=True)
-        os._exit(128 + number)
+        os._exit(128 + signal_number)
 
     # A shell has its background processes ignore Ctrl-C; leave it so.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:

@@ -23,7 +23,7 @@ from cloning.base.cores import threads
 from cloning.base.errors import ModelError, UserError
 from cloning.browse.analyses import PROGRESS, Analysis, Result, stamp, write_result
 from cloning.lane.known import known_position
-from cloning.lane.place import place, shipped_networks
+from cloning.lane.localise import localise_recording, shipped_networks
 from cloning.lane.reader import LaneNetwork, detect_centres, read_strips
 from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
@@ -81,11 +81,11 @@ def lane(recording: Recording) -> Result:
     def strips(rows: slice) -> np.ndarray:
         return read_strips(recording, rows)
 
-    position, placed = place(recording, stretches(recording), detect, strips, shipped_networks())
+    position, localised = localise_recording(recording, stretches(recording), detect, strips, shipped_networks())
     position = known or position
     x, y = np.full((2, n), np.nan, np.float32)
     road, roads = np.full(n, -1, np.float32), []
-    for rows, localisation in placed:
+    for rows, localisation in localised:
         track = localisation.track
         found = {"name": track.name, "direction": track.direction, "outline": track.points[:, :2].round(1).tolist()}
         if found not in roads:

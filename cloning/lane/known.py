@@ -1,4 +1,4 @@
-"""The position in the lane of a recording that tells it, in `lane.csv` beside its `driving_log.csv`.
+"""The position in the lane of a recording that has a `lane.csv` with it beside its `driving_log.csv`.
 
 The stand-in simulator knows where its car is, so its recordings have this file, and the position need not be estimated
 from their frames. Each line has the name of a row's centre image, the lateral offset and the heading error, in the
@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.errors import RecordingError
-from cloning.lane.place import estimate_lane_position
-from cloning.lane.reader import LanePosition
+from cloning.lane.localise import estimate_lane_position
+from cloning.lane.recovery import LanePosition
 from cloning.recordings.columns import NUMBER
 from cloning.recordings.format import LANE_COLUMNS, LANE_FILE
 from cloning.recordings.log import Recording
@@ -33,7 +33,7 @@ def lane_position(recording: Recording, stretches: list[Stretch]) -> LanePositio
 
 
 def known_position(recording: Recording) -> LanePosition | None:
-    """Return the position in the lane that a recording's `lane.csv` tells, or None if there is no such file.
+    """Return the position in the lane from a recording's `lane.csv`, or None if there is no such file.
 
     It is trusted in the rows that the file names. Raises RecordingError for a file that is not as described above.
     """

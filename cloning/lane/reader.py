@@ -1,19 +1,17 @@
 """Estimates the car's lateral offset and heading error in its lane from camera frames, with a small network.
 
 The network detects where the lane's centre lies at some distances ahead of a camera. With the car's motion, detections
-from frames that were taken a second earlier tell the centre next to the car, too, where no camera looks.
+from frames that were taken a second earlier show the centre next to the car, too, where no camera looks.
 
 `tools/train_lane.py` trains the network. Two sets of weights come with the project: `lane.pt`, trained on the lake and
-jungle tracks alone, reads these more accurately, also in places where a frame hardly shows the lane; `any_road.pt`,
+jungle tracks alone, reads these more accurately, also where a frame hardly shows the lane; `any_road.pt`,
 trained on generated roads and shadows as well, reads any road.
 """
 
 import copy
 import functools
 import itertools
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -24,6 +22,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.lane.recovery import LanePosition
 from cloning.network import tensors
 from cloning.network.compute import choose_precision, in_precision, one_thread, threads
 from cloning.recordings.log import Recording
@@ -57,13 +56,8 @@ def extract_strip(frame: np.ndarray) -> np.ndarray:
     The strip has half the resolution and is seen by a camera that looks straight ahead and is not rolled, so that the
     mirror image of a strip is the strip of the mirrored world. Only the frame's `ROAD_ROWS` matter.
     """
-    return cv2.warpPerspective(
-        frame,
-        STRIP_TO_FRAME,
-        STRIP_SHAPE[1::-1],
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    size, flags = STRIP_SHAPE[1::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(frame, STRIP_TO_FRAME, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
 def normalize(strip: np.ndarray) -> np.ndarray:
@@ -83,12 +77,7 @@ class LaneNetwork(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        shapes: list[tuple[int, int, int, int | tuple[int, int]]] = [
-            (3, 24, 5, 2),
-            (24, 32, 3, 2),
-            (32, 48, 3, 2),
-            (48, 64, 3, (1, 2)),
-        ]
+        shapes = [(3, 24, 5, (2, 2)), (24, 32, 3, (2, 2)), (32, 48, 3, (2, 2)), (48, 64, 3, (1, 2))]
         layers: list[nn.Module] = []
         for inputs, outputs, kernel, stride in shapes:
             convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
@@ -117,7 +106,7 @@ def save_network(path: str | Path, network: LaneNetwork) -> None:
 @functools.cache
 def load_network(path: str | Path | None = None) -> LaneNetwork:
     """Return the network with the weights of a file, or with the shipped ones. Raises ModelError."""
-    path = SHIPPED_WEIGHTS if path is None else path
+    path = path or SHIPPED_WEIGHTS
     remedy = f"train the lane network with `python -m tools.train_lane --output {path}`"
     weights = tensors.load(path, remedy)
     network = LaneNetwork()
@@ -165,21 +154,6 @@ def estimate_centres(strips: np.ndarray, network: LaneNetwork | None = None) -> 
     return centres.reshape(*strips.shape[:-3], len(DISTANCES_AHEAD))
 
 
-@dataclass
-class LanePosition:
-    """The car's position in its lane, one value for each row of a recording.
-
-    lateral_offset  float32 (n,): m from the lane's centre to the car's middle, right positive
-    heading_error   float32 (n,): radians from the road's direction next to the car to the car's, right positive
-    trusted         bool (n,): whether the other two values can be relied on: the three cameras' detections agree with
-                    each other and over time, or the row was localised on a known track
-    """
-
-    lateral_offset: np.ndarray
-    heading_error: np.ndarray
-    trusted: np.ndarray
-
-
 def read_strips(recording: Recording, rows: slice = slice(None)) -> np.ndarray:
     """Return the strips of a recording's three cameras in these rows: uint8 (n, 3, 32, 160, 3). Raises RecordingError.
 
@@ -195,8 +169,7 @@ def read_strips(recording: Recording, rows: slice = slice(None)) -> np.ndarray:
             strips[row - first, camera] = extract_strip(frame)
 
     with ThreadPoolExecutor(threads()) as pool:
-        for _ in pool.map(read, range(first, end)):
-            pass
+        list(pool.map(read, range(first, end)))  # raises what reading a row raised
     return strips
 
 
@@ -209,25 +182,20 @@ def detect_centres(recording: Recording, network: LaneNetwork | None = None) -> 
     return estimate_centres(read_strips(recording), network)
 
 
-def fuse_detections(recording: Recording, centres: np.ndarray, stretches: Sequence[Stretch] = ()) -> LanePosition:
+def fuse_detections(recording: Recording, centres: np.ndarray) -> LanePosition:
     """Estimate the position in the lane from the cameras' detections and the car's motion, on any road.
 
-    Detections before a break in time are not used after it. centres: float32 (n, 3, 5), of `detect_centres`;
-    stretches: of the recording, whose trajectories need not be integrated again.
+    Detections before a break in time are not used after it. centres: float32 (n, 3, 5), of `detect_centres`.
     """
     centres = centres + MOUNT_OFFSETS[:, None]
     pause = np.diff(recording.time)
     breaks = np.flatnonzero((pause <= 0) | (pause > MAX_GAP)) + 1
-    known = {(stretch.rows.start, stretch.rows.stop): stretch for stretch in stretches}
-    parts = []
-    for edges in itertools.pairwise([0, *breaks.tolist(), len(recording)]):
-        stretch = known[edges] if edges in known else Stretch.of(recording, slice(*edges))
-        parts.append(_fit_centre(stretch, centres[stretch.rows]))
-    return LanePosition(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+    parts = [slice(*edges) for edges in itertools.pairwise([0, *breaks.tolist(), len(recording)])]
+    return LanePosition.joined([_fit_centre(Stretch.of(recording, rows), centres[rows]) for rows in parts])
 
 
-def _fit_centre(stretch: Stretch, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit a centre line next to the car in each row without a break; return offset, heading error and trust.
+def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
+    """Fit a centre line next to the car in each row without a break; return the car's position relative to it.
 
     centres: float32 (n, 3, 5), m to the right of the car's middle line.
     """
@@ -253,7 +221,7 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> tuple[np.ndarray, np.n
         yaw[row] = -np.arctan(b)
         offset[row] = -a * np.cos(yaw[row])
     trusted = (np.abs(camera_error) < MAX_CAMERA_ERROR).all((1, 2)) & (_smooth(residual) < MAX_RESIDUAL)
-    return offset, yaw, trusted
+    return LanePosition(offset, yaw, trusted)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

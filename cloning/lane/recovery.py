@@ -28,6 +28,21 @@ HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far be
 
 
 @dataclass(frozen=True)
+class LanePosition(Table):
+    """The car's position in its lane, one value for each row of a recording.
+
+    lateral_offset  float32 (n,): m from the lane's centre to the car's middle, right positive
+    heading_error   float32 (n,): radians from the road's direction next to the car to the car's, right positive
+    trusted         bool (n,): whether the other two values can be relied on: the three cameras' detections agree with
+                    each other and over time, or the row was localised on a known track
+    """
+
+    lateral_offset: Column
+    heading_error: Column
+    trusted: Column
+
+
+@dataclass(frozen=True)
 class LaneAhead(Table):
     """The lane ahead at each of n rows of recordings.
 

@@ -1,1 +1,1 @@
-"""Pilot: the network that steers, its file, what it looks at, and the page that shows it."""
+"""Network: the network that steers, its file, what it looks at, and what it is computed with."""

@@ -9,10 +9,7 @@ The file takes `frames`, uint8 (n, 160, 320, 3), RGB, as the simulator sends the
 
 import argparse
 import logging
-import sys
-import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 from cloning.base import program
@@ -27,42 +24,46 @@ from cloning.base.errors import ModelError, UserError
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME
 from cloning.base.outputs import check_folders
+from cloning.network.compute import one_thread
 from cloning.network.network import Network, load_model
-
-try:
-    import onnx
-    import onnxruntime
-    import onnxscript  # noqa: F401  # torch's exporter needs it, and says so less clearly
-except ImportError as error:
-    sys.exit(program.failed("export", UserError(f"{error}; pip install -r requirements-export.txt")))
 
 OPSET = 20  # of ONNX's operators; ONNX Runtime knows it since 1.17 (2024)
 TOLERANCE = 1e-5  # of the steering
-ROUNDS = 30  # of timing
 
 
 def export(network: Network, path: Path) -> None:
-    """Write a network as an ONNX file, after checking it. Raises ModelError if it steers differently, OSError."""
-    example = (torch.from_numpy(check_frames()[:2]),)
-    any_number = torch.export.Dim("n", min=1)
+    """Write a network as an ONNX file, after checking it.
+
+    Raises UserError without the libraries for it, ModelError if the file steers differently, OSError.
+    """
+    try:
+        import onnx
+        import onnxruntime
+        import onnxscript  # noqa: F401  # torch's exporter needs it, and says so less clearly
+    except ImportError as error:
+        raise UserError(f"{error}; pip install -r requirements-export.txt") from None
+    frames = check_frames()
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports its steps as warnings
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 warns of its own code
         exported = torch.onnx.export(
             network,
-            example,
+            (torch.from_numpy(frames[:2]),),
             dynamo=True,
             input_names=["frames"],
             output_names=["steering"],
-            dynamic_shapes=({0: any_number},),
+            dynamic_shapes=({0: torch.export.Dim("n", min=1)},),
             opset_version=OPSET,
             verbose=False,
         )
     assert exported, "torch returns the program with dynamo=True"
+    with torch.inference_mode():
+        expected = network(torch.from_numpy(frames)).numpy()
     with written_whole(path) as temporary:
         exported.save(temporary)
         onnx.checker.check_model(temporary, full_check=True)
-        worst = difference(network, onnxruntime.InferenceSession(temporary), check_frames())
+        (steering,) = onnxruntime.InferenceSession(temporary).run(["steering"], {"frames": frames})
+        worst = float(np.abs(steering - expected).max())
         if not worst <= TOLERANCE:
             raise ModelError(f"{path}: its steering differs by {worst:.1e} from the model's; nothing was written")
 
@@ -78,24 +79,6 @@ def check_frames() -> np.ndarray:
     return np.clip(frames, 0, 255).astype(np.uint8)
 
 
-def difference(network: Network, session: onnxruntime.InferenceSession, frames: np.ndarray) -> float:
-    """Return the largest difference in steering between network and ONNX file; frames: uint8 (n, 160, 320, 3)."""
-    with torch.inference_mode():
-        expected = network(torch.from_numpy(frames)).numpy()
-    (steering,) = session.run(["steering"], {"frames": frames})
-    return float(np.abs(steering - expected).max())
-
-
-def milliseconds(call: Callable[[], object]) -> float:
-    """Return the median duration of a call, in ms."""
-    durations = []
-    for _ in range(ROUNDS):
-        begin = time.perf_counter()
-        call()
-        durations.append(1e3 * (time.perf_counter() - begin))
-    return float(np.median(durations))
-
-
 def main() -> int:
     """Export a model and print what the file contains; return the exit status."""
     parser = argparse.ArgumentParser(
@@ -106,23 +89,14 @@ def main() -> int:
     parser.add_argument("model", type=Path, help="model file to read")
     parser.add_argument("output", type=Path, help="ONNX file to write")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)  # as drive.py does
+    one_thread()  # as drive.py does
     try:
         check_folders(str(arguments.output))
-        network = load_model(arguments.model)
-        export(network, arguments.output)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        session = onnxruntime.InferenceSession(arguments.output, options)
+        export(load_model(arguments.model), arguments.output)
     except (UserError, OSError) as error:
         return program.failed("export", error)
-    frame = check_frames()[:1]
-    with torch.inference_mode():
-        by_torch = milliseconds(lambda: network(torch.from_numpy(frame)))
-    by_onnx = milliseconds(lambda: session.run(None, {"frames": frame}))
     print(f"{arguments.output}: opset {OPSET}, frames uint8 (n, 160, 320, 3) RGB -> steering float32 (n,)")
-    print(f"the same steering as {arguments.model} to {TOLERANCE:g}")
-    print(f"one frame on one core: ONNX Runtime {by_onnx:.1f} ms, PyTorch {by_torch:.1f} ms")
+    print(f"the same steering as {arguments.model} to {TOLERANCE:g}, compared with ONNX Runtime")
     return program.DONE
 
 

@@ -52,7 +52,7 @@ def load(path: str | Path, remedy: str) -> dict[str, Any]:
         raise ModelError(f"{path}: no such file; {remedy}") from None
     except OSError as error:
         raise ModelError(f"{path}: {error.strerror or error}; {remedy}") from error
-    except Exception as error:  # torch.load and pickle raise many kinds for a foreign or damaged file
+    except Exception as error:  # torch.load and pickle raise all sorts for a foreign or damaged file
         is_plain = type(error) in (ValueError, zipfile.BadZipFile)
         reason = error if is_plain else type(error).__name__
         raise ModelError(f"{path}: not a model of this project, or damaged ({reason}); {remedy}") from error
@@ -60,7 +60,7 @@ def load(path: str | Path, remedy: str) -> dict[str, Any]:
 
 
 def matching(found: object, expected: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return copies of tensors of a file that have the names, shapes and kinds of number of `expected`, and are finite.
+    """Return copies of a file's tensors, all finite, with the names and shapes of `expected`, and floats where it has.
 
     Raises ValueError, saying what differs.
     """

@@ -119,23 +119,22 @@ def drive_at_limits(
     """
     rows = sum(len(line.stretch) for line in lines)
 
-    def drive_at(place: int, watch: Watcher | None = None) -> Drive:
-        limit = limits[place]
-        name = f"{recording.folder.name}, limit {limit:g} m"
-        with tqdm(total=rows, desc=name, unit="row", disable=None, leave=False, position=place) as bar:
+    def drive_at(index: int, watch: Watcher | None = None) -> Drive:
+        name = f"{recording.folder.name}, limit {limits[index]:g} m"
+        with tqdm(total=rows, desc=name, unit="row", disable=None, leave=False, position=index) as bar:
 
             def after_row(frame: ReplayFrame, done: Drive) -> None:
                 bar.update()
                 if watch:
                     watch(frame, done)
 
-            return drive(recording, lines, limit, driver, after_row)
+            return drive(recording, lines, limits[index], driver, after_row)
 
     *others, last = range(len(limits))
     if not (parallel and CAN_FORK):
         return [*map(drive_at, others), drive_at(last, watch)]
     cv2.setNumThreads(1)  # its threads do not survive a fork, and the other drives need the cores
-    with ForkedDrives([functools.partial(drive_at, place) for place in others]) as forked:
+    with ForkedDrives([functools.partial(drive_at, index) for index in others]) as forked:
 
         def watch_all(frame: ReplayFrame, done: Drive) -> None:
             forked.collect(0)
@@ -144,4 +143,4 @@ def drive_at_limits(
 
         driven_here = drive_at(last, watch_all)
         forked.collect(None)
-        return [*(forked.results[place] for place in others), driven_here]
+        return [*(forked.results[index] for index in others), driven_here]

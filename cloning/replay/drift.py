@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from cloning.base.errors import SimulatorError
-from cloning.lane.recovery import LaneAhead
 from cloning.network.network import Network
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
@@ -50,9 +49,9 @@ def held_out(recordings: Sequence[Recording], recording: np.ndarray, row: np.nda
     rows are too few, or the car stands still.
     """
     found = []
-    for number, whole in enumerate(recordings):
-        rows, first = np.unique(row[recording == number], return_index=True)
-        aims = aim[recording == number][first]
+    for index, whole in enumerate(recordings):
+        rows, first = np.unique(row[recording == index], return_index=True)
+        aims = aim[recording == index][first]
         drives = stretch_rows(whole)
         for group in np.split(rows, np.flatnonzero(np.abs(np.diff(whole.time[rows])) > SECONDS) + 1):
             for driven in drives if len(group) else ():
@@ -62,15 +61,10 @@ def held_out(recordings: Sequence[Recording], recording: np.ndarray, row: np.nda
                     last = np.searchsorted(rows, stop - 1, "right") - 1  # or the row before, if that one is missing
                     found.append((whole, slice(at, stop), float(aims[last])))
     chosen = np.linspace(0, len(found) - 1, min(len(found), MOST_PIECES)).round().astype(int)
-    return [Piece(whole, _line(whole, rows), aim_there) for whole, rows, aim_there in (found[n] for n in chosen)]
-
-
-def _line(recording: Recording, rows: slice) -> ReferenceLine:
-    """Return the driver's path in these rows."""
-    stretch = Stretch.of(recording, rows)
-    zeros = np.zeros(len(stretch))
-    ahead = LaneAhead.of_stretch(stretch, zeros, zeros.astype(bool)).extended()
-    return ReferenceLine(stretch, zeros, zeros, is_lane_centre=False, ahead=ahead)
+    return [
+        Piece(whole, ReferenceLine.human_path(Stretch.of(whole, rows)), aim_there)
+        for whole, rows, aim_there in (found[index] for index in chosen)
+    ]
 
 
 def drifts(driven: Sequence[Piece], network: Network, pool: Executor) -> np.ndarray:

@@ -21,7 +21,7 @@ class ForkedDrives:
         """Start them; what they change in memory is lost, but for the Drive that each returns."""
         context = multiprocessing.get_context("fork")
         self.processes: list[BaseProcess] = []
-        self.pending: dict[Connection, int] = {}  # where a drive's result will come from -> its number
+        self.pending: dict[Connection, int] = {}  # where a drive's result will come from -> its index
         self.results: dict[int, Drive] = {}
         # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -29,15 +29,15 @@ class ForkedDrives:
         received: list[int] = []
         handler = signal.getsignal(signal.SIGINT)
         if callable(handler):
-            signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+            signal.signal(signal.SIGINT, lambda signal_number, _: received.append(signal_number))
         try:
-            for number, drive in enumerate(drives):
+            for index, drive in enumerate(drives):
                 receiver, sender = context.Pipe(duplex=False)
                 process = context.Process(target=_send_result, args=(drive, sender), daemon=True)
                 process.start()
                 sender.close()
                 self.processes.append(process)
-                self.pending[receiver] = number
+                self.pending[receiver] = index
         finally:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             if callable(handler):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.errors import RecordingError
-from cloning.lane.recovery import LaneAhead
+from cloning.lane.recovery import LaneAhead, LanePosition
 from cloning.recordings.check import check_images
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.images import compress, compressed_rows, encode
@@ -52,6 +52,13 @@ class ReferenceLine:
     yaw: np.ndarray
     is_lane_centre: bool
     ahead: LaneAhead
+
+    @staticmethod
+    def human_path(stretch: Stretch) -> "ReferenceLine":
+        """Return the human driver's path over a stretch."""
+        zeros = np.zeros(len(stretch))
+        ahead = LaneAhead.of_stretch(stretch, zeros, zeros.astype(bool)).extended()
+        return ReferenceLine(stretch, zeros, zeros, is_lane_centre=False, ahead=ahead)
 
     @property
     def rows(self) -> slice:
@@ -108,34 +115,33 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
     in which the human driver is off the road; in other stretches, and if not by_lane, use the human driver's path.
     Raises RecordingError if there is no stretch to replay.
     """
-    lines, driven = [], stretches(recording)
+    driven, lines = stretches(recording), list[ReferenceLine]()
     if by_lane:
         from cloning.lane.known import lane_position  # imports torch
 
         lane = lane_position(recording, driven)
-        offset, yaw, trusted = lane.lateral_offset, lane.heading_error, lane.trusted
+        lines = [line for stretch in driven for line in _lines_of(recording, stretch, lane.take(stretch.rows))]
     else:
-        offset = yaw = trusted = np.zeros(len(recording))
-    for stretch in driven:
-        rows = stretch.rows
-        sure = np.asarray(trusted[rows], bool)
-        ahead = LaneAhead.of_stretch(stretch, offset[rows], sure).extended()
-        if sure.mean() < MIN_TRUSTED:
-            n = len(stretch)
-            lines.append(ReferenceLine(stretch, np.zeros(n), np.zeros(n), is_lane_centre=False, ahead=ahead))
-            continue
-        every, known = np.arange(len(sure)), np.flatnonzero(sure)
-        offsets, yaws = (np.interp(every, known, values[rows][sure].astype(float)) for values in (offset, yaw))
-        on_road = np.r_[False, np.abs(offsets) < OFF_ROAD, False]
-        starts, ends = (np.flatnonzero(np.diff(on_road.astype(int)) == sign) for sign in (1, -1))
-        for a, b in zip(starts.tolist(), ends.tolist(), strict=True):
-            if b - a >= MIN_STRETCH_ROWS:
-                part = stretch
-                if b - a < len(stretch):
-                    part = Stretch.of(recording, slice(rows.start + a, rows.start + b))
-                lines.append(ReferenceLine(part, offsets[a:b], yaws[a:b], True, ahead.take(slice(a, b))))
+        lines = [ReferenceLine.human_path(stretch) for stretch in driven]
     if not lines:
         raise RecordingError(f"{recording.folder}: no two seconds of driving without a break to replay")
+    return lines
+
+
+def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> list[ReferenceLine]:
+    """Return the reference lines of a stretch; lane: the position in the lane in its rows."""
+    if lane.trusted.mean() < MIN_TRUSTED:
+        return [ReferenceLine.human_path(stretch)]
+    ahead = LaneAhead.of_stretch(stretch, lane.lateral_offset, lane.trusted).extended()
+    every, known, sure = np.arange(len(lane)), np.flatnonzero(lane.trusted), lane.take(lane.trusted)
+    offset, yaw = (np.interp(every, known, column) for column in (sure.lateral_offset, sure.heading_error))
+    lines = []
+    changes = np.flatnonzero(np.diff(np.r_[False, np.abs(offset) < OFF_ROAD, False]))  # onto the road, and off it
+    for start, end in changes.reshape(-1, 2).tolist():
+        if end - start >= MIN_STRETCH_ROWS:
+            first, rows = stretch.rows.start, slice(start, end)
+            part = stretch if rows == slice(0, len(lane)) else Stretch.of(recording, slice(first + start, first + end))
+            lines.append(ReferenceLine(part, offset[rows], yaw[rows], True, ahead.take(rows)))
     return lines
 
 

@@ -38,7 +38,7 @@ CAMERA_MATRIX = (
     @ _turn(down=-np.radians(CAMERA_YAW))
 )
 FROM_PIXELS = np.linalg.inv(CAMERA_MATRIX)
-# A camera at the same place that looks straight ahead and is not rolled.
+# Of a camera at the same position that looks straight ahead and is not rolled.
 LEVEL_CAMERA_MATRIX = INTRINSICS @ _turn(right=np.radians(CAMERA_PITCH))
 
 

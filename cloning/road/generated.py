@@ -1,4 +1,4 @@
-"""Roads made from a number: closed loops with bends, hills and one of the usual kinds of marking.
+"""Roads made from a number: closed loops with bends, hills and one of the usual markings.
 
 A random polygon gets round corners and is smoothed; polygons that give too sharp a bend or come too close to themselves
 are refused. The random numbers depend on the road's number alone, so a number always gives the same road.
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-# Yellow double lines as on the lake, white lines as in the jungle, or no lines and only an edge of this kind.
+# Yellow double lines as on the lake, white lines as in the jungle, or no lines and only such an edge.
 MARKINGS = ("yellow double", "white", "kerb", "grass", "dirt", "wall", "rail")
 NAME = re.compile("road-([1-9][0-9]{0,8})")
 SPACING = 2.0  # m between the points
@@ -47,28 +47,28 @@ def road_number(name: str) -> int | None:
 
 def generate(number: int) -> GeneratedRoad:
     """Return the road of a number, 1 or more."""
-    random = np.random.default_rng(number)
-    width = random.uniform(MIN_WIDTH, MAX_WIDTH)
-    winding = 2 * np.pi * random.uniform(1, 2.3)
-    flat = next(loop for loop in (draw_loop(random, winding) for _ in itertools.count()) if loop is not None)
-    points = np.c_[flat, hills(random, len(flat))]
+    rng = np.random.default_rng(number)
+    width = rng.uniform(MIN_WIDTH, MAX_WIDTH)
+    winding = 2 * np.pi * rng.uniform(1, 2.3)
+    flat = next(loop for loop in (draw_loop(rng, winding) for _ in itertools.count()) if loop is not None)
+    points = np.c_[flat, hills(rng, len(flat))]
     # Rounded, because the last bit of a sine differs from machine to machine.
     return GeneratedRoad(points.round(4), round(width, 2), MARKINGS[(number - 1) % len(MARKINGS)])
 
 
-def draw_loop(random: Generator, winding: float) -> np.ndarray | None:
+def draw_loop(rng: Generator, winding: float) -> np.ndarray | None:
     """Draw a closed curve, float64 (n, 2), m, about its middle; None if it breaks one of the limits.
 
     winding: radians that its bends to both sides have together, at least.
     """
-    corners = int(random.integers(8, 21))
-    turn = 2 * np.pi * (np.arange(corners) + random.uniform(-0.35, 0.35, corners)) / corners
-    reach = random.uniform(random.uniform(0.1, 0.5), 1, corners)
-    turn += random.uniform(-1.3, 1.3) * reach  # twisted, so that not every part is visible from the middle
-    polygon = np.stack([reach * np.cos(turn) * random.uniform(1, 1.8), reach * np.sin(turn)], axis=-1)
+    corners = int(rng.integers(8, 21))
+    turn = 2 * np.pi * (np.arange(corners) + rng.uniform(-0.35, 0.35, corners)) / corners
+    reach = rng.uniform(rng.uniform(0.1, 0.5), 1, corners)
+    turn += rng.uniform(-1.3, 1.3) * reach  # twisted, so that not every part is visible from the middle
+    polygon = np.stack([reach * np.cos(turn) * rng.uniform(1, 1.8), reach * np.sin(turn)], axis=-1)
     perimeter = np.linalg.norm(polygon - np.roll(polygon, 1, axis=0), axis=1).sum()
-    polygon *= random.uniform(1.1 * MIN_LENGTH, 1.1 * MAX_LENGTH) / perimeter
-    radii = random.uniform(1.1, 2) * MIN_RADIUS * random.uniform(1, 4, corners)
+    polygon *= rng.uniform(1.1 * MIN_LENGTH, 1.1 * MAX_LENGTH) / perimeter
+    radii = rng.uniform(1.1, 2) * MIN_RADIUS * rng.uniform(1, 4, corners)
     loop = round_corners(polygon, radii, 1.1 * MIN_RADIUS)
     if loop is None:
         return None
@@ -138,13 +138,13 @@ def closest_approach(loop: np.ndarray) -> float:
     )
 
 
-def hills(random: Generator, n: int) -> np.ndarray:
+def hills(rng: Generator, n: int) -> np.ndarray:
     """Return heights in m along a closed curve of n points: waves of 90 m and more, or 0 for a flat road."""
-    if random.uniform() < FLAT_SHARE:
+    if rng.uniform() < FLAT_SHARE:
         return np.zeros(n)
     waves = np.arange(1, int(n * SPACING / 90) + 1)
-    phases = 2 * np.pi * (waves * np.arange(n)[:, None] / n + random.uniform(0, 1, len(waves)))
-    height = (np.sin(phases) * random.uniform(0, 1, len(waves)) / waves ** random.uniform(0.5, 1.5)).sum(axis=1)
+    phases = 2 * np.pi * (waves * np.arange(n)[:, None] / n + rng.uniform(0, 1, len(waves)))
+    height = (np.sin(phases) * rng.uniform(0, 1, len(waves)) / waves ** rng.uniform(0.5, 1.5)).sum(axis=1)
     steepest = np.abs(np.roll(height, -1) - height).max() / SPACING
     sharpest = np.abs(np.roll(height, -1) - 2 * height + np.roll(height, 1)).max() / SPACING**2
-    return height * min(random.uniform(0.1, 0.97) * MAX_GRADE / steepest, 1 / (MIN_CREST_RADIUS * sharpest))
+    return height * min(rng.uniform(0.1, 0.97) * MAX_GRADE / steepest, 1 / (MIN_CREST_RADIUS * sharpest))

@@ -13,7 +13,7 @@ LEFT, RIGHT = -1, 1  # sides of a road, with the signs of lateral offsets
 
 
 @dataclass(frozen=True)
-class Place:
+class Pose:
     """A pose on the road: position in metres, heading in radians, grade.
 
     x is east, y north, z up; heading is 0 towards the east and grows counter-clockwise; grade is dz/ds.
@@ -171,7 +171,7 @@ class Track:
         """Return the index of the last point at or before s metres along the track."""
         return int(s / self.step) % len(self.points)
 
-    def at(self, s: float, right: float = 0.0) -> Place:
+    def at(self, s: float, right: float = 0.0) -> Pose:
         """Return the pose at s metres along the track, `right` metres to the right of the centre line."""
         n = len(self.points)
         i, part = divmod(s / self.step, 1)
@@ -180,7 +180,7 @@ class Track:
         x, y, z = self.points[i] * (1 - part) + self.points[j] * part
         heading = self.heading[i] + part * wrap_angle(self.heading[j] - self.heading[i])
         grade = self.grade[i] * (1 - part) + self.grade[j] * part
-        return Place(x + np.sin(heading) * right, y - np.cos(heading) * right, z, heading, grade)
+        return Pose(x + np.sin(heading) * right, y - np.cos(heading) * right, z, heading, grade)
 
     def locate(self, x: float, y: float, near: float | None = None) -> tuple[float, float]:
         """Return s and the lateral offset, in metres, of the position (x, y).

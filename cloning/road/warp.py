@@ -131,16 +131,10 @@ class CroppedView:
         whether they are for the mirrored world.
         """
         ground, sky = matrices
-        view = _warp_ground(rows, ground, (self.columns, self.rows))
-        seen = cv2.warpPerspective(
-            road_mask()[ROAD_ROWS],
-            ground,
-            (self.columns, self.rows),
-            flags=cv2.INTER_NEAREST,
-            borderMode=cv2.BORDER_CONSTANT,
-        )
-        size = self.columns, self.sky_rows
-        far = cv2.warpPerspective(rows, sky, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        size, sky_size = (self.columns, self.rows), (self.columns, self.sky_rows)
+        view = _warp_ground(rows, ground, size)
+        seen = cv2.warpPerspective(road_mask()[ROAD_ROWS], ground, size, flags=cv2.INTER_NEAREST)  # 0 beyond the border
+        far = cv2.warpPerspective(rows, sky, sky_size, borderMode=cv2.BORDER_REFLECT_101)
         cv2.copyTo(far, self.sky[mirrored], view[: self.sky_rows])
         np.bitwise_or(seen[: self.sky_rows], self.sky[mirrored], out=seen[: self.sky_rows])
         return view, seen

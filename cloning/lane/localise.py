@@ -8,6 +8,7 @@ passes add the line's detections (`marking.py`), which are several times as exac
 before, since in sharp bends over crests a filter's own prediction is too far off.
 """
 
+import functools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -20,12 +21,12 @@ from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
     LaneNetwork,
-    LanePosition,
     estimate_centres,
     fuse_detections,
     load_network,
     read_strips,
 )
+from cloning.lane.recovery import LanePosition
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
 from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, wrap_angle
@@ -60,7 +61,7 @@ MAX_TURN_RESIDUAL = {"lake": 0.5, "jungle": 1.2}
 Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
 
 
-@dataclass
+@dataclass(frozen=True)
 class Localisation:
     """The result of localising a stretch of a recording on a known track.
 
@@ -80,7 +81,7 @@ class Localisation:
     turn_residual: float
 
     def is_certain(self) -> bool:
-        """Tell whether the stretch certainly is on this track."""
+        """Return whether the stretch certainly is on this track."""
         likely = self.log_likelihood > MIN_LOG_LIKELIHOOD
         return likely and self.turn_residual < MAX_TURN_RESIDUAL[self.track.name]
 
@@ -92,7 +93,7 @@ class TrackFilter:
         """Prepare a stretch's motion and measurements.
 
         centres: float32 (n, 3, 5), of `reader.detect_centres`; marks: float (n, 3), m from the centre camera to the
-        painted line at `marking.DISTANCES`, nan where none was found.
+        painted line at `marking.DISTANCES`, nan where none was found; None: the line is not measured.
         """
         self.track, self.step, self.turn = track, np.diff(stretch.driven), np.diff(stretch.heading)
         self.slip = stretch.slip
@@ -145,8 +146,7 @@ class TrackFilter:
         """Return the expected measurement, (k,), and its Jacobian by the state, (k, 3); nan out of sight."""
         s, right, yaw = state
         camera = self.camera_at(state)
-        seen = centre_ahead(self.track, s, *camera, DISTANCES_AHEAD + NEIGHBOURS)
-        factor = np.ones(len(DISTANCES_AHEAD))
+        seen, factor = centre_ahead(self.track, s, *camera, DISTANCES_AHEAD + NEIGHBOURS), np.ones(len(DISTANCES_AHEAD))
         if self.has_marks:
             line, factors = line_ahead(self.track, s, *camera, marking.DISTANCES + NEIGHBOURS)
             seen, factor = np.concatenate([seen, line], axis=1), np.r_[factor, factors[0]]
@@ -175,14 +175,13 @@ class Candidate:
         """
         follower = self.follower
         for row in range(len(self.filtered), end):
+            x, p, f = np.array([self.s, 0.0, 0.0]), INITIAL_COVARIANCE, np.eye(3)
             if row:
                 x, p = self.filtered[-1]
                 about = x if around is None else around[row - 1]
                 moved, f = follower.predict(row - 1, about)
                 x = moved + f @ (x - about)
                 p = f @ p @ f.T + follower.process_noise[row - 1]
-            else:
-                x, p, f = np.array([self.s, 0.0, 0.0]), INITIAL_COVARIANCE, np.eye(3)
             self.predicted.append((x, p, f))
             about = x if around is None else around[row]
             expected, jacobian = follower.expect(about)
@@ -241,17 +240,13 @@ def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
 
     centres: float32 (n, 3, 5): of `reader.detect_centres`, in the stretch's rows.
     """
-    n = len(stretch)
-    candidates = []
-    for name in ROADS:
-        for direction in ("ccw", "cw"):
-            follower = TrackFilter(stretch, centres, Track(name, direction))
-            candidates += [(deviation, Candidate(follower, s)) for deviation, s in candidate_positions(follower)]
+    filters = [TrackFilter(stretch, centres, Track(name, direction)) for name in ROADS for direction in ("ccw", "cw")]
+    candidates = [(badness, Candidate(each, s)) for each in filters for badness, s in candidate_positions(each)]
     for count, rows in SEARCH:
         best = sorted(candidates, key=lambda candidate: candidate[0])[:count]
-        candidates = [(-candidate.follow(min(rows, n)), candidate) for _, candidate in best]
+        candidates = [(-candidate.follow(min(rows, len(stretch))), candidate) for _, candidate in best]
     _, found = min(candidates, key=lambda candidate: candidate[0])
-    log_likelihood, states = found.follow(n), found.smooth()
+    log_likelihood, states = found.follow(len(stretch)), found.smooth()
     return Localisation(found.follower.track, states, log_likelihood, found.turn_residual(states))
 
 
@@ -300,20 +295,33 @@ def localise_all(stretches: list[Stretch], centres: np.ndarray, strips: Strips) 
                 yield stretch.rows, localisation
 
 
-def estimate_lane_position(
-    recording: Recording, stretches: list[Stretch], network: LaneNetwork | None = None
-) -> LanePosition:
-    """Estimate the position in the lane at every row of a recording, as `place` does.
+def localise_recording(
+    recording: Recording,
+    stretches: list[Stretch],
+    detect: Callable[[LaneNetwork], np.ndarray],
+    strips: Strips,
+    networks: Iterable[LaneNetwork],
+) -> tuple[LanePosition, list[tuple[slice, Localisation]]]:
+    """Return the position in the lane at every row of a recording, and what `localise_all` yields for it.
 
-    stretches: of the recording, `motion.stretches`; network: to use instead of the two that come with the project.
-    Raises RecordingError for images that can't be read, ModelError without a usable network.
+    Where a stretch is on a known road, the position is from its localisation; elsewhere `reader.fuse_detections` gives
+    it. If no stretch is on one by a network's detections, the next network is tried; after the last one, those
+    detections count that are trusted in most rows.
+
+    stretches: of the recording; detect: returns what `reader.detect_centres` does with a network.
     """
-    strips = read_strips(recording)
-
-    def detect(detector: LaneNetwork) -> np.ndarray:
-        return estimate_centres(strips, detector)
-
-    return place(recording, stretches, detect, strips.__getitem__, [network] if network else shipped_networks())[0]
+    positions = []
+    for network in networks:
+        centres = detect(network)
+        position = fuse_detections(recording, centres)
+        if localised := list(localise_all(stretches, centres, strips)):
+            for rows, localisation in localised:
+                _, offset, heading_error = localisation.states.T
+                position.lateral_offset[rows] = offset + REAR_AXLE * np.sin(heading_error)
+                position.heading_error[rows], position.trusted[rows] = heading_error, True
+            return position, localised
+        positions.append(position)
+    return max(positions, key=lambda position: position.trusted.sum()), []
 
 
 def shipped_networks() -> Iterator[LaneNetwork]:
@@ -321,32 +329,15 @@ def shipped_networks() -> Iterator[LaneNetwork]:
     return map(load_network, (None, ANY_ROAD_WEIGHTS))
 
 
-def place(
-    recording: Recording,
-    stretches: list[Stretch],
-    detect: Callable[[LaneNetwork], np.ndarray],
-    strips: Strips,
-    networks: Iterable[LaneNetwork],
-) -> tuple[LanePosition, list[tuple[slice, Localisation]]]:
-    """Return the position in the lane at every row of a recording, and where its stretches are on known roads.
+def estimate_lane_position(
+    recording: Recording, stretches: list[Stretch], network: LaneNetwork | None = None
+) -> LanePosition:
+    """Estimate the position in the lane at every row of a recording, as `localise_recording` does.
 
-    Where a stretch is on a known road, the position is from its localisation; elsewhere `reader.fuse_detections` gives
-    it. The second value has the rows and the localisation of each stretch that `localise_all` places. If it places
-    none with a network, the next one is tried; if none places any, the one counts that is trusted in most rows.
-
-    stretches: of the recording; detect: returns what `reader.detect_centres` does with a network.
+    stretches: of the recording, `motion.stretches`; network: to use instead of the two that come with the project.
+    Raises RecordingError for images that can't be read, ModelError without a usable network.
     """
-    positions = []
-    for network in networks:
-        centres = detect(network)
-        position = fuse_detections(recording, centres, stretches)
-        placed = list(localise_all(stretches, centres, strips))
-        for rows, localisation in placed:
-            _, lateral_offset, heading_error = localisation.states.T
-            position.heading_error[rows] = heading_error
-            position.lateral_offset[rows] = lateral_offset + REAR_AXLE * np.sin(heading_error)
-            position.trusted[rows] = True
-        if placed:
-            return position, placed
-        positions.append(position)
-    return max(positions, key=lambda position: position.trusted.sum()), []
+    strips = read_strips(recording)
+    networks = [network] if network else shipped_networks()
+    detect = functools.partial(estimate_centres, strips)
+    return localise_recording(recording, stretches, detect, strips.__getitem__, networks)[0]
