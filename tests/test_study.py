@@ -166,6 +166,6 @@ def test_the_report_and_the_pictures_show_all_networks():
     assert text.count("\n| lake, ") == sum(variant.track == "lake" for variant in plan())
     assert f"lake, {text.count(chr(10) + '| lake, ')} networks" in text
     assert "| robust | 25 %, 25 %, 25 %, 25 %, 25 % | 25 % |" in text
-    for draw in (figures.correlation_picture, figures.scatter_picture, figures.recovery_picture):
+    for draw in (figures.correlation_picture, figures.recovery_picture):
         pixels = cv2.imdecode(np.frombuffer(draw(rows), np.uint8), cv2.IMREAD_COLOR)
         assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20

@@ -36,40 +36,43 @@ from cloning.base.outputs import write_json, write_output
 from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record
-from tools.study.figures import Row, correlation_picture, recovery_picture, report, row, scatter_picture
+from tools.study.figures import Row, correlation_picture, recovery_picture, report, row
 from tools.study.network import RESULT
 from tools.study.networks import EPOCH_IMAGES, RENDERED, TRACKS, Variant, plan
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
 
-def prepare(args: argparse.Namespace) -> None:
+def prepare(options: argparse.Namespace) -> None:
     """Check the recordings, and render the one that is rendered. Raises UserError, OSError."""
     names = sorted({name for track in TRACKS.values() for name in (track.train, track.held_out)})
     for name in names:
-        if not (args.recordings / name / DRIVING_LOG).exists():
+        if not (options.recordings / name / DRIVING_LOG).exists():
             raise RecordingError(
-                f"{args.recordings / name}: the study needs recordings by the names {', '.join(names)}"
+                f"{options.recordings / name}: the study needs recordings by the names {', '.join(names)}"
             )
-    args.folder.mkdir(parents=True, exist_ok=True)
-    options, file = {"images": args.images, "laps": args.laps, "starts": args.starts}, args.folder / "options.json"
+    options.folder.mkdir(parents=True, exist_ok=True)
+    options, file = (
+        {"images": options.images, "laps": options.laps, "starts": options.starts},
+        options.folder / "options.json",
+    )
     if file.exists() and json.loads(file.read_text(encoding="utf-8")) != options:
         raise UserError(f"{file}: the study began with other options; give these, or another --folder")
-    write_json(file, options)
-    rendered = args.folder / RENDERED
+    write_json(file, began)
+    rendered = options.folder / RENDERED
     if not rendered.exists():
         unfinished = rendered.with_name(f"unfinished-{RENDERED}")
         shutil.rmtree(unfinished, ignore_errors=True)
-        record(unfinished, Track("lake"), args.laps)
+        record(unfinished, Track("lake"), options.laps)
         unfinished.rename(rendered)
 
 
-def result(variant: Variant, args: argparse.Namespace) -> dict[str, float]:
+def result(variant: Variant, options: argparse.Namespace) -> dict[str, float]:
     """Return a network's measures; train and measure it first if that is still to be done. Raises UserError."""
-    folder = args.folder / variant.name
+    folder = options.folder / variant.name
     file = folder / RESULT
     if not file.exists():
-        command = [variant.name, args.recordings, folder, args.images, args.laps, args.starts]
+        command = [variant.name, options.recordings, folder, options.images, options.laps, options.starts]
         done = subprocess.run(
             [sys.executable, "-m", "tools.study.network", *map(str, command)], cwd=ROOT, capture_output=True, text=True
         )
@@ -87,7 +90,7 @@ def write_study(rows: list[Row], folder: Path) -> None:
     table.writerows(rows)
     write_output(folder / "study.csv", text.getvalue().encode())
     write_output(folder / "study.md", report(rows).encode())
-    for picture in (correlation_picture, scatter_picture, recovery_picture):
+    for picture in (correlation_picture, recovery_picture):
         write_output(folder / f"study_{picture.__name__.removesuffix('_picture')}.png", picture(rows))
 
 
@@ -107,22 +110,22 @@ def main(argv: list[str] | None = None) -> int:
         "--jobs", type=number(int, 1), default=threads(), help="networks at a time (default: one for each core)"
     )
     parser.add_argument("--folder", type=Path, default=Path("study"), help="where to write (default %(default)s)")
-    args = parser.parse_args(argv)
-    args.folder = args.folder.resolve()  # the networks' processes run in another folder
-    args.recordings = args.recordings.resolve()
-    variants = plan()[: args.networks]
+    options = parser.parse_args(argv)
+    options.folder = options.folder.resolve()  # the networks' processes run in another folder
+    options.recordings = options.recordings.resolve()
+    variants = plan()[: options.networks]
     try:
-        prepare(args)
-        with ThreadPoolExecutor(args.jobs) as pool:
+        prepare(options)
+        with ThreadPoolExecutor(options.jobs) as pool:
             try:
-                results = list(pool.map(partial(result, args=args), variants))
+                results = list(pool.map(partial(result, options=options), variants))
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-        write_study([row(variant, found) for variant, found in zip(variants, results, strict=True)], args.folder)
+        write_study([row(variant, found) for variant, found in zip(variants, results, strict=True)], options.folder)
     except (UserError, OSError) as error:
         return program.failed("study", error)
-    print(f"{args.folder / 'study.md'}, study.csv and pictures")
+    print(f"{options.folder / 'study.md'}, study.csv and pictures")
     return program.DONE
 
 

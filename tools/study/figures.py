@@ -163,10 +163,10 @@ def correlation_picture(rows: Sequence[Row]) -> bytes:
     def draw(figure: Figure) -> None:
         for axes, (title, part) in zip(figure.subplots(1, len(compared), sharey=True), compared.items(), strict=True):
             found = correlations(part, "driving") if len(part) > 2 else {}
-            for place, measure in enumerate(MEASURES):
+            for at, measure in enumerate(MEASURES):
                 value, low, high = found.get(measure.name, (np.nan,) * 3)
-                axes.barh(place, value, color=COLOURS[measure.group], alpha=0.8, height=0.7)
-                axes.plot([low, high], [place, place], color="black", linewidth=1.2)
+                axes.barh(at, value, color=COLOURS[measure.group], alpha=0.8, height=0.7)
+                axes.plot([low, high], [at, at], color="black", linewidth=1.2)
             axes.axvline(0, color="black", linewidth=0.8)
             axes.set(
                 yticks=range(len(MEASURES)),
@@ -181,32 +181,8 @@ def correlation_picture(rows: Sequence[Row]) -> bytes:
     return png(draw, 12, 4.6)
 
 
-def scatter_picture(rows: Sequence[Row]) -> bytes:
-    """Return, for each track, the networks by loss and by replay, against how they drive."""
-    shown = [next(measure for measure in MEASURES if measure.name == name) for name in ("mse", "replay_distance_2.5")]
-
-    def draw(figure: Figure) -> None:
-        grid = figure.subplots(len(TRACKS), len(shown), squeeze=False)
-        for line, track in zip(grid, TRACKS, strict=True):
-            part = groups(rows)[track]
-            for axes, measure in zip(line, shown, strict=True):
-                for recipe, colour in (("report", "tab:orange"), ("robust", "tab:blue")):
-                    some = [each for each in part if each["recipe"] == recipe]
-                    if some:
-                        where = column(some, measure.name), column(some, "offset_mean")
-                        axes.scatter(*where, s=18, color=colour, alpha=0.8, label=recipe)
-                axes.set(title=track, xlabel=measure.title, ylabel="m from the centre, in laps")
-                axes.set_xlim(left=0)
-                axes.set_ylim(bottom=0)
-                axes.grid(alpha=0.3)
-        if rows:
-            grid[0, 0].legend()
-
-    return png(draw, 9, 7)
-
-
 def recovery_picture(rows: Sequence[Row]) -> bytes:
-    """Return the share of starts from which each kind of network comes back: bars for means, dots for seeds."""
+    """Return the share of starts from which the networks of each method come back: bars for means, dots for seeds."""
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
