@@ -52,11 +52,9 @@ def prepare(options: argparse.Namespace) -> None:
                 f"{options.recordings / name}: the study needs recordings by the names {', '.join(names)}"
             )
     options.folder.mkdir(parents=True, exist_ok=True)
-    options, file = (
-        {"images": options.images, "laps": options.laps, "starts": options.starts},
-        options.folder / "options.json",
-    )
-    if file.exists() and json.loads(file.read_text(encoding="utf-8")) != options:
+    file = options.folder / "options.json"
+    began = {"images": options.images, "laps": options.laps, "starts": options.starts}
+    if file.exists() and json.loads(file.read_text(encoding="utf-8")) != began:
         raise UserError(f"{file}: the study began with other options; give these, or another --folder")
     write_json(file, began)
     rendered = options.folder / RENDERED
