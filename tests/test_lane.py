@@ -46,7 +46,7 @@ from cloning.road.track import ROADS, Track
 from simulator import __main__ as simulator
 from simulator.car import STEP
 from simulator.record import record
-from tools import follow_driver, lane_accuracy, likeness, train_lane
+from tools import lane_accuracy, likeness, train_lane
 from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
@@ -383,10 +383,9 @@ def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsy
     assert same < 5 and other > 2 * same  # not 0, because so short a drive is placed only to some metres
 
 
-@pytest.mark.parametrize("tool", [train_lane, lane_accuracy, follow_driver], ids=lambda tool: tool.__name__)
-def test_the_tools_name_what_is_missing(tool, tmp_path, capsys):
+@pytest.mark.parametrize("tool, options", [(train_lane, []), (lane_accuracy, ["--laps", "0"])])
+def test_the_tools_name_what_is_missing(tool, options, tmp_path, capsys):
     name = tool.__name__.removeprefix("tools.")
-    arguments = {"lane_accuracy": ["--laps", "0"], "follow_driver": [str(PILOT)]}
-    assert tool.main([*arguments.get(name, []), str(tmp_path / "nowhere")]) == 2
+    assert tool.main([*options, str(tmp_path / "nowhere")]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"{name}: ") and "nowhere" in error

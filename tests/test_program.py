@@ -66,8 +66,6 @@ def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
         ["drive.py", "nowhere.pt"],
         ["video.py", "nowhere"],
         ["-m", "simulator", "replay", "nowhere"],
-        ["-m", "tools.follow_driver", "nowhere.pt", "nowhere"],
-        ["-m", "tools.pose_errors", "nowhere.pt", "nowhere"],
         ["-m", "tools.scoreboard", "nowhere.pt", "--name", "x", "--recordings", "nowhere"],
     ],
 )
