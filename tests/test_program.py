@@ -22,9 +22,7 @@ except BaseException:
 
 # Those that a user calls; the other modules in tools/ are parts of them.
 TOOLS = [
-    path.stem
-    for path in sorted((ROOT / "tools").glob("*.py"))
-    if "argparse.ArgumentParser" in path.read_text(encoding="utf-8")
+    path.stem for path in sorted((ROOT / "tools").glob("*.py")) if "= command_line(" in path.read_text(encoding="utf-8")
 ]
 
 INTERRUPTED_MAIN = """
