@@ -51,7 +51,7 @@ def test_the_attacks_find_a_fault(server, jpegs, expected):
     """What a car is told must be right: an answer that is not the expected one, and none at all, are found."""
     other = [expected[0]] * len(expected)
     assert "wrong" in attack.run(None, server, jpegs, other, SECONDS).faults()
-    assert attack.Report(attack.Drive(2, 1), 500.0, 9.0, 1).faults(timely=False) == [
+    assert attack.Report(attack.Drive(asked=2, round_trips=[0.01]), 500.0, 9.0, 1).faults(timely=False) == [
         "lost",
         "memory",
         "new car",

@@ -12,7 +12,6 @@ import itertools
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -42,10 +41,14 @@ class Drive:
     """What a car met: its telemetries, the answers to them, and how long each took, in s."""
 
     asked: int = 0
-    answered: int = 0
     wrong: int = 0
     seconds: float = 0.0
     round_trips: list[float] = field(default_factory=list)
+
+    @property
+    def answered(self) -> int:
+        """How many telemetries were answered."""
+        return len(self.round_trips)
 
     def milliseconds(self) -> list[float]:
         """Return the median, the 99th percentile and the largest of the round trips, in ms."""
@@ -79,24 +82,22 @@ class Car:
         self.simulator.send(message)
         return self.simulator.receive()
 
-    def drive(self, goes_on: Callable[[], bool]) -> Drive:
-        """Drive as long as `goes_on()`; a lost connection ends it, and leaves its last telemetry unanswered."""
-        drive, started = Drive(), time.perf_counter()
+    def drive(self, until: float) -> Drive:
+        """Drive until this time.monotonic(); a lost connection ends it, and leaves its last telemetry unanswered."""
+        drive, started = Drive(), time.monotonic()
         try:
-            for n in itertools.count():
-                due = time.perf_counter()
-                if not goes_on():
+            for message, expected in itertools.cycle(zip(self.messages, self.expected, strict=True)):
+                if (sent := time.monotonic()) >= until:
                     break
                 drive.asked += 1
-                answer = self.ask(self.messages[n % len(self.messages)])
-                drive.round_trips.append(time.perf_counter() - due)
-                drive.answered += 1
-                drive.wrong += answer != self.expected[n % len(self.messages)]
-                time.sleep(max(0.0, due + FRAME_INTERVAL - time.perf_counter()))
+                answer = self.ask(message)
+                drive.round_trips.append(time.monotonic() - sent)
+                drive.wrong += answer != expected
+                time.sleep(max(0.0, sent + FRAME_INTERVAL - time.monotonic()))
             drive.wrong += self.ask("2") != "3"  # else an answer has come twice
         except OSError:
             pass  # what is not answered is counted
-        drive.seconds = time.perf_counter() - started
+        drive.seconds = time.monotonic() - started
         return drive
 
 
@@ -149,7 +150,7 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     before, until = server.open_files(), time.monotonic() + seconds
     attacker = multiprocessing.get_context("fork").Process(target=_attack, args=(attack, server.port, until))
     attacker.start()
-    drive = car.drive(lambda: time.monotonic() < until)
+    drive = car.drive(until)
     attacker.kill()
     attacker.join()
     if server.process.poll() is not None:
