@@ -63,14 +63,15 @@ def test_a_whole_demo_and_then_nothing_is_done_again(commands, capsys):
     assert commands == [["record", "ccw", "cw"]]  # which finds its recordings
 
 
-def test_a_stopped_training_is_resumed_and_a_stopped_lap_is_driven_again(commands, monkeypatch):
+@pytest.mark.parametrize("status", [program.FAILED, program.INCOMPLETE])  # with an error, or a crash
+def test_a_stopped_training_is_resumed_and_a_stopped_lap_is_driven_again(commands, monkeypatch, status):
     (demo.FOLDER / "model-resume.pt").touch()
     (demo.FOLDER / "unfinished-jungle").mkdir()
     (demo.FOLDER / "unfinished-jungle" / "lap.png").touch()
     python = demo.python
 
     def without_room(*words, **more):
-        return subprocess.CompletedProcess(words, 2, "", "simulator: no room") if "cw" in words else python(*words)
+        return subprocess.CompletedProcess(words, status, "", "simulator: no room") if "cw" in words else python(*words)
 
     monkeypatch.setattr(demo, "python", without_room)
     with pytest.raises(SimulatorError, match="simulator: no room; start the demo again to continue"):

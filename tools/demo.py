@@ -108,7 +108,7 @@ def drive(lap: Drive) -> None:
         with ServerProcess(ROOT / "drive.py", lap.model, "--speed", str(lap.speed), "--port", "0") as server:
             road = ("--track", lap.track, "--direction", lap.direction, "--port", server.port)
             done = python("-m", "simulator", "drive", *road, *files, capture_output=True)
-        if done.returncode not in (program.DONE, program.INCOMPLETE):
+        if done.returncode not in (program.DONE, program.INCOMPLETE) or not (unfinished / "lap.json").exists():
             raise SimulatorError(f"{lap.title}: {done.stderr.strip()}; start the demo again to continue")
         unfinished.rename(lap.folder)
     print(f"{lap.title}: {in_words(lap.report())}", flush=True)
