@@ -8,6 +8,7 @@ import time
 import urllib.error
 import urllib.request
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from drive_process import serving
@@ -50,7 +51,7 @@ def test_the_attacks_find_a_fault(server, jpegs, expected):
     """What a car is told must be right: an answer that is not the expected one, and none at all, are found."""
     other = [expected[0]] * len(expected)
     assert "wrong" in attack.run(None, server, jpegs, other, SECONDS).faults()
-    assert attack.Report(attack.Drive(2, 1), 500.0, 9.0, 1).faults(timely=False) == [
+    assert attack.Report(attack.Drive(asked=2, round_trips=[0.01]), 500.0, 9.0, 1).faults(timely=False) == [
         "lost",
         "memory",
         "new car",
@@ -130,7 +131,7 @@ def test_a_long_ping_has_a_short_pong_over_polling(server):
         with urllib.request.urlopen(urllib.request.Request(address, body), timeout=10) as answer:
             return answer.read()
 
-    sid = re.search(r'"sid":"(\w+)"', request().decode("latin-1"))[1]
+    [sid] = re.findall(r'"sid":"(\w+)"', request().decode("latin-1"))
     assert request(f"&sid={sid}", b"100001:2" + b"x" * 100_000) == b"OK"
     assert request(f"&sid={sid}") == b"\0\1\xff3"
     assert request(f"&sid={sid}", b"6:2probe") == b"OK"
@@ -172,13 +173,18 @@ def test_closed_pages_are_noticed_while_nobody_drives(server):
 
 
 def test_all_pages_share_a_picture(jpegs, monkeypatch):
-    server, drawn, now = drive.DriveServer(Network().eval()), [], [0.0]
+    server, drawn, now = drive.DriveServer(Network().eval()), list[float](), [0.0]
     session = server.sessions["sid"] = drive.Session(server, {})
-    monkeypatch.setattr(page, "image", lambda *_: drawn.append(now[0]) or "picture")
+
+    def image(*_):
+        drawn.append(now[0])
+        return "picture"
+
+    monkeypatch.setattr(page, "image", image)
     monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
     monkeypatch.setattr(page, "UPDATE_INTERVAL", 2**-10)
     pages = page.Pages(server, with_attention=True)
-    readers = [pages.events() for _ in range(50)]
+    readers: list[Any] = [pages.events() for _ in range(50)]
     for interval in range(1, 4):
         now[0] = interval * 2**-10
         for _ in range(2):

@@ -1,71 +1,60 @@
-"""The tools that measure how fast training and the stand-in simulator are, and count what the network computes."""
+"""The benchmarks of training and of the stand-in simulator, and the speed run, each in its quickest form."""
 
+import json
 import re
-import sys
+from types import SimpleNamespace
 
-import torch
-from commands import ROOT, run_model
-
+from cloning.base.program import DONE, INCOMPLETE
 from cloning.network.network import Network
-from cloning.training.pieces import converted
-from tools import bench_layers
+from tools import bench_simulator, bench_training, speedrun
 
 
-def run_tool(name, *arguments):
-    """A tool in a process of its own, with its output."""
-    return run_model(*arguments, command=[sys.executable, "-m", f"tools.{name}"], cwd=ROOT)
+def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording, capsys):
+    assert bench_training.main([str(sample_recording), "--part", "ab", "--samples", "2370"]) == DONE
+    measured = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert set(measured["rates"]) == {"a", "b"} and min(measured["rates"].values()) > 0
 
 
-def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording):
-    done = run_tool("bench_training", sample_recording, "--part", "ab", "--samples", 2370)
-    assert done.returncode == 0, done.stderr
-    rates = re.search(r'"rates": \{"a": ([\d.]+), "b": ([\d.]+)\}', done.stdout)
-    assert rates, done.stdout
-    assert float(rates[1]) > 0 and float(rates[2]) > 0
+def test_the_training_benchmark_compares_its_parts(monkeypatch, capsys):
+    """Part (c) takes the same time in both rounds, the others half of it in the second."""
+    rounds = {"limit": [400.0, 800.0], "a": [100.0, 200.0], "b": [200.0, 400.0], "c": [50.0, 50.0]}
+    parts: list[str] = []
+
+    def python(*words, **_):
+        part = words[words.index("--part") + 1]
+        rates = {name: rounds[name][parts.count(part)] for name in ({"a", "b"} if part == "ab" else {part})}
+        parts.append(part)
+        about = {"gb": 1.5, "device": "cpu", "precision": "float32", "flops": 5e7}
+        return SimpleNamespace(returncode=0, stdout="training: 6 rows\n" + json.dumps(about | {"rates": rates}))
+
+    monkeypatch.setattr(bench_training, "python", python)
+    assert bench_training.main(["recording", "--rounds", "2"]) == DONE
+    assert parts == ["limit", "ab", "c"] * 2
+    printed = capsys.readouterr().out
+    assert "cpu, float32, 2 rounds, 50 MFLOP per image" in printed
+    assert "| (a) an epoch of model.py | 150 | 100 | 200 | 1.50 |" in printed
+    assert "| a / c | 3.00 | 2.00 | 4.00 |" in printed and "| b / limit | 0.50 | 0.50 | 0.50 |" in printed
 
 
-def test_the_layers_costs_are_those_of_the_network():
-    network = Network().to(memory_format=torch.channels_last)
-    found, whole = bench_layers.costs(network, torch.float32)
-    assert [cost.name for cost in found[:3]] == [
-        "convolution 1, 3 to 24",
-        "ELU of convolution 1",
-        "convolution 2, 24 to 36",
-    ]
-    images = bench_layers.PIECE
-    assert found[0].operations == 2 * images * 36 * 158 * 24 * 75
-    assert found[0].operations_back == found[0].operations  # the image needs no gradient
-    assert found[2].operations == 2 * images * 16 * 77 * 36 * 600
-    assert found[2].operations_back == 2 * found[2].operations
-    rows = bench_layers.table(found, whole).splitlines()
-    shares = [int(re.search(r"(-?\d+) % \|$", row)[1]) for row in rows[2:-1]]
-    assert abs(sum(shares) - 100) <= len(shares)  # rounded
+def test_the_operations_are_those_of_the_network():
+    """By hand: height x width x filters x inputs of each output, twice, and for three passes but for the image."""
+    convolutions = (36 * 158 * 24 * 75, 16 * 77 * 36 * 600, 6 * 37 * 48 * 900, 4 * 35 * 64 * 432, 2 * 33 * 64 * 576)
+    dense = 4224 * 100 + 100 * 50 + 50 * 10 + 10
+    assert bench_training.flops(Network()) == 2 * (3 * (sum(convolutions) + dense) - convolutions[0])
 
 
-def test_activations_in_half_the_precision_are_half_the_traffic():
-    network = Network().to(memory_format=torch.channels_last)
-    single, half = (
-        bench_layers.traffic(converted(network, precision)) for precision in (torch.float32, torch.bfloat16)
-    )
-    assert single == 2 * half
-
-
-def test_the_simulator_benchmark_measures_both_tracks():
-    done = run_tool("bench_simulator", "--laps", 0.02, "--repeat", 1)
-    assert done.returncode == 0, done.stderr
+def test_the_simulator_benchmark_measures_both_tracks(capsys):
+    assert bench_simulator.main(["--laps", "0.01", "--repeat", "1", "--frames", "5"]) == DONE
+    printed = capsys.readouterr().out
     for track in ("lake", "jungle"):
-        row = re.search(rf"^{track} (.*)$", done.stdout, re.MULTILINE)
-        assert row, done.stdout
-        speeds = [float(number) for number in re.findall(r"[\d.]+", row[1])]
+        [row] = re.findall(rf"^{track} (.*)$", printed, re.MULTILINE)
+        speeds = [float(number) for number in re.findall(r"[\d.]+", row)]
         assert len(speeds) == 7 and min(speeds) > 0
 
 
-def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording):
-    few = ["--in-sample", "--seeds", "1", "--images", "60", "--limit", "20", "--autonomy", "99"]
-    done = run_tool("speedrun", sample_recording, *few)
-    name = sample_recording.name
-    row = re.search(rf"\| {name} \| {name} \| 0 \| [\d.]+ \| (.*?) % \|", done.stdout)
-    assert row, done.stderr
-    passed = float(row[1]) >= 99
-    assert f"{int(passed)} of 1 runs at 99 % or better at 20 m" in done.stdout
-    assert done.returncode == (0 if passed else 1)
+def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording, capsys):
+    few = ["--in-sample", "--seeds", "1", "--images", "60", "--limit", "20", "--autonomy", "101"]
+    assert speedrun.main([str(sample_recording), *few]) == INCOMPLETE
+    printed, name = capsys.readouterr().out, sample_recording.name
+    assert re.search(rf"^\| {name} \| {name} \| 0 \| [\d.]+ \| .* % \| .* m \|$", printed, re.MULTILINE)
+    assert "0 of 1 runs at 101 % or better at 20 m" in printed

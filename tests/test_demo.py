@@ -1,5 +1,6 @@
 """The demo: what it takes up again after an interruption, and its page."""
 
+import contextlib
 import json
 import re
 import subprocess
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from cloning.base import program
+from cloning.base.errors import SimulatorError
 from tools import demo
 
 REPORT = {"distance_m": 1137.9, "mean_speed_mph": 29.6, "departures": [], "offset_mean_m": 0.074, "offset_max_m": 0.281}
@@ -23,13 +25,14 @@ def commands(tmp_path, monkeypatch) -> list[list[str]]:
     def record(folder, laps):
         run.append(["record", *(lap.direction for lap in laps)])
 
-    def start_server(command):
+    @contextlib.contextmanager
+    def server(*command):
         run.append(["server", *map(str, command)])
-        return SimpleNamespace(terminate=lambda: run.append(["stopped"]), wait=lambda: 0), 4567
+        yield SimpleNamespace(port=4567)
+        run.append(["stopped"])
 
-    def command(words, **_):
-        words = list(map(str, words))
-        run.append(words)
+    def python(*words, **_):
+        run.append([*map(str, words)])
         for option, content in (("--output", "model"), ("--report", json.dumps(REPORT)), ("--picture", "p")):
             if option in words:
                 Path(words[words.index(option) + 1]).write_text(content, encoding="utf-8")
@@ -38,8 +41,8 @@ def commands(tmp_path, monkeypatch) -> list[list[str]]:
     monkeypatch.chdir(tmp_path)
     demo.FOLDER.mkdir()
     monkeypatch.setattr(demo, "render", record)
-    monkeypatch.setattr(demo, "start_server", start_server)
-    monkeypatch.setattr(demo.subprocess, "run", command)
+    monkeypatch.setattr(demo, "ServerProcess", server)
+    monkeypatch.setattr(demo, "python", python)
     return run
 
 
@@ -60,23 +63,22 @@ def test_a_whole_demo_and_then_nothing_is_done_again(commands, capsys):
     assert commands == [["record", "ccw", "cw"]]  # which finds its recordings
 
 
-def test_a_stopped_training_is_resumed_and_a_stopped_lap_is_driven_again(commands, monkeypatch, capsys):
+@pytest.mark.parametrize("status", [program.FAILED, program.INCOMPLETE])  # with an error, or a crash
+def test_a_stopped_training_is_resumed_and_a_stopped_lap_is_driven_again(commands, monkeypatch, status):
     (demo.FOLDER / "model-resume.pt").touch()
     (demo.FOLDER / "unfinished-jungle").mkdir()
     (demo.FOLDER / "unfinished-jungle" / "lap.png").touch()
-    ended = demo.subprocess.run
-    monkeypatch.setattr(
-        demo.subprocess,
-        "run",
-        lambda words, **more: (
-            subprocess.CompletedProcess(words, 2, "", "simulator: no room") if "cw" in words else ended(words, **more)
-        ),
-    )
-    assert demo.main([]) == program.FAILED
+    python = demo.python
+
+    def without_room(*words, **more):
+        return subprocess.CompletedProcess(words, status, "", "simulator: no room") if "cw" in words else python(*words)
+
+    monkeypatch.setattr(demo, "python", without_room)
+    with pytest.raises(SimulatorError, match="simulator: no room; start the demo again to continue"):
+        demo.main([])
     assert "--resume" in commands[1]
-    assert "simulator: no room; start the demo again to continue\n" in capsys.readouterr().err
     assert not (demo.FOLDER / "jungle").exists()
-    monkeypatch.setattr(demo.subprocess, "run", ended)
+    monkeypatch.setattr(demo, "python", python)
     assert demo.main([]) == program.DONE
     assert not list(demo.FOLDER.glob("unfinished*"))
 

@@ -47,7 +47,7 @@ from cloning.road.track import ROADS, Track
 from simulator import __main__ as simulator
 from simulator.car import STEP
 from simulator.record import record
-from tools import follow_driver, lane_accuracy, likeness, train_lane
+from tools import lane_accuracy, likeness, train_lane
 from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
@@ -352,10 +352,20 @@ def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsy
     assert same < 5 and other > 2 * same  # not 0, because so short a drive is placed only to some metres
 
 
-@pytest.mark.parametrize("tool", [train_lane, lane_accuracy, follow_driver], ids=lambda tool: tool.__name__)
-def test_the_tools_name_what_is_missing(tool, tmp_path, capsys):
-    name = tool.__name__.removeprefix("tools.")
-    arguments = {"lane_accuracy": ["--laps", "0"], "follow_driver": [str(SHIPPED_MODEL)]}
-    assert tool.main([*arguments.get(name, []), str(tmp_path / "nowhere")]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"{name}: ") and "nowhere" in error
+@pytest.mark.parametrize("main, options", [(train_lane.main, []), (lane_accuracy.main, ["--laps", "0"])])
+def test_the_tools_name_what_is_missing(main, options, tmp_path):
+    with pytest.raises(RecordingError, match="nowhere"):
+        main([*options, str(tmp_path / "nowhere")])
+
+
+def test_the_accuracy_on_a_recording_is_printed(drive, capsys):
+    """The side cameras appear to be where they are mounted, and the car as far off the centre as it was driven."""
+    recording, true = drive
+    assert lane_accuracy.main(["--laps", "0", str(recording.folder)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{len(recording)} rows" in printed
+    for side, mounted in (("left", MOUNT_OFFSETS[1]), ("right", MOUNT_OFFSETS[2])):
+        [appears] = re.findall(rf"{side} camera appears to be at +([-+.\d]+) ±", printed)
+        assert float(appears) == pytest.approx(mounted, abs=0.04)
+    [offset] = re.findall(r"lateral offset +([.\d]+) m", printed)
+    assert float(offset) == pytest.approx(np.abs(true).mean(), abs=0.15)

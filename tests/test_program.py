@@ -23,9 +23,7 @@ except BaseException:
 
 # Those that a user calls; the other modules in tools/ are parts of them.
 TOOLS = [
-    path.stem
-    for path in sorted((ROOT / "tools").glob("*.py"))
-    if "argparse.ArgumentParser" in path.read_text(encoding="utf-8")
+    path.stem for path in sorted((ROOT / "tools").glob("*.py")) if "= command_line(" in path.read_text(encoding="utf-8")
 ]
 
 INTERRUPTED_MAIN = """
@@ -67,8 +65,6 @@ def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
         ["drive.py", "nowhere.pt"],
         ["video.py", "nowhere"],
         ["-m", "simulator", "replay", "nowhere"],
-        ["-m", "tools.follow_driver", "nowhere.pt", "nowhere"],
-        ["-m", "tools.pose_errors", "nowhere.pt", "nowhere"],
         ["-m", "tools.scoreboard", "nowhere.pt", "--name", "x", "--recordings", "nowhere"],
     ],
 )

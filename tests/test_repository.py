@@ -15,7 +15,6 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("cloning", "simulator", "tools")
 SCRIPTS = ("model.py", "drive.py", "video.py")
-OPTIONAL = {"keras"}  # tools/bench_training.py compares with it where it is installed
 WRITTEN = [*ROOT.glob("*.md"), ROOT / "data" / "README.md", ROOT / "tools" / "experiments.md"]
 DOCUMENTS = [*WRITTEN, ROOT / "tools" / "scoreboard.md"]  # tools/scoreboard.py writes this one
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -88,7 +87,7 @@ def test_requirements_are_what_the_code_imports():
     files += [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
     imported = set().union(*(imported_packages(ast.parse(path.read_text(encoding="utf-8"))) for path in files))
     own = {*PACKAGES, *(Path(script).stem for script in SCRIPTS)}
-    foreign = imported - own - set(sys.stdlib_module_names) - OPTIONAL
+    foreign = imported - own - set(sys.stdlib_module_names)
     distributions = packages_distributions()
     used = {distributions[name][0].lower() for name in foreign}
     lines = [

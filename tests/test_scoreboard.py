@@ -1,16 +1,19 @@
 """The scoreboard: what is in sample and what the summary pools, by hand; and the command itself."""
 
 import argparse
+import contextlib
 import json
-import sys
+from queue import SimpleQueue
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
-import warm
 from commands import ROOT
 from rendered import render_recording
 
 from cloning.base.errors import UserError
+from cloning.base.program import DONE, FAILED
 from cloning.network.network import Network, save_model
 from tools import score_table, scoreboard
 from tools.score_table import drive_in_sample, replay_in_sample, table
@@ -44,10 +47,8 @@ def test_a_recording_is_in_sample_by_its_name_or_that_of_a_numbered_copy():
 )
 def test_a_drive_is_in_sample_by_track_and_look(track, look, in_sample):
     assert drive_in_sample(track, look, TRAINED_ON) == in_sample
-
-
-def test_without_a_real_recording_look_0_is_held_out():
-    assert not drive_in_sample("jungle", 0, ["jungle-cw-look5", "lake-ccw"])
+    rendered = [name for name in TRAINED_ON if "look" in name]
+    assert drive_in_sample(track, look, rendered) == (in_sample and look > 0), "look 0 resembles real recordings"
 
 
 def drive(track, look=0, speed_mph=10, **more):
@@ -63,7 +64,7 @@ def replayed(percent, interventions, metres):
 @pytest.fixture
 def board():
     """Two networks, "one" trained on TRAINED_ON, "two" on nothing of this, with results in other sections."""
-    one = {
+    one: dict[str, Any] = {
         "replays": {
             "jungle": {"1": replayed(94.0, 1, 0.2)},
             "jungle-shadows": {"1": replayed(40.0, 10, 0.3)},
@@ -81,14 +82,14 @@ def board():
             drive("road-1001", 1001, 15),
         ],
     }
-    recordings = {
-        "jungle": {"seconds": 100.0, "lane_centre_percent": 100.0, "oracle": {"1": replayed(100.0, 0, 0.12)}},
-        "jungle-shadows": {"seconds": 100.0, "lane_centre_percent": 75.4, "oracle": {"1": replayed(94.0, 1, 0.13)}},
-        "jungle-2": {"seconds": 200.0, "lane_centre_percent": 100.0, "oracle": {}},
-        "jungle-fast": {"seconds": 40.0, "lane_centre_percent": 100.0, "oracle": {}},
+    recordings: dict[str, Any] = {
+        name: {"seconds": seconds, "lane_centre_percent": 100.0, "oracle": {}}
+        for name, seconds in (("jungle", 100.0), ("jungle-shadows", 100.0), ("jungle-2", 200.0), ("jungle-fast", 40.0))
     }
+    recordings["jungle"]["oracle"]["1"] = replayed(100.0, 0, 0.12)
+    recordings["jungle-shadows"]["lane_centre_percent"] = 75.4
     two = {"replays": {"jungle": {"1": replayed(88.0, 2, 0.5)}}, "drives": []}
-    about = {"what": "trained somehow", "commands": ["a command"], "sha256": ""}
+    about = {"what": "trained somehow", "sha256": ""}
     networks = {"one": {**about, "trained_on": TRAINED_ON, **one}, "two": {**about, "trained_on": ["other"], **two}}
     return {"recordings": recordings, "networks": networks}
 
@@ -133,7 +134,7 @@ def test_a_row_names_the_reference_and_shows_the_oracle(board):
 
 def test_generated_roads_share_a_row_and_columns_without_results_are_left_out(board):
     drives = table(board).split("## Laps in the stand-in simulator")[1]
-    assert "two" not in drives.split("## Measured with")[0]
+    assert "two" not in drives.split("## The networks")[0]
     assert cells(drives, "jungle cw, 10 mph, look 6") == [
         "3 departures in 12.0 km, 0.20 m, at most 0.50 m, roughness 0.10/s, held out"
     ]
@@ -146,19 +147,21 @@ def test_generated_roads_share_a_row_and_columns_without_results_are_left_out(bo
     assert cells(drives, "15 mph, looks without shadows, held out")[0].startswith("1 road: 1 of 1 laps")
 
 
+def lap_report(**more) -> Any:
+    report = {"track": "lake", "direction": "cw", "laps": 1, "seconds_a_lap": [100.0], "distance_m": 1138.0}
+    report |= {"offset_mean_m": 0.1, "offset_max_m": 0.2, "steering_roughness_per_s": 0.3, "departures": []}
+    return report | more
+
+
 @pytest.mark.parametrize(
     ("times", "laps", "finished", "expected"),
     [([], 2, True, (2, 0)), ([3, 99], 2, True, (2, 1)), ([3, 101], 2, True, (2, 2)), ([], 5, False, (3, 1))],
 )
 def test_laps_are_counted_by_their_departures(times, laps, finished, expected):
-    report = {
-        **{"track": "lake", "direction": "cw", "laps": 2, "seconds_a_lap": [100.0, 80.0], "distance_m": 2260.0},
-        **{"offset_mean_m": 0.1, "offset_max_m": 0.2, "steering_roughness_per_s": 0.3},
-        "departures": [{"time_s": time} for time in times],
-    }
+    report = lap_report(laps=2, seconds_a_lap=[100.0, 80.0], departures=[{"time_s": time} for time in times])
     result = score_table.driven(report, 9, 0, laps, finished)
     assert (result["laps"], result["laps_with_departure"]) == expected
-    assert result["departures"] == len(times) and result["distance_km"] == 2.26
+    assert result["departures"] == len(times) and result["distance_km"] == 1.14
 
 
 def test_a_road_may_be_driven_in_its_own_look():
@@ -168,11 +171,6 @@ def test_a_road_may_be_driven_in_its_own_look():
     for wrong in ("mine", "own3", "3+4", "-1"):
         with pytest.raises(argparse.ArgumentTypeError, match="is not a number, own"):
             scoreboard.parse_look(wrong)
-
-
-def test_a_command_names_many_roads_as_the_shell_does():
-    words = ["--tracks", *(f"road-{n}" for n in range(98, 102)), "road-7", "lake", "--name", "a b"]
-    assert " ".join(scoreboard.shortened(words)) == "--tracks road-{98..101} road-7 lake --name 'a b'"
 
 
 def test_what_a_model_was_trained_on_is_in_its_file(tmp_path):
@@ -186,55 +184,82 @@ def test_what_a_model_was_trained_on_is_in_its_file(tmp_path):
 
 
 @pytest.fixture
-def measured(tmp_path):
-    """A function that runs the command on a model and returns its process."""
+def measure(tmp_path):
+    """Run the command on a model, with its results in tmp_path, and return its exit status."""
 
-    def measure(model, name, *more):
-        command = [sys.executable, "-m", "tools.scoreboard", model, "--name", name, "--table", tmp_path / "table.md"]
-        return warm.run([*command, *more], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    def run(model, name, *more):
+        return scoreboard.main([str(model), "--name", name, "--table", str(tmp_path / "table.md"), *map(str, more)])
 
-    return measure
+    return run
 
 
-def test_the_scoreboard_keeps_its_columns(tmp_path, measured):
-    folder = render_recording(tmp_path / "lake", rows=40)
-    for name, seed, extra in (("one", 1, ["--what", "untrained"]), ("two", 2, ["--trained-on", "lake"])):
+def test_a_model_drives_a_recording_and_a_road(tmp_path, measure, model_file):
+    """Without stand-ins: a replay, and two drives at the same time by one drive.py, in the road's own look."""
+    recording = render_recording(tmp_path / "lake", rows=32)
+    courses = ("--tracks", "road-3", "--looks", "own", "--speeds", "20", "--laps", "0.01")
+    assert measure(model_file, "one", "--trained-on", "lake", "--recordings", recording, *courses) == DONE
+    text = (tmp_path / "table.md").read_text(encoding="utf-8")
+    [line] = [line for line in text.splitlines() if line.startswith("| lake, limit 1 m")]
+    assert line.count(" %, ") == 2 and line.endswith("m, in sample |")
+    [cell] = cells(text, "20 mph, looks without shadows, held out")
+    assert cell.startswith("1 road: ") and "of 0.02 laps" in cell
+
+
+@pytest.fixture
+def simulated(monkeypatch):
+    """What stands in for the simulator and drive.py: laps of so many `metres`, or the error if there is one."""
+    answers = SimpleNamespace(metres=1000.0, error="")
+
+    def simulate(*words):
+        direction = words[words.index("--direction") + 1]
+        report = lap_report(direction=direction, distance_m=answers.metres)
+        return (None, FAILED, answers.error) if answers.error else (report, DONE, "")
+
+    ports: SimpleQueue[int] = SimpleQueue()
+    ports.put(4567)
+    monkeypatch.setattr(scoreboard, "simulate", simulate)
+    monkeypatch.setattr(scoreboard, "serving", lambda *_: contextlib.nullcontext(ports))
+    return answers
+
+
+def test_drives_are_kept_by_network_and_replaced_by_course(tmp_path, measure, simulated):
+    for name, seed in (("one", 1), ("two", 2)):
         torch.manual_seed(seed)
         save_model(tmp_path / f"{name}.pt", Network(), arguments={"recordings": ["/data/jungle"]})
-        done = measured(tmp_path / f"{name}.pt", name, "--recordings", folder, "--tracks", *extra)
-        assert done.returncode == 0, done.stderr
-    text = (tmp_path / "table.md").read_text(encoding="utf-8")
-    oracle, one, two = cells(text, "lake, limit 1 m")
-    assert "%" in oracle and one.endswith("m, held out") and two.endswith("m, in sample")
-    lines = text.splitlines()
-    assert lines[lines.index("* one: untrained") + 1] == (
-        "  * `python -m tools.scoreboard one.pt --name one --table table.md --recordings lake --tracks`"
-    )
+    lake = ("--tracks", "lake", "--speeds", "9", "--looks")
+    assert measure(tmp_path / "one.pt", "one", *lake, "0", "7", "--what", "untrained") == DONE
+    assert measure(tmp_path / "two.pt", "two", *lake, "7") == DONE
+    simulated.metres = 2000.0
+    assert measure(tmp_path / "one.pt", "one", *lake, "7") == DONE
+    board = json.loads((tmp_path / "table.json").read_text(encoding="utf-8"))
+    found = {
+        name: [(drive["direction"], drive["look"], drive["distance_km"]) for drive in network["drives"]]
+        for name, network in board["networks"].items()
+    }
+    assert found == {
+        "one": [("ccw", 0, 1), ("ccw", 7, 2), ("cw", 0, 1), ("cw", 7, 2)],
+        "two": [("ccw", 7, 1), ("cw", 7, 1)],
+    }
+    assert "* one: untrained\n* two: \n" in (tmp_path / "table.md").read_text(encoding="utf-8")
     before = (tmp_path / "table.json").read_bytes()
-    done = measured(tmp_path / "two.pt", "one", "--tracks")
-    assert done.returncode == 2 and "one: has results of another model file; give another --name" in done.stderr
+    with pytest.raises(UserError, match="one: has results of another model file; give another --name"):
+        measure(tmp_path / "two.pt", "one", "--tracks")
     assert (tmp_path / "table.json").read_bytes() == before
 
 
-def test_results_in_another_form_are_left_alone(tmp_path, measured, model_file):
+def test_a_drive_without_a_report_is_an_error(measure, model_file, simulated):
+    simulated.error = "simulator: no server"
+    with pytest.raises(UserError, match="lake ccw, 9 mph, look 0: simulator: no server"):
+        measure(model_file, "one", "--trained-on", "lake", "--tracks", "lake", "--speeds", "9", "--looks", "0")
+
+
+def test_results_in_another_form_are_left_alone(tmp_path, measure, model_file):
     (tmp_path / "table.json").write_text('{"shipped": {}}', encoding="utf-8")
-    done = measured(model_file, "one", "--trained-on", "lake", "--tracks")
-    assert done.returncode == 2 and "table.json: holds results in another form" in done.stderr
+    with pytest.raises(UserError, match=r"table\.json: holds results in another form"):
+        measure(model_file, "one", "--trained-on", "lake", "--tracks")
     assert (tmp_path / "table.json").read_text(encoding="utf-8") == '{"shipped": {}}'
 
 
-def test_drives_share_a_server_and_are_replaced(tmp_path, measured, model_file):
-    """Two drives at each speed, on the road's own look; a second run replaces the first one's results."""
-    road = ("--trained-on", "lake", "--tracks", "road-3", "--looks", "own", "--speeds", "20", "--laps")
-    for laps in ("0.03", "0.02"):
-        done = measured(model_file, "one", *road, laps)
-        assert done.returncode == 0, done.stderr
-    board = json.loads((tmp_path / "table.json").read_text(encoding="utf-8"))
-    drives = board["networks"]["one"]["drives"]
-    assert [(drive["track"], drive["direction"], drive["look"]) for drive in drives] == [
-        ("road-3", "ccw", 3),
-        ("road-3", "cw", 3),
-    ]
-    assert {drive["laps"] for drive in drives} == {0.02} and {drive["speed_mph"] for drive in drives} == {20}
-    [cell] = cells((tmp_path / "table.md").read_text(encoding="utf-8"), "20 mph, looks without shadows, held out")
-    assert cell.startswith("1 road: ")
+def test_the_projects_tables_are_those_of_its_results():
+    board = scoreboard.read_board(ROOT / "tools" / "scoreboard.json")
+    assert (ROOT / "tools" / "scoreboard.md").read_text(encoding="utf-8") == table(board)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cloning.base.errors import RecordingError
+from cloning.base.program import DONE, INCOMPLETE
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import IMAGE_FOLDER, PROBLEM_AREAS
 from cloning.recordings.log import read_recording, read_uncut
@@ -26,42 +27,45 @@ def test_what_is_left_to_measure_with_is_not_trained_on():
     assert len(set(laps(21, 40))) == len(laps(21, 40)) == 2 * (2 * 3 + 20) + 40
 
 
-def test_every_kind_of_lap_is_rendered_in_both_directions_and_lights():
+def test_each_track_is_rendered_in_both_directions_and_lights():
     chosen = laps(21, 40)
     for start in ("lake", "jungle", "road-"):
         some = [lap for lap in chosen if lap.track.startswith(start)]
-        kinds = {(lap.direction, lap.look >= SHADOWED) for lap in some}
-        assert kinds == {(direction, shadows) for direction in ("ccw", "cw") for shadows in (False, True)}
+        combined = {(lap.direction, lap.look >= SHADOWED) for lap in some}
+        assert combined == {(direction, shadows) for direction in ("ccw", "cw") for shadows in (False, True)}
         assert {lap.look // SHADOWED for lap in some} == {0, 1, 2}, "without shadows, and with both kinds"
         assert 0.4 < np.mean([lap.look >= SHADOWED for lap in some]) < 0.6
 
 
-def test_rendering_goes_on_where_it_was_interrupted(tmp_path, monkeypatch):
-    recorded = []
+@pytest.fixture
+def expert(monkeypatch):
+    """A stand-in for the expert: the laps it was asked to drive, its departures, the lap that is interrupted."""
+    expert = SimpleNamespace(laps=[], departures=[], interrupted=0)
 
     def record(folder, track, laps, seed, look):
         folder.mkdir(parents=True)
-        recorded.append((track.name, track.direction, look, seed))
-        if len(recorded) == 2:
+        expert.laps.append((track.name, track.direction, look, seed))
+        if len(expert.laps) == expert.interrupted:
             raise KeyboardInterrupt
-        return SimpleNamespace(departures=[]), 1
+        return SimpleNamespace(departures=expert.departures), 1
 
     monkeypatch.setattr(shipped, "record", record)
+    return expert
+
+
+def test_rendering_goes_on_where_it_was_interrupted(tmp_path, expert):
     chosen = [Lap("lake", "ccw", 0), Lap("lake", "cw", 10_000), Lap("road-1001", "ccw", 1)]
+    expert.interrupted = 2
     with pytest.raises(KeyboardInterrupt):
         render(tmp_path, chosen)
     names = ["lake-ccw-look0", "lake-cw-look10000", "road-1001-ccw-look1"]
     assert render(tmp_path, chosen) == [tmp_path / name for name in names]
-    assert [seed for *_, seed in recorded] == [0, 1, 1, 2]
+    assert expert.laps == [(*lap, seed) for lap, seed in zip([*chosen[:2], *chosen[1:]], (0, 1, 1, 2), strict=True)]
     assert sorted(folder.name for folder in tmp_path.iterdir()) == names
 
 
-def test_a_lap_that_left_the_road_is_not_trained_on(tmp_path, monkeypatch):
-    def record(folder, *_, **__):
-        folder.mkdir(parents=True)
-        return SimpleNamespace(departures=["one"]), 1
-
-    monkeypatch.setattr(shipped, "record", record)
+def test_a_lap_that_left_the_road_is_not_trained_on(tmp_path, expert):
+    expert.departures = ["one"]
     with pytest.raises(RecordingError, match="lake-ccw-look0: the expert left the road"):
         render(tmp_path, [Lap("lake", "ccw", 0)])
     assert not (tmp_path / "lake-ccw-look0").exists()
@@ -83,46 +87,46 @@ def test_a_repeated_recording_is_read_like_the_original(sample_recording, tmp_pa
     assert repeated.path(0).read_bytes() == original.path(0).read_bytes()
 
 
-def test_a_repeated_recording_shows_the_images_of_this_run(sample_recording, tmp_path):
-    sources = [tmp_path / place / "lake" for place in ("before", "now")]
-    for source in sources:
-        shutil.copytree(sample_recording, source)
+def test_a_repeated_recording_shows_the_images_of_this_run(linked, tmp_path):
+    for folder in ("before", "now"):
+        source = shutil.copytree(linked, tmp_path / folder / "lake")
         [twin] = repeat(tmp_path / "repeated", [source])
-    assert (twin / IMAGE_FOLDER).resolve() == sources[1] / IMAGE_FOLDER
+    assert (twin / IMAGE_FOLDER).resolve() == source / IMAGE_FOLDER
+    with pytest.raises(RecordingError, match=r"now/lake and .*before/lake have the same name"):
+        repeat(tmp_path / "repeated", [tmp_path / "before" / "lake", source])
 
 
-def test_two_recordings_of_one_name_are_not_mixed(sample_recording, tmp_path):
-    sources = [tmp_path / place / "lake" for place in ("one", "other")]
-    for source in sources:
-        shutil.copytree(sample_recording, source)
-    with pytest.raises(RecordingError, match=r"other/lake and .*one/lake have the same name"):
-        repeat(tmp_path / "repeated", sources)
+def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path, expert, monkeypatch):
+    """The folder may hold laps and recordings of an earlier run with other options."""
+    commands: list[list[str]] = []
 
+    def python(*words):
+        commands.append([str(word) for word in words])
+        return SimpleNamespace(returncode=INCOMPLETE)
 
-def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path, monkeypatch):
-    """The folder may hold laps and recordings of an earlier run with other arguments."""
-    commands = []
-
-    def record(folder, *_, **__):
-        folder.mkdir(parents=True)
-        return SimpleNamespace(departures=[]), 1
-
-    def run(command):
-        commands.append([str(part) for part in command])
-        return SimpleNamespace(returncode=1)
-
-    monkeypatch.setattr(shipped, "record", record)
-    monkeypatch.setattr(shipped.subprocess, "run", run)
+    monkeypatch.setattr(shipped, "python", python)
     out = tmp_path / "out"
     for name, roads in (("first", "2"), ("second", "1")):
         shutil.copytree(sample_recording, tmp_path / name)
-        assert shipped.main([str(tmp_path / name), "--looks", "1", "--roads", roads, "--folder", str(out)]) == 1
+        options = [str(tmp_path / name), "--looks", "1", "--roads", roads, "--folder", str(out)]
+        assert shipped.main(options) == INCOMPLETE
     first, second = commands
     assert sum("road-" in part for part in first) == 2 and sum("road-" in part for part in second) == 1
     assert [part for part in second if "/real/" in part] == [str(out / "real" / f"second{PROBLEM_AREAS[0]}")]
+    with pytest.raises(RecordingError, match="none: no such folder"):
+        shipped.main([str(tmp_path / "none"), "--folder", str(out)])
 
 
-def test_recordings_that_are_not_there_are_named(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(shipped, "render", lambda *_: None)
-    assert shipped.main([str(tmp_path / "none"), "--folder", str(tmp_path / "out")]) == 2
-    assert "none: no such folder" in capsys.readouterr().err
+def test_a_trained_network_is_measured(sample_recording, tmp_path, expert, monkeypatch):
+    commands: list[tuple[object, ...]] = []
+
+    def python(*words):
+        commands.append(words)
+        return SimpleNamespace(returncode=DONE)
+
+    monkeypatch.setattr(shipped, "python", python)
+    out = tmp_path / "out"
+    assert shipped.main([str(sample_recording), "--looks", "1", "--roads", "0", "--folder", str(out)]) == DONE
+    training, measuring = commands
+    assert training[training.index("--output") + 1] == measuring[2] == out / "model.pt"
+    assert measuring[:2] == ("-m", "tools.scoreboard") and str(sample_recording) in measuring

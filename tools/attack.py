@@ -8,13 +8,10 @@ one telemetry in flight, must get the right answer to each of its frames, and in
 answered, and the attack's connections must be closed. Needs Linux, because memory is read from /proc.
 """
 
-import argparse
 import itertools
-import json
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,13 +23,12 @@ if __name__ == "__main__":
 import numpy as np
 
 from cloning.base.arguments import number
-from cloning.base.errors import UserError
 from cloning.network.network import SHIPPED_MODEL
 from tools.attacks import Attack, all_attacks, frames
-from tools.server_process import start_server
-from tools.simulator_client import Simulator, telemetry
+from tools.command import ROOT, command_line, run_tool
+from tools.server_process import ServerProcess
+from tools.simulator_client import Simulator, telemetry_message
 
-ROOT = Path(__file__).resolve().parent.parent
 OPEN_FILES = 1024  # that the server may have: Linux's usual limit
 MAX_MEMORY, MAX_P99, MIN_RATE = 450, 40, 15  # MB, ms, frames/s: beside an attack
 NEW_CAR, LEFT_OPEN = 5.0, 10.0  # s after an attack until a new car is answered, and until its connections are closed
@@ -45,10 +41,14 @@ class Drive:
     """What a car met: its telemetries, the answers to them, and how long each took, in s."""
 
     asked: int = 0
-    answered: int = 0
     wrong: int = 0
     seconds: float = 0.0
     round_trips: list[float] = field(default_factory=list)
+
+    @property
+    def answered(self) -> int:
+        """How many telemetries were answered."""
+        return len(self.round_trips)
 
     def milliseconds(self) -> list[float]:
         """Return the median, the 99th percentile and the largest of the round trips, in ms."""
@@ -74,7 +74,7 @@ class Car:
             time.sleep(0.1)
         self.simulator = simulator
         self.simulator.open()
-        self.messages = ["42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")]) for jpeg in jpegs]
+        self.messages = [telemetry_message(jpeg) for jpeg in jpegs]
         self.expected = expected or [self.ask(message) for message in self.messages]
 
     def ask(self, message: str) -> str:
@@ -82,60 +82,42 @@ class Car:
         self.simulator.send(message)
         return self.simulator.receive()
 
-    def drive(self, goes_on: Callable[[], bool]) -> Drive:
-        """Drive as long as `goes_on()`; a lost connection ends it, and leaves its last telemetry unanswered."""
-        drive, started = Drive(), time.perf_counter()
+    def drive(self, until: float) -> Drive:
+        """Drive until this time.monotonic(); a lost connection ends it, and leaves its last telemetry unanswered."""
+        drive, started = Drive(), time.monotonic()
         try:
-            for n in itertools.count():
-                due = time.perf_counter()
-                if not goes_on():
+            for message, expected in itertools.cycle(zip(self.messages, self.expected, strict=True)):
+                if (sent := time.monotonic()) >= until:
                     break
                 drive.asked += 1
-                answer = self.ask(self.messages[n % len(self.messages)])
-                drive.round_trips.append(time.perf_counter() - due)
-                drive.answered += 1
-                drive.wrong += answer != self.expected[n % len(self.messages)]
-                time.sleep(max(0.0, due + FRAME_INTERVAL - time.perf_counter()))
+                answer = self.ask(message)
+                drive.round_trips.append(time.monotonic() - sent)
+                drive.wrong += answer != expected
+                time.sleep(max(0.0, sent + FRAME_INTERVAL - time.monotonic()))
             drive.wrong += self.ask("2") != "3"  # else an answer has come twice
         except OSError:
             pass  # what is not answered is counted
-        drive.seconds = time.perf_counter() - started
+        drive.seconds = time.monotonic() - started
         return drive
 
 
-class Target:
+class Target(ServerProcess):
     """A drive.py process under attack."""
 
     def __init__(self, model: str | Path):
         """Start it."""
         import resource  # missing on Windows, where main refuses to run
 
-        self.process, self.port = start_server((ROOT / "drive.py", model, "--port", "0"))
+        super().__init__(ROOT / "drive.py", model, "--port", "0")
         resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (OPEN_FILES, OPEN_FILES))
 
-    def alive(self) -> bool:
-        """Return whether it still runs."""
-        return self.process.poll() is None
-
     def open_files(self) -> int:
-        """Return the number of files and sockets that it has open."""
+        """Return how many files and sockets it has open."""
         return len(os.listdir(f"/proc/{self.process.pid}/fd"))
 
     def forget_peak(self) -> None:
-        """Let `peak_memory` count from now on."""
+        """Let `memory("VmHWM")`, its peak, count from now on."""
         Path(f"/proc/{self.process.pid}/clear_refs").write_text("5", encoding="ascii")
-
-    def peak_memory(self) -> float:
-        """Return its largest resident memory, in MB."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="ascii")
-        return int(status.split("VmHWM:")[1].split()[0]) / 1024
-
-    def __enter__(self) -> "Target":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.wait()
 
 
 @dataclass
@@ -168,10 +150,10 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     before, until = server.open_files(), time.monotonic() + seconds
     attacker = multiprocessing.get_context("fork").Process(target=_attack, args=(attack, server.port, until))
     attacker.start()
-    drive = car.drive(lambda: time.monotonic() < until)
+    drive = car.drive(until)
     attacker.kill()
     attacker.join()
-    if not server.alive():
+    if server.process.poll() is not None:
         return Report(drive, 0.0, PATIENCE, 0)
     ended = time.monotonic()
     try:
@@ -184,7 +166,7 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     while (left := server.open_files() - before) > 0 and time.monotonic() < ended + LEFT_OPEN:
         time.sleep(0.05)
     car.simulator.socket.close()
-    return Report(drive, server.peak_memory(), answered_after, max(left, 0))
+    return Report(drive, server.memory("VmHWM"), answered_after, max(left, 0))
 
 
 def _attack(attack: Attack | None, port: int, until: float) -> None:
@@ -197,30 +179,23 @@ def _attack(attack: Attack | None, port: int, until: float) -> None:
         attack(port, until)
 
 
-def main() -> int:
-    """Run the attacks and print a table; return the exit status."""
+def main(argv: list[str] | None = None) -> int:
+    """Run the attacks and print a table; return the exit status. Raises UserError."""
     attacks = all_attacks()
-    parser = argparse.ArgumentParser(
-        prog="attack", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--model", default=SHIPPED_MODEL, help="a model file (default: the project's own)")
-    parser.add_argument(
-        "--seconds", type=number(float, 0.1, 3600), default=5, help="for each attack (default %(default)s)"
-    )
-    parser.add_argument("--only", nargs="+", choices=attacks, metavar="ATTACK", help=f"of {', '.join(attacks)}")
-    args = parser.parse_args()
+    parser = command_line("attack", __doc__)
+    add = parser.add_argument
+    add("--model", default=SHIPPED_MODEL, help="a model file (default: the project's own)")
+    add("--seconds", type=number(float, 0.1, 3600), default=5, help="for each attack (default %(default)s)")
+    add("--only", nargs="+", choices=attacks, metavar="ATTACK", help=f"of {', '.join(attacks)} (default: all)")
+    options = parser.parse_args(argv)
     if not Path("/proc/self/status").exists():
         parser.error("needs Linux, because memory is read from /proc")
-    chosen: Iterable[str] = args.only or attacks
     jpegs, broken = frames(), 0
     print(f"{'':22} asked   got wrong  fps  p50 ms p99 ms max ms  peak MB  new car s  left open")
-    for name in ("nobody", *chosen):
-        try:
-            with Target(args.model) as server:
-                expected = Car(server.port, jpegs).expected
-                report = run(attacks.get(name), server, jpegs, expected, args.seconds)
-        except UserError as error:
-            return program.failed("attack", error)
+    for name in ("nobody", *(options.only or attacks)):
+        with Target(options.model) as server:
+            expected = Car(server.port, jpegs).expected
+            report = run(attacks.get(name), server, jpegs, expected, options.seconds)
         faults, drive = report.faults(), report.drive
         median, p99, largest = drive.milliseconds()
         broken += bool(faults)
@@ -234,4 +209,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("attack", main)

@@ -1,7 +1,6 @@
 """The attacks of `tools.attack`: what each sends to a drive.py, and how often."""
 
 import itertools
-import json
 import socket
 import struct
 import time
@@ -12,7 +11,7 @@ import numpy as np
 
 from cloning.base.frame import FRAME
 from cloning.recordings.images import encode
-from tools.simulator_client import fragments, telemetry
+from tools.simulator_client import fragments, telemetry_message
 
 Attack = Callable[[int, float], None]  # takes the server's port and the time.monotonic() at which to stop
 T = TypeVar("T")
@@ -104,11 +103,6 @@ def flooding(opening: bytes, data: bytes = b"", **options: Any) -> Attack:
 def websockets(data: bytes, **options: Any) -> Attack:
     """Return the attack that floods an open websocket with frames."""
     return flooding(WEBSOCKET % b"", data, **options)
-
-
-def requests(data: bytes, **options: Any) -> Attack:
-    """Return the attack that floods a connection with HTTP requests."""
-    return flooding(b"", data, **options)
 
 
 def bad_frames(port: int, until: float) -> None:
@@ -206,11 +200,6 @@ def unread_polls(port: int, until: float) -> None:
             time.sleep(0.01)
 
 
-def one_frame_of(jpeg: bytes) -> bytes:
-    """Return a telemetry's websocket frames."""
-    return b"".join(fragments("42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")])))
-
-
 def frames(count: int = 8) -> list[bytes]:
     """Return JPEGs about as large as the simulator's, 12 kB: a sky, and a field of grains."""
     rng = np.random.default_rng(0)
@@ -220,14 +209,14 @@ def frames(count: int = 8) -> list[bytes]:
 
 def all_attacks() -> dict[str, Attack]:
     """Return the attacks by name."""
-    driving = one_frame_of(frames(1)[0])
+    driving = b"".join(fragments(telemetry_message(frames(1)[0])))
     names = b"".join(frame(b"40/%d," % n) for n in range(50_000))
     return {
         # Answers that nobody reads
         "unread_pongs": websockets(frame(b"2" + b"x" * 1_000_000), connections=4),
         "unread_small_pongs": websockets(frame(b"2") * 1000),
         "unread_answers": websockets(driving),
-        "unread_pages": requests(GET % b"/live?attention", connections=20),
+        "unread_pages": flooding(b"", GET % b"/live?attention", connections=20),
         "connect_again": websockets(frame(b"40") * 1000),
         "namespaces": websockets(names, read=True),
         "upgrade_packets": websockets(frame(b"5") * 1000),
@@ -242,7 +231,7 @@ def all_attacks() -> dict[str, Attack]:
         "endless_frame": flooding(WEBSOCKET % b"" + frame(b"4", length=1 << 40), bytes(1 << 20), connections=8),
         "bad_frames": bad_frames,
         # HTTP
-        "polling_sessions": requests(GET % POLLING, connections=50, read=True),
+        "polling_sessions": flooding(b"", GET % POLLING, connections=50, read=True),
         "unfetched_answers": in_sessions(
             lambda sid: post(POLLING + sid, b'24:42["telemetry",{"a":"b"}]' * 16), connections=8
         ),
@@ -256,10 +245,12 @@ def all_attacks() -> dict[str, Attack]:
         "endless_chunks": flooding(
             POST % (POLLING, b"Transfer-Encoding: chunked"), b"10000\r\n" + bytes(1 << 16) + b"\r\n"
         ),
-        "long_headers": requests(b"GET / HTTP/1.1\r\n" + b"A: %s\r\n" % (b"b" * 600) * 99, connections=100, read=True),
-        "slow_headers": requests(GET % b"/" + b"A: b\r\n" * 1000, connections=500, pause=0.001),
-        "odd_versions": requests(GET % b"/socket.io/?EIO=9&transport=websocket", connections=50, read=True),
-        "page_requests": requests(GET % b"/", connections=100, read=True),
+        "long_headers": flooding(
+            b"", b"GET / HTTP/1.1\r\n" + b"A: %s\r\n" % (b"b" * 600) * 99, connections=100, read=True
+        ),
+        "slow_headers": flooding(b"", GET % b"/" + b"A: b\r\n" * 1000, connections=500, pause=0.001),
+        "odd_versions": flooding(b"", GET % b"/socket.io/?EIO=9&transport=websocket", connections=50, read=True),
+        "page_requests": flooding(b"", GET % b"/", connections=100, read=True),
         "reconnections": flooding(WEBSOCKET % b"", connections=50, hold=False),
         # Many at once
         "idle_connections": flooding(b"", connections=1500),

@@ -9,14 +9,14 @@ thread). The servers take turns, so that other load on the machine affects all o
 time and memory are read from /proc.
 """
 
-import argparse
+import itertools
 import json
 import subprocess
 import sys
 import tempfile
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
@@ -29,38 +29,35 @@ import numpy as np
 import torch
 
 from cloning.base.arguments import number
-from cloning.base.errors import UserError
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
 from cloning.server.page import DrivenFrame
-from tools.server_process import start_server
-from tools.simulator_client import Simulator, fragments, telemetry
-
-ROOT = Path(__file__).resolve().parent.parent
+from tools.command import ROOT, command_line, run_tool
+from tools.server_process import ServerProcess
+from tools.simulator_client import Simulator, fragments, telemetry_message
 
 TICKS = 100  # per second: the unit of time in /proc/PID/stat
 TURN = 100  # frames that a server answers in one turn
 WARM_UP = 50  # frames that are not counted
+PAGE_OPEN, TYPICAL = "drive.py, page open", "typical server"  # names in the table
 
 
-class Server:
-    """A server process with a connected client, and its measurements."""
+class Server(ServerProcess):
+    """A server process with a connected client, and its measurements; name: in the table."""
 
-    def __init__(self, name: str, command: Sequence[str | Path]):
+    def __init__(self, name: str, *command: str | Path):
+        super().__init__(*command)
         self.name = name
-        self.process, self.port = start_server(command)
         self.client = Simulator(self.port)
         self.client.open()
         self.round_trips: list[float] = []  # seconds, measured by the client
         self.latencies: list[float] = []  # seconds, measured by the server
-        self.memory: list[float] = []  # MB, after each turn
+        self.megabytes: list[float] = []  # resident, after each turn
         self.seconds = self.cpu_time = 0.0  # over all counted frames
 
-    def close(self) -> None:
-        """End the client and the server."""
+    def __exit__(self, *_: object) -> None:
         self.client.socket.close()
-        self.process.terminate()
-        self.process.wait()
+        super().__exit__()
 
     def drive(self, messages: list[list[bytes]], count: bool = True) -> None:
         """Send messages, each a list of fragments, one after each answer; measure them if `count`."""
@@ -77,17 +74,12 @@ class Server:
         if count:
             self.seconds += time.perf_counter() - started
             self.cpu_time += self.cpu_seconds() - cpu_before
-            self.memory.append(self.resident_megabytes())
+            self.megabytes.append(self.memory())
 
     def cpu_seconds(self) -> float:
         """Return the server's CPU time so far in seconds, user and system."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / TICKS
-
-    def resident_megabytes(self) -> float:
-        """Return the server's resident memory in MB."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
-        return int(status.split("VmRSS:")[1].split()[0]) / 1024
 
     def read_latencies(self, frames: int) -> None:
         """Read the latencies of the last frames, as the server measured them, from the events for its page."""
@@ -119,78 +111,67 @@ def lower_bounds(network: Network, jpegs: list[bytes]) -> list[float]:
     return times
 
 
-def milliseconds(times: list[float]) -> str:
-    """Format the median and the 99th percentile of times in seconds."""
-    return f"{np.median(times) * 1e3:7.2f} {np.quantile(times, 0.99) * 1e3:8.2f}"
+def milliseconds(times: list[float], bound: list[float]) -> str:
+    """Format the median and the 99th percentile of times in seconds, and the median's ratio to that of the bound."""
+    median = np.median(times)
+    return f"{median * 1e3:7.2f} {np.quantile(times, 0.99) * 1e3:8.2f} {median / np.median(bound):7.2f}"
 
 
 def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], list[Server]]:
-    """Return the lower bounds in seconds, and the servers with their measurements."""
-    messages = [fragments("42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")])) for jpeg in jpegs]
+    """Return the lower bounds in seconds, and the servers with their measurements. Raises UserError."""
+    messages = [fragments(telemetry_message(jpeg)) for jpeg in jpegs]
     network, bounds = load_model(model), []
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        drive = (ROOT / "drive.py", model)
-        commands: dict[str, Sequence[str | Path]] = {
-            "drive.py": (*drive, "--port", "0"),
-            "drive.py, saving frames": (*drive, Path(folder) / "run1", "--port", "0"),
-            "drive.py, page open": (*drive, "--port", "0"),
-            "typical server": ("-m", "tools.classic_server", model),
+        drive = (ROOT / "drive.py", model, "--port", "0")
+        commands: dict[str, tuple[str | Path, ...]] = {
+            "drive.py": drive,
+            "drive.py, saving frames": (*drive, Path(folder) / "run1"),
+            PAGE_OPEN: drive,
+            TYPICAL: ("-m", "tools.classic_server", model),
         }
-        servers = []
-        for name, command in commands.items():
-            servers.append(Server(name, command))
-            stack.callback(servers[-1].close)
-            servers[-1].drive(messages[:WARM_UP], count=False)
-        start = 0
-        for _ in range(frames // TURN):
-            turn, start = slice(start, start + TURN), (start + TURN) % len(jpegs)
+        servers = [stack.enter_context(Server(name, *command)) for name, command in commands.items()]
+        for server in servers:
+            server.drive(messages[:WARM_UP], count=False)
+        turns = itertools.cycle(range(0, len(jpegs), TURN))
+        for start in itertools.islice(turns, frames // TURN):
+            turn = slice(start, start + TURN)
             bounds += lower_bounds(network, jpegs[turn])
             for server in servers:
-                with open_page(server.port) if "page" in server.name else nullcontext():
+                with open_page(server.port) if server.name == PAGE_OPEN else nullcontext():
                     server.drive(messages[turn])
-                if "drive" in server.name:
+                if server.name != TYPICAL:
                     server.read_latencies(TURN)
     return bounds, servers
 
 
-def main() -> int:
-    """Run the benchmark and print its table; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="bench_driving", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("model", help="a model file of model.py")
-    parser.add_argument("recording", type=Path, help="folder of a recording, whose first 500 centre images are sent")
-    parser.add_argument(
-        "--frames", type=number(int, TURN), default=3000, help="frames for each server (default %(default)s)"
-    )
-    args = parser.parse_args()
+def main(argv: list[str] | None = None) -> int:
+    """Run the benchmark and print its table; return the exit status. Raises UserError."""
+    parser = command_line("bench_driving", __doc__)
+    add = parser.add_argument
+    add("model", help="a model file of model.py")
+    add("recording", type=Path, help="folder of a recording, whose first 500 centre images are sent")
+    add("--frames", type=number(int, TURN), default=3000, help="frames for each server (default %(default)s)")
+    options = parser.parse_args(argv)
     if not Path("/proc/self/stat").exists():
         parser.error("needs Linux, because CPU time and memory are read from /proc")
-    jpegs = [path.read_bytes() for path in sorted(args.recording.glob("IMG/center_*.jpg"))[:500]]
+    jpegs = [path.read_bytes() for path in sorted(options.recording.glob("IMG/center_*.jpg"))[:500]]
     if not jpegs:
-        parser.error(f"{args.recording}: no centre images in its IMG/; name a folder that holds driving_log.csv")
+        parser.error(f"{options.recording}: no centre images in its IMG/; name a folder that holds driving_log.csv")
     torch.set_num_threads(1)
-    try:
-        bounds, servers = measure(args.model, jpegs, args.frames)
-    except UserError as error:
-        return program.failed("bench_driving", error)
-    print(
-        f"{len(bounds)} frames each; times in ms\n{'':25} median      p99  /bound  frames/s  CPU/frame  MB first  last"
-    )
-    print(f"{'bound: decode + forward':24} {milliseconds(bounds)}    1.00")
+    bounds, servers = measure(options.model, jpegs, options.frames)
+    print(f"{len(bounds)} frames each; times in ms")
+    print(f"{'':25} median      p99  /bound  frames/s  CPU/frame  MB first  last")
+    print(f"{'bound: decode + forward':24} {milliseconds(bounds, bounds)}")
     for server in servers:
         count = len(server.round_trips)
         print(
-            f"{server.name:24} {milliseconds(server.round_trips)} "
-            f"{np.median(server.round_trips) / np.median(bounds):7.2f} "
-            f"{count / server.seconds:9.1f} {server.cpu_time / count * 1e3:10.2f} "
-            f"{server.memory[0]:9.0f} {server.memory[-1]:5.0f}"
+            f"{server.name:24} {milliseconds(server.round_trips, bounds)} {count / server.seconds:9.1f} "
+            f"{server.cpu_time / count * 1e3:10.2f} {server.megabytes[0]:9.0f} {server.megabytes[-1]:5.0f}"
         )
         if server.latencies:
-            ratio = np.median(server.latencies) / np.median(bounds)
-            print(f"{'  in the server':24} {milliseconds(server.latencies)} {ratio:7.2f}")
+            print(f"{'  in the server':24} {milliseconds(server.latencies, bounds)}")
     return program.DONE
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("bench_driving", main)

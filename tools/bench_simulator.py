@@ -9,7 +9,6 @@ other load on the machine disturbs it less than wall time. Memory is that of all
 counted once. Needs Linux, because memory is read from /proc.
 """
 
-import argparse
 import contextlib
 import os
 import re
@@ -18,8 +17,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from cloning.base import program
 
@@ -27,7 +26,7 @@ if __name__ == "__main__":
     program.end_on_interrupt("bench_simulator")  # also while the libraries below are loaded
 
 from cloning.base.arguments import number
-from cloning.base.errors import SimulatorError, UserError
+from cloning.base.errors import SimulatorError
 from cloning.recordings.format import DRIVING_LOG, SAMPLE_RATE
 from cloning.road.track import ROADS, Track
 from simulator import scenery
@@ -36,13 +35,12 @@ from simulator.car import STEP
 from simulator.expert import Expert
 from simulator.run import Run
 from simulator.world import Scene
+from tools.command import ROOT, command_line, run_tool
 
-ROOT = Path(__file__).resolve().parent.parent
 WARM_UP = 20  # frames before the lock-step measurement
 
 
-@dataclass(frozen=True)
-class Speed:
+class Speed(NamedTuple):
     """Simulated seconds per second of wall time and of processor time, and the peak memory use in MB."""
 
     wall: float
@@ -64,7 +62,7 @@ def recording(track: str, laps: float) -> Speed:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "simulator", "record", f"{folder}/out", "--track", track, "--laps", str(laps)]
         begin = time.perf_counter()
-        process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         peak = 0.0
         while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # a child that has just ended
@@ -99,43 +97,36 @@ def lockstep(track: str, frames: int) -> tuple[float, float]:
     return (time.perf_counter() - wall) / frames * 1000, (time.process_time() - cpu) / frames * 1000
 
 
-def measure(laps: float, repeat: int) -> None:
-    """Measure both tracks and print the table."""
+def measure(laps: float, repeat: int, frames: int) -> None:
+    """Measure both tracks and print the table. Raises SimulatorError."""
     import resource  # missing on Windows, where main refuses to run
 
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start")
     print("track   recording, times real time     memory   lock-step, ms per frame")
     print("        wall (worst)  cpu (worst)      MB       wall   cpu")
     for track in ROADS:
-        runs = [recording(track, laps) for _ in range(repeat)]
-        wall, cpu = [run.wall for run in runs], [run.cpu for run in runs]
-        frame_wall, frame_cpu = lockstep(track, 300)
+        wall, cpu, memory = zip(*(recording(track, laps) for _ in range(repeat)), strict=True)
+        frame_wall, frame_cpu = lockstep(track, frames)
         print(
-            f"{track:7} {statistics.median(wall):.1f} ({min(wall):.1f})     "
-            f"{statistics.median(cpu):.1f} ({min(cpu):.1f})        "
-            f"{max(run.memory for run in runs):.0f}      {frame_wall:.1f}   {frame_cpu:.1f}"
+            f"{track:7} {statistics.median(wall):.1f} ({min(wall):.1f})     {statistics.median(cpu):.1f} "
+            f"({min(cpu):.1f})        {max(memory):.0f}      {frame_wall:.1f}   {frame_cpu:.1f}"
         )
     print(f"peak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 
-def main() -> int:
-    """Parse the command line, measure and return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="bench_simulator", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--laps", type=number(float, 0.001, 1e5), default=1.0, help="laps to record on each track (default 1)"
-    )
-    parser.add_argument("--repeat", type=number(int, 1), default=3, help="recordings of each track (default 3)")
-    args = parser.parse_args()
+def main(argv: list[str] | None = None) -> int:
+    """Parse the command line, measure and return the exit status. Raises SimulatorError."""
+    parser = command_line("bench_simulator", __doc__)
+    add = parser.add_argument
+    add("--laps", type=number(float, 0.001, 1e5), default=1, help="to record on each track (default %(default)s)")
+    add("--repeat", type=number(int, 1), default=3, help="recordings of each track (default %(default)s)")
+    add("--frames", type=number(int, 1), default=300, help="in lock-step on each track (default %(default)s)")
+    options = parser.parse_args(argv)
     if not Path("/proc/self/smaps_rollup").exists():
         parser.error("needs Linux, because memory is read from /proc")
-    try:
-        measure(args.laps, args.repeat)
-    except UserError as error:
-        return program.failed("bench_simulator", error)
+    measure(options.laps, options.repeat, options.frames)
     return program.DONE
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("bench_simulator", main)

@@ -7,16 +7,13 @@
 (b) only the optimisation step, as model.py does it, repeated on one batch in memory
 (c) a typical training loop: float32, contiguous tensors, the whole batch at once; the training thread itself decodes
     and augments the images one by one
-(k) Keras with the same one-by-one generator, if TensorFlow is installed
 
-The limit for (b) is the rate at which the processor could train if it only multiplied matrices, or if it only moved the
-activations in memory, whichever is lower. Each part runs in a process of its own; the parts take turns, so that a
-change of the machine's speed affects all of them. Rates are in training images per second. On a CPU, a last table shows
-what each layer costs.
+The limit for (b) is the rate at which the processor could train if it only multiplied matrices. Each part runs in a
+process of its own; the parts take turns, so that a change of the machine's speed affects all of them. Rates are in
+training images per second.
 """
 
 import argparse
-import importlib.util
 import itertools
 import json
 import statistics
@@ -27,7 +24,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 from unittest import mock
 
 from cloning.base import program
@@ -35,36 +31,34 @@ from cloning.base import program
 if __name__ == "__main__":
     program.end_on_interrupt("bench_training")  # also while the libraries below are loaded
 
+import cv2
+import numpy as np
+import torch
+
+import model
 from cloning.base.arguments import number
 from cloning.base.errors import UserError
+from cloning.base.frame import FRAME
 from cloning.network.compute import keep_freed_memory, threads
+from cloning.network.network import CROP, SEEN_ROWS, Network
 from cloning.road.track import Track
+from cloning.training.distributed import Ranks
+from cloning.training.options import Command, Process, Run
+from simulator.record import record
+from tools.command import command_line, head, python, row, run_tool
 
-if TYPE_CHECKING:
-    import numpy as np
-    import torch
-
-    import model
-    from cloning.network.network import Network
-
-PARTS = ("limit", "ab", "c", "k")  # that measure rates
 BATCH_IMAGES = 474  # images in a batch of 128 observations, at 3.7 images each on average
 NAMES = {
     "limit": "limit by matrix multiplication",
-    "memory": "limit by memory traffic",
     "a": "(a) an epoch of model.py",
     "b": "(b) only the optimisation step",
     "c": "(c) a typical training loop",
-    "k": "(k) Keras, one-by-one generator",
 }
+RATIOS = (("b", "limit"), ("a", "b"), ("a", "c"))
 
 
-def begin(folders: list[str], samples: int, output: Path) -> "model.TrainingRun":
+def begin(folders: list[str], samples: int, output: Path) -> model.TrainingRun:
     """Prepare a run of model.py on these folders, without training."""
-    import model
-    from cloning.training.distributed import Ranks
-    from cloning.training.options import Command, Process, Run
-
     recipe = replace(model.REPORT, samples_per_epoch=samples, epochs=1)
     command = Command(Run(recipe, tuple(folders)), Process(str(output)), frozenset(), {})
     run = model.TrainingRun(model.prepare(command), command.process, Ranks())
@@ -72,27 +66,24 @@ def begin(folders: list[str], samples: int, output: Path) -> "model.TrainingRun"
     return run
 
 
-def flops(network: "Network") -> int:
+def flops(network: Network) -> int:
     """Count the multiplications and additions per image, forward and backward."""
-    import torch
+    total = 0
 
-    from tools.bench_layers import operations
+    def count(layer: torch.nn.Module, _: tuple, output: torch.Tensor) -> None:
+        nonlocal total
+        assert isinstance(layer, torch.nn.Conv2d | torch.nn.Linear)
+        passes = 2 if layer is network.convolutions[0] else 3  # no gradient for the image
+        total += passes * 2 * output.numel() * layer.weight[0].numel()
 
-    total: list[int] = []
-
-    def count(module: torch.nn.Module, _: tuple, output: torch.Tensor) -> None:
-        assert isinstance(module, torch.nn.Conv2d | torch.nn.Linear)
-        passes = 2 if module is network.convolutions[0] else 3  # no gradient for the image
-        total.append(operations(module, output) * passes)
-
-    hooks = [module.register_forward_hook(count) for module in (*network.convolutions, *network.dense)]
-    network(torch.zeros((1, 160, 320, 3), dtype=torch.uint8, device=next(network.parameters()).device))
+    hooks = [layer.register_forward_hook(count) for layer in (*network.convolutions, *network.dense)]
+    network(torch.zeros((1, *FRAME), dtype=torch.uint8, device=next(network.parameters()).device))
     for hook in hooks:
         hook.remove()
-    return sum(total)
+    return total
 
 
-def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
+def part_ab(run: model.TrainingRun, _: int) -> dict[str, float]:
     """Measure (a) and (b) in one process, with a step of (b) after every fourth batch of (a).
 
     So other load on the machine affects both equally.
@@ -119,16 +110,11 @@ def part_ab(run: "model.TrainingRun", _: int) -> dict[str, float]:
     return {"a": run.progress.history[0]["images"] / epoch_seconds, "b": steps * fixed_batch.total / spent}
 
 
-def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray", "np.ndarray"]:
+def one_by_one(generator: model.Generator, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a batch made as in a typical generator, one image at a time from its file.
 
     images: uint8 (n, 75, 320, 3); labels: float32 (n,).
     """
-    import cv2
-    import numpy as np
-
-    from cloning.network.network import CROP, SEEN_ROWS
-
     choices, images, angles = generator.sample(number), [], []
     for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
         seen = generator.observations.read(at, camera)[SEEN_ROWS]
@@ -141,10 +127,8 @@ def one_by_one(generator: "model.Generator", number: int) -> tuple["np.ndarray",
     return np.stack(images), np.array(angles)
 
 
-def part_c(run: "model.TrainingRun", steps: int) -> dict[str, float]:
+def part_c(run: model.TrainingRun, steps: int) -> dict[str, float]:
     """Measure (c), a typical training loop."""
-    import torch
-
     network = run.network
     for parameter in network.parameters():
         parameter.data = parameter.data.contiguous()  # in model.py they are channels last
@@ -169,54 +153,16 @@ def part_c(run: "model.TrainingRun", steps: int) -> dict[str, float]:
     return {"c": rate(step, BATCH_IMAGES, steps, run.device)}
 
 
-def part_k(run: "model.TrainingRun", steps: int) -> dict[str, float]:
-    """Measure (k), Keras with the one-by-one generator."""
-    import keras
-
-    layers = keras.layers
-    network = keras.Sequential(
-        [
-            layers.Input((75, 320, 3)),
-            layers.Rescaling(1 / 127.5, -1),
-            *[
-                layers.Conv2D(filters, size, stride, activation="elu")
-                for filters, size, stride in ((24, 5, 2), (36, 5, 2), (48, 5, 2), (64, 3, 1), (64, 3, 1))
-            ],
-            layers.Flatten(),
-            layers.Dropout(0.5),
-            *[layers.Dense(n, activation="elu") for n in (100, 50, 10)],
-            layers.Dense(1),
-        ]
-    )
-    network.compile(optimizer=keras.optimizers.Adam(1e-4), loss="mse")
-    numbers = iter(range(1000))
-
-    def step() -> None:
-        network.train_on_batch(*one_by_one(run.generator, next(numbers)))
-
-    return {"k": rate(step, BATCH_IMAGES, steps, run.device)}
-
-
-def part_limit(run: "model.TrainingRun", _: int) -> dict[str, float]:
-    """Measure the limits: images per second if a step only multiplied matrices, or only moved its activations.
-
-    Each is the best of eight measurements; the second one only on a CPU.
-    """
-    import torch
-
-    from tools import bench_layers
-
+def part_limit(run: model.TrainingRun, _: int) -> dict[str, float]:
+    """Measure the limit: images per second if a step only multiplied matrices; the best of eight measurements."""
     torch.set_num_threads(threads())
     size = 2048 if run.device.type == "cpu" else 8192
     a, b = (torch.randn(size, size, device=run.device).to(run.precision) for _ in "ab")
     fastest = max(rate(lambda: a @ b, 1, 1, run.device) for _ in range(8)) * 2 * size**3
-    limits = {"limit": fastest / flops(run.network)}
-    if run.device.type == "cpu":
-        limits["memory"] = bench_layers.memory_limit(run.network, run.precision)
-    return limits
+    return {"limit": fastest / flops(run.network)}
 
 
-def rate(step: Callable[[], object], images: int, steps: int, device: "torch.device") -> float:
+def rate(step: Callable[[], object], images: int, steps: int, device: torch.device) -> float:
     """Return the images per second over these steps, after one step that is not counted."""
     step()
     synchronize(device)
@@ -227,44 +173,35 @@ def rate(step: Callable[[], object], images: int, steps: int, device: "torch.dev
     return images * steps / (time.perf_counter() - started)
 
 
-def synchronize(device: "torch.device") -> None:
+def synchronize(device: torch.device) -> None:
     """Wait until a GPU has finished its work."""
     if device.type == "cuda":
-        import torch
-
         torch.cuda.synchronize(device)
 
 
-PART_FUNCTIONS = {"limit": part_limit, "ab": part_ab, "c": part_c, "k": part_k}
+PARTS = {"limit": part_limit, "ab": part_ab, "c": part_c}
 
 
-def layer_table(run: "model.TrainingRun") -> str:
-    """Return what each layer costs in an optimisation step, as a table."""
-    from tools import bench_layers
-
-    keep_freed_memory()
-    return bench_layers.table(*bench_layers.costs(run.network, run.precision))
-
-
-def measure(part: str, recordings: list[str], samples: int, steps: int, folder: Path) -> dict:
+def measure(part: str, recordings: list[str], samples: int, steps: int) -> dict:
     """Measure one part in this process; return its rates in images per second, memory, device and precision."""
     if part == "ab":
         keep_freed_memory()  # as model.py does
-    run = begin(recordings, samples, folder / "model.pt")
-    rates = PART_FUNCTIONS[part](run, steps)
+    with tempfile.TemporaryDirectory() as folder:
+        training = begin(recordings, samples, Path(folder, "model.pt"))
+        rates = PARTS[part](training, steps)
     return {
         "rates": rates,
         "gb": peak_memory(),
-        "device": str(run.device),
-        "precision": str(run.precision),
-        "flops": flops(run.network),
+        "device": str(training.device),
+        "precision": str(training.precision).removeprefix("torch."),
+        "flops": flops(training.network),
     }
 
 
-def peak_memory() -> float | None:
-    """Return the peak resident memory of this process in GB, or None on Windows, where it is unknown."""
+def peak_memory() -> float:
+    """Return the peak resident memory of this process in GB, or 0 on Windows, where it is unknown."""
     if sys.platform == "win32":
-        return None
+        return 0.0
     import resource
 
     unit = 1e9 if sys.platform == "darwin" else 1e6  # bytes on macOS, kilobytes elsewhere
@@ -272,85 +209,56 @@ def peak_memory() -> float | None:
 
 
 def compare(recordings: list[str], rounds: int, samples: int, steps: int) -> None:
-    """Measure every part in each round and print the tables."""
-    parts = [part for part in PARTS if part != "k" or importlib.util.find_spec("tensorflow")]
+    """Measure every part in each round, in processes of their own, and print the tables."""
     rates: dict[str, list[float]] = {}
     memory: dict[str, float] = {}
     measured: dict = {}
-
-    def output(part: str) -> str:
-        command = [sys.executable, "-m", "tools.bench_training", *recordings, "--part", part]
-        command += ["--samples", str(samples), "--steps", str(steps)]
-        process = subprocess.run(command, stdout=subprocess.PIPE, text=True)
-        if process.returncode:
+    options = ("--samples", samples, "--steps", steps)
+    for turn, part in itertools.product(range(1, rounds + 1), PARTS):
+        done = python("-m", "tools.bench_training", *recordings, "--part", part, *options, stdout=subprocess.PIPE)
+        if done.returncode:
             raise UserError(f"part {part} failed; its error message is above")
-        return process.stdout
-
-    for round_number in range(1, rounds + 1):
-        for part in parts:
-            measured = json.loads(output(part).splitlines()[-1])
-            for name, value in measured["rates"].items():
-                rates.setdefault(name, []).append(value)
-                memory[name] = max(memory.get(name, 0.0), measured["gb"] or 0.0)
-                print(f"round {round_number}: {NAMES[name]}: {value:.0f}", file=sys.stderr, flush=True)
-    precision = measured["precision"].removeprefix("torch.")
-    print(f"\n{measured['device']}, {precision}, {rounds} rounds, {measured['flops'] / 1e6:.0f} MFLOP per image\n")
-    print("| training images/s | median | least | most | peak memory GB |\n|---|---|---|---|---|")
+        measured = json.loads(done.stdout.splitlines()[-1])
+        for name, value in measured["rates"].items():
+            rates.setdefault(name, []).append(value)
+            memory[name] = max(memory.get(name, 0.0), measured["gb"])
+            print(f"round {turn}: {NAMES[name]}: {value:.0f}", file=sys.stderr, flush=True)
+    print(f"\n{measured['device']}, {measured['precision']}, {rounds} rounds, ", end="")
+    print(f"{measured['flops'] / 1e6:.0f} MFLOP per image\n")
+    print(head("training images/s", "median", "least", "most", "peak memory GB"))
     for name, values in rates.items():
-        cells = (statistics.median(values), min(values), max(values))
-        print(f"| {NAMES[name]} | {' | '.join(f'{cell:.0f}' for cell in cells)} | {memory[name]:.2f} |")
-    print("\n| ratio in each round | median | least | most |\n|---|---|---|---|")
-    if "memory" in rates:
-        rates["limit"] = [min(pair) for pair in zip(rates["limit"], rates["memory"], strict=True)]
-    for above, below in (("b", "limit"), ("a", "b"), ("a", "c"), *((("a", "k"),) if "k" in parts else ())):
-        ratios = [x / y for x, y in zip(rates[above], rates[below], strict=True)]
-        print(f"| {above} / {below} | {statistics.median(ratios):.2f} | {min(ratios):.2f} | {max(ratios):.2f} |")
-    if measured["device"] == "cpu":
-        layers = output("layers")
-        print(f"\n{layers[layers.index('| layer') :]}", end="")
+        print(row(NAMES[name], *spread(values, 0), f"{memory[name]:.2f}"))
+    print(f"\n{head('ratio in each round', 'median', 'least', 'most')}")
+    for above, below in RATIOS:
+        print(row(f"{above} / {below}", *spread([x / y for x, y in zip(rates[above], rates[below], strict=True)], 2)))
 
 
-def main() -> int:
+def spread(values: list[float], digits: int) -> list[str]:
+    """Return the median, the least and the greatest value as texts with so many digits after the point."""
+    return [f"{value:.{digits}f}" for value in (statistics.median(values), min(values), max(values))]
+
+
+def main(argv: list[str] | None = None) -> int:
     """Run the benchmark, or with --part one part of it, in a process that it started; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="bench_training", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "recordings", nargs="*", help="folders of recordings; without any, a third of a lap is rendered"
-    )
-    parser.add_argument(
-        "--rounds", type=number(int, 1), default=3, help="measurements of each part (default %(default)s)"
-    )
-    parser.add_argument(
-        "--samples",
-        type=number(int, 5 * BATCH_IMAGES),
-        default=20224,
-        help="images per epoch in (a), at least five batches (default %(default)s)",
-    )
-    parser.add_argument(
-        "--steps", type=number(int, 1), default=5, help="measured batches in (c) and (k) (default %(default)s)"
-    )
-    parser.add_argument("--part", choices=(*PARTS, "layers"), help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            if args.part == "layers":
-                print("\n" + layer_table(begin(args.recordings, args.samples, Path(folder, "model.pt"))))
-                return program.DONE
-            if args.part:
-                measured = measure(args.part, args.recordings, args.samples, args.steps, Path(folder))
-                print("\n" + json.dumps(measured))
-                return program.DONE
-            if not args.recordings:
-                from simulator.record import record
-
-                args.recordings = [f"{folder}/rendered"]
-                record(args.recordings[0], Track("lake"), laps=0.35)
-            compare(args.recordings, args.rounds, args.samples, args.steps)
-    except UserError as error:
-        return program.failed("bench_training", error)
+    parser = command_line("bench_training", __doc__)
+    add = parser.add_argument
+    add("recordings", nargs="*", help="folders of recordings; without any, a third of a lap is rendered")
+    add("--rounds", type=number(int, 1), default=3, help="measurements of each part (default %(default)s)")
+    samples = "images per epoch in (a), at least five batches (default %(default)s)"
+    add("--samples", type=number(int, 5 * BATCH_IMAGES), default=20224, help=samples)
+    add("--steps", type=number(int, 1), default=5, help="measured batches in (c) (default %(default)s)")
+    add("--part", choices=PARTS, help=argparse.SUPPRESS)
+    options = parser.parse_args(argv)
+    if options.part:
+        print("\n" + json.dumps(measure(options.part, options.recordings, options.samples, options.steps)))
+        return program.DONE
+    with tempfile.TemporaryDirectory() as folder:
+        if not options.recordings:
+            options.recordings = [f"{folder}/rendered"]
+            record(options.recordings[0], Track("lake"), laps=0.35)
+        compare(options.recordings, options.rounds, options.samples, options.steps)
     return program.DONE
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("bench_training", main)

@@ -9,17 +9,14 @@ again; without the folder it begins anew.
 Exit status: 0 if every lap was driven without leaving the road, 1 if the car left it, 2 if a step failed.
 """
 
-import argparse
 import html
 import json
 import shutil
 import string
-import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from cloning.base import program
 
@@ -27,13 +24,14 @@ if __name__ == "__main__":
     program.end_on_interrupt("demo", "stopped; start it again to continue")  # also while the libraries below are loaded
 
 from cloning.base.cores import threads
-from cloning.base.errors import SimulatorError, UserError
+from cloning.base.errors import SimulatorError
 from cloning.base.files import write
 from cloning.network.network import SHIPPED_MODEL
 from cloning.server.site import STYLE
 from simulator.report import LapReport
-from tools.server_process import start_server
-from tools.shipped import ROOT, Lap, render
+from tools.command import ROOT, command_line, python, run_tool
+from tools.server_process import ServerProcess
+from tools.shipped import Lap, render
 
 FOLDER = Path("demo")
 MODEL = FOLDER / "model.pt"
@@ -49,8 +47,7 @@ NEXT = (
 )
 
 
-@dataclass(frozen=True)
-class Drive:
+class Drive(NamedTuple):
     """A lap that a network drives.
 
     name              of its folder, which holds lap.json (report), lap.png (picture) and lap.mp4 (film)
@@ -93,11 +90,10 @@ def train() -> None:
     """Train a network on the recorded laps, or continue to. Raises SimulatorError."""
     if MODEL.exists():  # written at the end of the only epoch
         return
-    options = ["--robust", "--epochs", "1", "--samples-per-epoch", str(IMAGES), "--output", str(MODEL)]
+    options = ["--robust", "--epochs", 1, "--samples-per-epoch", IMAGES, "--output", MODEL]
     if MODEL.with_stem(f"{MODEL.stem}-resume").exists():
         options.append("--resume")
-    done = subprocess.run([sys.executable, ROOT / "model.py", FOLDER / "recorded", *options])
-    if done.returncode != program.DONE:
+    if python(ROOT / "model.py", FOLDER / "recorded", *options).returncode != program.DONE:
         raise SimulatorError("the training did not finish; start the demo again to continue it")
 
 
@@ -107,17 +103,12 @@ def drive(lap: Drive) -> None:
         unfinished = FOLDER / f"unfinished-{lap.name}"
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir()
-        files = [unfinished / f"lap.{suffix}" for suffix in ("json", "png", "mp4")]
-        outputs = [str(word) for pair in zip(("--report", "--picture", "--film"), files, strict=True) for word in pair]
-        server, port = start_server([ROOT / "drive.py", lap.model, "--speed", str(lap.speed), "--port", "0"])
-        road = ("--track", lap.track, "--direction", lap.direction, "--port", str(port))
-        command = [sys.executable, "-m", "simulator", "drive", *road, *outputs]
-        try:
-            done = subprocess.run(command, capture_output=True, encoding="utf-8")
-        finally:
-            server.terminate()
-            server.wait()
-        if done.returncode not in (program.DONE, program.INCOMPLETE):
+        outputs = ("json", "--report"), ("png", "--picture"), ("mp4", "--film")
+        files = [word for suffix, option in outputs for word in (option, unfinished / f"lap.{suffix}")]
+        with ServerProcess(ROOT / "drive.py", lap.model, "--speed", str(lap.speed), "--port", "0") as server:
+            road = ("--track", lap.track, "--direction", lap.direction, "--port", server.port)
+            done = python("-m", "simulator", "drive", *road, *files, capture_output=True)
+        if done.returncode not in (program.DONE, program.INCOMPLETE) or not (unfinished / "lap.json").exists():
             raise SimulatorError(f"{lap.title}: {done.stderr.strip()}; start the demo again to continue")
         unfinished.rename(lap.folder)
     print(f"{lap.title}: {in_words(lap.report())}", flush=True)
@@ -164,27 +155,23 @@ def page() -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Take the steps that are not done yet, write the page and print what to do next; return the exit status."""
-    argparse.ArgumentParser(
-        prog="demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args(argv)
+    """Take the steps that are not done yet, write the page and print what to do next; return the exit status.
+
+    Raises UserError, OSError.
+    """
+    parser = command_line("demo", __doc__)
+    parser.parse_args(argv)
     steps = (
         ("record an expert who drives a lap of the lake in each direction (1 minute)", record),
         (f"train a network on {IMAGES:,} images of the two laps (1 minute)", train),
-        (
-            "let it drive the lake at 30 mph, and the project's own network the jungle, with films (2 minutes)",
-            drive_all,
-        ),
+        ("let it drive the lake at 30 mph, and the project's network the jungle, with films (2 minutes)", drive_all),
     )
-    try:
-        for number, (text, step) in enumerate(steps, 1):
-            print(f"\n{number} of {len(steps)}: {text}", flush=True)
-            begin = time.perf_counter()
-            step()
-            print(f"{number} of {len(steps)}: done in {time.perf_counter() - begin:.0f} s", flush=True)
-        write(FOLDER / "index.html", page().encode())
-    except (UserError, OSError) as error:
-        return program.failed("demo", error)
+    for n, (text, step) in enumerate(steps, 1):
+        print(f"\n{n} of {len(steps)}: {text}", flush=True)
+        begin = time.perf_counter()
+        step()
+        print(f"{n} of {len(steps)}: done in {time.perf_counter() - begin:.0f} s", flush=True)
+    write(FOLDER / "index.html", page().encode())
     width = max(len(command) for command, _ in NEXT)
     print(f"\nLook at it in a browser: {(FOLDER / 'index.html').resolve().as_uri()}")
     print(f"\nThree things to do next, after `{ACTIVATE}` in every new terminal:")
@@ -193,4 +180,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("demo", main)

@@ -23,13 +23,13 @@ from simulator.cameras import Cameras, jpeg
 from simulator.scenery.looks import SHADOWED
 from simulator.world import Scene
 
-FRAME_SHARES = {"lake": 1, "jungle": 2}  # relative number of frames: hills and narrow bends are harder
+FRAME_SHARES = {"lake": 1, "jungle": 2}  # relative: hills and narrow bends are harder
 FIRST_ROAD = 1001  # the first generated road that networks are trained on
 MAX_OFFSET, MAX_YAW = 3.5, 15.0  # m and degrees: lateral offset and heading error
 
 
 class RenderedScene(NamedTuple):
-    """A track in a look, and the number of frames to render of it."""
+    """A track in a look, and how many frames to render of it."""
 
     track: str
     look: int
@@ -82,15 +82,15 @@ def render_strips(scene: RenderedScene, seed: int) -> tuple[np.ndarray, np.ndarr
         right = rng.uniform(-MAX_OFFSET, MAX_OFFSET)
         large = rng.random() < 0.3
         yaw = rng.uniform(-MAX_YAW, MAX_YAW) if large else np.clip(rng.normal(0, MAX_YAW / 3), -MAX_YAW, MAX_YAW)
-        place = track.at(s, right)
-        heading = place.heading - np.radians(yaw)
-        pitch = np.degrees(np.arctan(place.grade)) + rng.normal(0.1, 0.5)
+        pose = track.at(s, right)
+        heading = pose.heading - np.radians(yaw)
+        pitch = np.degrees(np.arctan(pose.grade)) + rng.normal(0.1, 0.5)
         angles = Vec3(np.degrees(heading) - 90, pitch, rng.normal(0, 0.6))
-        middle = Point3(place.x, place.y, place.z + rng.normal(0.025, 0.03))
+        middle = Point3(pose.x, pose.y, pose.z + rng.normal(0.025, 0.03))
         frame = cameras.frames(TransformState.make_pos_hpr(middle, angles))[0]
         strips[k] = extract_strip(decode(jpeg(frame)))
         along = np.array([np.cos(heading), np.sin(heading)])
-        centres[k] = centre_ahead(track, s, np.array([place.x, place.y]) + CAMERA_FORWARD * along, heading)
+        centres[k] = centre_ahead(track, s, np.array([pose.x, pose.y]) + CAMERA_FORWARD * along, heading)
     return strips, centres
 
 

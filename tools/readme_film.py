@@ -7,9 +7,7 @@ Left the lake, right the jungle, each first without and then with shadows, as th
 film is an animated WebP, which web pages show like a picture.
 """
 
-import argparse
 import io
-from pathlib import Path
 
 from cloning.base import program
 
@@ -30,8 +28,9 @@ from cloning.network.network import SHIPPED_MODEL, Network, load_model
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.road.overlay import overlay
 from simulator.scenery.looks import SHADOWED
+from tools.command import ROOT, command_line, run_tool
 
-FILM = Path(__file__).resolve().parent.parent / "diagnostic_images" / "report" / "driving.webp"
+FILM = ROOT / "diagnostic_images" / "report" / "driving.webp"
 TRACKS = ("lake", "jungle")
 LOOKS = {0: "", SHADOWED: ", in shadow"}  # the looks, in their order, and what the label says of them
 STARTS, SECONDS = {"lake": 29, "jungle": 15}, 4  # s from the start of a lap to a bend with shadows; of each clip
@@ -58,30 +57,25 @@ def clip(network: Network, track: str, look: int) -> list[np.ndarray]:
     return frames
 
 
-def main() -> int:
-    """Drive the clips and write the film; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="readme_film", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("model", nargs="?", default=SHIPPED_MODEL, help="model file (default: the shipped network)")
-    parser.add_argument("film", nargs="?", default=str(FILM), help="WebP to write (default: the one in README.md)")
-    arguments = parser.parse_args()
+def main(argv: list[str] | None = None) -> int:
+    """Drive the clips and write the film; return the exit status. Raises UserError."""
+    parser = command_line("readme_film", __doc__)
+    add = parser.add_argument
+    add("model", nargs="?", default=SHIPPED_MODEL, help="model file (default: the shipped network)")
+    add("film", nargs="?", default=str(FILM), help="WebP to write (default: the one in README.md)")
+    options = parser.parse_args(argv)
     torch.set_num_threads(1)
-    try:
-        check_folders(arguments.film)
-        network = load_model(arguments.model)
-        clips = [np.concatenate([clip(network, track, look) for look in LOOKS]) for track in TRACKS]
-        first, *rest = [Image.fromarray(picture) for picture in np.concatenate(clips, axis=2)]
-        film, duration = io.BytesIO(), 1000 * EVERY // SAMPLE_RATE  # ms
-        first.save(
-            film, "WEBP", save_all=True, append_images=rest, duration=duration, loop=0, quality=QUALITY, method=EFFORT
-        )
-        write_output(arguments.film, film.getvalue())
-    except UserError as error:
-        return program.failed("readme_film", error)
-    print(f"{arguments.film}: {1 + len(rest)} frames, {len(film.getvalue()) / 1e6:.1f} MB")
+    check_folders(options.film)
+    network = load_model(options.model)
+    clips = [np.concatenate([clip(network, track, look) for look in LOOKS]) for track in TRACKS]
+    first, *rest = [Image.fromarray(picture) for picture in np.concatenate(clips, axis=2)]
+    film, duration = io.BytesIO(), 1000 * EVERY // SAMPLE_RATE  # ms
+    compression = {"quality": QUALITY, "method": EFFORT}
+    first.save(film, "WEBP", save_all=True, append_images=rest, duration=duration, loop=0, **compression)
+    write_output(options.film, film.getvalue())
+    print(f"{options.film}: {1 + len(rest)} frames, {len(film.getvalue()) / 1e6:.1f} MB")
     return program.DONE
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("readme_film", main)

@@ -2,9 +2,10 @@
 
 import re
 from bisect import bisect
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
-from typing import TypedDict, TypeVar
+from typing import Any, TypedDict, TypeVar
 
 from cloning.base.outputs import plural
 from cloning.recordings.format import PROBLEM_AREAS
@@ -13,11 +14,14 @@ from cloning.road.generated import road_number
 from cloning.road.track import ROADS
 from simulator.report import LapReport
 from simulator.scenery.looks import SHADOWED
+from tools.command import head, row
 
 RENDERED = re.compile(r"(.+?)-(ccw|cw)-look(\d+)\b")  # a rendered recording's name: track, direction, look
 SHADOWS, UNKNOWN_ROADS = "shadows", "unknown roads"
 SUMMARY_LINES = (*ROADS, SHADOWS, UNKNOWN_ROADS)
 ORACLE = "oracle (no network)"  # the title of its column
+LIMIT, STAND_IN = "real recordings, limit {:g} m", "stand-in simulator"  # titles in the summary
+Cells = dict[str, dict[str, str]]  # by row and column
 Result = TypeVar("Result")
 
 
@@ -60,12 +64,11 @@ class Driven(TypedDict):
 class NetworkResults(TypedDict):
     """A network's results.
 
-    what: how it was trained; commands: that measured it; sha256: of its model file; trained_on: the recordings' names;
-    replays: by the recording's name and the limit in metres.
+    what: how it was trained; sha256: of its model file; trained_on: the recordings' names; replays: by the recording's
+    name and the limit in metres.
     """
 
     what: str
-    commands: list[str]
     sha256: str
     trained_on: list[str]
     replays: dict[str, dict[str, Replayed]]
@@ -134,15 +137,24 @@ def drive_in_sample(track: str, look: int, trained_on: Sequence[str]) -> bool:
     return False
 
 
-def held_out_else_all(results: Sequence[Result], in_sample: Callable[[Result], bool]) -> tuple[list[Result], str]:
-    """Return the held-out results, or all of them if none is, and the words for that."""
-    held_out = [result for result in results if not in_sample(result)]
-    return (held_out, mark(False)) if held_out else (list(results), mark(True))
-
-
 def mark(in_sample: bool) -> str:
     """Return the words that mark a result."""
     return "in sample" if in_sample else "held out"
+
+
+def replays(board: Board) -> Iterator[tuple[str, str, float, Replayed, bool]]:
+    """Yield each replay: its network's title, recording and limit in metres, the result, whether it is in sample."""
+    for title, network in board["networks"].items():
+        for name, limits in network["replays"].items():
+            for limit, result in limits.items():
+                yield title, name, float(limit), result, replay_in_sample(name, network["trained_on"])
+
+
+def drives(board: Board) -> Iterator[tuple[str, Driven, bool]]:
+    """Yield each drive: its network's title, the result, whether it is in sample."""
+    for title, network in board["networks"].items():
+        for drive in network["drives"]:
+            yield title, drive, drive_in_sample(drive["track"], drive["look"], network["trained_on"])
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -154,51 +166,44 @@ def replay_line(recording: str) -> str | None:
     return SHADOWS if "shadow" in recording else next((track for track in ROADS if recording.startswith(track)), None)
 
 
-def drive_line(track: str, look: int) -> str:
+def drive_line(drive: Driven) -> str:
     """Return the line of the summary to which a drive belongs."""
-    if road_number(track) is not None:
+    if road_number(drive["track"]) is not None:
         return UNKNOWN_ROADS
-    return SHADOWS if look >= SHADOWED else track
+    return SHADOWS if drive["look"] >= SHADOWED else drive["track"]
 
 
-def summary(board: Board) -> list[str]:
-    """Return the summary as Markdown."""
-    columns = [*(f"real recordings, limit {limit:g} m" for limit in LIMITS), "stand-in simulator"]
-    rows: dict[str, dict[str, str]] = {}
-    for name, network in board["networks"].items():
-        for line in SUMMARY_LINES:
-            cells = {columns[i]: pooled_replays(board, network, line, f"{limit:g}") for i, limit in enumerate(LIMITS)}
-            cells["stand-in simulator"] = pooled_drives(network, line)
-            rows[f"{name}: {line}"] = {column: cell for column, cell in cells.items() if cell}
-    return grid("network: where", columns, rows)
+def summary(board: Board) -> Cells:
+    """Return the summary's cells: of each network's results on a line those held out, or all if there are none."""
+    pools: dict[str, dict[str, list[tuple[Any, bool]]]] = defaultdict(lambda: defaultdict(list))
+    for title, name, limit, result, in_sample in replays(board):
+        counted = board["recordings"][name]["seconds"], result["interventions"]
+        pools[f"{title}: {replay_line(name)}"][LIMIT.format(limit)].append((counted, in_sample))
+    for title, drive, in_sample in drives(board):
+        pools[f"{title}: {drive_line(drive)}"][STAND_IN].append((drive, in_sample))
+
+    def pooled(column: str, results: list[tuple[Any, bool]]) -> str:
+        held_out = [result for result, in_sample in results if not in_sample]
+        chosen = held_out or [result for result, _ in results]
+        return f"{laps_text(chosen) if column == STAND_IN else autonomy_text(chosen)}, {mark(not held_out)}"
+
+    rows = [f"{title}: {line}" for title in board["networks"] for line in SUMMARY_LINES]
+    return {row: {column: pooled(column, results) for column, results in pools[row].items()} for row in rows}
 
 
-def pooled_replays(board: Board, network: NetworkResults, line: str, limit: str) -> str:
-    """Return the autonomy over a line's real recordings together, by their seconds and interventions; "" for none."""
-    names = [name for name, limits in network["replays"].items() if replay_line(name) == line and limit in limits]
-    names, words = held_out_else_all(names, lambda name: replay_in_sample(name, network["trained_on"]))
-    if not names:
-        return ""
-    seconds = sum(board["recordings"][name]["seconds"] for name in names)
-    interventions = sum(network["replays"][name][limit]["interventions"] for name in names)
-    percent = 100 * autonomy(interventions, seconds)
-    return f"{percent:.1f} %, {plural(interventions, 'intervention')} in {seconds:.0f} s, {words}"
-
-
-def pooled_drives(network: NetworkResults, line: str) -> str:
-    """Return the departures in all drives of a line together; "" for none."""
-    drives = [drive for drive in network["drives"] if drive_line(drive["track"], drive["look"]) == line]
-    drives, words = held_out_else_all(
-        drives, lambda drive: drive_in_sample(drive["track"], drive["look"], network["trained_on"])
-    )
-    return f"{laps_text(drives)}, {words}" if drives else ""
+def autonomy_text(counted: Sequence[tuple[float, int]]) -> str:
+    """Return the autonomy over the seconds and interventions of replays, together."""
+    seconds, interventions = (sum(column) for column in zip(*counted, strict=True))
+    percent = 100 * autonomy(int(interventions), seconds)
+    return f"{percent:.1f} %, {plural(int(interventions), 'intervention')} in {seconds:.0f} s"
 
 
 def laps_text(drives: Sequence[Driven]) -> str:
     """Return how often the car left the road in drives, together."""
-    km, departures = sum(drive["distance_km"] for drive in drives), sum(drive["departures"] for drive in drives)
-    laps = sum(drive["laps"] for drive in drives)
-    kept = max(0.0, laps - sum(drive["laps_with_departure"] for drive in drives))
+    km, departures, laps, left = (
+        sum(drive[key] for drive in drives) for key in ("distance_km", "departures", "laps", "laps_with_departure")
+    )
+    kept = max(0.0, laps - left)
     return f"{kept:g} of {laps:g} laps without a departure, {departures / km if km else 0:.2f} departures per km"
 
 
@@ -206,27 +211,20 @@ def laps_text(drives: Sequence[Driven]) -> str:
 # The tables of all results
 
 
-def replay_rows(board: Board) -> dict[str, dict[str, str]]:
-    """Return the cells of real recordings, by row and column."""
-    rows: dict[str, dict[str, str]] = {}
-    for name, recording in sorted(board["recordings"].items()):
-        share = recording["lane_centre_percent"]
-        reference = "" if share == 100 else f", {share:.0f} % of it from the lane's centre"
-        replays = {
-            title: network["replays"][name]
-            for title, network in board["networks"].items()
-            if name in network["replays"]
-        }
-        limits = {limit for results in (recording["oracle"], *replays.values()) for limit in results}
-        for limit in sorted(limits, key=float):
-            row = rows[f"{name}, limit {limit} m{reference}"] = {}
-            if limit in recording["oracle"]:
-                row[ORACLE] = replay_text(recording["oracle"][limit])
-            for title, results in replays.items():
-                if limit in results:
-                    in_sample = replay_in_sample(name, board["networks"][title]["trained_on"])
-                    row[title] = f"{replay_text(results[limit])}, {mark(in_sample)}"
-    return rows
+def replay_rows(board: Board) -> Cells:
+    """Return the cells of real recordings."""
+    rows: dict[tuple[str, float], dict[str, str]] = defaultdict(dict)
+    for name, recording in board["recordings"].items():
+        for limit, result in recording["oracle"].items():
+            rows[name, float(limit)][ORACLE] = replay_text(result)
+    for title, name, metres, result, in_sample in replays(board):
+        rows[name, metres][title] = f"{replay_text(result)}, {mark(in_sample)}"
+
+    def reference(share: float) -> str:
+        return "" if share == 100 else f", {share:.0f} % of it from the lane's centre"
+
+    references = {name: reference(recording["lane_centre_percent"]) for name, recording in board["recordings"].items()}
+    return {f"{name}, limit {limit:g} m{references[name]}": rows[name, limit] for name, limit in sorted(rows)}
 
 
 def replay_text(result: Replayed) -> str:
@@ -235,58 +233,50 @@ def replay_text(result: Replayed) -> str:
     return f"{result['autonomy_percent']:.1f} %, {interventions}, {result['distance_mean_m']:.2f} m"
 
 
-def known_track_rows(board: Board) -> dict[str, dict[str, str]]:
-    """Return the cells of drives on the two known tracks, by row and column."""
-    rows: dict[tuple[str, str, int, int], dict[str, str]] = {}
-    for title, network in board["networks"].items():
-        for drive in network["drives"]:
-            if road_number(drive["track"]) is None:
-                in_sample = drive_in_sample(drive["track"], drive["look"], network["trained_on"])
-                rows.setdefault(course(drive), {})[title] = (
-                    f"{plural(drive['departures'], 'departure')} in {drive['distance_km']:.1f} km, "
-                    f"{drive['offset_mean_m']:.2f} m, at most {drive['offset_max_m']:.2f} m, "
-                    f"roughness {drive['roughness_per_s']:.2f}/s, {mark(in_sample)}"
-                )
+def known_track_rows(board: Board) -> Cells:
+    """Return the cells of drives on the two known tracks."""
+    rows: dict[tuple[str, str, int, int], dict[str, str]] = defaultdict(dict)
+    for title, drive, in_sample in drives(board):
+        if road_number(drive["track"]) is None:
+            rows[course(drive)][title] = (
+                f"{plural(drive['departures'], 'departure')} in {drive['distance_km']:.1f} km, "
+                f"{drive['offset_mean_m']:.2f} m, at most {drive['offset_max_m']:.2f} m, "
+                f"roughness {drive['roughness_per_s']:.2f}/s, {mark(in_sample)}"
+            )
     return {
         f"{track} {direction}, {mph} mph, look {look}": rows[track, direction, mph, look]
         for track, direction, mph, look in sorted(rows)
     }
 
 
-def generated_road_rows(board: Board) -> dict[str, dict[str, str]]:
-    """Return the cells of drives on generated roads, by row and column: all roads of one kind in one cell."""
-    kinds: dict[tuple[int, bool, bool], dict[str, list[Driven]]] = {}
-    for title, network in board["networks"].items():
-        for drive in network["drives"]:
-            if road_number(drive["track"]) is not None:
-                in_sample = drive_in_sample(drive["track"], drive["look"], network["trained_on"])
-                kind = drive["speed_mph"], drive["look"] >= SHADOWED, in_sample
-                kinds.setdefault(kind, {}).setdefault(title, []).append(drive)
+def generated_road_rows(board: Board) -> Cells:
+    """Return the cells of drives on generated roads: all roads at one speed in one light in one cell."""
+    pools: dict[tuple[int, bool, bool], dict[str, list[Driven]]] = defaultdict(lambda: defaultdict(list))
+    for title, drive, in_sample in drives(board):
+        if road_number(drive["track"]) is not None:
+            pools[drive["speed_mph"], drive["look"] >= SHADOWED, in_sample][title].append(drive)
     return {
         f"{mph} mph, looks {'with' if shadowed else 'without'} shadows, {mark(in_sample)}": {
-            title: roads_text(drives) for title, drives in kinds[mph, shadowed, in_sample].items()
+            title: roads_text(pool) for title, pool in pools[mph, shadowed, in_sample].items()
         }
-        for mph, shadowed, in_sample in sorted(kinds)
+        for mph, shadowed, in_sample in sorted(pools)
     }
 
 
 def roads_text(drives: Sequence[Driven]) -> str:
     """Return the cell of drives on several roads; means are by distance."""
-    km = sum(drive["distance_km"] for drive in drives)
-    offset = sum(drive["offset_mean_m"] * drive["distance_km"] for drive in drives) / km if km else 0.0
-    roughness = sum(drive["roughness_per_s"] * drive["distance_km"] for drive in drives) / km if km else 0.0
+    km = sum(drive["distance_km"] for drive in drives) or 1
+    offset = sum(drive["offset_mean_m"] * drive["distance_km"] for drive in drives) / km
+    roughness = sum(drive["roughness_per_s"] * drive["distance_km"] for drive in drives) / km
     roads = plural(len({drive["track"] for drive in drives}), "road")
     return f"{roads}: {laps_text(drives)}, {offset:.2f} m, roughness {roughness:.2f}/s"
 
 
-def grid(corner: str, columns: Sequence[str], rows: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Return a Markdown table without the columns and rows that have no cell."""
+def grid(corner: str, columns: Sequence[str], rows: Cells) -> str:
+    """Return a Markdown table without the columns and rows that have no cell, or "" if none is left."""
     used = [column for column in columns if any(column in cells for cells in rows.values())]
-    lines = [f"| {corner} | " + " | ".join(used) + " |", "|---" * (len(used) + 1) + "|"]
-    for row, cells in rows.items():
-        if cells:
-            lines.append(f"| {row} | " + " | ".join(cells.get(column, "-") for column in used) + " |")
-    return lines
+    lines = [row(name, *(cells.get(column, "-") for column in used)) for name, cells in rows.items() if cells]
+    return "\n".join([head(corner, *used), *lines]) if lines else ""
 
 
 HEAD = """# How models drive
@@ -299,8 +289,6 @@ real recordings with shadows in their names, and the lake and the jungle in look
 generated ones in any look.
 """
 REAL = """
-## Real recordings
-
 NVIDIA's autonomy, the number of interventions, and the mean distance from the lane's centre. The oracle is the recovery
 steering itself, driven instead of a network: the best that the measure allows.
 """
@@ -313,14 +301,12 @@ absolute change per second, where 1 is full lock.
 def table(board: Board) -> str:
     """Return all tables as Markdown."""
     titles = list(board["networks"])
-    lines = [HEAD, *summary(board)]
-    if rows := replay_rows(board):
-        lines += [REAL, *grid("recording", [ORACLE, *titles], rows)]
-    if rows := known_track_rows(board):
-        lines += ["\n## Laps in the stand-in simulator", DRIVES, *grid("course", titles, rows)]
-    if rows := generated_road_rows(board):
-        lines += ["\n## Laps on generated roads", DRIVES, *grid("courses", titles, rows)]
-    lines += ["\n## Measured with"]
-    for title, network in board["networks"].items():
-        lines += ["", f"* {title}: {network['what']}", *(f"  * `{command}`" for command in network["commands"])]
-    return "\n".join(lines) + "\n"
+    networks = [f"* {title}: {network['what']}" for title, network in board["networks"].items()]
+    sections = (
+        ("", HEAD, grid("network: where", [*map(LIMIT.format, LIMITS), STAND_IN], summary(board))),
+        ("## Real recordings\n", REAL, grid("recording", [ORACLE, *titles], replay_rows(board))),
+        ("## Laps in the stand-in simulator\n", DRIVES, grid("course", titles, known_track_rows(board))),
+        ("## Laps on generated roads\n", DRIVES, grid("courses", titles, generated_road_rows(board))),
+        ("## The networks\n", "", "\n".join(networks)),
+    )
+    return "\n".join(f"{title}{text}\n{cells}\n" for title, text, cells in sections if cells)

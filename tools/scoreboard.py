@@ -10,8 +10,8 @@ that results can be committed. --table names another table. Recordings are repla
 `python -m simulator replay --model`, laps are driven with `python -m simulator drive`, as many at a time as the machine
 has cores, all at one speed by the same drive.py.
 
-What a model was trained on, and so what is in sample, is told by the names of the recordings in its file: rendered ones
-must be named by track, direction and look, such as jungle-cw-look5. --trained-on adds other names.
+What a model was trained on, and so what is in sample, follows from the names of the recordings in its file: rendered
+ones must be named by track, direction and look, such as jungle-cw-look5. --trained-on adds other names.
 """
 
 import argparse
@@ -19,17 +19,15 @@ import hashlib
 import json
 import os
 import re
-import shlex
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import pairwise
+from itertools import product
 from pathlib import Path, PureWindowsPath
 from queue import SimpleQueue
+from typing import Any
 
 from cloning.base import program
 
@@ -47,37 +45,35 @@ from cloning.road.generated import road_number
 from cloning.road.track import ROADS, find_road
 from cloning.server.server import MAX_CLIENTS
 from simulator.report import LapReport
+from tools.command import ROOT, command_line, python, run_tool
 from tools.score_table import Board, Driven, NetworkResults, RealRecording, Replayed, course, driven, table
-from tools.server_process import start_server
-
-ROOT = Path(__file__).resolve().parent.parent
+from tools.server_process import ServerProcess
 
 DIRECTIONS = ("ccw", "cw")
 UNSEEN_LOOKS = (101, 102)  # no model was trained on looks 101 to 1000
-ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
-def simulate(report: Path, *arguments: str) -> tuple[int, str]:
-    """Run a simulator command that writes its report to this file, and return its exit status and stderr."""
-    process = subprocess.run(
-        [sys.executable, "-m", "simulator", *arguments, "--report", str(report)],
-        cwd=ROOT,
-        env=ONE_THREAD,
-        capture_output=True,
-        text=True,
-    )
-    return process.returncode, process.stderr
+def one_thread() -> dict[str, str]:
+    """Return an environment in which a process computes with one thread, because as many run as there are cores."""
+    return {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def simulate(*command: object) -> tuple[Any, int, str]:
+    """Run a simulator command, and return its report, None if there is none, its exit status and its stderr."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "report.json")
+        words = ("-m", "simulator", *command, "--report", file)
+        done = python(*words, cwd=ROOT, env=one_thread(), capture_output=True)
+        report = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+    return report, done.returncode, done.stderr
 
 
 def replay(model: Path, folder: Path) -> tuple[RealRecording, dict[str, Replayed]]:
     """Replay a recording, and return what all models have in common and this one's results. Raises UserError."""
-    with tempfile.TemporaryDirectory() as temporary:
-        file = Path(temporary) / "report.json"
-        _, errors = simulate(file, "replay", str(folder.resolve()), "--model", str(model))
-        if not file.exists():
-            raise UserError(f"{folder}: {errors}")
-        reports: list[ReplayReport] = json.loads(file.read_text(encoding="utf-8"))
-    [report] = reports
+    reports, _, errors = simulate("replay", folder.resolve(), "--model", model)
+    if reports is None:
+        raise UserError(f"{folder}: {errors}")
+    report: ReplayReport = reports[0]
 
     def shown(metrics: DrivingMetrics) -> Replayed:
         return {
@@ -100,33 +96,30 @@ def serving(model: Path, mph: int, drives: int) -> Iterator[SimpleQueue[int]]:
     ports: SimpleQueue[int] = SimpleQueue()
     with ExitStack() as stack:
         for first in range(0, drives, MAX_CLIENTS):
-            server, port = start_server((ROOT / "drive.py", model, "--speed", str(mph), "--port", "0"), ONE_THREAD)
-            stack.callback(server.wait)
-            stack.callback(server.terminate)
+            words = (ROOT / "drive.py", model, "--speed", str(mph), "--port", "0")
+            server = stack.enter_context(ServerProcess(*words, environment=one_thread()))
             for _ in range(min(MAX_CLIENTS, drives - first)):
-                ports.put(port)
+                ports.put(server.port)
         yield ports
 
 
-def drive_laps(ports: SimpleQueue[int], mph: int, laps: float, place: tuple[str, str, int]) -> Driven:
-    """Drive laps in the stand-in simulator; ports: of `serving`; place: track, direction, look. Raises UserError."""
-    (track, direction, look), port = place, ports.get()
+def drive_laps(ports: SimpleQueue[int], mph: int, laps: float, on: tuple[str, str, int]) -> Driven:
+    """Drive laps in the stand-in simulator; ports: of `serving`; on: track, direction, look. Raises UserError."""
+    (track, direction, look), port = on, ports.get()
+    road = ("--track", track, "--direction", direction, "--look", look)
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "report.json"
-            road = ("--track", track, "--direction", direction, "--look", str(look))
-            status, errors = simulate(file, "drive", *road, "--laps", str(laps), "--port", str(port))
-            # A car that stands still is the model's fault, anything else is not.
-            if not file.exists() or (status == program.FAILED and "the car has stood still" not in errors):
-                raise UserError(f"{track} {direction}, {mph} mph, look {look}: {errors}")
-            report: LapReport = json.loads(file.read_text(encoding="utf-8"))
+        report: LapReport
+        report, status, errors = simulate("drive", *road, "--laps", laps, "--port", port)
     finally:
         ports.put(port)
+    # A car that stands still is the model's fault, anything else is not.
+    if report is None or (status == program.FAILED and "the car has stood still" not in errors):
+        raise UserError(f"{track} {direction}, {mph} mph, look {look}: {errors}")
     return driven(report, mph, look, laps, finished=status != program.FAILED)
 
 
 def parse_look(text: str) -> tuple[bool, int]:
-    """Parse an item of --looks: return whether the road's number is to be added, and a number."""
+    """Parse an item of --looks: return whether the road's number is to be added, and a look."""
     match = re.fullmatch(r"(own)(?:\+(\d+))?|(\d+)", text)
     if not match:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number, own, or own+N such as own+10000")
@@ -136,8 +129,8 @@ def parse_look(text: str) -> tuple[bool, int]:
 
 def look_of(track: str, chosen: tuple[bool, int]) -> int:
     """Return the look in which a track is driven; chosen: of `parse_look`. The two known tracks' own look is 0."""
-    own, look_number = chosen
-    return look_number + ((road_number(track) or 0) if own else 0)
+    own, look = chosen
+    return look + (road_number(track) or 0) * own
 
 
 def trained_on(model: Path, more: Sequence[str]) -> list[str]:
@@ -168,135 +161,82 @@ def read_board(file: Path) -> Board:
     return board
 
 
-def network_of(board: Board, args: argparse.Namespace) -> NetworkResults:
+def network_of(board: Board, options: argparse.Namespace) -> NetworkResults:
     """Return the entry of the chosen column. Raises UserError if it holds results of another model."""
-    model_file = args.model.resolve()
-    names, sha256 = trained_on(model_file, args.trained_on), hashlib.sha256(model_file.read_bytes()).hexdigest()
-    network = board["networks"].setdefault(
-        args.name,
-        {"what": "", "commands": [], "sha256": sha256, "trained_on": names, "replays": {}, "drives": []},
-    )
+    names = trained_on(options.model, options.trained_on)
+    sha256 = hashlib.sha256(options.model.read_bytes()).hexdigest()
+    new: NetworkResults = {"what": "", "sha256": sha256, "trained_on": [], "replays": {}, "drives": []}
+    network = board["networks"].setdefault(options.name, new)
     if network["sha256"] != sha256:
-        file = args.table.with_suffix(".json")
+        file = options.table.with_suffix(".json")
         raise UserError(
-            f"{args.name}: has results of another model file; give another --name, or take it out of {file}"
+            f"{options.name}: has results of another model file; give another --name, or take it out of {file}"
         )
     network["trained_on"] = sorted({*names, *network["trained_on"]}, key=natural)
-    network["what"] = args.what or network["what"]
-    command = command_line()
-    network["commands"] = [*(earlier for earlier in network["commands"] if earlier != command), command]
+    network["what"] = options.what or network["what"]
     return network
 
 
-def command_line() -> str:
-    """Return the command that was typed, without --what, and with only the last part of each path."""
-    words = [word for before, word in pairwise(sys.argv) if "--what" not in (before, word)]
-    words = [Path(word).name if len(Path(word).parts) > 1 else word for word in words]
-    return "python -m tools.scoreboard " + " ".join(shortened(words))
-
-
-def shortened(words: Sequence[str]) -> list[str]:
-    """Return the words of a command, quoted, with roads that follow one another as the shell's road-{1..9}."""
-    runs: list[list[str]] = []
-    for word in words:
-        before = road_number(runs[-1][-1]) if runs else None
-        if before is not None and road_number(word) == before + 1:
-            runs[-1].append(word)
-        else:
-            runs.append([word])
-    return [
-        f"road-{{{road_number(run[0])}..{road_number(run[-1])}}}" if len(run) > 1 else shlex.quote(run[0])
-        for run in runs
-    ]
-
-
-def measure(args: argparse.Namespace) -> None:
+def measure(options: argparse.Namespace) -> None:
     """Drive the model on the chosen courses, and write the tables after each result. Raises UserError."""
-    model = args.model.resolve()
-    for track in args.tracks:
+    for track in options.tracks:
         find_road(track)
-    folders = find_folders(args.recordings) if args.recordings else []
-    places = [
-        (track, direction, look_of(track, chosen))
-        for track in args.tracks
-        for direction in DIRECTIONS
-        for chosen in args.looks
-    ]
-    places = list(dict.fromkeys(places))
-    file = args.table.with_suffix(".json")
+    folders = find_folders(options.recordings) if options.recordings else []
+    chosen = product(options.tracks, DIRECTIONS, options.looks)
+    courses = list(dict.fromkeys((track, direction, look_of(track, look)) for track, direction, look in chosen))
+    file = options.table.with_suffix(".json")
     board = read_board(file)
-    network = network_of(board, args)
+    network = network_of(board, options)
 
-    def save() -> None:
+    def save(result: object) -> None:
+        print(result, flush=True)
         network["drives"].sort(key=lambda drive: [natural(str(part)) for part in course(drive)])
         write_json(file, board)
-        write_output(args.table, table(board).encode())
+        write_output(options.table, table(board).encode())
 
     with ThreadPoolExecutor(threads()) as pool:
-        replays = pool.map(partial(replay, model), folders)
+        replays = pool.map(partial(replay, options.model), folders)
         for folder, (recording, results) in zip(folders, replays, strict=True):
             board["recordings"][folder.name], network["replays"][folder.name] = recording, results
-            print(f"{folder.name}: {results}", flush=True)
-            save()
-    for mph in args.speeds if places else ():
-        drives = min(threads(), len(places))
-        with serving(model, mph, drives) as ports, ThreadPoolExecutor(drives) as pool:
-            for result in pool.map(partial(drive_laps, ports, mph, args.laps), places):
+            save(f"{folder.name}: {results}")
+    for mph in options.speeds if courses else ():
+        at_once = min(threads(), len(courses))
+        with serving(options.model, mph, at_once) as ports, ThreadPoolExecutor(at_once) as pool:
+            for result in pool.map(partial(drive_laps, ports, mph, options.laps), courses):
                 others = [drive for drive in network["drives"] if course(drive) != course(result)]
                 network["drives"] = [*others, result]
-                print(result, flush=True)
-                save()
+                save(result)
 
 
-def main() -> int:
-    """Parse the command line and measure; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="scoreboard", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def main(argv: list[str] | None = None) -> int:
+    """Parse the command line and measure; return the exit status. Raises UserError."""
+    parser = command_line("scoreboard", __doc__)
+    add = parser.add_argument
+    add("model", type=lambda text: Path(text).resolve(), help="a model file of model.py")
+    add("--name", required=True, help="name of the model's column")
+    add("--what", default="", help="how the model was trained, for the list below the tables")
+    names = "recordings that the model was trained on, besides those that its file names (default: none)"
+    add("--trained-on", nargs="*", default=[], metavar="NAME", help=names)
+    add("--recordings", nargs="*", default=[], help="to replay, or folders of recordings (default: none)")
+    tracks = f"tracks to drive, also road-1, road-2 and so on (default: {' '.join(ROADS)})"
+    add("--tracks", nargs="*", default=list(ROADS), help=tracks)
+    speeds = "set speeds in mph (default 9 15 30)"
+    add("--speeds", nargs="*", type=number(int, 1, 30), default=[9, 15, 30], help=speeds)
+    looks = (
+        "looks of the tracks: numbers, own for look N of road-N (0 of the lake and the jungle), or own+10000 for the "
+        "same with shadows (default 0 101 102)"
     )
-    parser.add_argument("model", type=Path, help="a model file of model.py")
-    parser.add_argument("--name", required=True, help="name of the model's column")
-    parser.add_argument("--what", default="", help="how the model was trained, for the list below the table")
-    parser.add_argument(
-        "--trained-on",
-        nargs="*",
-        default=[],
-        metavar="NAME",
-        help="recordings that the model was trained on, besides those that its file names (default: none)",
+    default_looks = [(False, look) for look in (0, *UNSEEN_LOOKS)]
+    add("--looks", nargs="*", type=parse_look, default=default_looks, help=looks)
+    add("--laps", type=number(float, 0.001, 1e5), default=1, help="laps on each course (default %(default)s)")
+    file = (
+        "Markdown file for the tables; the results are kept next to it, in a JSON file of the same name "
+        "(default: tools/scoreboard.md, which git tracks)"
     )
-    parser.add_argument(
-        "--recordings", nargs="*", default=[], help="recordings to replay, or folders of recordings (default: none)"
-    )
-    parser.add_argument(
-        "--tracks",
-        nargs="*",
-        default=list(ROADS),
-        help=f"tracks to drive, also road-1, road-2 and so on (default: {' '.join(ROADS)})",
-    )
-    parser.add_argument(
-        "--speeds", nargs="*", type=number(int, 1, 30), default=[9, 15, 30], help="set speeds in mph (default 9 15 30)"
-    )
-    parser.add_argument(
-        "--looks",
-        nargs="*",
-        type=parse_look,
-        default=[(False, chosen) for chosen in (0, *UNSEEN_LOOKS)],
-        help="looks of the tracks: numbers, own for look N of road-N (0 of the lake and the jungle), or own+10000 for "
-        "the same with shadows (default 0 101 102)",
-    )
-    parser.add_argument("--laps", type=number(float, 0.001, 1e5), default=1, help="laps on each course (default 1)")
-    parser.add_argument(
-        "--table",
-        type=Path,
-        default=ROOT / "tools" / "scoreboard.md",
-        help="Markdown file for the table; the results are kept next to it, in a JSON file of the same name "
-        "(default: tools/scoreboard.md, which git tracks)",
-    )
-    try:
-        measure(parser.parse_args())
-    except UserError as error:
-        return program.failed("scoreboard", error)
+    add("--table", type=Path, default=ROOT / "tools" / "scoreboard.md", help=file)
+    measure(parser.parse_args(argv))
     return program.DONE
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("scoreboard", main)

@@ -1,32 +1,49 @@
-"""Servers as processes, for the tools that measure them."""
+"""A server as a process, for the tools that drive with it or measure it."""
 
 import re
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Self
 
 from cloning.base.errors import UserError
 
 
-def start_server(
-    command: Sequence[str | Path], environment: Mapping[str, str] | None = None
-) -> tuple[subprocess.Popen[str], int]:
-    """Start a server, such as drive.py, and return its process and the port that it prints.
+class ServerProcess:
+    """A server, such as drive.py, in a process that is ended with the `with` statement.
 
-    command: arguments for the Python interpreter. What the server prints later is discarded. Raises UserError if it
-    ends before it listens.
+    port: that it listens on.
     """
-    process = subprocess.Popen(
-        [sys.executable, *map(str, command)], env=environment, stderr=subprocess.PIPE, text=True, encoding="utf-8"
-    )
-    assert process.stderr
-    printed = []
-    for line in process.stderr:
-        printed.append(line)
-        if port := re.search(r"Listening on .*:(\d+)", line):
-            threading.Thread(target=process.stderr.read, daemon=True).start()
-            return process, int(port[1])
-    process.wait()
-    raise UserError(f"{' '.join(map(str, command))} ended before it listened: {''.join(printed).strip()}")
+
+    def __init__(self, *command: str | Path, environment: Mapping[str, str] | None = None):
+        """Start it; command: arguments for the Python interpreter. Raises UserError if it ends before it listens.
+
+        What it prints afterwards is discarded.
+        """
+        self.process = subprocess.Popen(
+            [sys.executable, *map(str, command)], env=environment, stderr=subprocess.PIPE, text=True, encoding="utf-8"
+        )
+        assert self.process.stderr
+        printed = []
+        for line in self.process.stderr:
+            printed.append(line)
+            if port := re.search(r"Listening on .*:(\d+)", line):
+                threading.Thread(target=self.process.stderr.read, daemon=True).start()
+                self.port = int(port[1])
+                return
+        self.process.wait()
+        raise UserError(f"{' '.join(map(str, command))} ended before it listened: {''.join(printed).strip()}")
+
+    def memory(self, line: str = "VmRSS") -> float:
+        """Return its resident memory in MB, or another line of Linux's /proc/PID/status, such as VmHWM, the peak."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="ascii")
+        return int(status.split(f"{line}:")[1].split()[0]) / 1024
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()

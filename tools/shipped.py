@@ -11,10 +11,7 @@ The network that comes with the project was made so; cloning/network/shipped.md,
 what came out.
 """
 
-import argparse
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -25,16 +22,16 @@ if __name__ == "__main__":
     program.end_on_interrupt("shipped")  # also while the libraries below are loaded
 
 from cloning.base.arguments import number
-from cloning.base.errors import RecordingError, UserError
+from cloning.base.errors import RecordingError
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE, PROBLEM_AREAS
 from cloning.recordings.log import find_folders
 from cloning.road.track import ROADS, Track
 from simulator.record import record
 from simulator.scenery.looks import SHADOWED
+from tools.command import ROOT, command_line, python, run_tool
 from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 
-ROOT = Path(__file__).resolve().parent.parent
 REPEATS = 20  # how often each real recording counts, because the rendered ones are many
 LEARNING_RATE = 2e-3  # half of --robust's: this training is longer
 DIRECTIONS = ("ccw", "cw")
@@ -112,35 +109,28 @@ def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Render, train and measure; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="shipped", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("recordings", nargs="+", help="real recordings, or folders of recordings")
-    parser.add_argument(
-        "--looks", type=number(int, 1, 101), default=15, help="looks of each track (default %(default)s)"
-    )
-    parser.add_argument("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
-    parser.add_argument("--epochs", type=number(int, 1), default=17, help="of 60,000 images (default %(default)s)")
-    parser.add_argument("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
-    parser.add_argument("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
-    args = parser.parse_args(argv)
-    try:
-        real = repeat(args.folder / "real", find_folders(args.recordings))  # first, since rendering takes long
-        rendered = render(args.folder / "rendered", laps(args.looks, args.roads))
-    except (UserError, OSError) as error:
-        return program.failed("shipped", error)
-    length = ("--epochs", str(args.epochs), "--learning-rate", str(LEARNING_RATE))
-    training = ("--robust", *length, "--repeats", str(REPEATS), "--seed", str(args.seed), "--resume")
-    # By name, since the folders may also hold what an earlier run with other arguments left there.
-    files = (*real, *rendered, "--output", args.folder / "model.pt")
-    status = subprocess.run([sys.executable, ROOT / "model.py", *files, *training]).returncode
+    """Render, train and measure; return the exit status. Raises UserError, OSError."""
+    parser = command_line("shipped", __doc__)
+    add = parser.add_argument
+    add("recordings", nargs="+", help="real recordings, or folders of recordings")
+    add("--looks", type=number(int, 1, 101), default=15, help="looks of each track (default %(default)s)")
+    add("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
+    add("--epochs", type=number(int, 1), default=17, help="of 60,000 images (default %(default)s)")
+    add("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
+    add("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
+    options = parser.parse_args(argv)
+    model = options.folder / "model.pt"
+    real = repeat(options.folder / "real", find_folders(options.recordings))  # first, since rendering takes long
+    rendered = render(options.folder / "rendered", laps(options.looks, options.roads))
+    length = ("--epochs", options.epochs, "--learning-rate", LEARNING_RATE)
+    training = ("--robust", *length, "--repeats", REPEATS, "--seed", options.seed, "--resume")
+    # By name, since the folders may also hold what an earlier run with other options left there.
+    status = python(ROOT / "model.py", *real, *rendered, "--output", model, *training).returncode
     if status != program.DONE:
         return status
-    board = ("--name", "shipped", "--speeds", "15", *MEASURED, "--table", args.folder / "scoreboard.md")
-    command = [sys.executable, "-m", "tools.scoreboard", args.folder / "model.pt", "--recordings", *args.recordings]
-    return subprocess.run([*command, *board]).returncode
+    board = ("--name", "shipped", "--speeds", 15, *MEASURED, "--table", options.folder / "scoreboard.md")
+    return python("-m", "tools.scoreboard", model, "--recordings", *options.recordings, *board).returncode
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("shipped", main)

@@ -5,7 +5,7 @@ import json
 import os
 import socket
 import struct
-from types import TracebackType
+from typing import Self
 
 from cloning.wire.protocol import FRAGMENT
 
@@ -32,12 +32,10 @@ class Simulator:
         head, self._buffer = self._buffer.split(b"\r\n\r\n", 1)
         self.status = int(head.split()[1])
 
-    def __enter__(self) -> "Simulator":
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.socket.close()
 
     def _fill(self) -> None:
@@ -104,3 +102,8 @@ def telemetry(
         "speed": speed,
         "image": base64.b64encode(jpeg).decode(),
     }
+
+
+def telemetry_message(jpeg: bytes) -> str:
+    """Return the message of a telemetry at 9 mph, the set speed."""
+    return "42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")])

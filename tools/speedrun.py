@@ -10,8 +10,6 @@ checking the recordings, estimating the lane, training, validation, pictures. Th
 import argparse
 import os
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -33,8 +31,8 @@ from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import ReferenceLine, drive, load_recording, reference_lines
 from cloning.road.autonomy import autonomy
 from model import ROBUST
+from tools.command import ROOT, command_line, head, python, row, run_tool
 
-ROOT = Path(__file__).resolve().parent.parent
 IMAGES, BATCH = 6_500, 8  # enough for one lap of the lake; tools/experiments.md has what was tried
 
 
@@ -68,12 +66,11 @@ def speed_run(train: Sequence[Path], courses: Sequence[Course], options: argpars
     """Train on some recordings and drive others. Raises UserError if the training fails."""
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder, "model.pt")
-        command = [sys.executable, ROOT / "model.py", *train, "--output", model, "--robust", "--epochs", 1]
-        command += ["--samples-per-epoch", options.images, "--batch-size", options.batch_size]
-        command += ["--learning-rate", options.learning_rate, "--seed", seed]
-        begin = time.perf_counter()
+        length = ("--epochs", 1, "--samples-per-epoch", options.images, "--batch-size", options.batch_size)
+        words = (*train, "--output", model, "--robust", *length, "--learning-rate", options.learning_rate)
         environment = {**os.environ, "XDG_CACHE_HOME": folder}
-        done = subprocess.run([*map(str, command)], env=environment, capture_output=True, text=True)
+        begin = time.perf_counter()
+        done = python(ROOT / "model.py", *words, "--seed", seed, env=environment, capture_output=True)
         seconds = time.perf_counter() - begin
         if done.returncode != program.DONE:
             raise UserError(f"model.py failed: {done.stderr.strip()[-500:]}")
@@ -85,52 +82,39 @@ def speed_run(train: Sequence[Path], courses: Sequence[Course], options: argpars
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Train and drive with every seed, print a table, and return 1 if a model drives worse than it should."""
-    parser = argparse.ArgumentParser(
-        prog="speedrun", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("recordings", nargs="+", help="real recordings, or folders of recordings")
-    parser.add_argument("--in-sample", action="store_true", help="train on all recordings, and drive these")
-    parser.add_argument("--seeds", type=number(int, 1), default=5, help="runs of each kind (default %(default)s)")
-    parser.add_argument("--limit", type=number(float, 0.1), default=1.0, help="m from the centre (default %(default)s)")
-    parser.add_argument(
-        "--autonomy", type=number(float), default=98.0, help="per cent that every run must reach (default %(default)s)"
-    )
-    parser.add_argument("--images", type=number(int, 1), default=IMAGES, help="to train on (default %(default)s)")
-    parser.add_argument(
-        "--batch-size",
-        type=number(int, 1),
-        default=BATCH,
-        help="observations (default %(default)s)",
-    )
-    parser.add_argument(
-        "--learning-rate",
-        type=number(float, 1e-9),
-        default=ROBUST.learning_rate,
-        help="at first (default %(default)s)",
-    )
+    """Train and drive with every seed, print a table, and return 1 if a model drives worse than it should.
+
+    Raises UserError, OSError.
+    """
+    parser = command_line("speedrun", __doc__)
+    add = parser.add_argument
+    add("recordings", nargs="+", help="real recordings, or folders of recordings")
+    add("--in-sample", action="store_true", help="train on all recordings, and drive these")
+    add("--seeds", type=number(int, 1), default=5, help="runs on the same recordings (default %(default)s)")
+    add("--limit", type=number(float, 0.1), default=1.0, help="m from the centre (default %(default)s)")
+    add("--autonomy", type=number(float), default=98.0, help="per cent that every run must reach (default %(default)s)")
+    add("--images", type=number(int, 1), default=IMAGES, help="to train on (default %(default)s)")
+    add("--batch-size", type=number(int, 1), default=BATCH, help="observations (default %(default)s)")
+    rate = ROBUST.learning_rate
+    add("--learning-rate", type=number(float, 1e-9), default=rate, help="at first (default %(default)s)")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
+    folders = find_folders(options.recordings)
+    courses = {folder: Course.of(folder) for folder in folders}
+    runs = [([train], [other for other in folders if other != train]) for train in folders]
+    if options.in_sample:
+        runs = [(folders, folders)]
+    if not all(driven for _, driven in runs):
+        raise UserError("one recording has no other to drive; name two, or use --in-sample")
     results = []
-    try:
-        folders = find_folders(options.recordings)
-        courses = {folder: Course.of(folder) for folder in folders}
-        if options.in_sample:
-            kinds = [(folders, folders)]
-        else:
-            kinds = [([train], [other for other in folders if other != train]) for train in folders]
-        if not all(driven for _, driven in kinds):
-            raise UserError("one recording has no other to drive; name two, or use --in-sample")
-        print("| trained on | driven | seed | seconds | autonomy | mean distance |\n|---|---|---|---|---|---|")
-        for train, driven in kinds:
-            names = [", ".join(folder.name for folder in part) for part in (train, driven)]
-            for seed in range(options.seeds):
-                result = speed_run(train, [courses[folder] for folder in driven], options, seed)
-                results.append(result)
-                figures = f"{result.seconds:.1f} | {result.autonomy:.1f} % | {result.distance:.2f} m"
-                print(f"| {names[0]} | {names[1]} | {seed} | {figures} |", flush=True)
-    except (UserError, OSError) as error:
-        return program.failed("speedrun", error)
+    print(head("trained on", "driven", "seed", "seconds", "autonomy", "mean distance"))
+    for train, driven in runs:
+        names = [", ".join(folder.name for folder in part) for part in (train, driven)]
+        for seed in range(options.seeds):
+            result = speed_run(train, [courses[folder] for folder in driven], options, seed)
+            results.append(result)
+            figures = f"{result.seconds:.1f}", f"{result.autonomy:.1f} %", f"{result.distance:.2f} m"
+            print(row(*names, seed, *figures), flush=True)
     seconds = [result.seconds for result in results]
     passed = sum(result.autonomy >= options.autonomy for result in results)
     print(
@@ -141,4 +125,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("speedrun", main)

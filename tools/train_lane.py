@@ -11,10 +11,10 @@ cloning/lane/any_road.pt, which was made like this. cloning/lane/lane.pt was mad
 from the two tracks without shadows. For both, the jungle was rendered with 4.1 m between its centre and its edge lines.
 """
 
-import argparse
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 from cloning.base import program
 
@@ -26,7 +26,6 @@ import numpy as np
 import torch
 
 from cloning.base.arguments import number
-from cloning.base.errors import UserError
 from cloning.lane.reader import (
     DIRECTION_TO_STRIP,
     DISTANCES_AHEAD,
@@ -42,6 +41,7 @@ from cloning.network.compute import choose_precision, in_precision, one_thread
 from cloning.recordings.log import find_folders, read_recording
 from cloning.road.camera import LEVEL_CAMERA_MATRIX, camera_position, homographies
 from cloning.road.motion import MAX_GAP, Stretch, components, forward_vector
+from tools.command import command_line, run_tool
 from tools.lane_frames import render_all, scenes
 
 WARP_DEVIATION = (0.9, 3.0)  # m and degrees: standard deviations of the poses to which real frames are warped
@@ -53,7 +53,7 @@ BRIGHTNESS = (0.3, 1.4)  # least and greatest factor; dark ones lose digits, as 
 TRAVEL = (1.0, 8.0)  # m that the car drives between the two frames of a pair
 
 
-# --------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 # Augmentation
 
 STRIP_TO_DIRECTION = np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_LEVEL
@@ -120,7 +120,7 @@ class PhotometricAugmentation:
         return cv2.LUT(strip, np.clip(table, 0, 255).astype(np.uint8)[None])
 
 
-# --------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 # Batches
 
 
@@ -151,32 +151,43 @@ Pose = tuple[float, float, float, float]
 Batch = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
+class Pair(NamedTuple):
+    """Two strips of the same road, uint8 (32, 160, 3), and the second camera's pose relative to the first.
+
+    mask: of both, uint8 (32, 160, 1): the same, so that it does not show which camera is further right.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    mask: np.ndarray
+    pose: Pose
+
+
 class BatchSampler:
-    """Samples training batches, which depend only on the seed and the batch's number."""
+    """Samples training batches, which depend only on the seed and the batch's index."""
 
     def __init__(self, strips: np.ndarray, centres: np.ndarray, recordings: list[RealRecording], seed: int) -> None:
         """strips, centres: rendered, see `render_all`; recordings: real ones."""
         self.strips, self.centres, self.recordings, self.seed = strips, centres, recordings, seed
         self.augmentation = PhotometricAugmentation(np.random.default_rng([seed, 1]))
 
-    def __call__(self, number: int) -> Batch:
-        """Return the batch of this number: inputs, signs, centres, poses.
+    def __call__(self, index: int) -> Batch:
+        """Return the batch of this index: inputs, signs, centres, poses.
 
         inputs: float32 (n, 32, 160, 3), the rendered strips, then the first and then the second strip of each real
         pair; signs: float32 (n, 1), -1 where mirrored; centres: float32 (RENDERED, 5), of the rendered strips; poses:
         float32 (PAIRS, 4), of each pair's second camera relative to its first, see `Pose`.
         """
-        rng = np.random.default_rng([self.seed, 2, number])
+        rng = np.random.default_rng([self.seed, 2, index])
         chosen = rng.integers(0, len(self.strips), RENDERED)
         strips, masks = list(self.strips[chosen]), [self.augmentation.mask(rng, 0.3) for _ in range(RENDERED)]
-        firsts, seconds, pair_masks, poses = [], [], [], []
-        for _ in range(PAIRS if self.recordings else 0):
-            (first, second), mask, pose = self.pair(self.recordings[rng.integers(len(self.recordings))], rng)
-            firsts.append(first)
-            seconds.append(second)
-            pair_masks.append(mask)
-            poses.append(pose)
-        strips, masks = strips + firsts + seconds, masks + pair_masks + pair_masks
+        sampled = [
+            self.pair(self.recordings[rng.integers(len(self.recordings))], rng)
+            for _ in range(PAIRS if self.recordings else 0)
+        ]
+        strips += [pair.first for pair in sampled] + [pair.second for pair in sampled]
+        masks += 2 * [pair.mask for pair in sampled]
+        poses = [pair.pose for pair in sampled]
         pairs = zip(strips, masks, strict=True)
         inputs = np.stack([normalize(self.augmentation.apply(strip, rng)) * mask for strip, mask in pairs])
         mirrored = rng.random(len(inputs)) < 0.5
@@ -184,46 +195,36 @@ class BatchSampler:
         signs = np.where(mirrored, -1, 1)[:, None].astype(np.float32)
         return inputs, signs, self.centres[chosen], np.array(poses, np.float32).reshape(-1, 4)
 
-    def pair(
-        self, recording: RealRecording, rng: np.random.Generator
-    ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, Pose]:
-        """Sample two strips of a place, a mask for both, and the second camera's pose relative to the first.
-
-        The strips are from two cameras at once, from two rows of a drive, or from one row, warped twice. Both get the
-        same mask, so that it does not show which camera is further right.
-        """
-        row, kind = int(rng.integers(len(recording.strips))), rng.random()
-        if kind < 0.4:
+    def pair(self, recording: RealRecording, rng: np.random.Generator) -> Pair:
+        """Sample a pair: from two cameras at once, from two rows of a drive, or from one row, warped twice."""
+        row, choice = int(rng.integers(len(recording.strips))), rng.random()
+        if choice < 0.4:
             first, second = rng.permutation(3)[:2]
             views = recording.strips[row, first], recording.strips[row, second]
             apart = MOUNT_OFFSETS[second] - MOUNT_OFFSETS[first]
-            return views, self.augmentation.mask(rng, 0.3), (apart, 0, 0, np.inf)
-        if kind < 0.7:
+            return Pair(*views, self.augmentation.mask(rng, 0.3), (apart, 0, 0, np.inf))
+        if choice < 0.7:
             later, (right, forward, yaw) = recording.later(row, rng.uniform(*TRAVEL))
             first, second = rng.integers(0, 3, 2)
             views = recording.strips[row, first], recording.strips[later, second]
             right = right + MOUNT_OFFSETS[second] * np.cos(yaw) - MOUNT_OFFSETS[first]
             forward = forward - MOUNT_OFFSETS[second] * np.sin(yaw)
-            return views, self.augmentation.mask(rng, 0.3), (right, forward, yaw, np.inf)
+            return Pair(*views, self.augmentation.mask(rng, 0.3), (right, forward, yaw, np.inf))
         mask = self.augmentation.mask(rng, 0.5)
         warped, poses = [], []
         for camera in rng.integers(0, 3, 2):
             right, yaw = rng.normal(0, WARP_DEVIATION[0]), np.radians(rng.normal(0, WARP_DEVIATION[1]))
             homography, strip = strip_homography(right, yaw), recording.strips[row, camera]
-            warped.append(
-                cv2.warpPerspective(
-                    strip, homography, STRIP_SHAPE[1::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-                )
-            )
+            warped.append(cv2.warpPerspective(strip, homography, STRIP_SHAPE[1::-1], borderMode=cv2.BORDER_REFLECT))
             mask = mask & visible_mask(homography)
             poses.append((MOUNT_OFFSETS[camera] + right, yaw))
         (first_right, yaw), (second_right, second_yaw) = poses
         apart = second_right - first_right
-        right, forward = apart * np.cos(yaw), apart * np.sin(yaw)
-        return (warped[0], warped[1]), mask, (right, forward, second_yaw - yaw, FLAT_GROUND)
+        pose = (apart * np.cos(yaw), apart * np.sin(yaw), second_yaw - yaw, FLAT_GROUND)
+        return Pair(warped[0], warped[1], mask, pose)
 
 
-# --------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 # Training
 
 
@@ -297,46 +298,31 @@ def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
     return network.eval()
 
 
-# --------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------------------
 # The command
 
 
-def parse(argv: list[str] | None) -> argparse.Namespace:
-    """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        prog="train_lane", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
-    parser.add_argument(
-        "--looks", type=number(int, 1), default=24, help="looks of each track, each also with shadows (default 24)"
-    )
-    parser.add_argument(
-        "--frames",
-        type=number(int, 1),
-        default=150,
-        help="frames of the lake in a look, and of each road; twice as many of the jungle (default %(default)s)",
-    )
-    parser.add_argument("--roads", type=number(int, 0), default=100, help="generated roads (default %(default)s)")
-    parser.add_argument("--steps", type=number(int, 1), default=3600, help="batches to train on (default %(default)s)")
-    parser.add_argument("--seed", type=number(int, 0), default=0, help="of all random choices (default %(default)s)")
-    parser.add_argument("--output", type=Path, default=Path("lane.pt"), help="file of weights (default %(default)s)")
-    return parser.parse_args(argv)
-
-
 def main(argv: list[str] | None = None) -> int:
-    """Train the network and write its weights; return the exit status."""
-    arguments = parse(argv)
-    try:
-        recordings = [RealRecording(folder) for folder in find_folders(arguments.recordings)]
-        chosen = scenes(arguments.looks, arguments.roads, arguments.frames)
-        print(f"rendering {sum(scene.frames for scene in chosen)} frames of {len(chosen)} scenes", flush=True)
-        strips, centres = render_all(chosen, arguments.seed)
-        network = train(BatchSampler(strips, centres, recordings, arguments.seed), arguments.steps)
-        save_network(arguments.output, network)
-    except (UserError, OSError) as error:
-        return program.failed("train_lane", error)
+    """Train the network and write its weights; return the exit status. Raises UserError, OSError."""
+    parser = command_line("train_lane", __doc__)
+    add = parser.add_argument
+    add("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
+    looks = "looks of each track, each also with shadows (default %(default)s)"
+    add("--looks", type=number(int, 1), default=24, help=looks)
+    frames = "frames of the lake in a look, and of each road; twice as many of the jungle (default %(default)s)"
+    add("--frames", type=number(int, 1), default=150, help=frames)
+    add("--roads", type=number(int, 0), default=100, help="generated roads (default %(default)s)")
+    add("--steps", type=number(int, 1), default=3600, help="batches to train on (default %(default)s)")
+    add("--seed", type=number(int, 0), default=0, help="of all random choices (default %(default)s)")
+    add("--output", type=Path, default=Path("lane.pt"), help="file of weights (default %(default)s)")
+    options = parser.parse_args(argv)
+    recordings = [RealRecording(folder) for folder in find_folders(options.recordings)]
+    chosen = scenes(options.looks, options.roads, options.frames)
+    print(f"rendering {sum(scene.frames for scene in chosen)} frames of {len(chosen)} scenes", flush=True)
+    strips, centres = render_all(chosen, options.seed)
+    save_network(options.output, train(BatchSampler(strips, centres, recordings, options.seed), options.steps))
     return program.DONE
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("train_lane", main)

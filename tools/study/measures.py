@@ -4,9 +4,11 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import torch
 
 from cloning.network.network import Network, steer
 from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording
 from cloning.recordings.writer import SampleClock
 from cloning.replay.command import drive_at_limits
@@ -20,13 +22,24 @@ from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.run import Run
 from simulator.world import Scene
-from tools.follow_driver import predict
 
 LARGE_ERROR = 0.2  # of steering: the "thresholded relative error" of Codevilla et al. (1809.04843) has another unit
 TIME_OUT = 1.5  # times the time of a lap at the set speed; a car that leaves the road over and over gets no further
 RECOVERY_SPEED, RECOVERY_SECONDS = 20.0, 3.0  # mph; the time is ChauffeurNet's (1812.03079)
 RECOVERY_OFFSETS, RECOVERY_TURNS = (0.5, 2.0), (2.0, 20.0)  # m from the lane's centre, degrees to its direction
 RECOVERED = 0.5, 5.0  # m and degrees: nearer than both is back in the lane
+FRAMES_PER_BATCH = 32
+
+
+def predict(network: Network, recording: Recording) -> np.ndarray:
+    """Return a network's steering on a recording's centre frames: float32 (n,). Raises RecordingError."""
+    paths = [recording.path(row) for row in range(len(recording))]
+    predicted = []
+    for start in range(0, len(paths), FRAMES_PER_BATCH):
+        frames = np.stack([read_frame(path) for path in paths[start : start + FRAMES_PER_BATCH]])
+        with torch.inference_mode():
+            predicted.append(network(torch.from_numpy(frames)).numpy())
+    return np.concatenate(predicted)
 
 
 def offline(network: Network, recording: Recording) -> dict[str, float]:
