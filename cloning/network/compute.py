@@ -80,5 +80,5 @@ def keep_freed_memory() -> None:
 
 
 def one_thread() -> None:
-    """Limit torch to one thread for each of this process's own, because these already occupy every core."""
+    """Make torch compute on the calling thread alone, because other threads or processes already occupy the cores."""
     torch.set_num_threads(1)
