@@ -51,11 +51,11 @@ def test_places_are_those_that_are_not_cut():
     steering = np.zeros(90, np.float32)
     steering[[5, 70]] = 1, -1
     offset, models = np.linspace(0, 3, 90, dtype=np.float32), [np.full(90, 0.1), np.full(90, np.nan)]
-    nothing_cut = summary.places(steering, offset, models, np.zeros(90, bool))
+    nothing_cut = summary.jumps(steering, offset, models, np.zeros(90, bool))
     assert nothing_cut == {"stop": [5, 70], "offset": [29, 59, 89], "difference": [5, 35, 70]}
-    cut = summary.places(steering, offset, models, np.arange(90) >= 60)
+    cut = summary.jumps(steering, offset, models, np.arange(90) >= 60)
     assert cut == {"stop": [5], "offset": [29, 59], "difference": [5, 35]}
-    assert summary.places(steering, None, [], np.zeros(90, bool)) == {"stop": [5, 70]}
+    assert summary.jumps(steering, None, [], np.zeros(90, bool)) == {"stop": [5, 70]}
 
 
 def test_figures_are_those_of_the_rows_that_are_not_cut(sample_recording):
@@ -140,7 +140,7 @@ def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, t
         with library.analyses.changed:  # until all of them wait
             for folder in folders:
                 library.analyses.state(folder, LANE)
-            library.analyses.hurry(folders[3])
+            library.analyses.urgent = folders[3]
         for folder in folders:
             assert ended(library, folder, LANE)[-1]["state"] == "failed"
     finally:
@@ -159,15 +159,31 @@ def test_an_analysis_tells_how_far_it_is_and_why_it_failed(linked, monkeypatch):
         states = ended(library, linked, LANE)
         assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
         assert states[-1] == {"state": "failed", "message": "analyse: no model"}
-        [name] = library.folders
-        library.retry(name, "offset")
+        [name] = library.recordings
+        library[name].retry("offset")
         assert library.analyses.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
         assert ended(library, linked, LANE)[-1] == states[-1]
         with pytest.raises(UnknownError):
-            library.retry(name, "steering")
+            library[name].retry("steering")
         time.sleep(0.02)  # longer than a tick of the file system's clock
         (linked / "driving_log.csv").touch()
         assert library.analyses.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
     finally:
         library.analyses.close()
     assert library.analyses.process is None
+
+
+def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried_again(linked, monkeypatch, tmp_path):
+    good = analyses.COMMAND
+    monkeypatch.setattr(analyses, "COMMAND", (str(tmp_path / "no python"),))
+    library = Library([linked], [])
+    [name] = library.recordings
+    try:
+        failed = ended(library, linked, LANE)[-1]
+        wanted = f"its process cannot be started: {tmp_path / 'no python'}: No such file or directory"
+        assert failed == {"state": "failed", "message": wanted}
+        monkeypatch.setattr(analyses, "COMMAND", good)
+        library[name].retry("offset")
+        assert ended(library, linked, LANE)[-1] == {"state": "ready"}
+    finally:
+        library.close()

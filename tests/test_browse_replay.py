@@ -51,28 +51,28 @@ def test_a_replay_on_the_page_is_that_of_the_command(linked, model_file, tmp_pat
     command.run(command.Options([str(linked)], str(model_file), "", 0, 0, [1.0], "lane", str(report), None, None))
     expected = json.loads(report.read_bytes())[0]["limits"]["1"]
     library = Library([linked], [model_file])
-    [name] = library.folders
+    [name] = library.recordings
     try:
-        shown = library.details(name, "1")["replays"][0]
+        shown = library[name].details("1")["replays"][0]
         assert shown["state"] == "ready" and shown["driven"] == 55
         for key in ("autonomy_percent", "interventions", "distance_mean_m", "distance_p95_m"):
             assert shown[key] == expected[key]
-        images = [library.row(name, row)["images"][0] for row, _ in shown["where"]]
+        images = [library[name].row(row)["images"][0] for row, _ in shown["where"]]
         assert images == [each["image"] for each in expected["where"]] and len(images) > 0
-        column = library.column(name, "replay-0-1")
+        column = library[name].column("replay-0-1")
         assert np.isnan(column[:5]).all() and not np.isnan(column[5:]).any()
         for row, jpeg in given[::9]:
-            seen = decode(library.jpeg(name, row + 5, "replay-0-1"))  # the replay does not have the five rows
+            seen = decode(library[name].jpeg(row + 5, "replay-0-1"))  # the replay does not have the five rows
             assert np.abs(seen.astype(int) - decode(jpeg)).mean() < 0.5
-            drawn = decode(library.jpeg(name, row + 5, "replay-0-1", with_path=True)).astype(int)
+            drawn = decode(library[name].jpeg(row + 5, "replay-0-1", with_path=True)).astype(int)
             film = overlay(decode(jpeg), float(steer(load_model(model_file), decode(jpeg))))
             film = cv2.resize(film, (320, 160), interpolation=cv2.INTER_AREA)
             path = np.abs(film.astype(int) - decode(jpeg)).max(axis=2) > 80
             assert path.sum() > 50 and np.abs(drawn - film)[path].mean() < 45 < np.abs(drawn - seen)[path].mean()
         with pytest.raises(NotReplayedError):
-            library.jpeg(name, 4, "replay-0-1")
+            library[name].jpeg(4, "replay-0-1")
         add_cut(linked, Cut(center(linked, 50), center(linked, 59), "crash"))
-        assert library.details(name, "1")["replays"] == [{"state": "none"}], "of other cuts"
+        assert library[name].details("1")["replays"] == [{"state": "none"}], "of other cuts"
     finally:
         library.close()
 
@@ -82,22 +82,22 @@ def test_a_replay_begins_only_when_asked_for_and_can_be_stopped(linked, model_fi
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
     placed(linked, np.zeros(60))
     library = Library([linked], [model_file])
-    [name] = library.folders
+    [name] = library.recordings
 
     def state(limit: str = "2.5") -> dict:
-        return library.details(name, limit)["replays"][0]
+        return library[name].details(limit)["replays"][0]
 
     try:
         assert state() == {"state": "none"}
-        library.replay(name, "2.5", begin=True)
+        library[name].replay("2.5", begin=True)
         end = time.monotonic() + 60
         while state() != {"state": "running", "progress": 0.25}:
             assert time.monotonic() < end
             time.sleep(0.02)
-        library.replay(name, "1", begin=True)
+        library[name].replay("1", begin=True)
         assert state("1") == {"state": "waiting"}
         for limit in ("1", "2.5"):
-            library.replay(name, limit, begin=False)
+            library[name].replay(limit, begin=False)
         while state()["state"] == "running":
             assert time.monotonic() < end
             time.sleep(0.02)

@@ -213,16 +213,20 @@ def test_the_state_is_what_happens(network, jpegs, monkeypatch):
 
 def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monkeypatch):
     server, naps = drive.DriveServer(network), []
+
+    def pause(seconds):
+        naps.append(seconds)
+        time.sleep(seconds)
+
     monkeypatch.setattr(drive_page, "UPDATE_INTERVAL", 2**-10)
-    monkeypatch.setattr(drive_page.eventlet, "sleep", lambda seconds: (naps.append(seconds), time.sleep(seconds)))
-    events = drive_page.Pages(server, with_attention=False).events()
+    events = drive_page.Pages(server, with_attention=False, pause=pause).events()
     assert json.loads(next(events)[6:]) == {"state": "waiting", "set_speed": 9.0, "saving": "", "saver": False}
     next(events)
-    assert len(naps) == drive_page.QUIET_INTERVALS
+    assert len(naps) == 1 + drive_page.QUIET_INTERVALS
     session = server.sessions["sid"] = drive.Session(server, {})
     session.heard, session.manual = time.time(), True
     assert json.loads(next(events)[6:])["state"] == "manual"
-    assert len(naps) <= drive_page.QUIET_INTERVALS + 2
+    assert len(naps) <= drive_page.QUIET_INTERVALS + 3
     events.close()
 
 

@@ -14,7 +14,7 @@ import pytest
 from cloning.road.track import Track
 
 ROOT = Path(__file__).parent.parent
-SHIPPED = Path("cloning") / "pilot" / "shipped.pt"
+SHIPPED = Path("cloning") / "network" / "shipped.pt"
 
 
 def run(*command: object, cwd: Path) -> str:

@@ -1,7 +1,7 @@
 """Compute what models look at on frames, as pictures to lay over them; `attention.py` asks for them over a pipe."""
 
-import json
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -25,7 +25,7 @@ IDLE = 120.0  # s without a question after which the process ends, and frees its
 
 
 def main() -> None:
-    """Answer {"model", "bytes"} and a JPEG with {"message", "bytes"} and a PNG, until stdin ends, or IDLE seconds."""
+    """Answer each pickled (JPEG, model's file) with a (message, PNG), until stdin ends, or for IDLE seconds."""
     if hasattr(os, "nice"):
         os.nice(10)  # the page, and whatever else the user does, goes first
     torch.set_num_threads(1)
@@ -33,20 +33,23 @@ def main() -> None:
         idle = threading.Timer(IDLE, os._exit, [0])
         idle.daemon = True
         idle.start()
-        line = sys.stdin.buffer.readline()
-        idle.cancel()
-        if not line:
-            return
-        asked = json.loads(line)
-        jpeg, message, png = sys.stdin.buffer.read(asked["bytes"]), "", b""
         try:
-            png = picture(jpeg, asked["model"])
-        except (UserError, OSError) as error:
-            message = message_of(error)
-        except ValueError as error:
-            message = f"the picture is unusable: {error}"
-        sys.stdout.buffer.write(json.dumps({"message": message, "bytes": len(png)}).encode() + b"\n" + png)
+            jpeg, model = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        idle.cancel()
+        pickle.dump(answer(jpeg, model), sys.stdout.buffer)
         sys.stdout.buffer.flush()
+
+
+def answer(jpeg: bytes, model: str) -> tuple[str, bytes]:
+    """Return a message, empty without an error, and the `picture`."""
+    try:
+        return "", picture(jpeg, model)
+    except (UserError, OSError) as error:
+        return message_of(error), b""
+    except ValueError as error:
+        return f"the picture is unusable: {error}", b""
 
 
 def picture(jpeg: bytes, model: str) -> bytes:

@@ -1,10 +1,9 @@
 """What a model looks at on a picture, computed by a process of its own: PyTorch alone takes 250 MB."""
 
-import json
+import pickle
 import subprocess
 import sys
 import threading
-from contextlib import suppress
 
 from cloning.base.errors import ModelError
 
@@ -21,7 +20,7 @@ class Attention:
         self.closed = False
 
     def png(self, jpeg: bytes, model: str) -> bytes:
-        """Return a PNG to lay over a frame; model: its file. Blocks until it is there. Raises ModelError."""
+        """Return a PNG to lay over a frame; model: its file. Blocks until it is there. Raises ModelError, OSError."""
         with self.one_at_a_time:
             answer = self._ask(jpeg, model) or self._ask(jpeg, model)  # the process may just have ended itself
         if not answer:
@@ -39,17 +38,16 @@ class Attention:
             self.process.wait()
 
     def _ask(self, jpeg: bytes, model: str) -> tuple[str, bytes] | None:
-        """Return the process's message, empty without an error, and its PNG; None if it has ended."""
+        """Return the process's message, empty without an error, and its PNG; None if it has ended. Raises OSError."""
         if self.closed:
             return None
         if not self.process or self.process.poll() is not None:
             self.process = subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         assert self.process.stdin and self.process.stdout
-        with suppress(BrokenPipeError):
-            self.process.stdin.write(json.dumps({"model": model, "bytes": len(jpeg)}).encode() + b"\n" + jpeg)
+        try:
+            pickle.dump((jpeg, model), self.process.stdin)
             self.process.stdin.flush()
-        if not (line := self.process.stdout.readline()):
+            return pickle.load(self.process.stdout)
+        except (BrokenPipeError, EOFError, pickle.UnpicklingError):
             self.process.wait()
             return None
-        answer = json.loads(line)
-        return answer["message"], self.process.stdout.read(answer["bytes"])

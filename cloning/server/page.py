@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import flask
@@ -21,8 +21,6 @@ from cloning.recordings.saved_frames import FrameSaver, SessionFolder
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.overlay import overlay
 from cloning.server import site
-from cloning.server.libraries import eventlet
-from cloning.server.turns import STRANGERS, TURNS
 
 SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
@@ -36,6 +34,7 @@ MAX_BODY = 200  # bytes of a request; more could be JSON that is nested too deep
 JPEG_QUALITY = 80  # of the pictures
 LEAST_SPEED, LARGEST_SPEED = 0.1, 1000  # mph: the range of the set speed
 speed_argument = number(float, LEAST_SPEED, LARGEST_SPEED)
+Pause = Callable[[float], None]  # waits for so many seconds, while others work
 
 
 class DrivenFrame(NamedTuple):
@@ -79,8 +78,8 @@ class Server(Protocol):
         """Drive at another set speed, in mph, from now on."""
 
 
-def create_app(server: Server) -> flask.Flask:
-    """Return the web application.
+def create_app(server: Server, pause: Pause) -> flask.Flask:
+    """Return the web application; pause: of `turns`.
 
     `/` is the page, `/live` its figures and pictures as server-sent events. POST to `/set-speed` changes the set speed:
     {"set_speed": text, mph}; the answer is {"set_speed": number}, or {"message"} with 400.
@@ -88,7 +87,7 @@ def create_app(server: Server) -> flask.Flask:
     app = flask.Flask(__name__, static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     site.prepare(app, "img-src data:")
-    pages = {False: Pages(server, with_attention=False), True: Pages(server, with_attention=True)}
+    pages = {with_attention: Pages(server, with_attention, pause) for with_attention in (False, True)}
 
     @app.get("/")
     def index() -> str:
@@ -132,9 +131,9 @@ class Pages:
     interval at which a page asked for one, so that all pages get the same picture, and most of them the same text.
     """
 
-    def __init__(self, server: Server, with_attention: bool):
-        """with_attention: whether the pictures show what the network looks at."""
-        self.server, self.with_attention = server, with_attention
+    def __init__(self, server: Server, with_attention: bool, pause: Pause):
+        """with_attention: whether the pictures show what the network looks at; pause: of `turns`."""
+        self.server, self.with_attention, self.pause = server, with_attention, pause
         self.open = 0  # number of pages
         self.interval = -1
         self.session: Session | None = None  # shown in this interval
@@ -153,8 +152,8 @@ class Pages:
         self.open += 1
         try:
             shown, state, last, quiet = None, "", 0.0, 0
+            self.pause(0)
             while True:
-                TURNS.take(STRANGERS)
                 self._begin_interval()
                 last = last if self.session is shown else 0.0
                 quiet += 1
@@ -162,7 +161,7 @@ class Pages:
                     event = self._event(last)
                     shown, state, last, quiet = self.session, self.state, self.until, 0
                     yield event
-                eventlet.sleep(UPDATE_INTERVAL)
+                self.pause(UPDATE_INTERVAL)
         finally:
             self.open -= 1
 

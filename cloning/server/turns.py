@@ -74,3 +74,9 @@ class Turns:
 
 TURNS = Turns()  # of the one thread
 STRANGERS = Account()  # of all that is no open session: accepting connections, HTTP requests, the page
+
+
+def pause(seconds: float) -> None:
+    """Let others work for so long, and then wait for a turn among the strangers."""
+    eventlet.sleep(seconds)
+    TURNS.take(STRANGERS)
