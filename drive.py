@@ -13,7 +13,6 @@ import re
 import statistics
 import sys
 import time
-from collections import deque
 from pathlib import Path
 from wsgiref.types import WSGIEnvironment
 
@@ -65,23 +64,16 @@ class SpeedController:
         return min(1.0, max(-1.0, throttle))
 
 
-class Session:
-    """A connected simulator: its speed controller, its saved frames and the figures for the page."""
+class Session(page.Session):
+    """A connected simulator, with its speed controller."""
 
     def __init__(self, server: "DriveServer", environ: WSGIEnvironment):
         """environ: the WSGI environment of the connection."""
+        super().__init__()
         self.server, self.environ = server, environ
         self.controller = SpeedController(server.set_speed)
-        self.folder: saved_frames.SessionFolder | None = None
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
-        self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
-        self.driven = self.unusable = 0  # frames
-        self.reason = ""  # why the last unusable one was
-        self.heard = 0.0  # time of the last telemetry, in seconds since 1970
-        self.manual = self.ended = False  # whether a person drove then; whether the connection has ended
-        self.history: deque[page.DrivenFrame] = deque(maxlen=page.HISTORY_FRAMES)
-        self.started = time.perf_counter()
         self.warned: set[str] = set()  # kinds of warnings logged: see OncePerKind
 
     def answer(self, message: object) -> dict[str, str]:
@@ -107,8 +99,8 @@ class Session:
                 self.folder = self.folder or self.server.saver.start_session()
                 self.folder.save(telemetry.jpeg)
             latency = (time.perf_counter() - arrived) * 1000
-            shown = (time.time(), float(self.steering), telemetry.speed, throttle, latency, telemetry.cte)
-            self.history.append(page.DrivenFrame(*shown))
+            figures = (time.time(), float(self.steering), telemetry.speed, throttle, latency, telemetry.cte)
+            self.history.append(page.DrivenFrame(*figures))
         return {
             "steering_angle": format_number(self.steering, self.separator),
             "throttle": format_number(throttle, self.separator),
@@ -120,7 +112,7 @@ class Session:
         return websocket.arrived if websocket else time.perf_counter()
 
     def summary(self) -> str:
-        """Return a line about the whole session: its numbers of frames, and where they are saved."""
+        """Return a line about the whole session: how many frames, and where they are saved."""
         saved = f"; {self.folder.summary()}" if self.folder else ""
         return f"session ended: {self.driven} frames driven, {self.unusable} unusable{saved}"
 

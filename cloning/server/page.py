@@ -48,19 +48,19 @@ class DrivenFrame(NamedTuple):
     cte: float | None = None  # m from the lane's centre, if the simulator tells; the sign is the simulator's own
 
 
-class Session(Protocol):
+class Session:
     """What the page shows of a simulator that is, or was, connected."""
 
-    started: float  # tells sessions apart
-    heard: float  # time of the last telemetry, in seconds since 1970
-    manual: bool  # whether a person drove then
-    ended: bool  # whether the connection has ended
-    history: deque[DrivenFrame]
-    frame: np.ndarray | None  # the last driven one: uint8 (160, 320, 3), RGB; None before the first
-    driven: int  # frames
-    unusable: int  # frames
-    reason: str  # why the last unusable one was; "" if there was none
-    folder: SessionFolder | None  # of its saved frames
+    def __init__(self) -> None:
+        """Begin when the simulator has connected."""
+        self.started = time.perf_counter()  # tells sessions apart
+        self.heard = 0.0  # time of the last telemetry, in seconds since 1970
+        self.manual = self.ended = False  # whether a person drove then; whether the connection has ended
+        self.history: deque[DrivenFrame] = deque(maxlen=HISTORY_FRAMES)
+        self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
+        self.driven = self.unusable = 0  # frames
+        self.reason = ""  # why the last unusable one was
+        self.folder: SessionFolder | None = None  # of its saved frames
 
 
 class Server(Protocol):
@@ -91,23 +91,15 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
 
     @app.get("/")
     def index() -> str:
-        return flask.render_template(
-            "drive.html",
-            model=server.model,
-            seconds=SHOWN_SECONDS,
-            top_speed=TOP_SPEED_MPH,
-            speeds=(LEAST_SPEED, LARGEST_SPEED),
-        )
+        speeds = {"top_speed": TOP_SPEED_MPH, "speeds": (LEAST_SPEED, LARGEST_SPEED)}
+        return flask.render_template("drive.html", model=server.model, seconds=SHOWN_SECONDS, **speeds)
 
     @app.get("/live")
     def live() -> flask.Response:
         if sum(each.open for each in pages.values()) >= MAX_PAGES:
             return flask.Response(f"{MAX_PAGES} pages are open already.\n", 503, mimetype="text/plain")
-        return flask.Response(
-            pages["attention" in flask.request.args].events(),
-            mimetype="text/event-stream",
-            headers={"Cache-Control": "no-store"},
-        )
+        events = pages["attention" in flask.request.args].events()
+        return flask.Response(events, mimetype="text/event-stream", headers={"Cache-Control": "no-store"})
 
     @app.post("/set-speed")
     def change_set_speed() -> tuple[dict[str, Any], int]:
@@ -125,7 +117,7 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
 
 
 class Pages:
-    """The events for the open pages of one kind: what is drawn and encoded for one of them serves all.
+    """The events for the open pages with or without attention: what is drawn and encoded for one of them serves all.
 
     Time is divided into intervals of UPDATE_INTERVAL. Each event shows the driving up to the first moment of its
     interval at which a page asked for one, so that all pages get the same picture, and most of them the same text.
@@ -183,8 +175,8 @@ class Pages:
                 self.picture = self.picture or image(self.server, self.session, self.with_attention)
                 rows = frames_since(self.session.history, max(last, self.now - SHOWN_SECONDS))
                 rows = [frame for frame in rows if frame.time <= self.until]
-                event |= {"rows": rows[:: -math.ceil(len(rows) / SHOWN_FRAMES)][::-1] if rows else []}  # with the last
-                event |= {"image": self.picture}
+                rows = rows[:: -math.ceil(len(rows) / SHOWN_FRAMES)][::-1] if rows else []  # with the last one
+                event |= {"rows": rows, "image": self.picture}
             self.texts[last] = f"data: {json.dumps(event)}\n\n"
         return self.texts[last]
 
