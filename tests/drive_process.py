@@ -8,13 +8,15 @@ import signal
 import subprocess
 import sys
 import threading
+import time
+from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
 
 from conftest import HERE, ROOT
 
 # What Ctrl-C sends; Windows sends it to a whole console, and Ctrl-Break to one process group.
-STOP = signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGINT
+STOP = getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT)
 
 
 def found(pattern: str, text: str) -> str:
@@ -22,6 +24,14 @@ def found(pattern: str, text: str) -> str:
     match = re.search(pattern, text)
     assert match, text
     return match[1]
+
+
+def awaited(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    """Wait until a condition is true."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.02)
 
 
 def ask(port: int, path: str, method: str = "GET", body: object = None, **headers: str) -> tuple[int, bytes, dict]:

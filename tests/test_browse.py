@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drive_process import awaited
 
 from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses, summary
-from cloning.browse.analyses import LANE, Analysis, Result, read_result, stamp, write_result
+from cloning.browse.analyses import LANE, Result, read_result, stamp, write_result
 from cloning.browse.library import Library, UnknownError
 from cloning.lane.place import Localisation
 from cloning.network.network import load_model, steer
@@ -33,7 +34,8 @@ def test_largest_places_by_brute_force(seed):
     rng = np.random.default_rng(seed)
     values = np.round(rng.normal(size=200), 1)
     values[rng.random(200) < 0.3] = np.nan
-    left, wanted = {row for row in range(200) if not np.isnan(values[row]) and values[row]}, []
+    left = {row for row in range(200) if not np.isnan(values[row]) and values[row]}
+    wanted: list[int] = []
     while left and len(wanted) < 5:
         best = max(left, key=lambda row: (abs(values[row]), -row))
         wanted.append(best)
@@ -106,6 +108,7 @@ def test_a_result_is_kept_until_the_recording_changes(linked):
     assert read_result(linked, LANE) is None
     write_result(linked, LANE, stamp(linked, LANE), result)
     found = read_result(linked, LANE)
+    assert found
     np.testing.assert_array_equal(found.column("offset", np.array([0, 1, 2, 2])), [np.nan, np.nan, 0.5, 0.5])
     time.sleep(0.02)  # longer than a tick of the file system's clock
     (linked / "driving_log.csv").touch()
@@ -115,14 +118,23 @@ def test_a_result_is_kept_until_the_recording_changes(linked):
         read_result(linked, LANE)
 
 
-def ended(library: Library, folder: Path, analysis: Analysis) -> list[dict]:
-    """The states of an analysis until it is done or has failed, without repetitions."""
-    states, end = [library.analyses.state(folder, analysis)], time.monotonic() + 60
-    while states[-1]["state"] in ("waiting", "running"):
-        assert time.monotonic() < end, states
-        time.sleep(0.005)
-        if (state := library.analyses.state(folder, analysis)) != states[-1]:
+@pytest.fixture
+def library(linked):
+    library = Library([linked], [])
+    yield library
+    library.close()
+
+
+def ended(library: Library, folder: Path) -> list[dict]:
+    """The states of an analysis of the lane until it is done or has failed, without repetitions."""
+    states = [library.analyses.state(folder, LANE)]
+
+    def is_over() -> bool:
+        if (state := library.analyses.state(folder, LANE)) != states[-1]:
             states.append(state)
+        return state["state"] not in ("waiting", "running")
+
+    awaited(is_over)
     return states
 
 
@@ -136,54 +148,43 @@ def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, t
     code = f"import sys; open({str(tmp_path / 'order')!r}, 'a').write(sys.argv[1] + '\\n'); sys.exit('no')"
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
     library = Library(folders, [])
-    try:
-        with library.analyses.changed:  # until all of them wait
-            for folder in folders:
-                library.analyses.state(folder, LANE)
-            library.analyses.urgent = folders[3]
+    with library.analyses.changed:  # until all of them wait
         for folder in folders:
-            assert ended(library, folder, LANE)[-1]["state"] == "failed"
-    finally:
-        library.analyses.close()
+            library.analyses.state(folder, LANE)
+        library.analyses.urgent = folders[3]
+    for folder in folders:
+        assert ended(library, folder)[-1]["state"] == "failed"
+    library.close()
     order = [Path(line).name for line in (tmp_path / "order").read_text(encoding="utf-8").splitlines()]
     assert order == ["open", "small", "middle", "large"]
 
 
-def test_an_analysis_tells_how_far_it_is_and_why_it_failed(linked, monkeypatch):
+def test_an_analysis_tells_how_far_it_is_and_why_it_failed(library, linked, monkeypatch):
     code = (
         "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nanalyse: no model')"
     )
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
-    library = Library([linked], [])
-    try:
-        states = ended(library, linked, LANE)
-        assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
-        assert states[-1] == {"state": "failed", "message": "analyse: no model"}
-        [name] = library.recordings
-        library[name].retry("offset")
-        assert library.analyses.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
-        assert ended(library, linked, LANE)[-1] == states[-1]
-        with pytest.raises(UnknownError):
-            library[name].retry("steering")
-        time.sleep(0.02)  # longer than a tick of the file system's clock
-        (linked / "driving_log.csv").touch()
-        assert library.analyses.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
-    finally:
-        library.analyses.close()
+    states = ended(library, linked)
+    assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
+    assert states[-1] == {"state": "failed", "message": "analyse: no model"}
+    [name] = library.recordings
+    library[name].retry("offset")
+    assert library.analyses.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
+    assert ended(library, linked)[-1] == states[-1]
+    with pytest.raises(UnknownError):
+        library[name].retry("steering")
+    time.sleep(0.02)  # longer than a tick of the file system's clock
+    (linked / "driving_log.csv").touch()
+    assert library.analyses.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
+    library.close()
     assert library.analyses.process is None
 
 
-def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried_again(linked, monkeypatch, tmp_path):
-    good = analyses.COMMAND
-    monkeypatch.setattr(analyses, "COMMAND", (str(tmp_path / "no python"),))
-    library = Library([linked], [])
+def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried_again(library, linked, monkeypatch):
+    monkeypatch.setattr(analyses, "COMMAND", ("/no/python",))
+    message = "its process cannot be started: /no/python: No such file or directory"
+    assert ended(library, linked)[-1] == {"state": "failed", "message": message}
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", "import sys; sys.exit('started')"))
     [name] = library.recordings
-    try:
-        failed = ended(library, linked, LANE)[-1]
-        wanted = f"its process cannot be started: {tmp_path / 'no python'}: No such file or directory"
-        assert failed == {"state": "failed", "message": wanted}
-        monkeypatch.setattr(analyses, "COMMAND", good)
-        library[name].retry("offset")
-        assert ended(library, linked, LANE)[-1] == {"state": "ready"}
-    finally:
-        library.close()
+    library[name].retry("offset")
+    assert ended(library, linked)[-1] == {"state": "failed", "message": "started"}
