@@ -7,6 +7,7 @@ import re
 import socket
 import struct
 import threading
+from typing import Any, cast
 
 import numpy as np
 
@@ -26,8 +27,8 @@ def accept_websocket(client, headers=b""):
     request = b""
     while not request.endswith(b"\r\n\r\n"):
         request += client.recv(1) or lost()
-    key = re.search(rb"(?i)sec-websocket-key: (.*)\r", request)[1]
-    accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
+    key = re.findall(rb"(?i)sec-websocket-key: (.*)\r", request)
+    accept = base64.b64encode(hashlib.sha1(key[0] + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
     client.sendall(
         b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         + headers
@@ -130,8 +131,8 @@ class Blank:
 
 
 def drive(server, laps=0.02, wait=5.0, realtime=False):
-    run = Run(Track("lake"), "autonomous")
-    client = Client(run, Blank(), "127.0.0.1", server.port, wait, realtime)
+    run, cameras = Run(Track("lake"), "autonomous"), cast(Any, Blank())
+    client = Client(run, cameras, "127.0.0.1", server.port, wait, realtime)
     client.drive(laps)
     return client
 
