@@ -54,8 +54,8 @@ def run(tmp_path, monkeypatch, capsys):
 
 def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
     capture, seen = cv2.VideoCapture(str(path)), []
-    while (frame := capture.read()[1]) is not None:
-        seen.append(frame)
+    while (read := capture.read())[0]:
+        seen.append(read[1])
     return capture.get(cv2.CAP_PROP_FPS), seen
 
 
