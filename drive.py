@@ -241,7 +241,6 @@ class OncePerKind(logging.Filter):
     """
 
     def __init__(self) -> None:
-        """Start with no warnings logged."""
         super().__init__()
         self.warned: set[str] = set()
 

@@ -128,7 +128,6 @@ class Analyses:
     """Runs the analyses that are asked for, one after the other, the smallest recording first, and replays last."""
 
     def __init__(self) -> None:
-        """Begin with nothing to do."""
         self.waiting: dict[Job, int] = {}  # -> size of the log, bytes
         self.urgent: Path | None = None  # the folder whose analyses go before all others
         self.failed: dict[tuple[Job, str], str] = {}  # job, stamp -> message

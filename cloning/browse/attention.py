@@ -14,7 +14,6 @@ class Attention:
     """Asks the process, and starts it when it is needed; it ends itself when nothing has been asked for a while."""
 
     def __init__(self) -> None:
-        """Start nothing yet."""
         self.process: subprocess.Popen[bytes] | None = None
         self.one_at_a_time = threading.Lock()
         self.closed = False

@@ -28,7 +28,6 @@ class Listener:
     """
 
     def __init__(self, sock: Any):
-        """Wrap a listening green socket."""
         self.sock = sock
         self.family, self.getsockname, self.close = sock.family, sock.getsockname, sock.close
         self.idle: dict[Any, None] = {}  # connections without a whole request, the oldest first

@@ -52,7 +52,6 @@ class Session:
     """What the page shows of a simulator that is, or was, connected."""
 
     def __init__(self) -> None:
-        """Begin when the simulator has connected."""
         self.started = time.perf_counter()  # tells sessions apart
         self.heard = 0.0  # time of the last telemetry, in seconds since 1970
         self.manual = self.ended = False  # whether a person drove then; whether the connection has ended

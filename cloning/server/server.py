@@ -40,7 +40,6 @@ class Client(engineio.socket.Socket):
     """A client's session, which ends when the client does not read what it is sent, or sends nothing for too long."""
 
     def __init__(self, server: "Engine", sid: str):
-        """Begin a session; sid: its id."""
         super().__init__(server, sid)
         self.account, self.polled = Account(), False
         self.websocket: WebSocket | None = None
@@ -155,7 +154,6 @@ class Engine(engineio.Server):
     """python-engineio's server for a few clients, which refuses requests that it would fail on."""
 
     def __init__(self, *args: Any, **options: Any):
-        """Begin without clients; the arguments are those of engineio.Server."""
         super().__init__(*args, **options)
         self._async: dict[str, Any] = {**engineio.async_drivers.eventlet._async, "websocket": WebSocketWSGI}
         engineio.socket.Socket = Client  # of which python-engineio makes one for each session
@@ -200,8 +198,7 @@ class Engine(engineio.Server):
 class Server(socketio.Server):
     """python-socketio's server with the settings and filters that the simulator needs."""
 
-    def __init__(self, **options: Any):
-        """options: further options of socketio.Server."""
+    def __init__(self) -> None:
         super().__init__(
             async_mode="eventlet",
             async_handlers=False,
@@ -212,7 +209,6 @@ class Server(socketio.Server):
             ping_interval=(PING_INTERVAL, 60),
             cookie=None,
             cors_allowed_origins=[],
-            **options,
         )
 
     def application(self, page: WSGIApplication) -> WSGIApplication:

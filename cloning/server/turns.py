@@ -24,7 +24,6 @@ class Turns:
     """
 
     def __init__(self) -> None:
-        """Begin with nobody at work."""
         self.clock = 0.0  # what the account at work had used when its turn began
         self.waiting: list[tuple[Account, Any]] = []  # in the order of arrival, each with the event that ends its wait
         self.working: Account | None = None

@@ -30,7 +30,6 @@ class QuickSocket:
     """
 
     def __init__(self, sock: Any):
-        """Wrap a connected green socket."""
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self.sock, self.buffer, self.at = sock, b"", 0
@@ -90,7 +89,6 @@ class WebSocket(eventlet.websocket.RFC6455WebSocket):
                     self.data = [kept.decode("ascii", "ignore").encode()]
 
     def __init__(self, sock: Any, *args: Any, **kwargs: Any):
-        """Take over a green socket after the handshake."""
         super().__init__(QuickSocket(sock), *args, **kwargs)
         self.max_frame_length = float("inf")  # Message limits the length
 
