@@ -42,23 +42,27 @@ def change_set_speed(server, body: object, **headers: str) -> tuple[int, bytes]:
     return ask(server.port, "/set-speed", "POST", body, **headers)[:2]
 
 
-def shown(server) -> dict:
-    """The figures that a page is told first."""
+def shown(server, query: str = "") -> dict:
+    """The figures that a page is given first."""
     time.sleep(2 * drive_page.UPDATE_INTERVAL)  # all pages are told the same in an interval
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
-    connection.request("GET", "/live")
+    connection.request("GET", f"/live{query}")
     try:
         return json.loads(connection.getresponse().readline()[6:])
     finally:
         connection.close()
 
 
-def test_the_benchmark_finds_the_latencies_in_what_a_page_is_told(server, jpegs):
+def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_in_it(server, jpegs):
     with Simulator(server.port) as simulator:
         simulator.open()
         for _ in range(3):
-            simulator.drive(telemetry(jpegs[0], speed="9.0000"))
-        time.sleep(2 * drive_page.UPDATE_INTERVAL)
+            simulator.drive(telemetry(jpegs[0], speed="8.5000"))
+        for query in ("", "?attention"):
+            live = shown(server, query)
+            time_stamp, _, speed, throttle, latency, _ = live["rows"][-1]
+            assert abs(time_stamp - time.time()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
+            assert live["image"].startswith("data:image/jpeg;base64,/9j/")
         measured: Any = SimpleNamespace(port=server.port, latencies=[])
         bench_driving.Server.read_latencies(measured, 2)
     assert len(measured.latencies) == 2 and all(0 < seconds < 60 for seconds in measured.latencies)
