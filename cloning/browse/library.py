@@ -65,12 +65,11 @@ class ShownRecording:
 
     def __init__(self, identifier: str, folder: Path, models: list[str], analyses: Analyses):
         """models: their files, in the order of the page."""
-        self.identifier, self.folder, self.analyses = identifier, folder, analyses
-        self.steering = [Analysis("steering", model) for model in models]
-        self.replays = {f"{limit:g}": [Analysis("replay", model, limit) for model in models] for limit in LIMITS}
-        self.analysed = {"offset": LANE} | {f"model-{index}": each for index, each in enumerate(self.steering)}
-        for limit, replays_at in self.replays.items():
-            self.analysed |= {f"replay-{index}-{limit}": each for index, each in enumerate(replays_at)}
+        self.identifier, self.folder, self.models, self.analyses = identifier, folder, models, analyses
+        self.analysed = {"offset": LANE}
+        for index, model in enumerate(models):
+            self.analysed[f"model-{index}"] = Analysis("steering", model)
+            self.analysed |= {f"replay-{index}-{limit:g}": Analysis("replay", model, limit) for limit in LIMITS}
 
     def version(self) -> str:
         """Return what changes when the log does. Raises RecordingError if it is gone."""
@@ -92,7 +91,7 @@ class ShownRecording:
         shown: dict[str, Any] = {"id": self.identifier, "name": self.folder.resolve().name, "folder": str(self.folder)}
         try:
             shown |= _figures(self.folder, self.version(), tuple(read_cuts(self.folder)))
-            shown["lane"] = self.analyses.state(self.folder, LANE)
+            shown["lane"] = self._state("offset")
             if shown["lane"]["state"] == "ready":
                 shown |= _road(self.folder, self.version(), stamp(self.folder, LANE))
         except (UserError, OSError) as error:
@@ -106,10 +105,8 @@ class ShownRecording:
         """
         recording, cuts = self.read(), read_cuts(self.folder)
         self.analyses.urgent = self.folder
-        models = [
-            {"name": Path(each.model).name, **self.analyses.state(self.folder, each)} for each in self.steering
-        ]  # fmt: skip
-        shown = self.overview() | {"lane": self.analyses.state(self.folder, LANE), "version": self.version()}
+        models = [{"name": Path(model).name, **self._state(f"model-{at}")} for at, model in enumerate(self.models)]
+        shown = self.overview() | {"lane": self._state("offset"), "version": self.version()}
         rows_cut = _rows_cut(self.folder, tuple(cuts), recording)
         shown["cuts"] = [
             {
@@ -125,26 +122,24 @@ class ShownRecording:
             "models": models,
             "jumps": summary.jumps(recording.steering, offset, steering, np.logical_or.reduce(rows_cut)),
             "limit": limit,
-            "replays": [self._replay(recording, each) for each in self._replays(limit)] if limit else [],
+            "replays": [self._replay(recording, column) for column in self._replays(limit)] if limit else [],
         }
 
-    def _replays(self, limit: str) -> list[Analysis]:
-        """Return the replays at a limit, one a model. Raises UnknownError."""
-        if limit not in self.replays:
-            raise UnknownError(f"no limit {limit[:40]}; there are {' and '.join(self.replays)} m")
-        return self.replays[limit]
+    def _replays(self, limit: str) -> list[str]:
+        """Return the columns of the replays at a limit, one a model."""
+        return [f"replay-{index}-{limit}" for index in range(len(self.models))]
 
-    def _replay(self, recording: Recording, replay: Analysis) -> dict[str, Any]:
-        shown = self.analyses.state(self.folder, replay, begin=False)
+    def _replay(self, recording: Recording, column: str) -> dict[str, Any]:
+        shown = self._state(column, begin=False)
         if shown["state"] == "ready":
-            now = stamp(self.folder, replay)
-            shown |= {**replays.figures(_result(self.folder, replay, now), recording.images[:, 0]), "stamp": now}
+            result, now = self._result(column)
+            shown |= {**replays.figures(result, recording.images[:, 0]), "stamp": now}
         return shown
 
     def replay(self, limit: str, begin: bool) -> None:
         """Begin the replays at a limit, or end those that are not done. Raises UnknownError."""
-        for replay in self._replays(limit):
-            (self.analyses.state if begin else self.analyses.stop)(self.folder, replay)
+        for column in self._replays(limit):
+            (self.analyses.state if begin else self.analyses.stop)(self.folder, self._analysis(column))
 
     def retry(self, column: str) -> None:
         """Begin the analysis that has a column again, after it failed. Raises UnknownError, RecordingError."""
@@ -155,6 +150,14 @@ class ShownRecording:
             raise UnknownError(f"no column {column[:40]}")
         return self.analysed[column]
 
+    def _state(self, column: str, begin: bool = True) -> dict[str, Any]:
+        return self.analyses.state(self.folder, self._analysis(column), begin)
+
+    def _result(self, column: str) -> tuple[Result, str]:
+        """Return the result of the analysis that has a column, and its stamp."""
+        now = stamp(self.folder, self._analysis(column))
+        return _result(self.folder, self._analysis(column), now), now
+
     def column(self, name: str, version: str | None = None) -> np.ndarray:
         """Return a column: float32 (n,), nan where nothing is known. Raises UnknownError, RecordingError."""
         recording = self.read(version)
@@ -162,9 +165,8 @@ class ShownRecording:
             return summary.driven_seconds(recording.time).astype(np.float32)
         if name in COLUMNS:
             return getattr(recording, name)
-        analysis = self._analysis(name)
-        result = _result(self.folder, analysis, stamp(self.folder, analysis))
-        return result.column("steering" if analysis.kind == "steering" else "offset", recording.images[:, 0])
+        part = "steering" if self._analysis(name).kind == "steering" else "offset"
+        return self._result(name)[0].column(part, recording.images[:, 0])
 
     def row(self, row: int, version: str | None = None) -> dict[str, Any]:
         """Return a row's line in the log and the names of its images. Raises UnknownError, RecordingError."""
@@ -181,8 +183,7 @@ class ShownRecording:
         recording = self._with_row(row, version)
         replay = self.analysed.get(picture)
         if replay and replay.kind == "replay":
-            now = stamp(self.folder, replay)
-            result = _result(self.folder, replay, now)
+            result, now = self._result(picture)
             index = replays.index_of(result, int(recording.images[row, 0]))
             line = int(result.columns["line"][index])
             return _line_views(self.folder, self.version(), replay, now, line).jpeg(index, with_path)
