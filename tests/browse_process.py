@@ -14,6 +14,7 @@ from conftest import ROOT
 from drive_process import ask, found
 
 from cloning.browse.analyses import LANE, Analysis, Result, stamp, write_result
+from cloning.browse.library import Library
 from cloning.recordings.log import read_recording
 from cloning.road.track import Track
 from cloning.training.run_files import RunFiles
@@ -57,6 +58,16 @@ def browsing(*arguments, **more):
     finally:
         server.process.send_signal(signal.SIGINT)
         assert server.process.wait(30) == 0
+
+
+@contextmanager
+def opened(folder: Path, *models: Path):
+    """A recording as the page shows it, without a server."""
+    library = Library([folder], list(models))
+    try:
+        yield library[next(iter(library.recordings))]
+    finally:
+        library.close()
 
 
 def written(folder: Path, analysis: Analysis, columns: dict[str, np.ndarray], **about: object) -> None:

@@ -1,4 +1,4 @@
-"""A real Chromium for the tests, told what to do over a pipe in its DevTools protocol."""
+"""A real Chromium for the tests, driven over a pipe in its DevTools protocol."""
 
 import base64
 import json

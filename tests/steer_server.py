@@ -40,7 +40,7 @@ def accept_websocket(client, headers=b""):
 
 
 class Server:
-    """Speaks the server's part of the transcript; `reply(packet, n)` returns the answers to telemetry number n."""
+    """Speaks the server's part of the transcript; `reply(packet, n)` returns the answers to telemetry n."""
 
     def __init__(self, reply, greet=True, sessions=1):
         self.reply, self.greet, self.sessions = reply, greet, sessions

@@ -9,7 +9,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from browse_process import placed, written_run
+from browse_process import opened, placed, written_run
 from conftest import HERE, run_here
 from drive_process import awaited
 from test_excluded import center
@@ -18,7 +18,6 @@ from cloning.base.errors import ModelError
 from cloning.browse import analyse, analyses, attend, runs
 from cloning.browse.analyses import Analysis, stamp, write_result
 from cloning.browse.attention import Attention
-from cloning.browse.library import Library
 from cloning.browse.replays import NotReplayedError
 from cloning.network.attention import visual_backprop
 from cloning.network.network import load_model, steer
@@ -50,55 +49,47 @@ def test_a_replay_on_the_page_is_that_of_the_command(linked, model_file, tmp_pat
     report = tmp_path / "replay.json"
     command.run(command.Options([str(linked)], str(model_file), "", 0, 0, [1.0], "lane", str(report), None, None))
     expected = json.loads(report.read_bytes())[0]["limits"]["1"]
-    library = Library([linked], [model_file])
-    [name] = library.recordings
-    try:
-        shown = library[name].details("1")["replays"][0]
+    with opened(linked, model_file) as recording:
+        shown = recording.details("1")["replays"][0]
         assert shown["state"] == "ready" and shown["driven"] == 55
         for key in ("autonomy_percent", "interventions", "distance_mean_m", "distance_p95_m"):
             assert shown[key] == expected[key]
-        images = [library[name].row(row)["images"][0] for row, _ in shown["where"]]
+        images = [recording.row(row)["images"][0] for row, _ in shown["where"]]
         assert images == [each["image"] for each in expected["where"]] and len(images) > 0
-        column = library[name].column("replay-0-1")
+        column = recording.column("replay-0-1")
         assert np.isnan(column[:5]).all() and not np.isnan(column[5:]).any()
         for row, jpeg in given[::9]:
-            seen = decode(library[name].jpeg(row + 5, "replay-0-1"))  # the replay does not have the five rows
+            seen = decode(recording.jpeg(row + 5, "replay-0-1"))  # the replay does not have the five rows
             assert np.abs(seen.astype(int) - decode(jpeg)).mean() < 0.5
-            drawn = decode(library[name].jpeg(row + 5, "replay-0-1", with_path=True)).astype(int)
+            drawn = decode(recording.jpeg(row + 5, "replay-0-1", with_path=True)).astype(int)
             film = overlay(decode(jpeg), float(steer(load_model(model_file), decode(jpeg))))
             film = cv2.resize(film, (320, 160), interpolation=cv2.INTER_AREA)
             path = np.abs(film.astype(int) - decode(jpeg)).max(axis=2) > 80
             assert path.sum() > 50 and np.abs(drawn - film)[path].mean() < 45 < np.abs(drawn - seen)[path].mean()
         with pytest.raises(NotReplayedError):
-            library[name].jpeg(4, "replay-0-1")
+            recording.jpeg(4, "replay-0-1")
         add_cut(linked, Cut(center(linked, 50), center(linked, 59), "crash"))
-        assert library[name].details("1")["replays"] == [{"state": "none"}], "of other cuts"
-    finally:
-        library.close()
+        assert recording.details("1")["replays"] == [{"state": "none"}], "of other cuts"
 
 
 def test_a_replay_begins_only_when_asked_for_and_can_be_stopped(linked, model_file, monkeypatch):
     code = "import sys, time; print('progress 0.25', flush=True); time.sleep('replay' in sys.argv and 600)"
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
     placed(linked, np.zeros(60))
-    library = Library([linked], [model_file])
-    [name] = library.recordings
+    with opened(linked, model_file) as recording:
 
-    def state(limit: str = "2.5") -> dict:
-        return library[name].details(limit)["replays"][0]
+        def state(limit: str = "2.5") -> dict:
+            return recording.details(limit)["replays"][0]
 
-    try:
         assert state() == {"state": "none"}
-        library[name].replay("2.5", begin=True)
+        recording.replay("2.5", begin=True)
         awaited(lambda: state() == {"state": "running", "progress": 0.25})
-        library[name].replay("1", begin=True)
+        recording.replay("1", begin=True)
         assert state("1") == {"state": "waiting"}
         for limit in ("1", "2.5"):
-            library[name].replay(limit, begin=False)
+            recording.replay(limit, begin=False)
         awaited(lambda: state()["state"] != "running")
         assert state() == state("1") == {"state": "none"}
-    finally:
-        library.close()
 
 
 # ----------------------------------------------------------------------------------------------------------------------

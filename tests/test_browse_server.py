@@ -5,12 +5,11 @@ import sys
 
 import numpy as np
 import pytest
-from browse_process import browsing, placed, replayed, written_run
+from browse_process import browsing, opened, placed, replayed, written_run
 from test_excluded import center
 
 from cloning.base.errors import RecordingError
 from cloning.browse import __main__ as browse
-from cloning.browse.library import Library
 from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording
 
@@ -111,16 +110,15 @@ def test_nothing_but_rows_cameras_columns_and_pictures_is_served(served):
 
 def test_an_image_that_is_no_frame_is_not_served(linked):
     """A csv may name any file below its IMG/, and that may be a link to anywhere."""
-    recording, library = read_recording(linked), Library([linked], [])
+    recording = read_recording(linked)
     for row in range(3):
         recording.path(row).unlink()
     recording.path(0).symlink_to("/etc/passwd")
     recording.path(1).write_bytes(b"GIF89a")
-    [name] = library.recordings
-    for row, words in enumerate(("not a JPEG", "not a JPEG", "No such file")):
-        with pytest.raises(RecordingError, match=words):
-            library[name].jpeg(row, "center")
-    library.close()
+    with opened(linked) as shown:
+        for row, words in enumerate(("not a JPEG", "not a JPEG", "No such file")):
+            with pytest.raises(RecordingError, match=words):
+                shown.jpeg(row, "center")
 
 
 def test_cuts_over_the_socket(linked):

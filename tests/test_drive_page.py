@@ -44,7 +44,7 @@ def change_set_speed(server, body: object, **headers: str) -> tuple[int, bytes]:
 
 def shown(server, query: str = "") -> dict:
     """The figures that a page is given first."""
-    time.sleep(2 * drive_page.UPDATE_INTERVAL)  # all pages are told the same in an interval
+    time.sleep(2 * drive_page.UPDATE_INTERVAL)  # all pages get the same in an interval
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
     connection.request("GET", f"/live{query}")
     try:
