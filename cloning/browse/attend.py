@@ -1,7 +1,6 @@
 """Compute what models look at on frames, as pictures to lay over them; `attention.py` asks for them over a pipe."""
 
 import os
-import pickle
 import signal
 import sys
 import threading
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 
 from cloning.base.errors import ModelError, UserError, message_of
+from cloning.browse.attention import receive, send
 from cloning.network.attention import visual_backprop
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
@@ -25,7 +25,7 @@ IDLE = 120.0  # s without a question after which the process ends, and frees its
 
 
 def main() -> None:
-    """Answer each pickled (JPEG, model's file) with a (message, PNG), until stdin ends, or for IDLE seconds."""
+    """Answer each JPEG and model's file with a message and a PNG, until stdin ends, or for IDLE seconds."""
     if hasattr(os, "nice"):
         os.nice(10)  # the page, and whatever else the user does, goes first
     torch.set_num_threads(1)
@@ -34,22 +34,18 @@ def main() -> None:
         idle.daemon = True
         idle.start()
         try:
-            jpeg, model = pickle.load(sys.stdin.buffer)
+            jpeg, model = receive(sys.stdin.buffer)
         except EOFError:
             return
         idle.cancel()
-        pickle.dump(answer(jpeg, model), sys.stdout.buffer)
-        sys.stdout.buffer.flush()
-
-
-def answer(jpeg: bytes, model: str) -> tuple[str, bytes]:
-    """Return a message, empty without an error, and the `picture`."""
-    try:
-        return "", picture(jpeg, model)
-    except (UserError, OSError) as error:
-        return message_of(error), b""
-    except ValueError as error:
-        return f"the picture is unusable: {error}", b""
+        message, png = "", b""
+        try:
+            png = picture(jpeg, os.fsdecode(model))
+        except (UserError, OSError) as error:
+            message = message_of(error)
+        except ValueError as error:
+            message = f"the picture is unusable: {error}"
+        send(sys.stdout.buffer, message.encode(errors="replace"), png)
 
 
 def picture(jpeg: bytes, model: str) -> bytes:
