@@ -22,6 +22,12 @@ def lost():
     raise ConnectionError
 
 
+def exactly(stream, n):
+    """Read n bytes, unless the connection ends before."""
+    data = stream.read(n)
+    return data if len(data) == n else lost()
+
+
 def accept_websocket(client, headers=b""):
     """Read a client's request, accept it, and return it; headers: additional ones, each with its line end."""
     request = b""
@@ -76,27 +82,21 @@ class Server:
         size = bytes([len(data)]) if len(data) < 126 else b"\x7e" + struct.pack(">H", len(data))
         client.sendall(b"\x81" + size + data)
 
-    def exactly(self, client, n):
-        data = b""
-        while len(data) < n:
-            data += client.recv(n - len(data)) or lost()
-        return data
-
     def session(self, client):
         self.requests.append(accept_websocket(client))
         self.send(client, '0{"sid":"x","upgrades":[],"pingTimeout":60000,"pingInterval":25000}')
         if self.greet:
             self.send(client, STEER % ("0", "0"))
         self.send(client, "40")
-        message, answered, pieces = b"", 0, []
+        message, answered, pieces, stream = b"", 0, [], client.makefile("rb")
         while True:
-            first, second = self.exactly(client, 2)
+            first, second = exactly(stream, 2)
             assert second & 0x80, "a client masks its frames"
             size = second & 0x7F
             if size == 126:
-                size = struct.unpack(">H", self.exactly(client, 2))[0]
-            mask = self.exactly(client, 4)
-            data = bytes(a ^ mask[i % 4] for i, a in enumerate(self.exactly(client, size)))
+                size = struct.unpack(">H", exactly(stream, 2))[0]
+            mask = exactly(stream, 4)
+            data = bytes(a ^ mask[i % 4] for i, a in enumerate(exactly(stream, size)))
             if first & 0x0F == 8:
                 self.closed = True
                 return

@@ -1,7 +1,6 @@
 """drive.py as a process, over real sockets: the simulator's session, requests of other sites, other clients."""
 
 import json
-import os
 import re
 import shutil
 import signal
@@ -176,26 +175,20 @@ def test_ten_thousand_malformed_messages_do_not_disturb_another_session(server, 
     with Simulator(server.port) as simulator, Simulator(server.port) as stranger:
         simulator.open()
         stranger.open()
-        answers = []
 
         def drain():
-            while not stopped.is_set():
-                try:
-                    answers.append(stranger.receive())
-                except OSError:
-                    return
+            with suppress(OSError):
+                while stranger.socket.recv(65536):
+                    pass
 
-        stopped = threading.Event()
         threads = [threading.Thread(target=stranger.socket.sendall, args=(flood,)), threading.Thread(target=drain)]
         for thread in threads:
             thread.start()
         rounds = 0
         while threads[0].is_alive() or rounds < 100:
             answer = simulator.drive(telemetry(jpegs[rounds % 8], speed="9.0000"))
-            assert np.float32(answer["steering_angle"]) == steering[rounds % 8]
-            assert answer["throttle"] == "0"
+            assert np.float32(answer["steering_angle"]) == steering[rounds % 8] and answer["throttle"] == "0"
             rounds += 1
-        stopped.set()
         stranger.socket.shutdown(socket.SHUT_RDWR)
         threads[1].join()
 
@@ -257,14 +250,9 @@ def node_client(tmp_path_factory) -> Path:
     if not npm:
         pytest.skip("no node here")
     folder = tmp_path_factory.mktemp("node")
+    command = [npm, "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"]
     try:
-        subprocess.run(
-            [npm, "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"],
-            cwd=folder,
-            check=True,
-            timeout=40,
-            capture_output=True,
-        )
+        subprocess.run(command, cwd=folder, check=True, timeout=40, capture_output=True)
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
         pytest.skip("npm can't install socket.io-client here")
     (folder / "client.js").write_text(CLIENT, encoding="utf-8")
@@ -275,15 +263,8 @@ def node_client(tmp_path_factory) -> Path:
 def test_the_independent_client(server, node_client, jpegs, steering, transports):
     message = json.dumps(telemetry(jpegs[3], speed="9.0000"))
     (node_client / "telemetry.json").write_text(message, encoding="utf-8")
-    output = subprocess.run(
-        ["node", "client.js", str(server.port), json.dumps({"transports": transports}), "telemetry.json"],
-        cwd=node_client,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env=dict(os.environ),
-    ).stdout
-    session = json.loads(output)
+    command = ["node", "client.js", str(server.port), json.dumps({"transports": transports}), "telemetry.json"]
+    session = json.loads(subprocess.run(command, cwd=node_client, capture_output=True, timeout=60).stdout)
     assert session["answers"][0] == {"steering_angle": "0", "throttle": "0"} and session["data"] == {}
     for answer in session["answers"][1:]:
         assert np.float32(answer["steering_angle"]) == steering[3] and answer["throttle"] == "0"
