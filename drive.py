@@ -10,11 +10,9 @@ import gc
 import itertools
 import logging
 import re
-import socket
 import statistics
 import sys
 import time
-from collections import deque
 from pathlib import Path
 from wsgiref.types import WSGIEnvironment
 
@@ -32,15 +30,10 @@ from cloning.base.frame import FRAME
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
+from cloning.server import page
+from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
+from cloning.server.versions import check_versions
 from cloning.wire.protocol import PORT
-
-try:
-    from cloning.server import connections, page
-    from cloning.server import server as wire
-    from cloning.server.libraries import socketio
-    from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
-except UserError as error:  # wrong versions of the socket libraries
-    sys.exit(program.failed("drive.py", error))
 
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
 log = logging.getLogger("drive")
@@ -71,23 +64,16 @@ class SpeedController:
         return min(1.0, max(-1.0, throttle))
 
 
-class Session:
-    """A connected simulator: its speed controller, its saved frames and the figures for the page."""
+class Session(page.Session):
+    """A connected simulator, with its speed controller."""
 
     def __init__(self, server: "DriveServer", environ: WSGIEnvironment):
         """environ: the WSGI environment of the connection."""
+        super().__init__()
         self.server, self.environ = server, environ
         self.controller = SpeedController(server.set_speed)
-        self.folder: saved_frames.SessionFolder | None = None
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
-        self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
-        self.driven = self.unusable = 0  # frames
-        self.reason = ""  # why the last unusable one was
-        self.heard = 0.0  # time of the last telemetry, in seconds since 1970
-        self.manual = self.ended = False  # whether a person drove then; whether the connection has ended
-        self.history: deque[page.DrivenFrame] = deque(maxlen=page.HISTORY_FRAMES)
-        self.started = time.perf_counter()
         self.warned: set[str] = set()  # kinds of warnings logged: see OncePerKind
 
     def answer(self, message: object) -> dict[str, str]:
@@ -113,8 +99,8 @@ class Session:
                 self.folder = self.folder or self.server.saver.start_session()
                 self.folder.save(telemetry.jpeg)
             latency = (time.perf_counter() - arrived) * 1000
-            shown = (time.time(), float(self.steering), telemetry.speed, throttle, latency, telemetry.cte)
-            self.history.append(page.DrivenFrame(*shown))
+            figures = (time.time(), float(self.steering), telemetry.speed, throttle, latency, telemetry.cte)
+            self.history.append(page.DrivenFrame(*figures))
         return {
             "steering_angle": format_number(self.steering, self.separator),
             "throttle": format_number(throttle, self.separator),
@@ -126,7 +112,7 @@ class Session:
         return websocket.arrived if websocket else time.perf_counter()
 
     def summary(self) -> str:
-        """Return a line about the whole session: its numbers of frames, and where they are saved."""
+        """Return a line about the whole session: how many frames, and where they are saved."""
         saved = f"; {self.folder.summary()}" if self.folder else ""
         return f"session ended: {self.driven} frames driven, {self.unusable} unusable{saved}"
 
@@ -140,15 +126,17 @@ class DriveServer:
 
     def __init__(self, network: Network, set_speed: float = SET_SPEED_MPH, model: str = ""):
         """set_speed: mph; model: the network's name on the page."""
+        from cloning.server import server, turns  # here, because they need the socket libraries: see `main`
+
         self.network, self.set_speed, self.model = network, set_speed, model
         self.saver: saved_frames.FrameSaver | None = None  # saves the frames
         self.sessions: dict[str, Session] = {}
         self.last_ended: Session | None = None
-        self.socket = wire.Server()
+        self.socket = server.Server()
         self.socket.on("connect", self.connect)
         self.socket.on("telemetry", self.telemetry)
         self.socket.on("disconnect", self.disconnect)
-        self.app = wire.refuse_other_sites(socketio.WSGIApp(self.socket, page.create_app(self)))
+        self.app = self.socket.application(page.create_app(self, turns.pause))
         steer(network, np.zeros(FRAME, np.uint8))  # the first pass is slow: do it before the first frame
 
     def session(self, sid: str) -> Session:
@@ -241,13 +229,6 @@ class StatusLine:
         return f"{line}, {session.unusable} unusable" if session.unusable else line
 
 
-def run(server: DriveServer, listener: socket.socket) -> None:
-    """Serve, with a status line, until Ctrl-C or a signal that asks to terminate."""
-    gc.collect()
-    gc.freeze()  # else a client can make the collector look through all the libraries' objects: 0.2 s each time
-    connections.serve_until_stopped(listener, server.app, StatusLine(server, sys.stderr.isatty()).update)
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # Command line
 
@@ -260,7 +241,6 @@ class OncePerKind(logging.Filter):
     """
 
     def __init__(self) -> None:
-        """Start with no warnings logged."""
         super().__init__()
         self.warned: set[str] = set()
 
@@ -298,43 +278,21 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="Exit status: 0 after Ctrl-C, 1 if frames could not be saved, 2 if the server could not start.",
     )
-    parser.add_argument(
-        "model",
-        nargs="?",
-        type=Path,
-        help="model file, written by model.py (default: model.pt if it exists, else the project's own)",
-    )
-    parser.add_argument(
-        "folder", nargs="?", type=Path, help="save the frames here; frames saved here earlier are deleted"
-    )
-    parser.add_argument(
-        "--speed",
-        type=page.speed_argument,
-        default=SET_SPEED_MPH,
-        help=f"set speed in mph; the car does at most {TOP_SPEED_MPH} (default %(default)g)",
-    )
-    parser.add_argument(
-        "--host",
-        type=address,
-        default="127.0.0.1",
-        help="address to listen on (default %(default)s: this machine only; 0.0.0.0: any machine may connect)",
-    )
-    parser.add_argument(
-        "--port",
-        type=number(int, 0, MAX_PORT),
-        default=PORT,
-        help="port to listen on (default %(default)s, which the simulator uses; 0: any free one)",
-    )
-    parser.add_argument(
-        "--device",
-        default="cpu",
-        choices=["cpu", "cuda"],
-        help="device that runs the network (default %(default)s, which is fast enough)",
-    )
-    args = parser.parse_intermixed_args(arguments)  # the folder may follow options
-    if args.device == "cuda" and not torch.cuda.is_available():
+    add = parser.add_argument
+    add("model", nargs="?", type=Path, help="model file (default: model.pt if it exists, else the project's own)")
+    add("folder", nargs="?", type=Path, help="save the frames here; frames saved here earlier are deleted")
+    speed = f"set speed in mph; the car does at most {TOP_SPEED_MPH} (default %(default)g)"
+    add("--speed", type=page.speed_argument, default=SET_SPEED_MPH, help=speed)
+    host = "address to listen on (default %(default)s: this machine only; 0.0.0.0: any machine may connect)"
+    add("--host", type=address, default="127.0.0.1", help=host)
+    port = "port to listen on (default %(default)s, which the simulator uses; 0: any free one)"
+    add("--port", type=number(int, 0, MAX_PORT), default=PORT, help=port)
+    device = "device that runs the network (default %(default)s, which is fast enough)"
+    add("--device", default="cpu", choices=["cpu", "cuda"], help=device)
+    parsed = parser.parse_intermixed_args(arguments)  # the folder may follow options
+    if parsed.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch finds no GPU here; leave it out")
-    return args
+    return parsed
 
 
 def log_to_stderr() -> None:
@@ -348,34 +306,39 @@ def log_to_stderr() -> None:
 
 def main() -> int:
     """Load the model, listen, and drive until Ctrl-C; return the exit status."""
-    args = parse_arguments()
+    arguments = parse_arguments()
     log_to_stderr()
     torch.set_num_threads(1)  # a second thread would make single frames slower and their latency less regular
     saver = None
     try:
-        model = choose_model(args.model, args.folder)
-        network = load_model(model, args.device)
-        if args.folder:
-            saved_frames.check_folder(args.folder)
+        check_versions()
+        from cloning.server import connections  # with some other versions of the libraries, it cannot be imported
+
+        model = choose_model(arguments.model, arguments.folder)
+        network = load_model(model, arguments.device)
+        if arguments.folder:
+            saved_frames.check_folder(arguments.folder)
         origin = "the model that comes with the project" if model == SHIPPED_MODEL else ""
-        server = DriveServer(network, args.speed, origin or str(model))
-        listener = connections.claim_port(args.host, args.port)
-        if args.folder:
-            server.saver = saver = saved_frames.FrameSaver(args.folder)  # last, because it empties the folder
+        server = DriveServer(network, arguments.speed, origin or str(model))
+        listener = connections.claim_port(arguments.host, arguments.port)
+        if arguments.folder:
+            server.saver = saver = saved_frames.FrameSaver(arguments.folder)  # last, because it empties the folder
     except (UserError, OSError) as error:
         return program.failed("drive.py", error)
     port = listener.getsockname()[1]
-    watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(args.host, args.host)
+    watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(arguments.host, arguments.host)
     print(
         f"Driving with {model}{origin and f' ({origin})'}.\n"
-        f"Listening on {args.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
+        f"Listening on {arguments.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
         f"Watch at http://{f'[{watched}]' if ':' in watched else watched}:{port}/ . Ctrl-C ends.",
         file=sys.stderr,
         flush=True,
     )
+    gc.collect()
+    gc.freeze()  # else a client can make the collector look through all the libraries' objects: 0.2 s each time
     status = program.DONE
     try:
-        run(server, listener)
+        connections.serve_until_stopped(listener, server.app, StatusLine(server, sys.stderr.isatty()).update)
     finally:
         server.close()
         if saver:

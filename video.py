@@ -41,8 +41,9 @@ class FilmError(UserError):
 
 def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
     """Return the folder's frames and their times, sorted by time. Raises FilmError if there are none."""
+    remedy = f"`python drive.py model.pt {folder}` saves frames in it"
     if not folder.is_dir():
-        raise FilmError(f"{folder}: no such folder; `python drive.py model.pt {folder}` saves frames in it")
+        raise FilmError(f"{folder}: no such folder; {remedy}")
     frames: list[tuple[datetime, Path]] = []
     others: list[str] = []
     for path in folder.iterdir():
@@ -53,10 +54,7 @@ def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
         else:
             others.append(path.name)
     if not frames:
-        raise FilmError(
-            f"{folder}: no frames (files with names like 2018_07_16_17_11_43_382.jpg); "
-            f"`python drive.py model.pt {folder}` saves frames in it"
-        )
+        raise FilmError(f"{folder}: no frames (files with names like 2018_07_16_17_11_43_382.jpg); {remedy}")
     if others:
         print_note(f"left out, not frames: {abbreviated(sorted(others))}")
     return sorted(frames)
@@ -129,17 +127,14 @@ def main() -> int:
     """Parse the command line and make the film; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the folder with the frames; the film is FOLDER.mp4")
-    parser.add_argument(
-        "--fps",
-        type=number(ratio, *FPS_RANGE),
-        help="frames per second, such as 60 or 30000/1001 (default: from the frames' times)",
-    )
+    fps_help = "frames per second, such as 60 or 30000/1001 (default: from the frames' times)"
+    parser.add_argument("--fps", type=number(ratio, *FPS_RANGE), help=fps_help)
     parser.add_argument("--overlay", metavar="MODEL", type=Path, help="draw this model's steering and attention")
-    args = parser.parse_args()
-    folder = args.folder if args.folder.name not in ("", "..") else args.folder.resolve()  # a name for "."
-    fps = Fraction(args.fps).limit_denominator(1001) if args.fps else None
+    arguments = parser.parse_args()
+    folder = arguments.folder if arguments.folder.name not in ("", "..") else arguments.folder.resolve()  # "." has none
+    fps = Fraction(arguments.fps).limit_denominator(1001) if arguments.fps else None
     try:
-        left_out = make_film(folder, fps, load_overlay(args.overlay) if args.overlay else None)
+        left_out = make_film(folder, fps, load_overlay(arguments.overlay) if arguments.overlay else None)
     except (UserError, OSError) as error:
         return program.failed("video.py", error)
     return program.INCOMPLETE if left_out else program.DONE

@@ -1,17 +1,25 @@
-"""A real Chromium for the tests, told what to do over a pipe in its DevTools protocol."""
+"""A real Chromium for the tests, driven over a pipe in its DevTools protocol."""
 
 import base64
 import json
 import os
+import re
 import select
 import shutil
 import subprocess
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
 
 AXE = Path(__file__).with_name("axe.min.js")  # axe-core 4.14.1 by Deque Systems, MPL-2.0: see axe.LICENSE
-CHROMIUM = shutil.which("chromium")
+CHROMIUM = shutil.which("chromium") or ""
+needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
+LOOKS = [(390, True), (1280, False), (2200, True)]  # widths in px, and whether the system's colours are dark
 OPTIONS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
     *("--disable-background-networking", "--disable-component-update", "--remote-debugging-pipe"),
@@ -25,20 +33,24 @@ class Page:
         inward, self.outgoing = os.pipe()
         self.incoming, outward = os.pipe()
         # Chromium reads at 3 and writes at 4; the shell puts the pipes there.
-        command = f'exec "$0" "$@" 3<&{inward} 4>&{outward}'
+        command = ["bash", "-c", f'exec "$0" "$@" 3<&{inward} 4>&{outward}', CHROMIUM, *OPTIONS]
         self.process = subprocess.Popen(
-            ["bash", "-c", command, CHROMIUM, *OPTIONS, f"--user-data-dir={profile}", "about:blank"],
+            [*command, f"--user-data-dir={profile}", "about:blank"],
             pass_fds=(inward, outward),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
         os.close(inward)
         os.close(outward)
-        self.number, self.buffer, self.session, self.events = 0, b"", None, []
+        self.number, self.buffer = 0, b""
+        self.session: str | None = None
+        self.events: list[dict] = []
         tabs = self.until(lambda: [t for t in self.send("Target.getTargets")["targetInfos"] if t["type"] == "page"])
         self.session = self.send("Target.attachToTarget", targetId=tabs[0]["targetId"], flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
+        sooner = "const later = setTimeout; setTimeout = (action, ms, ...more) => later(action, ms / 10, ...more)"
+        self.send("Page.addScriptToEvaluateOnNewDocument", source=sooner)  # what a page waits for comes sooner
 
     def until(self, condition, seconds: float = 60.0):
         """Wait until a condition is true; return its value."""
@@ -70,7 +82,7 @@ class Page:
         message, _, self.buffer = self.buffer.partition(b"\0")
         return json.loads(message)
 
-    def run(self, code: str):
+    def run(self, code: str) -> Any:
         """Evaluate JavaScript, await it, and return its value."""
         done = self.send("Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in done, done
@@ -90,8 +102,15 @@ class Page:
         self.events.clear()
         self.send("Page.navigate", url=address)
 
-    def text(self) -> str:
-        return self.run("document.body.innerText")
+    def text(self, selector: str = "body") -> str:
+        return self.run(f"document.querySelector({selector!r}).innerText")
+
+    def shows(self, selector: str, words: str) -> None:
+        """Wait until an element's text contains these words."""
+        self.wait(f"document.querySelector({selector!r})?.textContent.includes({words!r})")
+
+    def click(self, selector: str) -> None:
+        self.run(f"document.querySelector({selector!r}).click()")
 
     def press(self, key: str, shift: bool = False) -> None:
         """Press and release a key, by its name in JavaScript."""
@@ -102,19 +121,23 @@ class Page:
         self.send("Input.dispatchKeyEvent", type="keyDown", **both, **character)
         self.send("Input.dispatchKeyEvent", type="keyUp", **both)
 
-    def look(self, width: int, height: int, dark: bool = False, scale: float = 1.0) -> None:
+    def look(self, width: int, height: int, dark: bool = False) -> None:
         """Choose the window's size in px and the system's colours."""
-        self.send(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
-        )
-        self.send(
-            "Emulation.setEmulatedMedia",
-            features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
-        )
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.send("Emulation.setDeviceMetricsOverride", **size)
+        colours = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.send("Emulation.setEmulatedMedia", features=[colours])
 
-    def screenshot(self, path: Path, whole: bool = False) -> None:
-        picture = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
-        Path(path).write_bytes(base64.b64decode(picture["data"]))
+    def screenshot(self) -> np.ndarray:
+        """What the window shows: BGR."""
+        picture = base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
+        return decoded(picture)
+
+    def difference(self, camera: str, picture: bytes) -> float:
+        """The mean difference between a camera's canvas and an image file's contents, in grey levels."""
+        pixels = f"document.querySelector('#{camera}').getContext('2d').getImageData(0, 0, 320, 160).data"
+        shown = np.array(self.run(f"[...{pixels}].join()").split(","), np.uint8).reshape(160, 320, 4)[..., 2::-1]
+        return float(np.abs(shown.astype(int) - decoded(picture)).mean())
 
     def complaints(self) -> list[str]:
         """What the page's console has said: errors, and what the Content-Security-Policy has stopped."""
@@ -129,6 +152,17 @@ class Page:
                 found.append(f"{parameters['entry']['text']} {parameters['entry'].get('url', '')}")
         return found
 
+    def has_colours(self, dark: bool) -> bool:
+        """Whether ink and paper are those for the system's colours, and far apart."""
+        style = "getComputedStyle(document.body)"
+        ink, paper = self.run(f"[{style}.color, {style}.backgroundColor]")
+        level = [sum(map(int, re.findall(r"\d+", colour)[:3])) for colour in (ink, paper)]
+        return (level[0] > level[1]) == dark and abs(level[0] - level[1]) > 400
+
+    def fits(self) -> bool:
+        """Whether nothing is wider than the window."""
+        return self.run("document.documentElement.scrollWidth <= innerWidth")
+
     def barriers(self) -> list[str]:
         """What axe-core finds on the page that is a serious or critical barrier to people."""
         self.run(AXE.read_text(encoding="utf-8") + ";0")
@@ -142,11 +176,8 @@ class Page:
 
     def addresses(self) -> list[str]:
         """What the page has asked for."""
-        return [
-            event["params"]["request"]["url"]
-            for event in self.events
-            if event.get("method") == "Network.requestWillBeSent"
-        ]
+        requests = [event for event in self.events if event.get("method") == "Network.requestWillBeSent"]
+        return [event["params"]["request"]["url"] for event in requests]
 
     def close(self) -> None:
         with suppress(OSError, AssertionError):
@@ -156,6 +187,13 @@ class Page:
         self.process.wait()
         os.close(self.outgoing)
         os.close(self.incoming)
+
+
+def decoded(picture: bytes) -> np.ndarray:
+    """An image file's pixels: BGR."""
+    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    assert pixels is not None
+    return pixels
 
 
 @contextmanager

@@ -1,11 +1,15 @@
-"""drive.py as a process, for the tests."""
+"""drive.py as a process, and requests to a server, for the tests."""
 
+import http.client
+import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import threading
+import time
+from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,7 +17,35 @@ import warm
 from commands import HERE, ROOT
 
 # What Ctrl-C sends; Windows sends it to a whole console, and Ctrl-Break to one process group.
-STOP = signal.CTRL_BREAK_EVENT if sys.platform == "win32" else signal.SIGINT
+STOP = getattr(signal, "CTRL_BREAK_EVENT", signal.SIGINT)
+
+
+def found(pattern: str, text: str) -> str:
+    """The first group of a pattern in a text that has it."""
+    match = re.search(pattern, text)
+    assert match, text
+    return match[1]
+
+
+def awaited(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    """Wait until a condition is true."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.02)
+
+
+def ask(port: int, path: str, method: str = "GET", body: object = None, **headers: str) -> tuple[int, bytes, dict]:
+    """A server's answer: status, body, headers. body: bytes, or what is sent as JSON."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    data = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
+    more = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path, data, {"Content-Type": "application/json", **more})
+    answer = connection.getresponse()
+    try:
+        return answer.status, answer.read(), dict(answer.headers)
+    finally:
+        connection.close()
 
 
 class Process:
@@ -25,21 +57,24 @@ class Process:
             cwd=cwd,
             env={**os.environ, **HERE},
             stderr=subprocess.PIPE,
-            stdout=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
             text=True,
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         )
-        self.lines, self.listening = [], threading.Event()
+        self.lines: list[str] = []
+        self.listening = threading.Event()
         self.reader = threading.Thread(target=self._read)
         self.reader.start()
         assert self.listening.wait(120)
-        self.port = int(re.search(r"Listening on [\d.]+:(\d+)", "".join(self.lines))[1])
+        self.port = int(found(r"Listening on [\d.]+:(\d+)", "".join(self.lines)))
 
     def _read(self):
-        for line in self.process.stderr:
-            self.lines.append(line)
-            if "Watch at" in line:
-                self.listening.set()
+        assert self.process.stderr
+        with self.process.stderr as lines:
+            for line in lines:
+                self.lines.append(line)
+                if "Watch at" in line:
+                    self.listening.set()
         self.listening.set()
 
     def stop(self, number=STOP) -> int:
@@ -47,16 +82,12 @@ class Process:
             self.process.send_signal(number)
         code = self.process.wait(60)
         self.reader.join()
-        self.process.stdout.close()
-        self.process.stderr.close()
         return code
 
     def memory(self) -> float:
         """Resident MB; 0 where the system does not tell it like Linux."""
-        if not Path("/proc/self/status").exists():
-            return 0.0
-        status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="utf-8")
-        return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
+        status = Path(f"/proc/{self.process.pid}/status")
+        return int(found(r"VmRSS:\s+(\d+)", status.read_text(encoding="utf-8"))) / 1024 if status.exists() else 0.0
 
 
 def script(name: str, first: str = "") -> list[str]:

@@ -7,6 +7,7 @@ import re
 import socket
 import struct
 import threading
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,13 +22,19 @@ def lost():
     raise ConnectionError
 
 
+def exactly(stream, n):
+    """Read n bytes, unless the connection ends before."""
+    data = stream.read(n)
+    return data if len(data) == n else lost()
+
+
 def accept_websocket(client, headers=b""):
     """Read a client's request, accept it, and return it; headers: additional ones, each with its line end."""
     request = b""
     while not request.endswith(b"\r\n\r\n"):
         request += client.recv(1) or lost()
-    key = re.search(rb"(?i)sec-websocket-key: (.*)\r", request)[1]
-    accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
+    key = re.findall(rb"(?i)sec-websocket-key: (.*)\r", request)
+    accept = base64.b64encode(hashlib.sha1(key[0] + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
     client.sendall(
         b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         + headers
@@ -39,7 +46,7 @@ def accept_websocket(client, headers=b""):
 
 
 class Server:
-    """Speaks the server's part of the transcript; `reply(packet, n)` returns the answers to telemetry number n."""
+    """Speaks the server's part of the transcript; `reply(packet, n)` returns the answers to telemetry n."""
 
     def __init__(self, reply, greet=True, sessions=1):
         self.reply, self.greet, self.sessions = reply, greet, sessions
@@ -75,27 +82,21 @@ class Server:
         size = bytes([len(data)]) if len(data) < 126 else b"\x7e" + struct.pack(">H", len(data))
         client.sendall(b"\x81" + size + data)
 
-    def exactly(self, client, n):
-        data = b""
-        while len(data) < n:
-            data += client.recv(n - len(data)) or lost()
-        return data
-
     def session(self, client):
         self.requests.append(accept_websocket(client))
         self.send(client, '0{"sid":"x","upgrades":[],"pingTimeout":60000,"pingInterval":25000}')
         if self.greet:
             self.send(client, STEER % ("0", "0"))
         self.send(client, "40")
-        message, answered, pieces = b"", 0, []
+        message, answered, pieces, stream = b"", 0, [], client.makefile("rb")
         while True:
-            first, second = self.exactly(client, 2)
+            first, second = exactly(stream, 2)
             assert second & 0x80, "a client masks its frames"
             size = second & 0x7F
             if size == 126:
-                size = struct.unpack(">H", self.exactly(client, 2))[0]
-            mask = self.exactly(client, 4)
-            data = bytes(a ^ mask[i % 4] for i, a in enumerate(self.exactly(client, size)))
+                size = struct.unpack(">H", exactly(stream, 2))[0]
+            mask = exactly(stream, 4)
+            data = bytes(a ^ mask[i % 4] for i, a in enumerate(exactly(stream, size)))
             if first & 0x0F == 8:
                 self.closed = True
                 return
@@ -130,8 +131,8 @@ class Blank:
 
 
 def drive(server, laps=0.02, wait=5.0, realtime=False):
-    run = Run(Track("lake"), "autonomous")
-    client = Client(run, Blank(), "127.0.0.1", server.port, wait, realtime)
+    run, cameras = Run(Track("lake"), "autonomous"), cast(Any, Blank())
+    client = Client(run, cameras, "127.0.0.1", server.port, wait, realtime)
     client.drive(laps)
     return client
 

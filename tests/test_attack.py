@@ -183,7 +183,7 @@ def test_all_pages_share_a_picture(jpegs, monkeypatch):
     monkeypatch.setattr(page, "image", image)
     monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
     monkeypatch.setattr(page, "UPDATE_INTERVAL", 2**-10)
-    pages = page.Pages(server, with_attention=True)
+    pages = page.Pages(server, with_attention=True, pause=time.sleep)
     readers: list[Any] = [pages.events() for _ in range(50)]
     for interval in range(1, 4):
         now[0] = interval * 2**-10
@@ -204,7 +204,8 @@ def test_a_new_page_gets_the_last_minute_in_as_many_rows_as_it_can_show(jpegs, m
     session.answer(telemetry(jpegs[0]))
     session.history.extend(page.DrivenFrame(now - 50 + at / 120, 0, 9, 0.5, 3) for at in range(5 * page.SHOWN_FRAMES))
     monkeypatch.setattr(page, "image", lambda *_: "picture")
-    times = [row[0] for row in json.loads(next(page.Pages(server, with_attention=False).events())[6:])["rows"]]
+    pages = page.Pages(server, with_attention=False, pause=time.sleep)
+    times = [row[0] for row in json.loads(next(pages.events())[6:])["rows"]]
     assert len(times) <= page.SHOWN_FRAMES and times == sorted(times)
     assert times[-1] == session.history[-1].time and times[-1] - times[0] > 49
 

@@ -1,4 +1,4 @@
-"""What the browser of recordings shows: figures, places, and the slow analyses of lane and models."""
+"""What the browser of recordings shows: figures, rows to jump to, and the slow analyses of lane and models."""
 
 import shutil
 import sys
@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browse_process import opened
+from drive_process import awaited
 
 from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses, summary
-from cloning.browse.analyses import LANE, Analysis, Result, read_result, stamp, write_result
-from cloning.browse.library import Library, UnknownError
+from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
+from cloning.browse.library import UnknownError
 from cloning.lane.localise import Localisation
 from cloning.network.network import load_model, steer
 from cloning.recordings.images import read_frame
@@ -28,12 +30,13 @@ def test_seconds_driven_leave_out_breaks():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_largest_places_by_brute_force(seed):
+def test_rows_with_the_largest_values_by_brute_force(seed):
     """The largest value that is left, and then no other within the distance, again and again."""
     rng = np.random.default_rng(seed)
     values = np.round(rng.normal(size=200), 1)
     values[rng.random(200) < 0.3] = np.nan
-    left, wanted = {row for row in range(200) if not np.isnan(values[row]) and values[row]}, []
+    left = {row for row in range(200) if not np.isnan(values[row]) and values[row]}
+    wanted: list[int] = []
     while left and len(wanted) < 5:
         best = max(left, key=lambda row: (abs(values[row]), -row))
         wanted.append(best)
@@ -41,21 +44,21 @@ def test_largest_places_by_brute_force(seed):
     assert summary.largest(values, 5, 12) == sorted(wanted)
 
 
-def test_places_with_the_steering_at_its_stop():
+def test_rows_with_the_steering_at_its_stop():
     steering = np.array([1, 1, 0.5, -1, 1, 0, -0.9, -1, -1, 0], np.float32)
     assert summary.at_stop(steering) == [0, 3, 4, 7]
     assert summary.at_stop(np.zeros(3)) == [] and summary.largest(np.full(3, np.nan)) == []
 
 
-def test_places_are_those_that_are_not_cut():
+def test_jumps_are_to_rows_that_are_not_cut():
     steering = np.zeros(90, np.float32)
     steering[[5, 70]] = 1, -1
     offset, models = np.linspace(0, 3, 90, dtype=np.float32), [np.full(90, 0.1), np.full(90, np.nan)]
-    nothing_cut = summary.places(steering, offset, models, np.zeros(90, bool))
+    nothing_cut = summary.jumps(steering, offset, models, np.zeros(90, bool))
     assert nothing_cut == {"stop": [5, 70], "offset": [29, 59, 89], "difference": [5, 35, 70]}
-    cut = summary.places(steering, offset, models, np.arange(90) >= 60)
+    cut = summary.jumps(steering, offset, models, np.arange(90) >= 60)
     assert cut == {"stop": [5], "offset": [29, 59], "difference": [5, 35]}
-    assert summary.places(steering, None, [], np.zeros(90, bool)) == {"stop": [5, 70]}
+    assert summary.jumps(steering, None, [], np.zeros(90, bool)) == {"stop": [5, 70]}
 
 
 def test_figures_are_those_of_the_rows_that_are_not_cut(sample_recording):
@@ -71,7 +74,7 @@ def test_figures_are_those_of_the_rows_that_are_not_cut(sample_recording):
 
 
 def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
-    """Rows placed on the lake at known places get these coordinates; what is not placed has none."""
+    """Rows placed on the lake at known positions get these coordinates; what is not placed has none."""
     recording, track = read_recording(sample_recording), Track("lake", "cw")
     s = np.linspace(100, 120, 40)
     placed = Localisation(track, np.stack([s, np.full(40, 1.5), np.zeros(40)], axis=1), 0.0, 0.0)
@@ -106,6 +109,7 @@ def test_a_result_is_kept_until_the_recording_changes(linked):
     assert read_result(linked, LANE) is None
     write_result(linked, LANE, stamp(linked, LANE), result)
     found = read_result(linked, LANE)
+    assert found
     np.testing.assert_array_equal(found.column("offset", np.array([0, 1, 2, 2])), [np.nan, np.nan, 0.5, 0.5])
     time.sleep(0.02)  # longer than a tick of the file system's clock
     (linked / "driving_log.csv").touch()
@@ -115,14 +119,22 @@ def test_a_result_is_kept_until_the_recording_changes(linked):
         read_result(linked, LANE)
 
 
-def ended(library: Library, folder: Path, analysis: Analysis) -> list[dict]:
-    """The states of an analysis until it is done or has failed, without repetitions."""
-    states, end = [library.analyses.state(folder, analysis)], time.monotonic() + 60
-    while states[-1]["state"] in ("waiting", "running"):
-        assert time.monotonic() < end, states
-        time.sleep(0.005)
-        if (state := library.analyses.state(folder, analysis)) != states[-1]:
+@pytest.fixture
+def recording(linked):
+    with opened(linked) as recording:
+        yield recording
+
+
+def ended(analyses: Analyses, folder: Path) -> list[dict]:
+    """The states of an analysis of the lane until it is done or has failed, without repetitions."""
+    states: list[dict] = []
+
+    def is_over() -> bool:
+        if (state := analyses.state(folder, LANE)) not in states[-1:]:
             states.append(state)
+        return state["state"] not in ("waiting", "running")
+
+    awaited(is_over)
     return states
 
 
@@ -135,39 +147,42 @@ def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, t
         folders.append(tmp_path / name)
     code = f"import sys; open({str(tmp_path / 'order')!r}, 'a').write(sys.argv[1] + '\\n'); sys.exit('no')"
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
-    library = Library(folders, [])
-    try:
-        with library.analyses.changed:  # until all of them wait
-            for folder in folders:
-                library.analyses.state(folder, LANE)
-            library.analyses.hurry(folders[3])
+    queue = Analyses()
+    with queue.changed:  # until all of them wait
         for folder in folders:
-            assert ended(library, folder, LANE)[-1]["state"] == "failed"
-    finally:
-        library.analyses.close()
+            queue.state(folder, LANE)
+        queue.urgent = folders[3]
+    for folder in folders:
+        assert ended(queue, folder)[-1]["state"] == "failed"
+    queue.close()
     order = [Path(line).name for line in (tmp_path / "order").read_text(encoding="utf-8").splitlines()]
     assert order == ["open", "small", "middle", "large"]
 
 
-def test_an_analysis_tells_how_far_it_is_and_why_it_failed(linked, monkeypatch):
+def test_an_analysis_tells_how_far_it_is_and_why_it_failed(recording, linked, monkeypatch):
     code = (
         "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nanalyse: no model')"
     )
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
-    library = Library([linked], [])
-    try:
-        states = ended(library, linked, LANE)
-        assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
-        assert states[-1] == {"state": "failed", "message": "analyse: no model"}
-        [name] = library.folders
-        library.retry(name, "offset")
-        assert library.analyses.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
-        assert ended(library, linked, LANE)[-1] == states[-1]
-        with pytest.raises(UnknownError):
-            library.retry(name, "steering")
-        time.sleep(0.02)  # longer than a tick of the file system's clock
-        (linked / "driving_log.csv").touch()
-        assert library.analyses.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
-    finally:
-        library.analyses.close()
-    assert library.analyses.process is None
+    states = ended(recording.analyses, linked)
+    assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
+    assert states[-1] == {"state": "failed", "message": "analyse: no model"}
+    recording.retry("offset")
+    assert recording.analyses.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
+    assert ended(recording.analyses, linked)[-1] == states[-1]
+    with pytest.raises(UnknownError):
+        recording.retry("steering")
+    time.sleep(0.02)  # longer than a tick of the file system's clock
+    (linked / "driving_log.csv").touch()
+    assert recording.analyses.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
+    recording.analyses.close()
+    assert recording.analyses.process is None
+
+
+def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried_again(recording, linked, monkeypatch):
+    monkeypatch.setattr(analyses, "COMMAND", ("/no/python",))
+    message = "its process cannot be started: /no/python: No such file or directory"
+    assert ended(recording.analyses, linked)[-1] == {"state": "failed", "message": message}
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", "import sys; sys.exit('started')"))
+    recording.retry("offset")
+    assert ended(recording.analyses, linked)[-1] == {"state": "failed", "message": "started"}

@@ -1,28 +1,36 @@
 """The server of recordings over a real socket: what it tells, what it refuses, and cuts."""
 
 import json
-import subprocess
 import sys
 
 import numpy as np
 import pytest
-from browse_process import browsing, placed
-from commands import ROOT
+from browse_process import browsing, opened, placed, replayed, written_run
 from test_excluded import center
 
+from cloning.base.errors import RecordingError
 from cloning.browse import __main__ as browse
+from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording
+
+PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.fixture(scope="module")
-def served(sample_recording, tmp_path_factory):
-    """A server of two recordings, "lake sample" and "spoilt"; they are not to be changed."""
+def served(sample_recording, model_file, tmp_path_factory):
+    """A server of "lake sample", with a replay, of "spoilt", and of a run; they are not to be changed."""
     data = tmp_path_factory.mktemp("served")
-    (data / "spoilt").mkdir()
+    for name in ("spoilt", "run", "empty"):
+        (data / name).mkdir()
     (data / "spoilt" / "driving_log.csv").write_text("nothing\n", encoding="utf-8")
     (data / "secret.jpg").write_bytes(min((sample_recording / "IMG").iterdir()).read_bytes())
+    (data / "secret.png").write_bytes(PNG)
     placed(sample_recording, np.zeros(60))
-    with browsing(sample_recording, data) as server:
+    replayed(sample_recording, model_file, 1.0, np.linspace(-0.5, 0.5, 60), [[30, 1.2]])
+    pictures = written_run(data / "run", finished=4, images=0).pictures
+    (pictures / "training_generator_LRC_5.png").symlink_to("/etc/passwd")
+    folders = [data / "empty", data / "run"]
+    with browsing(sample_recording, data, "--model", model_file, "--run", *folders) as server:
         yield server
 
 
@@ -44,55 +52,60 @@ def test_the_server_tells_what_the_reader_tells(served, sample_recording):
     assert "driving_log.csv: line 1: neither a row nor a header" in spoilt["message"] and "frames" not in spoilt
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
-        {"Origin": "http://evil.example"},
-        {"Origin": "null"},
-        {"Host": "evil.example"},
-        {"Host": "localhost.evil.example:80"},
-        {"Sec_Fetch_Site": "cross-site"},
-        {"Sec_Fetch_Site": "same-site"},
-    ],
-)
+def test_replays_and_runs_over_the_socket(served, sample_recording):
+    here = served.recordings()["lake sample"]
+    shown = served.get(f"{here}/details?limit=1")["replays"][0]
+    assert shown["where"] == [[30, 1.2]] and shown["autonomy_percent"] == 90
+    status, data, _ = served.ask(f"{here}/columns/replay-0-1")
+    assert status == 200 and np.frombuffer(data, "<f4")[-1] == 0.5
+    status, data, headers = served.ask(f"{here}/rows/59/replay-0-1.jpg")
+    recorded = read_frame(read_recording(sample_recording).path(59))
+    assert status == 200 and headers["Content-Type"] == "image/jpeg"
+    assert np.abs(decode(data).astype(int) - recorded).mean() > 1, "moved half a metre to the right"
+    assert served.get(f"{here}/details?limit=2.5")["replays"][0]["state"] == "none"
+    status, data, _ = served.ask(f"{here}/columns/offset", "POST")
+    assert status == 200 and json.loads(data)["lane"] == {"state": "ready"}, "what is there stays"
+    [found] = served.get("/runs")
+    assert found["id"] == 1 and found["state"] == "finished" and "pictures" not in found
+    assert served.get("/runs/1")["pictures"] == [0, 1200]
+    status, data, headers = served.ask("/runs/1/training_generator_LRC_0.png")
+    assert (status, data, headers["Content-Type"]) == (200, PNG, "image/png")
+    status, data, headers = served.ask("/runs/1/training_generator_LRC_5.png")
+    assert status == 409 and "not a PNG" in json.loads(data)["message"] and headers["Cache-Control"] == "no-store"
+
+
+FOREIGN = {"Origin": "http://evil.example"}, {"Host": "localhost.evil.example:80"}, {"Sec_Fetch_Site": "same-site"}
+
+
+@pytest.mark.parametrize("headers", FOREIGN)
 def test_no_page_of_another_site_is_answered(served, sample_recording, headers):
     here = served.recordings()["lake sample"]
     cut = {"first": center(sample_recording, 1), "last": center(sample_recording, 2), "reason": ""}
-    for method, path in (("GET", "/recordings"), ("GET", f"{here}/rows/0/left.jpg"), ("POST", f"{here}/cuts")):
-        assert served.ask(path, method, cut if method == "POST" else None, **headers)[0] == 403
+    for path in ("/recordings", f"{here}/rows/0/left.jpg", "/runs"):
+        assert served.ask(path, **headers)[0] == 403
+    for path in (f"{here}/cuts", f"{here}/columns/offset", f"{here}/replays/2.5"):
+        assert served.ask(path, "POST", cut, **headers)[0] == 403
     assert not (sample_recording / "excluded.csv").exists()
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "rows/60/left.jpg",
-        "rows/-1/left.jpg",
-        "rows/0/back.jpg",
-        "rows/0/../../secret.jpg",
-        "rows/0/..%2f..%2f..%2fsecret.jpg",
-        "columns/model-0",
-        "columns/model-²",
-        "columns/names",
-        "columns/__class__",
-        "../../etc/passwd",
-        "%2e%2e/%2e%2e/etc/passwd",
-        "rows/99999999999999999999999",
-    ],
-)
-def test_nothing_but_rows_cameras_and_columns_is_served(served, path):
-    status, data, _ = served.ask(f"{served.recordings()['lake sample']}/{path}".replace("²", "%C2%B2"))
-    assert status == 404 and b"root:" not in data and b"JFIF" not in data
-    assert served.ask("/recordings/..%2f..%2fetc/rows/0")[0] == 404
-    assert served.ask("/static/..%2f__main__.py")[0] == served.ask("/static/../page.py")[0] == 404
-
-
-def test_an_analysis_is_tried_again_by_pages_of_this_site(served):
+def test_nothing_but_rows_cameras_columns_and_pictures_is_served(served):
     here = served.recordings()["lake sample"]
-    status, data, _ = served.ask(f"{here}/columns/offset", "POST")
-    assert status == 200 and json.loads(data)["lane"] == {"state": "ready"}, "what is there stays"
-    assert served.ask(f"{here}/columns/steering", "POST")[0] == 404
-    assert served.ask(f"{here}/columns/offset", "POST", Origin="http://evil.example")[0] == 403
+    of_the_recording = (
+        *("rows/60/left.jpg", "rows/-1/left.jpg", "rows/0/back.jpg", "rows/9999999999999999999", "rows/0/center/1.png"),
+        *("rows/0/../../secret.jpg", "rows/0/..%2f..%2f..%2fsecret.jpg", "rows/0/secret/0.png"),
+        *("rows/0/replay-0-x.jpg", "columns/model-1", "columns/model-%C2%B2", "columns/names", "columns/__class__"),
+        *("columns/replay-1-1", "columns/replay-0-7", "details?limit=1.7", "../../etc/passwd", "%2e%2e/%2e%2e/etc"),
+    )  # fmt: skip
+    others = (
+        *("/recordings/..%2f..%2fetc/rows/0", "/static/..%2f__main__.py", "/static/../page.py", "/runs/2"),
+        *("/runs/1/..%2f..%2fsecret.png", "/runs/1/../../secret.png", "/runs/1/training_log.csv"),
+        *("/runs/1/training_generator_LRC_x.png", "/runs/1/training_generator_LRC_6.png"),
+    )  # fmt: skip
+    for path in (*(f"{here}/{each}" for each in of_the_recording), *others):
+        status, data, _ = served.ask(path)
+        assert status == 404 and b"root:" not in data and b"JFIF" not in data, path
+    for path in ("columns/steering", "replays/3"):
+        assert served.ask(f"{here}/{path}", "POST")[0] == 404
 
 
 def test_an_image_that_is_no_frame_is_not_served(linked):
@@ -102,20 +115,25 @@ def test_an_image_that_is_no_frame_is_not_served(linked):
         recording.path(row).unlink()
     recording.path(0).symlink_to("/etc/passwd")
     recording.path(1).write_bytes(b"GIF89a")
-    with browsing(linked) as server:
-        here = server.recordings()["lake"]
+    with opened(linked) as shown:
         for row, words in enumerate(("not a JPEG", "not a JPEG", "No such file")):
-            status, data, headers = server.ask(f"{here}/rows/{row}/center.jpg")
-            assert status == 409 and words in json.loads(data)["message"] and headers["Cache-Control"] == "no-store"
+            with pytest.raises(RecordingError, match=words):
+                shown.jpeg(row, "center")
 
 
 def test_cuts_over_the_socket(linked):
     """Two pages cut and undo; a wrong request, a changed log and a vanished recording lose nothing."""
     log, names = (linked / "driving_log.csv").read_bytes(), [center(linked, row) for row in range(60)]
     placed(linked, np.zeros(60))
+    cuts = linked / "excluded.csv"
     with browsing(linked) as server:
         here = server.recordings()["lake"]
         version = server.get(f"{here}/details")["version"]
+
+        def refused(words: str, path: str, *arguments: object) -> None:
+            status, data, _ = server.ask(f"{here}/{path}", *arguments)
+            assert status == 409 and words in json.loads(data)["message"]
+
         one = {"first": names[3], "last": names[5], "reason": "off"}
         two = {"first": names[10], "last": names[10], "reason": "crash, hard"}
         assert server.ask(f"{here}/cuts", "POST", one)[0] == 200
@@ -128,36 +146,30 @@ def test_cuts_over_the_socket(linked):
         ]
         assert len(read_recording(linked)) == 56
         assert server.ask(f"{here}/cuts", "DELETE", one)[0] == 200
-        status, data, _ = server.ask(f"{here}/cuts", "DELETE", one)
-        assert status == 409 and "not there any more" in json.loads(data)["message"]
-        for wrong, code in (([], 400), ({"first": 1, "last": "b", "reason": ""}, 400), (one | {"more": ""}, 400),
-                            (one | {"first": "../x"}, 409), (one | {"last": names[2]}, 409)):  # fmt: skip
-            assert server.ask(f"{here}/cuts", "POST", wrong)[0] == code
+        refused("not there any more", "cuts", "DELETE", one)
+        wrongs: tuple[object, ...] = ([], {"first": 1, "last": "b", "reason": ""}, one | {"more": ""})
+        for wrong in wrongs:
+            assert server.ask(f"{here}/cuts", "POST", wrong)[0] == 400
+        refused("is not the centre image", "cuts", "POST", one | {"first": "../x"})
+        refused("comes before", "cuts", "POST", one | {"last": names[2]})
         text = f'first image,last image,reason\n{names[10]},{names[10]},"crash, hard"\n'
-        assert (linked / "excluded.csv").read_text(encoding="utf-8") == text
-        (linked / "excluded.csv").write_text(text + "spoilt\n", encoding="utf-8")
-        status, data, _ = server.ask(f"{here}/cuts", "POST", one)
-        assert status == 409 and "excluded.csv: line 3: 1 fields where 3" in json.loads(data)["message"]
-        assert (linked / "excluded.csv").read_text(encoding="utf-8") == text + "spoilt\n"
-        (linked / "excluded.csv").write_text(text, encoding="utf-8")
+        assert cuts.read_text(encoding="utf-8") == text
+        cuts.write_text(text + "spoilt\n", encoding="utf-8")
+        refused("excluded.csv: line 3: 1 fields where 3", "cuts", "POST", one)
+        assert cuts.read_text(encoding="utf-8") == text + "spoilt\n"
+        cuts.write_text(text, encoding="utf-8")
         assert (linked / "driving_log.csv").read_bytes() == log
         (linked / "driving_log.csv").write_bytes(log[log.index(b"\n") + 1 :])
-        status, data, _ = server.ask(f"{here}/rows/0/left.jpg?version={version}")
-        assert status == 409 and "has changed since this page read it" in json.loads(data)["message"]
+        refused("has changed since this page read it", f"rows/0/left.jpg?version={version}")
         assert server.get(f"{here}/details")["frames"] == 59
         linked.rename(linked.with_name("elsewhere"))
-        for path, method in ((f"{here}/details", "GET"), (f"{here}/rows/0", "GET"), (f"{here}/cuts", "POST"),
-                             (f"{here}/columns/offset", "POST")):  # fmt: skip
-            status, data, _ = server.ask(path, method, one if method == "POST" else None)
-            assert status == 409 and "driving_log.csv: No such file" in json.loads(data)["message"]
-        assert "No such file" in server.get(f"{here}/overview")["message"]
+        gone = "driving_log.csv: No such file"
+        refused(gone, "details")
+        refused(gone, "rows/0")
+        refused(gone, "cuts", "POST", one)
+        refused(gone, "columns/offset", "POST")
+        assert gone in server.get(f"{here}/overview")["message"]
         assert (linked.with_name("elsewhere") / "excluded.csv").read_text(encoding="utf-8") == text
-
-
-def test_torch_is_not_imported_to_serve():
-    code = "import cloning.browse.__main__, sys; print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout == "False\n"
 
 
 def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, monkeypatch, capsys):

@@ -2,18 +2,18 @@
 
 import os
 import re
-import shutil
-import signal
-import socket
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import warm
-from commands import HERE
-from drive_process import STOP, script, serving
+from commands import HERE, ROOT
+from drive_process import script, serving
 
+import drive
 from cloning.base.errors import UserError
 from cloning.network.network import SHIPPED_MODEL, load_model, steer
 from cloning.recordings.images import decode
@@ -21,41 +21,36 @@ from cloning.server.versions import check_versions
 from tools.simulator_client import Simulator, telemetry
 
 
-def failing(*arguments, first="") -> str:
-    process = warm.run(
-        [*script("drive.py", first), *map(str, arguments)],
-        env={**os.environ, **HERE},
-        timeout=120,
-        capture_output=True,
-        text=True,
-    )
-    assert process.returncode == 2 and "Traceback" not in process.stderr
-    assert process.stderr.splitlines()[-1].startswith("drive.py: ")
-    return process.stderr
-
-
-def test_mistakes_are_reported(model_file, tmp_path):
+def test_mistakes_are_reported(model_file, tmp_path, monkeypatch, capsys):
     torch.save({"weights": [1]}, tmp_path / "foreign.pt")
-    assert "not a model of this project" in failing(tmp_path / "foreign.pt")
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "thesis.txt").write_text("words", encoding="utf-8")
-    assert "thesis.txt" in failing(model_file, mine)
-    (tmp_path / "run1").mkdir()
-    frame = tmp_path / "run1" / "2018_07_16_17_11_43_382.jpg"
-    frame.write_bytes(b"frame")
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = other.getsockname()[1]
-        assert f"can't listen on 127.0.0.1:{port}" in failing(model_file, tmp_path / "run1", "--port", port)
+    for folder, name in (("mine", "thesis.txt"), ("run1", "2018_07_16_17_11_43_382.jpg")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / name).write_bytes(b"frame")
     with serving(model_file) as other:  # two servers must not share a port, which SO_REUSEPORT would let them do
-        message = failing(model_file, tmp_path / "run1", "--port", other.port)
-        assert f"can't listen on 127.0.0.1:{other.port}" in message
-    assert frame.exists(), "a server that cannot start deletes nothing"
+        for arguments, words in (
+            ((tmp_path / "foreign.pt",), "not a model of this project"),
+            ((model_file, tmp_path / "mine"), "thesis.txt"),
+            ((model_file, tmp_path / "run1", "--port", other.port), f"can't listen on 127.0.0.1:{other.port}"),
+        ):
+            monkeypatch.setattr(sys, "argv", ["drive.py", *map(str, arguments)])
+            assert drive.main() == 2
+            message = capsys.readouterr().err
+            assert message.startswith("drive.py: ") and words in message and message.count("\n") == 1
+    assert any((tmp_path / "run1").iterdir()), "a server that cannot start deletes nothing"
 
 
-def test_other_versions_of_the_socket_libraries_are_refused():
-    message = failing(first="import importlib.metadata; importlib.metadata.version = lambda name: '5.18.1'")
-    assert "python-socketio is 5.18.1 and must be 4.6.1" in message and "pip install -r requirements.txt" in message
+@pytest.mark.parametrize("module", ["drive", "cloning.browse.__main__"])
+def test_other_socket_libraries_are_refused_by_the_command_and_no_harm_to_an_import(module):
+    """The page of recordings does not need PyTorch either."""
+    code = (
+        "import importlib.metadata, sys; sys.modules.update(eventlet=None, engineio=None, socketio=None)\n"
+        f"importlib.metadata.version = lambda name: '5.18.1'; import {module} as command\n"
+        "print('torch' in sys.modules); sys.exit(command.main())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout == f"{module == 'drive'}\n" and done.returncode == 2, done.stderr
+    assert "python-socketio is 5.18.1 and must be 4.6.1" in done.stderr and "Traceback" not in done.stderr
+    assert "pip install -r requirements.txt" in done.stderr
 
 
 def test_the_versions_come_from_requirements_txt(tmp_path):
@@ -65,17 +60,27 @@ def test_the_versions_come_from_requirements_txt(tmp_path):
         check_versions(tmp_path / "requirements.txt")
 
 
-def test_without_a_model_it_names_and_takes_model_pt_or_the_shipped_one(model_file, jpegs, steering, tmp_path):
+def test_which_model_drives(jpegs, tmp_path, monkeypatch):
     with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
         simulator.open()
         answer = np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"])
         assert answer == steer(load_model(SHIPPED_MODEL), decode(jpegs[0]))
         assert f"Driving with {SHIPPED_MODEL} (the model that comes with the project).\n" in process.lines
-    shutil.copy(model_file, tmp_path / "model.pt")
-    with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
-        simulator.open()
-        assert np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"]) == steering[0]
-        assert "Driving with model.pt.\n" in process.lines
+    monkeypatch.chdir(tmp_path)
+    assert drive.choose_model(None, None) == SHIPPED_MODEL
+    (tmp_path / "model.pt").touch()
+    assert drive.choose_model(None, None) == Path("model.pt")
+    assert drive.choose_model(Path("none.pt"), None) == Path("none.pt"), "whose loading tells that it is missing"
+    (tmp_path / "run1").mkdir()
+    for folder in ("run1", "run2"):
+        with pytest.raises(UserError, match=f"`python drive.py model.pt {folder}`"):
+            drive.choose_model(Path(folder), None)
+
+
+@pytest.mark.parametrize("text", ["model.pt run1 --port 1", "model.pt --port 1 run1", "--port 1 model.pt run1"])
+def test_the_folder_may_follow_options(text):
+    arguments = drive.parse_arguments(text.split())
+    assert (str(arguments.model), str(arguments.folder), arguments.port) == ("model.pt", "run1", 1)
 
 
 # Takes away what other systems do not have, after torch, whose Linux build needs some of it.
@@ -104,17 +109,13 @@ def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, stee
     assert film.returncode == 0 and "run1.mp4: 8 frames" in film.stdout, film.stderr
 
 
-WINDOWS_KILLS = pytest.mark.skipif(sys.platform == "win32", reason="there SIGTERM ends a process at once")
-
-
-@pytest.mark.parametrize("number", [STOP, pytest.param(signal.SIGTERM, marks=WINDOWS_KILLS)])
-def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path, number):
+def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path):
     with serving(model_file, "run1", cwd=tmp_path) as process, Simulator(process.port) as simulator:
         simulator.open()
         for n in range(200):
             simulator.drive(telemetry(jpegs[n % 8]))
         simulator.drive({})
-        assert process.stop(number) == 0
+        assert process.stop() == 0
     assert process.lines[-1] == "drive.py: session ended: 200 frames driven, 1 unusable; driven frames saved in run1\n"
     saved = sorted((tmp_path / "run1").iterdir())
     assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(200)]

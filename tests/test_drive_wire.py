@@ -1,7 +1,6 @@
 """drive.py as a process, over real sockets: the simulator's session, requests of other sites, other clients."""
 
 import json
-import os
 import re
 import shutil
 import signal
@@ -10,16 +9,12 @@ import struct
 import subprocess
 import sys
 import threading
-import time
-import urllib.error
-import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from browser import CHROMIUM, chromium
-from drive_process import serving
+from drive_process import awaited, serving
 
 from tools.simulator_client import Simulator, fragments, telemetry
 
@@ -65,7 +60,7 @@ def test_the_recorded_session_byte_by_byte(server, jpegs, steering):
     for jpeg, expected in zip(jpegs, steering, strict=True):
         send("42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")], separators=(",", ":")))
         answer = re.fullmatch(rb'42\["steer",\{"steering_angle":"(-?[\d.]+)","throttle":"0"\}\]', frame())
-        assert np.float32(answer[1].decode()) == expected, "the same steering as on disk, to the last bit"
+        assert answer and np.float32(answer[1].decode()) == expected, "the same steering as on disk, to the last bit"
     send('42["telemetry",null]')
     assert frame() == b'42["manual",{}]'
     send("41")
@@ -80,8 +75,6 @@ BROKEN = [
     '42["telemetry",{"steering_angle":"0.0000"',
     '42["telemetry"',
     '42["telemetry",' + "[" * 50000,
-    '42["telemetry",{}]',
-    '42["telemetry",{"speed":"fast"}]',
     '42["telemetry",7]',
     '42["telemetry",{},{},{}]',
     '42["telemetry",{"image":"' + "A" * 20_000_000 + '"}]',
@@ -102,26 +95,13 @@ def test_every_telemetry_gets_exactly_one_answer(server, jpegs, message):
         assert simulator.drive(telemetry(jpegs[0]))["steering_angle"] == last
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        "",
-        "4",
-        "9",
-        "42",
-        "42{",
-        '42["connect"]',
-        '42["disconnect"]',
-        '42["unknown",{}]',
-        "42" + "1" * 900_000,
-        '42/other,["telemetry",{}]',
-        "451-[",
-        "43[]",
-        "\x00",
-        "ä" * 1000,
-        "42[" * 30000,
-    ],
+OTHERS = (
+    *("", "4", "9", "42", "42{", '42["connect"]', '42["disconnect"]', '42["unknown",{}]', "451-[", "43[]", "\x00"),
+    *('42/other,["telemetry",{}]', "42" + "1" * 900_000, "ä" * 1000, "42[" * 30000),
 )
+
+
+@pytest.mark.parametrize("message", OTHERS, ids=lambda message: message[:20])
 def test_driving_continues_after_other_messages(server, jpegs, steering, message):
     with Simulator(server.port) as simulator:
         simulator.open()
@@ -132,30 +112,25 @@ def test_driving_continues_after_other_messages(server, jpegs, steering, message
         assert np.float32(simulator.drive(telemetry(jpegs[1]))["steering_angle"]) == steering[1]
 
 
-def test_each_kind_of_unusable_frame_is_logged_once(model_file, jpegs):
-    with serving(model_file) as process:
-        with Simulator(process.port) as simulator:
-            simulator.open()
-            simulator.drive(telemetry(jpegs[0]))
-            for _ in range(50):
-                simulator.drive({})
-                simulator.drive({**telemetry(jpegs[0]), "speed": "fast"})
-                simulator.drive(telemetry(jpegs[0][:3000]))
-        deadline = time.monotonic() + 60
-        while not any("session ended" in line for line in process.lines) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        process.stop()
-    text = "".join(process.lines)
+def test_each_kind_of_unusable_frame_is_logged_once(server, jpegs):
+    begin = len(server.lines)
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        simulator.drive(telemetry(jpegs[0]))
+        for _ in range(50):
+            simulator.drive({})
+            simulator.drive({**telemetry(jpegs[0]), "speed": "fast"})
+            simulator.drive(telemetry(jpegs[0][:3000]))
+    awaited(lambda: any("1 frames driven, 150 unusable" in line for line in server.lines[begin:]))
+    text = "".join(server.lines[begin:])
     assert text.count("can't be used") == 3
     assert all(reason in text for reason in ("speed is missing", "speed is not a number", "cut short"))
-    assert "1 frames driven, 150 unusable" in text
 
 
 def test_two_simulators_are_driven_independently(server, jpegs, steering):
     with Simulator(server.port) as slow, Simulator(server.port) as fast:
         slow.open()
         fast.open()
-        alone = []
         with Simulator(server.port) as other:
             other.open()
             alone = [other.drive(telemetry(jpegs[n], speed="8.0000")) for n in range(8)]
@@ -178,8 +153,6 @@ def test_frames_in_flight_are_answered_in_order(server, jpegs, steering):
 def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    with pytest.raises(ConnectionRefusedError):  # as for the simulator, before the server has started
-        Simulator(port)
     for _ in range(2):
         with serving(model_file, port=port) as process:
             gone = Simulator(port)
@@ -191,8 +164,8 @@ def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering
             with Simulator(port) as simulator:
                 simulator.open()
                 assert np.float32(simulator.drive(telemetry(jpegs[2]))["steering_angle"]) == steering[2]
-                process.stop(signal.SIGTERM)
-                with pytest.raises((ConnectionError, OSError)):
+                assert process.stop(signal.SIGTERM) == (0 if sys.platform != "win32" else 1)
+                with pytest.raises(OSError):
                     simulator.receive()
 
 
@@ -202,26 +175,20 @@ def test_ten_thousand_malformed_messages_do_not_disturb_another_session(server, 
     with Simulator(server.port) as simulator, Simulator(server.port) as stranger:
         simulator.open()
         stranger.open()
-        answers = []
 
         def drain():
-            while not stopped.is_set():
-                try:
-                    answers.append(stranger.receive())
-                except OSError:
-                    return
+            with suppress(OSError):
+                while stranger.socket.recv(65536):
+                    pass
 
-        stopped = threading.Event()
         threads = [threading.Thread(target=stranger.socket.sendall, args=(flood,)), threading.Thread(target=drain)]
         for thread in threads:
             thread.start()
         rounds = 0
         while threads[0].is_alive() or rounds < 100:
             answer = simulator.drive(telemetry(jpegs[rounds % 8], speed="9.0000"))
-            assert np.float32(answer["steering_angle"]) == steering[rounds % 8]
-            assert answer["throttle"] == "0"
+            assert np.float32(answer["steering_angle"]) == steering[rounds % 8] and answer["throttle"] == "0"
             rounds += 1
-        stopped.set()
         stranger.socket.shutdown(socket.SHUT_RDWR)
         threads[1].join()
 
@@ -234,8 +201,6 @@ def test_ten_thousand_malformed_messages_do_not_disturb_another_session(server, 
     "header, status",
     [
         ("Origin: http://evil.example\r\n", 403),
-        ("Origin: null\r\n", 403),
-        ("Origin: http://127.0.0.1:1\r\n", 403),
         ("Sec-Fetch-Site: cross-site\r\n", 403),
         ("Origin: http://127.0.0.1:{port}\r\n", 101),
         ("", 101),
@@ -246,76 +211,25 @@ def test_another_origin_cannot_connect(server, header, status):
         assert stranger.status == status
 
 
-@pytest.mark.parametrize("path", ["/", "/live", "/socket.io/?EIO=3&transport=polling"])
-def test_a_host_name_that_resolves_to_this_machine_is_refused(server, path):
-    request = urllib.request.Request(f"http://127.0.0.1:{server.port}{path}", headers={"Host": "evil.example"})
-    with pytest.raises(urllib.error.HTTPError, match="403"):
-        urllib.request.urlopen(request, timeout=10)
-
-
-def answers(address: str, port: int) -> bool:
-    """Whether a server on this machine accepts a connection to this address of it."""
-    try:
-        socket.create_connection((address, port), 2).close()
-    except OSError:
-        return False
-    return True
-
-
 def test_it_listens_on_loopback_alone(server):
-    others = ["127.0.0.2", "::1"]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+    def accepts(address: str, port: int) -> bool:
         try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing; the system chooses the address that faces the network
-            others.append(probe.getsockname()[0])
+            socket.create_connection((address, port), 2).close()
         except OSError:
-            pass  # no network here
-    assert answers("127.0.0.1", server.port)
-    table = Path("/proc/net/tcp")  # on Linux: 127.0.0.1 is 0100007F, and 0A is "listening"
-    if table.exists():
-        sockets = [line.split()[1:4:2] for line in table.read_text(encoding="ascii").splitlines()[1:]]
-        port = f":{server.port:04X}"
-        assert [at for at, state in sockets if at.endswith(port) and state == "0A"] == [f"0100007F{port}"]
-    assert not any(answers(address, server.port) for address in others)
+            return False
+        return True
+
+    others = ["127.0.0.2", "::1"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):  # no network here
+        probe.connect(("192.0.2.1", 9))  # sends nothing; the system chooses the address that faces the network
+        others.append(probe.getsockname()[0])
+    assert accepts("127.0.0.1", server.port) and not any(accepts(address, server.port) for address in others)
     with socket.create_server(("0.0.0.0", 0)) as everywhere:
-        assert any(answers(address, everywhere.getsockname()[1]) for address in others), "reachable"
+        assert any(accepts(address, everywhere.getsockname()[1]) for address in others), "reachable"
 
 
 # --------------------------------------------------------------------------------------------------
 # Independent clients
-
-
-def test_the_page_and_its_events(server, jpegs):
-    page = urllib.request.urlopen(f"http://127.0.0.1:{server.port}/", timeout=10).read().decode()
-    assert "http" not in page, "no outside host"
-    with Simulator(server.port) as simulator:
-        simulator.open()
-        simulator.drive(telemetry(jpegs[0], speed="8.5000"))
-        for query in ("", "?attention"):
-            with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/live{query}", timeout=10) as events:
-                event = next(line for line in events if line.startswith(b"data: "))
-            live = json.loads(event[6:])
-            time_stamp, _, speed, throttle, latency, _ = live["rows"][-1]
-            assert abs(time_stamp - time.time()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
-            assert live["image"].startswith("data:image/jpeg;base64,/9j/")
-
-
-@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
-def test_the_page_in_a_real_browser(server, jpegs, tmp_path):
-    sky = cv2.resize(cv2.imdecode(np.frombuffer(jpegs[0], np.uint8), cv2.IMREAD_COLOR), None, fx=2, fy=2)[:130]
-
-    def shows_the_sky() -> bool:
-        """Whether the page shows the camera's image, whose upper part has no line."""
-        page.screenshot(tmp_path / "page.png")
-        return cv2.matchTemplate(cv2.imread(f"{tmp_path}/page.png"), sky, cv2.TM_SQDIFF_NORMED).min() < 0.01
-
-    with Simulator(server.port) as simulator, chromium(tmp_path / "profile") as page:
-        simulator.open()
-        simulator.drive(telemetry(jpegs[0], speed="8.5000"))
-        page.look(800, 800)  # where the image is as wide as its pixels
-        page.open(f"http://127.0.0.1:{server.port}/")
-        page.wait(f"location.port == '{server.port}' && document.readyState == 'complete'")
-        page.until(shows_the_sky)
 
 
 CLIENT = """
@@ -336,14 +250,9 @@ def node_client(tmp_path_factory) -> Path:
     if not npm:
         pytest.skip("no node here")
     folder = tmp_path_factory.mktemp("node")
+    command = [npm, "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"]
     try:
-        subprocess.run(
-            [npm, "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"],
-            cwd=folder,
-            check=True,
-            timeout=40,
-            capture_output=True,
-        )
+        subprocess.run(command, cwd=folder, check=True, timeout=40, capture_output=True)
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
         pytest.skip("npm can't install socket.io-client here")
     (folder / "client.js").write_text(CLIENT, encoding="utf-8")
@@ -354,15 +263,8 @@ def node_client(tmp_path_factory) -> Path:
 def test_the_independent_client(server, node_client, jpegs, steering, transports):
     message = json.dumps(telemetry(jpegs[3], speed="9.0000"))
     (node_client / "telemetry.json").write_text(message, encoding="utf-8")
-    output = subprocess.run(
-        ["node", "client.js", str(server.port), json.dumps({"transports": transports}), "telemetry.json"],
-        cwd=node_client,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env=dict(os.environ),
-    ).stdout
-    session = json.loads(output)
+    command = ["node", "client.js", str(server.port), json.dumps({"transports": transports}), "telemetry.json"]
+    session = json.loads(subprocess.run(command, cwd=node_client, capture_output=True, timeout=60).stdout)
     assert session["answers"][0] == {"steering_angle": "0", "throttle": "0"} and session["data"] == {}
     for answer in session["answers"][1:]:
         assert np.float32(answer["steering_angle"]) == steering[3] and answer["throttle"] == "0"

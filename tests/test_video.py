@@ -17,30 +17,32 @@ import video
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.network.network import Network, save_model
 
-FILMED = "run.1.mp4: 10 frames at 60 frames/s\n"
+FIRST, SECOND = "2018_07_16_17_11_42_000.jpg", "2018_07_16_17_11_42_001.jpg"  # before those of `save`
 
 
-def red_frame(number: int, rows=160, columns=320) -> np.ndarray:
-    """A red frame whose brightness tells its number: BGR."""
+def red_frame(brightness: int, rows=160, columns=320) -> np.ndarray:
+    """A red frame, BGR."""
     frame = np.zeros((rows, columns, 3), np.uint8)
-    frame[..., 2] = 40 + 6 * number
+    frame[..., 2] = 40 + 6 * brightness
     return frame
 
 
-def save(folder: Path, count=30, gap=0.05, rows=160, columns=320, begin=datetime(2018, 7, 16, 17, 11, 43), first=0):
+def save(folder: Path, count: int, begin=datetime(2018, 7, 16, 17, 11, 43), rows=160, columns=320):
+    """Save frames at 20 frames/s, each brighter than the one before."""
     folder.mkdir(exist_ok=True)
-    for number in range(count):
-        name = (begin + timedelta(seconds=gap * number)).strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
-        cv2.imwrite(str(folder / f"{name}.jpg"), red_frame(first + number, rows, columns))
+    for index in range(count):
+        name = (begin + timedelta(seconds=0.05 * index)).strftime("%Y_%m_%d_%H_%M_%S_%f")[:-3]
+        cv2.imwrite(str(folder / f"{name}.jpg"), red_frame(index, rows, columns))
 
 
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
     """The command, in this process and in tmp_path: its exit status and what it says."""
 
-    def run(*arguments) -> tuple[int, str]:
+    def run(*arguments) -> tuple[object, str]:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", ["video.py", *arguments])
+        status: object
         try:
             status = video.main()
         except SystemExit as error:  # argparse's
@@ -52,13 +54,13 @@ def run(tmp_path, monkeypatch, capsys):
 
 def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
     capture, seen = cv2.VideoCapture(str(path)), []
-    while (frame := capture.read()[1]) is not None:
-        seen.append(frame)
+    while (read := capture.read())[0]:
+        seen.append(read[1])
     return capture.get(cv2.CAP_PROP_FPS), seen
 
 
 def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
-    save(tmp_path / "run1")
+    save(tmp_path / "run1", 30)
     result = warm.run(
         [sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
@@ -66,19 +68,19 @@ def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run1", "run1.mp4"]
     fps, seen = frames_of(tmp_path / "run1.mp4")
     assert fps == pytest.approx(20) and len(seen) == 30
-    for number, frame in enumerate(seen):
-        assert np.abs(frame.mean((0, 1)) - red_frame(number).mean((0, 1))).max() < 4, "in order, red still red"
+    for index, frame in enumerate(seen):
+        assert np.abs(frame.mean((0, 1)) - red_frame(index).mean((0, 1))).max() < 4, "in order, red still red"
     with av.open(str(tmp_path / "run1.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
 
 
-def test_odd_files_unreadable_frames_and_a_given_rate(run, tmp_path):
-    """Other files and unreadable frames are left out and reported; --fps is used."""
+def test_other_files_and_unreadable_frames_are_left_out_and_named(run, tmp_path):
     folder = tmp_path / "run.1"
     save(folder, 10)
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
-    assert run("run.1", "--fps", "60") == (0, FILMED + "video.py: left out, not frames: notes.txt\n")
+    filmed = "run.1.mp4: 10 frames at 60 frames/s\n"
+    assert run("run.1", "--fps", "60") == (0, filmed + "video.py: left out, not frames: notes.txt\n")
     save(folder, 1, rows=80, columns=160, begin=datetime(2018, 7, 16, 17, 11, 44))
     (folder / "2018_07_16_17_11_44_900.jpg").write_bytes(b"")
     whole = (folder / "2018_07_16_17_11_43_000.jpg").read_bytes()
@@ -92,11 +94,10 @@ def test_odd_files_unreadable_frames_and_a_given_rate(run, tmp_path):
     assert {frame.shape for frame in seen} == {(160, 320, 3)}
 
 
-@pytest.mark.parametrize("rows, columns", [(1, 1), (1, 320), (160, 1), (2_000, 2_000)])
+@pytest.mark.parametrize("rows, columns", [(1, 1), (160, 1), (2_000, 2_000)])
 def test_a_first_frame_of_another_size_is_left_out(run, tmp_path, rows, columns):
     save(tmp_path / "run1", 3)
-    first = tmp_path / "run1" / "2018_07_16_17_11_42_000.jpg"
-    cv2.imwrite(str(first), np.zeros((rows, columns, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "run1" / FIRST), np.zeros((rows, columns, 3), np.uint8))
     status, printed = run("run1")
     assert status == 1 and f"(the first: {columns}x{rows} pixels" in printed
     assert len(frames_of(tmp_path / "run1.mp4")[1]) == 3
@@ -105,15 +106,14 @@ def test_a_first_frame_of_another_size_is_left_out(run, tmp_path, rows, columns)
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pipes in folders")
 def test_what_is_only_named_like_a_frame(run, tmp_path):
     """A lost frame behind a link counts as unreadable; a folder and a pipe are no frames; nothing waits for them."""
-    folder = tmp_path / "run1"
+    folder, third = tmp_path / "run1", "2018_07_16_17_11_42_002.jpg"
     save(folder, 3)
-    (folder / "2018_07_16_17_11_42_000.jpg").symlink_to(tmp_path / "gone.jpg")
-    (folder / "2018_07_16_17_11_42_001.jpg").mkdir()
-    os.mkfifo(folder / "2018_07_16_17_11_42_002.jpg")
+    (folder / FIRST).symlink_to(tmp_path / "gone.jpg")
+    (folder / SECOND).mkdir()
+    os.mkfifo(folder / third)
     status, printed = run("run1")
-    assert status == 1
-    assert "left out, not frames: 2018_07_16_17_11_42_001.jpg, 2018_07_16_17_11_42_002.jpg\n" in printed
-    assert "unreadable (the first: No such file or directory): 2018_07_16_17_11_42_000.jpg\n" in printed
+    assert status == 1 and f"left out, not frames: {SECOND}, {third}\n" in printed
+    assert f"unreadable (the first: No such file or directory): {FIRST}\n" in printed
 
 
 def test_a_film_that_cannot_be_written(run, tmp_path, monkeypatch):
@@ -130,26 +130,6 @@ def test_a_film_that_cannot_be_written(run, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["run1"]
 
 
-def test_odd_sizes_lose_a_row_and_a_column(tmp_path):
-    writer = FilmWriter(tmp_path / "odd.mp4", 15)
-    writer.add(red_frame(0, 121, 161))
-    writer.close()
-    assert frames_of(tmp_path / "odd.mp4")[1][0].shape == (120, 160, 3)
-
-
-@pytest.mark.parametrize(
-    "name, content, printed",
-    [(None, None, "no such folder"), ("notes.txt", b"", "no frames"), ("2018_07_16_17_11_43_382.jpg", b"", "readable")],
-)
-def test_no_film_is_a_clear_error(run, tmp_path, name, content, printed):
-    if name:
-        (tmp_path / "run1").mkdir()
-        (tmp_path / "run1" / name).write_bytes(content)
-    status, error = run("run1")
-    assert status == 2 and printed in error
-    assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
-
-
 @pytest.mark.parametrize("room", [0, 1000])
 def test_a_full_disk_is_a_clear_error_and_leaves_nothing(run, tmp_path, room):
     resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
@@ -164,11 +144,29 @@ def test_a_full_disk_is_a_clear_error_and_leaves_nothing(run, tmp_path, room):
     assert [path.name for path in tmp_path.iterdir()] == ["run1"]
 
 
+def test_odd_sizes_lose_a_row_and_a_column(tmp_path):
+    writer = FilmWriter(tmp_path / "odd.mp4", 15)
+    writer.add(red_frame(0, 121, 161))
+    writer.close()
+    assert frames_of(tmp_path / "odd.mp4")[1][0].shape == (120, 160, 3)
+
+
+@pytest.mark.parametrize(
+    "name, words", [(None, "no such folder"), ("notes.txt", "no frames"), (FIRST, "none of its 1 frames is readable")]
+)
+def test_no_film_is_a_clear_error(run, tmp_path, name, words):
+    if name:
+        (tmp_path / "run1").mkdir()
+        (tmp_path / "run1" / name).write_bytes(b"")
+    status, error = run("run1")
+    assert status == 2 and words in error
+    assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
+
+
 @pytest.mark.parametrize(
     "fps", ["0", "-5", "fast", "nan", "inf", "1/0", "0/0", "1/", "1e-9", "1e300", "1e-999999999", "1000.1", "1/1/1", ""]
 )
-def test_an_impossible_rate_is_refused(run, tmp_path, fps):
-    save(tmp_path / "run1", 2)
+def test_an_impossible_rate_is_refused(run, fps):
     status, printed = run("run1", f"--fps={fps}")
     assert status == 2 and "--fps" in printed and "a finite number of at least 0.01 and at most 1000" in printed
 
@@ -178,7 +176,8 @@ def test_a_possible_rate_is_that_of_the_film(run, tmp_path, fps, filmed):
     save(tmp_path / "run1", 3)
     assert run("run1", "--fps", fps)[0] == 0
     with av.open(str(tmp_path / "run1.mp4")) as container:
-        assert float(container.streams.video[0].average_rate) == pytest.approx(filmed)
+        rate = container.streams.video[0].average_rate
+    assert rate is not None and float(rate) == pytest.approx(filmed)
 
 
 def test_a_pause_and_bunches_leave_the_rate_alone():
@@ -193,7 +192,8 @@ def test_a_pause_and_bunches_leave_the_rate_alone():
 def test_the_overlay_draws_steering_and_attention(run, tmp_path):
     torch.manual_seed(0)
     network = Network()
-    torch.nn.init.constant_(network.dense[-1].bias, -0.3)
+    layers = dict(network.named_parameters())
+    torch.nn.init.constant_(layers["dense.3.bias"], -0.3)
     save_model(tmp_path / "model.pt", network)
     save(tmp_path / "run1", 3)
     assert run("run1", "--overlay", "model.pt")[0] == 0
@@ -201,11 +201,9 @@ def test_the_overlay_draws_steering_and_attention(run, tmp_path):
     assert frame.shape == (320, 640, 3)
     green = (frame[..., 1] > 150).nonzero()[1]
     assert len(green) > 200 and green.min() < 280 and green.max() < 330, "the line bends to the left"
-    save(tmp_path / "small", 3, rows=80, columns=160)
-    assert "320x160" in run("small", "--overlay", "model.pt")[1]
     assert "video.py: none.pt: no such file" in run("run1", "--overlay", "none.pt")[1]
-    torch.nn.init.constant_(network.dense[-2].bias, 10.0)
-    torch.nn.init.constant_(network.dense[-1].weight, 3e38)
+    torch.nn.init.constant_(layers["dense.2.bias"], 10.0)
+    torch.nn.init.constant_(layers["dense.3.weight"], 3e38)
     save_model(tmp_path / "broken.pt", network)
     printed = run("run1", "--overlay", "broken.pt")[1]
     assert "video.py: broken.pt: the network's steering is not finite; train the model again" in printed

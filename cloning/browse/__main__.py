@@ -9,7 +9,6 @@ A cut is a line in excluded.csv beside the recording's driving_log.csv, which is
 """
 
 import argparse
-import sys
 from pathlib import Path
 
 from cloning.base import program
@@ -20,15 +19,10 @@ if __name__ == "__main__":
 from cloning.base.arguments import MAX_PORT, number
 from cloning.base.errors import UserError
 from cloning.browse.library import Library
+from cloning.browse.page import create_app
 from cloning.browse.runs import Runs
 from cloning.recordings.log import find_folders
-
-try:
-    from cloning.browse.page import create_app
-    from cloning.server import connections
-    from cloning.server.server import refuse_other_sites
-except UserError as error:  # wrong versions of the socket libraries
-    sys.exit(program.failed("browse", error))
+from cloning.server.versions import check_versions
 
 HOST, PORT = "127.0.0.1", 4568  # this machine only; next to the port of drive.py
 
@@ -41,25 +35,14 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="Exit status: 0 after Ctrl-C, 2 if the server could not start.",
     )
-    parser.add_argument(
-        "recordings", nargs="*", help="recordings, or folders of recordings (default: data)", metavar="FOLDER"
-    )
-    parser.add_argument(
-        "--model", nargs="+", type=Path, default=[], metavar="model.pt", help="show the steering of these models"
-    )
-    parser.add_argument(
-        "--run",
-        nargs="+",
-        type=Path,
-        metavar="FOLDER",
-        help="folders into which model.py writes (default: the current one); alone, without recordings",
-    )
-    parser.add_argument(
-        "--port",
-        type=number(int, 0, MAX_PORT),
-        default=PORT,
-        help="port to listen on, on this machine only (default %(default)s; 0: any free one)",
-    )
+    add = parser.add_argument
+    add("recordings", nargs="*", metavar="FOLDER", help="recordings, or folders of recordings (default: data)")
+    models = "show the steering of these models"
+    add("--model", nargs="+", type=Path, default=[], metavar="model.pt", help=models)
+    runs = "folders into which model.py writes (default: the current one); alone, without recordings"
+    add("--run", nargs="+", type=Path, metavar="FOLDER", help=runs)
+    port = "port to listen on, on this machine only (default %(default)s; 0: any free one)"
+    add("--port", type=number(int, 0, MAX_PORT), default=PORT, help=port)
     return parser.parse_intermixed_args(arguments)
 
 
@@ -67,6 +50,9 @@ def main() -> int:
     """Serve the page until Ctrl-C; return the exit status."""
     arguments = parse_arguments()
     try:
+        check_versions()
+        from cloning.server import connections  # with some other versions of the libraries, it cannot be imported
+
         folders = find_folders(arguments.recordings or ["data"]) if arguments.recordings or not arguments.run else []
         for model in arguments.model:
             if not model.is_file():
@@ -84,7 +70,7 @@ def main() -> int:
         flush=True,
     )
     try:
-        connections.serve_until_stopped(listener, refuse_other_sites(create_app(library, runs)))
+        connections.serve_until_stopped(listener, create_app(library, runs))
     finally:
         library.close()
     return program.DONE

@@ -1,6 +1,6 @@
 """Analyse each row of a recording: where the car is on the road, or how a model steers or drives; see `analyses.py`.
 
-python -m cloning.browse.analyse RECORDING lane                 # lateral offset, and the place on a known track
+python -m cloning.browse.analyse RECORDING lane                 # lateral offset, and the position on a known track
 python -m cloning.browse.analyse RECORDING steering model.pt    # the model's steering
 python -m cloning.browse.analyse RECORDING replay model.pt 1    # a drive with the model as the driver, at 1 m
 """
@@ -10,6 +10,7 @@ import copy
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from cloning.base import program
@@ -69,33 +70,30 @@ def lane(recording: Recording) -> Result:
     """Return the columns offset (m, right positive), x and y (m, where the track is known), road, and the tracks.
 
     road is an index into about["roads"], -1 where the track is not known; offset is nan where it is not trusted. A
-    `lane.csv` tells the offset, but not the track.
+    `lane.csv` has the offset, but not the track.
     """
-    n = len(recording)
     known = known_position(recording)  # first, since the rest takes long
 
     def detect(network: LaneNetwork) -> np.ndarray:
         of_parts = [detect_centres(part, network) for part in parts(recording)]
         return np.concatenate(of_parts or [np.empty((0, 3, 5), np.float32)])
 
-    def strips(rows: slice) -> np.ndarray:
-        return read_strips(recording, rows)
-
+    strips = partial(read_strips, recording)
     position, localised = localise_recording(recording, stretches(recording), detect, strips, shipped_networks())
     position = known or position
-    x, y = np.full((2, n), np.nan, np.float32)
-    road, roads = np.full(n, -1, np.float32), []
+    x, y = np.full((2, len(recording)), np.nan, np.float32)
+    road, roads = np.full(len(recording), -1, np.float32), []
     for rows, localisation in localised:
         track = localisation.track
         found = {"name": track.name, "direction": track.direction, "outline": track.points[:, :2].round(1).tolist()}
         if found not in roads:
             roads.append(found)
         road[rows] = roads.index(found)
-        places = [track.at(s, right) for s, right, _ in localisation.states.tolist()]
-        x[rows], y[rows] = np.array([(at.x, at.y) for at in places]).T
+        poses = [track.at(s, right) for s, right, _ in localisation.states.tolist()]
+        x[rows], y[rows] = np.array([(pose.x, pose.y) for pose in poses]).T
     offset = np.where(position.trusted, position.lateral_offset, np.nan).astype(np.float32)
-    about = {"roads": roads, "longest": max(map(len, stretches(recording)), default=0)}
-    return Result(recording.images[:, 0], {"offset": offset, "x": x, "y": y, "road": road}, about | rejected(recording))
+    columns = {"offset": offset, "x": x, "y": y, "road": road}
+    return Result(recording.images[:, 0], columns, {"roads": roads} | rejected(recording))
 
 
 def steering(recording: Recording, model: str) -> Result:
@@ -120,8 +118,8 @@ def replayed(recording: Recording, analysis: Analysis) -> Result:
     """Return how a model drives; see `cloning.replay.replay` and `Drive`. Raises UserError.
 
     The columns are offset and human, the cars' lateral offset in m from the reference line, right positive; right and
-    yaw, the pose of `ReplayedCar`; steering, the model's, -1..1; line, the number of the reference line. about has the
-    metrics, and the interventions as [place in the columns, offset in m].
+    yaw, the pose of `ReplayedCar`; steering, the model's, -1..1; line, the index of the reference line. about has the
+    metrics, and the interventions as [index in the columns, offset in m].
     """
     one_thread()
     lines = reference_lines(recording)

@@ -1,4 +1,4 @@
-"""Slow analyses of recordings: the place on the road, and how models steer and drive; each in a process of its own.
+"""Slow analyses of recordings: where the car is, and how models steer and drive; each in a process of its own.
 
 A process takes its memory along when it ends, and leaves its result in the user's cache folder, where it stays until
 the recording changes. `analyse.py` is what runs in it.
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, message_of
 from cloning.base.files import written_whole
 from cloning.recordings.check import cache_file
 from cloning.recordings.excluded import read_cuts
@@ -47,6 +47,7 @@ class Analysis:
 
 
 LANE = Analysis("lane")
+Job = tuple[Path, Analysis]  # a recording's folder, and what is analysed in it
 
 
 @dataclass(frozen=True)
@@ -79,8 +80,7 @@ def stamp(folder: Path, analysis: Analysis) -> str:
     images or the model is gone, and if a replay cannot read the cuts.
     """
     paths = [folder / DRIVING_LOG, folder / IMAGE_FOLDER, *[Path(analysis.model)] * bool(analysis.model)]
-    if (folder / LANE_FILE).exists():
-        paths.append(folder / LANE_FILE)
+    paths += [folder / LANE_FILE] * (folder / LANE_FILE).exists()
     cuts = f" {[(cut.first, cut.last) for cut in read_cuts(folder)]}" if analysis.kind == "replay" else ""
     return f"{RULES} {[file_stamp(path) for path in paths]}{cuts}"
 
@@ -102,12 +102,12 @@ def result_file(folder: Path, analysis: Analysis) -> Path:
     return cache_file(folder, name)
 
 
-def write_result(folder: Path, analysis: Analysis, of: str, result: Result) -> None:
-    """Write the result of an analysis; of: the `stamp` from before the analysis. Raises OSError."""
+def write_result(folder: Path, analysis: Analysis, before: str, result: Result) -> None:
+    """Write the result of an analysis; before: the `stamp` from before the analysis. Raises OSError."""
     file = result_file(folder, analysis)
     file.parent.mkdir(parents=True, exist_ok=True)
     names, columns = list(result.columns), np.array(list(result.columns.values()), np.float32)
-    about = np.frombuffer(json.dumps({"stamp": of, "columns": names, **result.about}).encode(), np.uint8)
+    about = np.frombuffer(json.dumps({"stamp": before, "columns": names, **result.about}).encode(), np.uint8)
     with written_whole(file) as temporary, open(temporary, "wb") as opened:
         np.savez(opened, about=about, images=result.images, columns=columns)
 
@@ -119,7 +119,7 @@ def read_result(folder: Path, analysis: Analysis) -> Result | None:
         with np.load(result_file(folder, analysis)) as file:
             about, images, columns = json.loads(file["about"].tobytes()), file["images"], file["columns"]
         named = dict(zip(about["columns"], columns, strict=True))
-    except Exception:  # there is no file yet, or a damaged one, of whatever kind: the analysis replaces it
+    except Exception:  # there is no file yet, or a damaged one, in whatever way: the analysis replaces it
         return None
     return Result(images, named, about) if about["stamp"] == wanted else None
 
@@ -128,18 +128,18 @@ class Analyses:
     """Runs the analyses that are asked for, one after the other, the smallest recording first, and replays last."""
 
     def __init__(self) -> None:
-        """Begin with nothing to do."""
-        self.waiting: dict[tuple[Path, Analysis], int] = {}  # -> size of the log, bytes
+        self.waiting: dict[Job, int] = {}  # -> size of the log, bytes
         self.urgent: Path | None = None  # the folder whose analyses go before all others
-        self.failed: dict[tuple[Path, Analysis, str], str] = {}  # folder, analysis, stamp -> message
-        self.ready: set[tuple[Path, Analysis, str]] = set()  # folder, analysis, stamp
-        self.running: tuple[Path, Analysis] | None = None
+        self.failed: dict[tuple[Job, str], str] = {}  # job, stamp -> message
+        self.ready: set[tuple[Job, str]] = set()  # job, stamp
+        self.running: Job | None = None
         self.progress = 0.0
         self.process: subprocess.Popen[str] | None = None
         self.changed = threading.Condition()
-        self.ended = False  # the process, before it was done, by `stop` or `close`
+        self.ended = False  # the running analysis, before it was done, by `stop` or `close`
         self.closed = False
         self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
 
     def state(self, folder: Path, analysis: Analysis, begin: bool = True) -> dict[str, Any]:
         """Return how far an analysis is, for the page: {"state", "progress" or "message"}.
@@ -147,28 +147,27 @@ class Analyses:
         The states are ready, running, waiting, failed and, if it is not to begin now and nobody asked for it, none.
         Raises RecordingError as `stamp` does.
         """
-        now = folder, analysis, stamp(folder, analysis)
+        job = folder, analysis
+        now = job, stamp(*job)
         with self.changed:
             if now in self.failed:
                 return {"state": "failed", "message": self.failed[now]}
-            if (now in self.ready and result_file(folder, analysis).exists()) or read_result(folder, analysis):
+            if (now in self.ready and result_file(*job).exists()) or read_result(*job):
                 self.ready.add(now)
                 return {"state": "ready"}
-            if self.running == (folder, analysis):
+            if self.running == job:
                 return {"state": "running", "progress": self.progress}
-            if (folder, analysis) not in self.waiting:
+            if job not in self.waiting:
                 if not begin:
                     return {"state": "none"}
-                self.waiting[folder, analysis] = file_stamp(folder / DRIVING_LOG)[0]
-                if not self.thread.is_alive():
-                    self.thread.start()
+                self.waiting[job] = file_stamp(folder / DRIVING_LOG)[0]
                 self.changed.notify()
         return {"state": "waiting"}
 
     def retry(self, folder: Path, analysis: Analysis) -> None:
         """Begin an analysis again that has failed. Raises RecordingError as `stamp` does."""
         with self.changed:
-            self.failed.pop((folder, analysis, stamp(folder, analysis)), None)
+            self.failed.pop(((folder, analysis), stamp(folder, analysis)), None)
         self.state(folder, analysis)
 
     def stop(self, folder: Path, analysis: Analysis) -> None:
@@ -178,54 +177,63 @@ class Analyses:
             if self.running == (folder, analysis):
                 self._end()
 
-    def hurry(self, folder: Path) -> None:
-        """Put a recording's analyses before all others that wait."""
-        self.urgent = folder
-
     def close(self) -> None:
-        """End the analysis that runs, if one does."""
+        """End the analysis that runs, if one does, and begin no other."""
         with self.changed:
             self.closed = True
             self.changed.notify()
             self._end()
-        if self.thread.is_alive():
-            self.thread.join()
+        self.thread.join()
 
     def _end(self) -> None:
         self.ended = True
         if self.process:
             self.process.kill()  # its result is whole or not there
 
-    def _order(self, waiting: tuple[Path, Analysis]) -> tuple[bool, bool, int]:
+    def _order(self, job: Job) -> tuple[bool, bool, int]:
         """Return what is least for the analysis to run next."""
-        folder, analysis = waiting
-        return folder != self.urgent, analysis.kind == "replay", self.waiting[waiting]
+        folder, analysis = job
+        return folder != self.urgent, analysis.kind == "replay", self.waiting[job]
 
     def _run(self) -> None:
-        while True:
-            with self.changed:
-                while not (self.waiting or self.closed):
-                    self.changed.wait()
-                if self.closed:
-                    return
-                self.running = folder, analysis = min(self.waiting, key=self._order)
-                self.progress, self.ended = 0.0, False
-                del self.waiting[self.running]
-                command, pipe = [*COMMAND, str(folder), *analysis.arguments()], subprocess.PIPE
-                self.process = subprocess.Popen(
-                    command, stdout=pipe, stderr=subprocess.STDOUT, text=True, errors="replace"
-                )
-            before, message = "", "was ended"
+        while job := self._next():
+            before = ""
             with contextlib.suppress(RecordingError):
-                before = stamp(folder, analysis)
-            with self.process:
-                assert self.process.stdout
-                for line in self.process.stdout:
-                    if line.startswith(PROGRESS):
-                        self.progress = float(line.removeprefix(PROGRESS))
-                    elif line.strip():
-                        message = line.strip()
+                before = stamp(*job)
+            try:
+                message = self._analyse(*job)
+            except OSError as error:
+                message = f"its process cannot be started: {message_of(error)}"
             with self.changed:
-                if self.process.returncode and not self.ended:
-                    self.failed[folder, analysis, before] = message
+                if message and not self.ended:
+                    self.failed[job, before] = message
                 self.process = self.running = None
+
+    def _next(self) -> Job | None:
+        """Wait for an analysis to do, and return it as the running one; None at the end."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.waiting or self.closed)
+            if self.closed:
+                return None
+            self.running, self.progress, self.ended = min(self.waiting, key=self._order), 0.0, False
+            del self.waiting[self.running]
+            return self.running
+
+    def _analyse(self, folder: Path, analysis: Analysis) -> str:
+        """Run the process of an analysis; return why it failed, "" if it did not. Raises OSError."""
+        with self.changed:
+            if self.ended:
+                return ""
+            command = [*COMMAND, str(folder), *analysis.arguments()]
+            self.process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+            )
+        message = "was ended"
+        with self.process as process:
+            assert process.stdout
+            for line in process.stdout:
+                if line.startswith(PROGRESS):
+                    self.progress = float(line.removeprefix(PROGRESS))
+                elif line.strip():
+                    message = line.strip()
+        return message if process.returncode else ""

@@ -1,6 +1,5 @@
 """Compute what models look at on frames, as pictures to lay over them; `attention.py` asks for them over a pipe."""
 
-import json
 import os
 import signal
 import sys
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 
 from cloning.base.errors import ModelError, UserError, message_of
+from cloning.browse.attention import receive, send
 from cloning.network.attention import visual_backprop
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
@@ -25,7 +25,7 @@ IDLE = 120.0  # s without a question after which the process ends, and frees its
 
 
 def main() -> None:
-    """Answer {"model", "bytes"} and a JPEG with {"message", "bytes"} and a PNG, until stdin ends, or IDLE seconds."""
+    """Answer each JPEG and model's file with a message and a PNG, until stdin ends, or for IDLE seconds."""
     if hasattr(os, "nice"):
         os.nice(10)  # the page, and whatever else the user does, goes first
     torch.set_num_threads(1)
@@ -33,20 +33,19 @@ def main() -> None:
         idle = threading.Timer(IDLE, os._exit, [0])
         idle.daemon = True
         idle.start()
-        line = sys.stdin.buffer.readline()
-        idle.cancel()
-        if not line:
-            return
-        asked = json.loads(line)
-        jpeg, message, png = sys.stdin.buffer.read(asked["bytes"]), "", b""
         try:
-            png = picture(jpeg, asked["model"])
+            jpeg, model = receive(sys.stdin.buffer)
+        except EOFError:
+            return
+        idle.cancel()
+        message, png = "", b""
+        try:
+            png = picture(jpeg, os.fsdecode(model))
         except (UserError, OSError) as error:
             message = message_of(error)
         except ValueError as error:
             message = f"the picture is unusable: {error}"
-        sys.stdout.buffer.write(json.dumps({"message": message, "bytes": len(png)}).encode() + b"\n" + png)
-        sys.stdout.buffer.flush()
+        send(sys.stdout.buffer, message.encode(errors="replace"), png)
 
 
 def picture(jpeg: bytes, model: str) -> bytes:

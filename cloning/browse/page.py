@@ -11,7 +11,6 @@ from cloning.browse.replays import NotReplayedError
 from cloning.browse.runs import Runs
 from cloning.road.autonomy import LIMITS
 from cloning.server import site
-from cloning.server.libraries import eventlet
 
 KEPT = 600  # s for which a browser does not ask again for a frame
 
@@ -27,6 +26,8 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/runs` and `/runs/N` tell
     of training runs, and `/runs/N/NAME` is a picture of one. An error is {"message"}.
     """
+    from cloning.server.libraries import eventlet  # here, because its version is checked first
+
     app = flask.Flask(__name__)
     site.prepare(app, "img-src 'self' data:")
 
@@ -47,78 +48,69 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/recordings")
     def recordings() -> list[dict[str, str]]:
-        return [{"id": identifier, "folder": str(folder)} for identifier, folder in library.folders.items()]
+        return [{"id": identifier, "folder": str(folder)} for identifier, folder in library.recordings.items()]
 
     @app.get("/recordings/<identifier>/overview")
     def overview(identifier: str) -> dict[str, Any]:
-        return library.overview(identifier)
+        return library[identifier].overview()
 
     @app.get("/recordings/<identifier>/details")
     def details(identifier: str) -> dict[str, Any]:
-        return library.details(identifier, limit_asked())
+        return library[identifier].details(limit())
 
-    @app.post("/recordings/<identifier>/replays/<limit>")
+    @app.route("/recordings/<identifier>/replays/<limit>", methods=["POST", "DELETE"])
     def replay(identifier: str, limit: str) -> dict[str, Any]:
-        library.replay(identifier, limit, begin=True)
-        return library.details(identifier, limit)
-
-    @app.delete("/recordings/<identifier>/replays/<limit>")
-    def stop_replay(identifier: str, limit: str) -> dict[str, Any]:
-        library.replay(identifier, limit, begin=False)
-        return library.details(identifier, limit)
+        library[identifier].replay(limit, begin=flask.request.method == "POST")
+        return library[identifier].details(limit)
 
     @app.get("/recordings/<identifier>/columns/<name>")
     def column(identifier: str, name: str) -> flask.Response:
-        values = library.column(identifier, name, version())
+        values = library[identifier].column(name, version())
         return flask.Response(np.ascontiguousarray(values, "<f4").tobytes(), mimetype="application/octet-stream")
 
     @app.post("/recordings/<identifier>/columns/<name>")
     def retry(identifier: str, name: str) -> dict[str, Any]:
-        library.retry(identifier, name)
-        return library.details(identifier, limit_asked())
+        library[identifier].retry(name)
+        return library[identifier].details(limit())
 
     @app.get("/recordings/<identifier>/rows/<int:row>")
     def row(identifier: str, row: int) -> dict[str, Any]:
-        return library.row(identifier, row, version())
+        return library[identifier].row(row, version())
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>.jpg")
     def frame(identifier: str, row: int, picture: str) -> flask.Response:
-        return kept(library.jpeg(identifier, row, picture, version(), with_path=True), "image/jpeg")
+        return kept(library[identifier].jpeg(row, picture, version(), with_path=True), "image/jpeg")
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/<int:model>.png")
     def attention(identifier: str, row: int, picture: str, model: int) -> flask.Response:
-        jpeg = library.jpeg(identifier, row, picture, version())
+        jpeg = library[identifier].jpeg(row, picture, version())
         # In a thread, so that others are answered meanwhile.
         return kept(eventlet.tpool.execute(library.attention.png, jpeg, library.model(model)), "image/png")
 
-    @app.post("/recordings/<identifier>/cuts")
+    @app.route("/recordings/<identifier>/cuts", methods=["POST", "DELETE"])
     def cut(identifier: str) -> dict[str, Any]:
-        changed = library.cut(identifier, **stretch())
-        return library.details(identifier, limit_asked()) | {"changed": changed}
-
-    @app.delete("/recordings/<identifier>/cuts")
-    def restore(identifier: str) -> dict[str, Any]:
-        changed = library.restore(identifier, **stretch())
-        return library.details(identifier, limit_asked()) | {"changed": changed}
+        change = library[identifier].cut if flask.request.method == "POST" else library[identifier].restore
+        changed = change(**stretch())
+        return library[identifier].details(limit()) | {"changed": changed}
 
     @app.get("/runs")
     def found() -> list[dict[str, Any]]:
         return runs.found()
 
-    @app.get("/runs/<int:number>")
-    def run(number: int) -> dict[str, Any]:
-        return runs.run(number)
+    @app.get("/runs/<int:index>")
+    def run(index: int) -> dict[str, Any]:
+        return runs.run(index)
 
-    @app.get("/runs/<int:number>/<name>")
-    def run_picture(number: int, name: str) -> flask.Response:
-        return kept(runs.picture(number, name), "image/png")
+    @app.get("/runs/<int:index>/<name>")
+    def run_picture(index: int, name: str) -> flask.Response:
+        return kept(runs.picture(index, name), "image/png")
 
     return app
 
 
-def kept(picture: bytes, kind: str) -> flask.Response:
-    """Return an answer that a browser keeps for KEPT seconds; kind: its MIME type."""
-    response = flask.Response(picture, mimetype=kind)
+def kept(picture: bytes, mime_type: str) -> flask.Response:
+    """Return an answer that a browser keeps for KEPT seconds."""
+    response = flask.Response(picture, mimetype=mime_type)
     response.headers["Cache-Control"] = f"private, max-age={KEPT}"
     response.add_etag()
     response.make_conditional(flask.request)
@@ -130,7 +122,7 @@ def version() -> str | None:
     return flask.request.args.get("version")
 
 
-def limit_asked() -> str | None:
+def limit() -> str | None:
     """Return the limit of the replays that the request is about."""
     return flask.request.args.get("limit")
 
@@ -138,7 +130,7 @@ def limit_asked() -> str | None:
 def stretch() -> dict[str, str]:
     """Return the request's cut: {"first", "last", "reason"}. Ends the request with 400 if it has none."""
     body = flask.request.get_json()
-    names = ("first", "last", "reason")
-    if not isinstance(body, dict) or set(body) != set(names) or any(type(body[name]) is not str for name in names):
+    names = {"first", "last", "reason"}
+    if not isinstance(body, dict) or set(body) != names or any(type(text) is not str for text in body.values()):
         flask.abort(400, "A cut is a JSON object with the texts first, last and reason.")
-    return {name: body[name] for name in names}
+    return body

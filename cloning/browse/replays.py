@@ -20,7 +20,7 @@ class NotReplayedError(UserError):
 
 
 def rows_driven(result: Result, centres: np.ndarray) -> np.ndarray:
-    """Return the recording's row of each place in the result's columns: int64 (k,).
+    """Return the recording's row of each value in the result's columns: int64 (k,).
 
     centres: int32 (n,), the rows' centre images. Of rows with the same one, which are copies, it is the first.
     """
@@ -32,29 +32,36 @@ def rows_driven(result: Result, centres: np.ndarray) -> np.ndarray:
 def figures(result: Result, centres: np.ndarray) -> dict[str, Any]:
     """Return a replay's metrics, and its interventions as [row, offset in m]; centres: as in `rows_driven`."""
     rows = rows_driven(result, centres)
-    where = [[int(rows[at]), metres] for at, metres in result.about["where"]]
+    where = [[int(rows[index]), metres] for index, metres in result.about["where"]]
     return {**result.about, "where": where, "driven": len(rows)}
+
+
+def index_of(result: Result, image: int) -> int:
+    """Return the index of a centre image in the result's columns. Raises NotReplayedError."""
+    indices = np.flatnonzero(result.images == image)
+    if not len(indices):
+        raise NotReplayedError("not replayed here: cut, an unusable image, off the road, or standing")
+    return int(indices[-1])
 
 
 class LineViews:
     """The views from the replayed car along one reference line, as the model saw them."""
 
     def __init__(self, recording: Recording, result: Result, line: int):
-        """line: its number in the result."""
-        places = np.flatnonzero(result.columns["line"] == line)
+        """line: its index among the reference lines."""
+        indices = np.flatnonzero(result.columns["line"] == line)
         part = copy.copy(recording)
-        part.keep(rows_driven(result, recording.images[:, 0])[places])
+        part.keep(rows_driven(result, recording.images[:, 0])[indices])
         self.views = StretchViews(part, Stretch.of(part, slice(0, len(part))))
-        self.right, self.yaw = result.columns["right"][places], result.columns["yaw"][places]
-        self.steering = result.columns["steering"][places]
-        self.first = int(places[0])
+        self.right, self.yaw, self.steering = (result.columns[name][indices] for name in ("right", "yaw", "steering"))
+        self.first = int(indices[0])
 
-    def jpeg(self, place: int, with_path: bool) -> bytes:
-        """Return the view at a place in the result's columns; at the human driver's pose, the recorded file itself.
+    def jpeg(self, index: int, with_path: bool) -> bytes:
+        """Return the view at an index of the result's columns; at the human driver's pose, the recorded file itself.
 
         with_path: draw the path ahead at the model's steering. Raises RecordingError if an image became unusable.
         """
-        at = place - self.first
+        at = index - self.first
         pose = float(self.right[at]), float(self.yaw[at])
         if not (any(pose) or with_path):
             return self.views.jpeg(at)
@@ -62,11 +69,3 @@ class LineViews:
         if with_path:
             draw_path(view, float(self.steering[at]))
         return encode(view, VIEW_JPEG_QUALITY)
-
-
-def place_of(result: Result, image: int) -> int:
-    """Return the place of a centre image in the result's columns. Raises NotReplayedError."""
-    places = np.flatnonzero(result.images == image)
-    if not len(places):
-        raise NotReplayedError("not replayed here: cut, an unusable image, off the road, or standing")
-    return int(places[-1])

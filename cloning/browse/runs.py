@@ -25,7 +25,7 @@ class RunError(UserError):
 
 
 class Runs:
-    """The runs in the given folders, by their number."""
+    """The runs in the given folders, each by its index."""
 
     def __init__(self, folders: list[Path]):
         """folders: into which model.py writes, or may later."""
@@ -34,23 +34,23 @@ class Runs:
     def found(self) -> list[dict[str, Any]]:
         """Return what the list shows of each run that has begun; {"message"} instead of figures if it can't be read."""
         shown = []
-        for number, files in enumerate(self.files):
+        for index, files in enumerate(self.files):
             if files.arguments.exists():
-                name: dict[str, Any] = {"id": number, "folder": str(files.last.parent.resolve())}
+                name: dict[str, Any] = {"id": index, "folder": str(files.last.parent.resolve())}
                 try:
                     shown.append(name | {key: value for key, value in overview(files).items() if key != "pictures"})
                 except (UserError, OSError) as error:
                     shown.append(name | {"message": message_of(error)})
         return shown
 
-    def run(self, number: int) -> dict[str, Any]:
+    def run(self, index: int) -> dict[str, Any]:
         """Return what the page shows of a run. Raises UnknownError, RunError, OSError."""
-        files = self._files(number)
-        return {"id": number, "folder": str(files.last.parent.resolve()), **overview(files)}
+        files = self._files(index)
+        return {"id": index, "folder": str(files.last.parent.resolve()), **overview(files)}
 
-    def picture(self, number: int, name: str) -> bytes:
+    def picture(self, index: int, name: str) -> bytes:
         """Return a diagnostic picture, a PNG. Raises UnknownError, RunError, OSError."""
-        files = self._files(number)
+        files = self._files(index)
         path = files.pictures / name
         if not (PICTURE.fullmatch(name) and path.is_file()):
             raise UnknownError(f"no picture {name[:60]}")
@@ -59,10 +59,10 @@ class Runs:
             raise RunError(f"{path}: not a PNG")
         return png
 
-    def _files(self, number: int) -> RunFiles:
-        if number >= len(self.files):
-            raise UnknownError(f"no run {number} here; go back to the list")
-        return self.files[number]
+    def _files(self, index: int) -> RunFiles:
+        if index >= len(self.files):
+            raise UnknownError(f"no run {index} here; go back to the list")
+        return self.files[index]
 
 
 def overview(files: RunFiles) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the page shows of a whole recording: its figures at a glance, and the places worth watching."""
+"""What the page shows of a whole recording: its figures at a glance, and the rows worth watching."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from cloning.road.motion import MAX_GAP
 BINS = 41  # of the histogram of steering, from -1 to 1; the middle one is around 0
 PATH_POINTS = 500  # of a drive on the map
 AT_STOP = 0.999  # |steering| from which the wheels are at their stop
-PLACES = 20  # to jump to, of each kind
+JUMPS = 20  # rows to jump to, for each reason
 APART = 2 * SAMPLE_RATE  # rows between two of them
 MIN_DIRECTION = 0.05  # share of the rows with a known road below which a road or direction is left out
 
@@ -27,8 +27,8 @@ def driven_seconds(time: np.ndarray) -> np.ndarray:
     return np.r_[0.0, np.cumsum(pause)]
 
 
-def largest(values: np.ndarray, count: int = PLACES, apart: int = APART) -> list[int]:
-    """Return where the largest absolute values are, ascending: at most `count` rows, at least `apart` from each other.
+def largest(values: np.ndarray, count: int = JUMPS, apart: int = APART) -> list[int]:
+    """Return the rows with the largest absolute values, ascending: at most `count`, at least `apart` from each other.
 
     The largest is taken first, then the largest of those far enough away from it, and so on. values: float (n,),
     nan where there is none.
@@ -48,10 +48,10 @@ def at_stop(steering: np.ndarray) -> list[int]:
     return np.flatnonzero((side != 0) & (np.diff(side, prepend=0) != 0)).tolist()
 
 
-def places(
+def jumps(
     steering: np.ndarray, offset: np.ndarray | None, models: list[np.ndarray], is_cut: np.ndarray
 ) -> dict[str, list[int]]:
-    """Return the places to jump to, by kind: rows in ascending order; none that is cut.
+    """Return the rows to jump to, ascending, by the reason for it; none that is cut.
 
     steering, offset, models: float32 (n,), the human driver's -1..1, m or None, and models' -1..1; is_cut: bool (n,).
     """
@@ -78,7 +78,7 @@ def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
         "zeros": float((steering == 0).mean()) if len(steering) else None,
         "speed": [float(function(speed)) for function in (np.min, np.mean, np.max)] if len(speed) else None,
         "rows_read": recording.rows_read,
-        "repairs": [[kind, rows, line] for kind, (rows, line) in recording.repairs.items()],
+        "repairs": [[repair, rows, line] for repair, (rows, line) in recording.repairs.items()],
         "rejected": len(recording.rejected),
         "first_rejected": [[line, detail] for line, _, detail in recording.rejected[:SHOWN_PER_KIND]],
     }
@@ -92,20 +92,21 @@ def road_of(result: Result, centres: np.ndarray) -> dict[str, Any]:
     """
     about = result.about
     road, x, y = (result.column(name, centres) for name in ("road", "x", "y"))
-    rows = [int((road == number).sum()) for number in range(len(about["roads"]))]
-    order = sorted(range(len(rows)), key=lambda number: -rows[number])
-    order = [number for number in order if rows[number] >= MIN_DIRECTION * sum(rows)]
-    names = [about["roads"][number]["name"] for number in order]
-    on_map = [number for number in order if names and about["roads"][number]["name"] == names[0]]
+    rows = [int((road == index).sum()) for index in range(len(about["roads"]))]
+    order = sorted(range(len(rows)), key=lambda index: -rows[index])
+    driven = [index for index in order if rows[index] >= MIN_DIRECTION * sum(rows)]
+    roads = [about["roads"][index] for index in driven]
     strokes = []
-    for number in on_map:
-        on_road = np.flatnonzero(road == number)
+    for index, found in zip(driven, roads, strict=True):
+        if found["name"] != roads[0]["name"]:
+            continue
+        on_road = np.flatnonzero(road == index)
         step = max(1, len(on_road) // PATH_POINTS)
         for stroke in np.split(on_road, np.flatnonzero(np.diff(on_road) > 1) + 1):
             strokes.append([[round(float(x[row]), 1), round(float(y[row]), 1)] for row in stroke[::step]])
     return {
-        "roads": [[about["roads"][number][key] for key in ("name", "direction")] for number in order],
-        "outline": about["roads"][on_map[0]]["outline"] if on_map else [],
+        "roads": [[found["name"], found["direction"]] for found in roads],
+        "outline": roads[0]["outline"] if roads else [],
         "path": strokes,
         "unusable": about["unusable"],
         "first_unusable": about["first_unusable"],

@@ -1,7 +1,8 @@
-"""The connections of the server: how many there may be, and how long and how much a request may take."""
+"""The connections of a server: how many there may be, what a request may take, and which sites it may come from."""
 
 import errno
 import io
+import ipaddress
 import signal
 import socket
 from collections.abc import Callable, Iterable
@@ -27,7 +28,6 @@ class Listener:
     """
 
     def __init__(self, sock: Any):
-        """Wrap a listening green socket."""
         self.sock = sock
         self.family, self.getsockname, self.close = sock.family, sock.getsockname, sock.close
         self.idle: dict[Any, None] = {}  # connections without a whole request, the oldest first
@@ -129,16 +129,44 @@ def refuse(start_response: StartResponse, status: str, reason: str) -> list[byte
     return [f"{reason}\n".encode()]
 
 
-def listen(host: str, port: int) -> socket.socket:
-    """Return a listening socket; port 0 chooses a free one. Raises OSError if the port is taken."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    return eventlet.listen((host, port), family, reuse_port=False)  # eventlet's default would share a taken port
+def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:
+    """Return a WSGI application that serves `app` to programs and to its own page, but to no page of another site.
+
+    A browser names another site's page in Origin (websocket, fetch) or Sec-Fetch-Site (image, script); if that page's
+    host name resolves to this machine (DNS rebinding), in Host.
+    """
+
+    def guard(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
+        host, origin = environ.get("HTTP_HOST", ""), environ.get("HTTP_ORIGIN")
+        site = environ.get("HTTP_SEC_FETCH_SITE", "none")
+        if (
+            _is_address(host)
+            and origin in (None, f"http://{host}")
+            and (site in ("none", "same-origin") or environ["PATH_INFO"] == "/")
+        ):
+            return app(environ, start_response)
+        reason = "This server answers programs and its own page, but no page of another site."
+        return refuse(start_response, "403 Forbidden", reason)
+
+    return guard
+
+
+def _is_address(host: str) -> bool:
+    """Return whether a Host header names an IP address, localhost, or nothing."""
+    name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
+    if name in ("localhost", ""):
+        return True
+    try:
+        return bool(ipaddress.ip_address(name.strip("[]")))
+    except ValueError:
+        return False
 
 
 def claim_port(host: str, port: int) -> socket.socket:
-    """Return a listening socket, as `listen` does. Raises UserError, with the remedy, if the port is taken."""
+    """Return a listening socket; port 0 chooses a free one. Raises UserError, with the remedy, if the port is taken."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        return listen(host, port)
+        return eventlet.listen((host, port), family, reuse_port=False)  # else it would share a taken port
     except OSError as error:
         raise UserError(
             f"can't listen on {host}:{port} ({error.strerror or error}); is another server running? Stop it, or "
@@ -155,22 +183,18 @@ def serve_until_stopped(
         if hasattr(signal, name):
             # The handler only notes the signal: python-engineio would catch an exception raised here.
             signal.signal(getattr(signal, name), lambda number, _: stopped.append(number))
-    serving = eventlet.spawn(serve, listener, app)
-    while not stopped and not serving.dead:
-        eventlet.sleep(0.1)
-        update()
-    if serving.dead:
-        serving.wait()  # raises the exception that ended it
-
-
-def serve(listener: socket.socket, app: WSGIApplication) -> None:
-    """Serve the application until this green thread is killed."""
-    eventlet.wsgi.server(
+    serving = eventlet.spawn(
+        eventlet.wsgi.server,
         Listener(listener),
-        whole_requests(app),
+        whole_requests(refuse_other_sites(app)),
         protocol=Protocol,
         minimum_chunk_size=1,  # so that each event of the page is sent at once
         socket_timeout=WRITE_TIMEOUT,
         log_output=False,
         debug=False,
     )
+    while not stopped and not serving.dead:
+        eventlet.sleep(0.1)
+        update()
+    if serving.dead:
+        serving.wait()  # raises the exception that ended it

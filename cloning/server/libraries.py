@@ -1,10 +1,9 @@
-"""Import the socket libraries, for the other modules of the server's end, once their versions are checked."""
+"""The socket libraries, for the modules of the server's end; commands call `check_versions` before they import those.
+
+With some other versions, the imports below fail.
+"""
 
 import warnings
-
-from cloning.server.versions import check_versions
-
-check_versions()  # before the imports below, which fail with some versions
 
 with warnings.catch_warnings():
     # eventlet advises against using it in new projects, but no server has been used longer with this simulator.

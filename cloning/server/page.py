@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import flask
@@ -21,8 +21,6 @@ from cloning.recordings.saved_frames import FrameSaver, SessionFolder
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.overlay import overlay
 from cloning.server import site
-from cloning.server.libraries import eventlet
-from cloning.server.turns import STRANGERS, TURNS
 
 SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
@@ -36,6 +34,7 @@ MAX_BODY = 200  # bytes of a request; more could be JSON that is nested too deep
 JPEG_QUALITY = 80  # of the pictures
 LEAST_SPEED, LARGEST_SPEED = 0.1, 1000  # mph: the range of the set speed
 speed_argument = number(float, LEAST_SPEED, LARGEST_SPEED)
+Pause = Callable[[float], None]  # waits for so many seconds, while others work
 
 
 class DrivenFrame(NamedTuple):
@@ -49,19 +48,18 @@ class DrivenFrame(NamedTuple):
     cte: float | None = None  # m from the lane's centre, if the simulator tells; the sign is the simulator's own
 
 
-class Session(Protocol):
+class Session:
     """What the page shows of a simulator that is, or was, connected."""
 
-    started: float  # tells sessions apart
-    heard: float  # time of the last telemetry, in seconds since 1970
-    manual: bool  # whether a person drove then
-    ended: bool  # whether the connection has ended
-    history: deque[DrivenFrame]
-    frame: np.ndarray | None  # the last driven one: uint8 (160, 320, 3), RGB; None before the first
-    driven: int  # frames
-    unusable: int  # frames
-    reason: str  # why the last unusable one was; "" if there was none
-    folder: SessionFolder | None  # of its saved frames
+    def __init__(self) -> None:
+        self.started = time.perf_counter()  # tells sessions apart
+        self.heard = 0.0  # time of the last telemetry, in seconds since 1970
+        self.manual = self.ended = False  # whether a person drove then; whether the connection has ended
+        self.history: deque[DrivenFrame] = deque(maxlen=HISTORY_FRAMES)
+        self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
+        self.driven = self.unusable = 0  # frames
+        self.reason = ""  # why the last unusable one was
+        self.folder: SessionFolder | None = None  # of its saved frames
 
 
 class Server(Protocol):
@@ -79,8 +77,8 @@ class Server(Protocol):
         """Drive at another set speed, in mph, from now on."""
 
 
-def create_app(server: Server) -> flask.Flask:
-    """Return the web application.
+def create_app(server: Server, pause: Pause) -> flask.Flask:
+    """Return the web application; pause: of `turns`.
 
     `/` is the page, `/live` its figures and pictures as server-sent events. POST to `/set-speed` changes the set speed:
     {"set_speed": text, mph}; the answer is {"set_speed": number}, or {"message"} with 400.
@@ -88,27 +86,19 @@ def create_app(server: Server) -> flask.Flask:
     app = flask.Flask(__name__, static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     site.prepare(app, "img-src data:")
-    pages = {False: Pages(server, with_attention=False), True: Pages(server, with_attention=True)}
+    pages = {with_attention: Pages(server, with_attention, pause) for with_attention in (False, True)}
 
     @app.get("/")
     def index() -> str:
-        return flask.render_template(
-            "drive.html",
-            model=server.model,
-            seconds=SHOWN_SECONDS,
-            top_speed=TOP_SPEED_MPH,
-            speeds=(LEAST_SPEED, LARGEST_SPEED),
-        )
+        speeds = {"top_speed": TOP_SPEED_MPH, "speeds": (LEAST_SPEED, LARGEST_SPEED)}
+        return flask.render_template("drive.html", model=server.model, seconds=SHOWN_SECONDS, **speeds)
 
     @app.get("/live")
     def live() -> flask.Response:
         if sum(each.open for each in pages.values()) >= MAX_PAGES:
             return flask.Response(f"{MAX_PAGES} pages are open already.\n", 503, mimetype="text/plain")
-        return flask.Response(
-            pages["attention" in flask.request.args].events(),
-            mimetype="text/event-stream",
-            headers={"Cache-Control": "no-store"},
-        )
+        events = pages["attention" in flask.request.args].events()
+        return flask.Response(events, mimetype="text/event-stream", headers={"Cache-Control": "no-store"})
 
     @app.post("/set-speed")
     def change_set_speed() -> tuple[dict[str, Any], int]:
@@ -126,15 +116,15 @@ def create_app(server: Server) -> flask.Flask:
 
 
 class Pages:
-    """The events for the open pages of one kind: what is drawn and encoded for one of them serves all.
+    """The events for the open pages with or without attention: what is drawn and encoded for one of them serves all.
 
     Time is divided into intervals of UPDATE_INTERVAL. Each event shows the driving up to the first moment of its
     interval at which a page asked for one, so that all pages get the same picture, and most of them the same text.
     """
 
-    def __init__(self, server: Server, with_attention: bool):
-        """with_attention: whether the pictures show what the network looks at."""
-        self.server, self.with_attention = server, with_attention
+    def __init__(self, server: Server, with_attention: bool, pause: Pause):
+        """with_attention: whether the pictures show what the network looks at; pause: of `turns`."""
+        self.server, self.with_attention, self.pause = server, with_attention, pause
         self.open = 0  # number of pages
         self.interval = -1
         self.session: Session | None = None  # shown in this interval
@@ -153,8 +143,8 @@ class Pages:
         self.open += 1
         try:
             shown, state, last, quiet = None, "", 0.0, 0
+            self.pause(0)
             while True:
-                TURNS.take(STRANGERS)
                 self._begin_interval()
                 last = last if self.session is shown else 0.0
                 quiet += 1
@@ -162,7 +152,7 @@ class Pages:
                     event = self._event(last)
                     shown, state, last, quiet = self.session, self.state, self.until, 0
                     yield event
-                eventlet.sleep(UPDATE_INTERVAL)
+                self.pause(UPDATE_INTERVAL)
         finally:
             self.open -= 1
 
@@ -184,8 +174,8 @@ class Pages:
                 self.picture = self.picture or image(self.server, self.session, self.with_attention)
                 rows = frames_since(self.session.history, max(last, self.now - SHOWN_SECONDS))
                 rows = [frame for frame in rows if frame.time <= self.until]
-                event |= {"rows": rows[:: -math.ceil(len(rows) / SHOWN_FRAMES)][::-1] if rows else []}  # with the last
-                event |= {"image": self.picture}
+                rows = rows[:: -math.ceil(len(rows) / SHOWN_FRAMES)][::-1] if rows else []  # with the last one
+                event |= {"rows": rows, "image": self.picture}
             self.texts[last] = f"data: {json.dumps(event)}\n\n"
         return self.texts[last]
 

@@ -1,24 +1,22 @@
-"""The server's end of the wire: python-socketio with bounds for each client, closed to pages of other sites."""
+"""The server's end of the wire: python-socketio with bounds for each client."""
 
-import ipaddress
 import json
 import logging
 import time
-from collections.abc import Iterable
 from typing import Any
 from urllib.parse import parse_qs
 from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
 from cloning.server.connections import refuse
 from cloning.server.libraries import engineio, socketio
+from cloning.server.telemetry import MAX_MESSAGE, UNREADABLE
 from cloning.server.turns import TURNS, Account
-from cloning.server.websocket import MAX_MESSAGE, SOCKET_IO_PACKET, WebSocket, WebSocketWSGI
+from cloning.server.websocket import SOCKET_IO_PACKET, WebSocket, WebSocketWSGI
 from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 MAX_UNREAD = 64  # packets that wait for a client; the simulator has 3 telemetries in flight
-UNREADABLE = object()  # what a handler is given for a telemetry that is too long or not JSON
 log = logging.getLogger(__name__)
 
 
@@ -42,7 +40,6 @@ class Client(engineio.socket.Socket):
     """A client's session, which ends when the client does not read what it is sent, or sends nothing for too long."""
 
     def __init__(self, server: "Engine", sid: str):
-        """Begin a session; sid: its id."""
         super().__init__(server, sid)
         self.account, self.polled = Account(), False
         self.websocket: WebSocket | None = None
@@ -119,9 +116,6 @@ class Client(engineio.socket.Socket):
                 self.server.clients.discard(self)
 
 
-engineio.socket.Socket = Client  # of which python-engineio makes one for each session
-
-
 def _is_payload(body: bytes) -> bool:
     """Return whether a POST's body has the lengths of its packets where python-engineio looks for them.
 
@@ -160,8 +154,9 @@ class Engine(engineio.Server):
     """python-engineio's server for a few clients, which refuses requests that it would fail on."""
 
     def __init__(self, *args: Any, **options: Any):
-        """Begin without clients; the arguments are those of engineio.Server."""
         super().__init__(*args, **options)
+        self._async: dict[str, Any] = {**engineio.async_drivers.eventlet._async, "websocket": WebSocketWSGI}
+        engineio.socket.Socket = Client  # of which python-engineio makes one for each session
         # Those with a session or a websocket. python-engineio's own table forgets a session that has ended, but the
         # websocket of such a session may still be open, and take time.
         self.clients: set[Client] = set()
@@ -203,9 +198,7 @@ class Engine(engineio.Server):
 class Server(socketio.Server):
     """python-socketio's server with the settings and filters that the simulator needs."""
 
-    def __init__(self, **options: Any):
-        """options: further options of socketio.Server."""
-        engineio.async_drivers.eventlet._async["websocket"] = WebSocketWSGI
+    def __init__(self) -> None:
         super().__init__(
             async_mode="eventlet",
             async_handlers=False,
@@ -216,8 +209,11 @@ class Server(socketio.Server):
             ping_interval=(PING_INTERVAL, 60),
             cookie=None,
             cors_allowed_origins=[],
-            **options,
         )
+
+    def application(self, page: WSGIApplication) -> WSGIApplication:
+        """Return the application that answers simulators itself, and all else with `page`."""
+        return socketio.WSGIApp(self, page)
 
     def _engineio_server_class(self) -> type[Engine]:
         return Engine
@@ -230,36 +226,3 @@ class Server(socketio.Server):
         """
         if isinstance(data, str) and SOCKET_IO_PACKET.match(data):
             super()._handle_eio_message(sid, data if data[0] != "5" else f"2{data[data.index('[') :]}!")
-
-
-def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:
-    """Return a WSGI application that serves `app` to programs and to its own page, but to no page of another site.
-
-    A browser names another site's page in Origin (websocket, fetch) or Sec-Fetch-Site (image, script); if that page's
-    host name resolves to this machine (DNS rebinding), in Host.
-    """
-
-    def guard(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
-        host, origin = environ.get("HTTP_HOST", ""), environ.get("HTTP_ORIGIN")
-        site = environ.get("HTTP_SEC_FETCH_SITE", "none")
-        if (
-            _is_address(host)
-            and origin in (None, f"http://{host}")
-            and (site in ("none", "same-origin") or environ["PATH_INFO"] == "/")
-        ):
-            return app(environ, start_response)
-        reason = "This server answers programs and its own page, but no page of another site."
-        return refuse(start_response, "403 Forbidden", reason)
-
-    return guard
-
-
-def _is_address(host: str) -> bool:
-    """Return whether a Host header names an IP address, localhost, or nothing."""
-    name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
-    if name in ("localhost", ""):
-        return True
-    try:
-        return bool(ipaddress.ip_address(name.strip("[]")))
-    except ValueError:
-        return False

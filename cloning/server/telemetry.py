@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from cloning.recordings.images import decode
-from cloning.server.server import UNREADABLE
-from cloning.server.websocket import MAX_MESSAGE
 
+MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
+UNREADABLE = object()  # what the server gives for a telemetry that is too long or not JSON
 NUMERIC_FIELDS = ("steering_angle", "throttle", "speed")  # degrees, -1..1, mph; the first two as applied at the moment
 
 # The simulator formats with "N4" of the machine's culture. Mono 6.8 writes -12.3456 as `12.3456-` in 16 Arabic cultures

@@ -24,7 +24,6 @@ class Turns:
     """
 
     def __init__(self) -> None:
-        """Begin with nobody at work."""
         self.clock = 0.0  # what the account at work had used when its turn began
         self.waiting: list[tuple[Account, Any]] = []  # in the order of arrival, each with the event that ends its wait
         self.working: Account | None = None
@@ -74,3 +73,9 @@ class Turns:
 
 TURNS = Turns()  # of the one thread
 STRANGERS = Account()  # of all that is no open session: accepting connections, HTTP requests, the page
+
+
+def pause(seconds: float) -> None:
+    """Let others work for so long, and then wait for a turn among the strangers."""
+    eventlet.sleep(seconds)
+    TURNS.take(STRANGERS)

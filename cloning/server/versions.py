@@ -12,10 +12,7 @@ REQUIREMENTS = Path(__file__).parents[2] / "requirements.txt"
 
 
 def check_versions(requirements: Path = REQUIREMENTS) -> None:
-    """Compare the installed socket libraries with the versions in requirements.txt.
-
-    Raises UserError if one differs or is missing.
-    """
+    """Raise UserError if a socket library is missing, or not of the version in requirements.txt."""
     if not requirements.is_file():
         return
     pinned = dict(re.findall(r"^([\w-]+)==([\w.]+)", requirements.read_text(encoding="utf-8"), re.MULTILINE))

@@ -8,9 +8,9 @@ from typing import Any
 from wsgiref.types import WSGIEnvironment
 
 from cloning.server.libraries import engineio, eventlet
+from cloning.server.telemetry import MAX_MESSAGE
 from cloning.server.turns import TURNS, Account
 
-MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
 UNREADABLE_LENGTH = 23  # bytes that are kept of a longer one: enough to see that it is a telemetry
 SEND_BUFFER = 1 << 15  # bytes of answers that the system keeps for a client that does not read; an answer has about 70
 SLICE = 0.0003  # s that a connection may read and unmask in one turn, or without one when it has waited for input
@@ -30,7 +30,6 @@ class QuickSocket:
     """
 
     def __init__(self, sock: Any):
-        """Wrap a connected green socket."""
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self.sock, self.buffer, self.at = sock, b"", 0
@@ -90,7 +89,6 @@ class WebSocket(eventlet.websocket.RFC6455WebSocket):
                     self.data = [kept.decode("ascii", "ignore").encode()]
 
     def __init__(self, sock: Any, *args: Any, **kwargs: Any):
-        """Take over a green socket after the handshake."""
         super().__init__(QuickSocket(sock), *args, **kwargs)
         self.max_frame_length = float("inf")  # Message limits the length
 

@@ -141,18 +141,16 @@ class Connection:
         """Close the socket after an error that the server can cause, and raise it as ConnectionLost."""
         try:
             yield
-        except ConnectionLost:
+        except (ConnectionLost, OSError, ProtocolError, UnicodeError) as error:
             self.socket.close()
-            raise
-        except TimeoutError as error:
-            self.socket.close()
-            raise ConnectionLost(f"the server has read nothing for {self.send_timeout:g} s") from error
-        except OSError as error:
-            self.socket.close()
-            raise ConnectionLost(f"the connection broke ({error.strerror or error})") from error
-        except (ProtocolError, UnicodeError) as error:  # UnicodeError: wsproto decodes a header as ASCII
-            self.socket.close()
-            raise ConnectionLost(f"the server does not speak WebSocket ({error!s:.100})") from error
+            if isinstance(error, ConnectionLost):
+                raise
+            reason = f"the server does not speak WebSocket ({error!s:.100})"  # UnicodeError: in a header
+            if isinstance(error, TimeoutError):
+                reason = f"the server has read nothing for {self.send_timeout:g} s"
+            elif isinstance(error, OSError):
+                reason = f"the connection broke ({error.strerror or error})"
+            raise ConnectionLost(reason) from error
 
     def _open_session(self, address: str, until: float) -> None:
         """Wait for the server's open packet, then ping at once, as the real client does."""
@@ -202,13 +200,10 @@ class Connection:
             self.socket.sendall(frame)
 
     def _send(self, packet: str) -> None:
-        data = packet.encode()
-        fragments = [data[i : i + FRAGMENT].decode() for i in range(0, len(data), FRAGMENT)]
-        last = len(fragments) - 1
-        frames = [
-            self.protocol.send(TextMessage(fragment, message_finished=i == last))
-            for i, fragment in enumerate(fragments)
-        ]
+        data, frames = packet.encode(), []
+        for start in range(0, len(data), FRAGMENT):
+            fragment, is_last = data[start : start + FRAGMENT].decode(), start + FRAGMENT >= len(data)
+            frames.append(self.protocol.send(TextMessage(fragment, message_finished=is_last)))
         self._write(*(frames if self.real_timing else [b"".join(frames)]))
 
     def send(self, packet: str) -> None:

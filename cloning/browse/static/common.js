@@ -36,12 +36,12 @@ export function onClick(button, action) {
 }
 
 // Give an element new children, unless they would show the same as before; build: makes them. A focus in them stays:
-// on the button at the same place.
-export function renew(place, content, build) {
+// on the button with the same index.
+export function renew(holder, content, build) {
   const now = JSON.stringify(content);
-  if (place.shown == now) return;
-  place.shown = now;
-  const focused = [...place.querySelectorAll("button")].indexOf(document.activeElement);
-  place.replaceChildren(...build());
-  place.querySelectorAll("button")[focused]?.focus();
+  if (holder.shown == now) return;
+  holder.shown = now;
+  const focused = [...holder.querySelectorAll("button")].indexOf(document.activeElement);
+  holder.replaceChildren(...build());
+  holder.querySelectorAll("button")[focused]?.focus();
 }

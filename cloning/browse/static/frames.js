@@ -88,8 +88,8 @@ const together = parts => ({
 });
 
 function paint({canvas, caption}, row, {layers, message}) {
-  const place = element(canvas), context = place.getContext("2d"), below = place.parentNode.lastElementChild;
-  context.clearRect(0, 0, place.width, place.height);
+  const picture = element(canvas), context = picture.getContext("2d"), below = picture.parentNode.lastElementChild;
+  context.clearRect(0, 0, picture.width, picture.height);
   for (const layer of layers) context.drawImage(layer, 0, 0);
   below.textContent = message?.split(/[\\/]IMG[\\/]/).at(-1) ?? caption(row); // no folder
   below.className = message ? "bad" : "";

@@ -109,21 +109,21 @@ function map({outline, path}) {
   svg.setAttribute("viewBox", `${left} ${top} ${size} ${size}`);
   svg.setAttribute("role", "img");
   svg.setAttribute("aria-label", "The path driven, on the track from above");
-  for (const [kind, points] of [["outline", [...outline, outline[0]]], ...path.map(stroke => ["path", stroke])]) {
+  for (const [name, points] of [["outline", [...outline, outline[0]]], ...path.map(stroke => ["path", stroke])]) {
     const line = document.createElementNS("http://www.w3.org/2000/svg", "polyline");
-    line.setAttribute("class", kind);
+    line.setAttribute("class", name);
     line.setAttribute("points", points.map(([x, y]) => `${x},${-y}`).join(" "));
     svg.append(line);
   }
   return svg;
 }
 
-function bars(counts, place) {
-  const colours = getComputedStyle(document.body), width = Math.max(120, place.clientWidth);
+function bars(counts, holder) {
+  const colours = getComputedStyle(document.body), width = Math.max(120, holder.clientWidth);
   const steering = counts.map((_, bin) => (bin + 0.5) / counts.length * 2 - 1);
-  place.setAttribute("role", "img");
-  place.setAttribute("aria-label", "Histogram of steering, on a square-root scale");
-  place.title = "How many frames have which steering, on a square-root scale";
+  holder.setAttribute("role", "img");
+  holder.setAttribute("aria-label", "Histogram of steering, on a square-root scale");
+  holder.title = "How many frames have which steering, on a square-root scale";
   return new uPlot({
     width, height: 100, legend: {show: false}, cursor: {show: false}, padding: [4, 8, 0, 8],
     scales: {x: {time: false, range: [-1, 1]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
@@ -132,5 +132,5 @@ function bars(counts, place) {
       splits: () => [-1, -0.5, 0, 0.5, 1], font: "12px system-ui, sans-serif"}, {show: false}],
     series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, paths: uPlot.paths.bars({size: [0.9, 100]}),
       points: {show: false}}],
-  }, [steering, counts], place);
+  }, [steering, counts], holder);
 }

@@ -1,12 +1,12 @@
-// Moving through a recording: to a row, by playing, and from place to place.
+// Moving through a recording: to a row, by playing, and to the rows worth watching.
 import {clock, element} from "./common.js";
 import {page, say} from "./state.js";
 
-// Kinds of places to jump to: what they are, and why there are none.
-export const PLACES = {
-  offset: ["places with the largest offset", "The lateral offset is not known yet."],
-  stop: ["places with the steering at its stop", "The steering is nowhere at its stop."],
-  difference: ["places where a model differs most", "No model's steering is there: start with --model, or wait for it."],
+// The reasons to jump to a row: what such rows are, and why there are none.
+export const JUMPS = {
+  offset: ["rows with the largest offset", "The lateral offset is not known yet."],
+  stop: ["rows with the steering at its stop", "The steering is nowhere at its stop."],
+  difference: ["rows where a model differs most", "No model's steering is there: start with --model, or wait for it."],
   intervention: ["interventions", "No intervention: there is no replay, or the car stayed within its limit."],
 };
 
@@ -53,8 +53,8 @@ export function play() {
   now.playing = requestAnimationFrame(tick);
 }
 
-export function jump(kind, back) {
-  const now = page.open, rows = now.places[kind] ?? [], [name, none] = PLACES[kind];
+export function jump(reason, back) {
+  const now = page.open, rows = now.jumps[reason] ?? [], [name, none] = JUMPS[reason];
   if (!rows.length) return say(none);
   const others = back ? rows.filter(row => row < now.row).reverse() : rows.filter(row => row > now.row);
   const row = others[0] ?? (back ? rows.at(-1) : rows[0]);

@@ -38,11 +38,11 @@ export class Plots {
     this.plots?.forEach(plot => plot.destroy());
     element("plots").replaceChildren();
     const {steering, throttle, speed, offset} = this.columns;
-    const models = this.models.map((name, number) =>
-      ({name, values: this.columns[`model-${number}`], colour: MODEL_COLOURS[number % MODEL_COLOURS.length]}));
-    const replays = this.replays.map((replay, number) => replay && ({...models[number], values: replay.offset,
+    const models = this.models.map((name, index) =>
+      ({name, values: this.columns[`model-${index}`], colour: MODEL_COLOURS[index % MODEL_COLOURS.length]}));
+    const replays = this.replays.map((replay, index) => replay && ({...models[index], values: replay.offset,
       marks: replay.where.map(([row]) => row)})).filter(Boolean);
-    const kinds = [
+    const graphs = [
       {title: "Steering", unit: "", digits: 3, range: [-1, 1],
         curves: [{name: models.length ? "human" : "", values: steering}, ...models]},
       {title: "Throttle", unit: "", digits: 2, range: [Math.min(0, least(throttle)), 1], curves: [{name: "", values: throttle}]},
@@ -52,21 +52,21 @@ export class Plots {
         curves: [{name: replays.length ? "human" : "", values: offset}, ...replays]},
     ];
     this.shown = [];
-    this.plots = kinds.map((kind, at) => this.plot(kind, at == kinds.length - 1));
+    this.plots = graphs.map((graph, at) => this.plot(graph, at == graphs.length - 1));
     if (this.zoom) this.setZoom(...this.zoom);
     this.goTo(this.row);
   }
 
   plot({title, unit, digits, range, curves}, isLast) {
     const colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
-    const figure = make("figure"), caption = make("figcaption", "", {}, make("span", title)), place = make("div");
+    const figure = make("figure"), caption = make("figcaption", "", {}, make("span", title)), holder = make("div");
     for (const curve of curves) {
       curve.colour ??= colour("--line");
       const named = curve.name ? [make("i", "", {style: `background: ${curve.colour}`}), `${curve.name} `] : [], value = make("b");
       caption.append(make("span", "", {}, ...named, value));
       this.shown.push({value, unit, digits, values: curve.values});
     }
-    figure.append(caption, place);
+    figure.append(caption, holder);
     element("plots").append(figure);
     const here = make("div", "", {class: "here"}), axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
       grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
@@ -91,7 +91,7 @@ export class Plots {
           plot.setSelect({left: 0, width: 0, top: 0, height: 0}, false);
         }],
       },
-    }, [this.rows, ...curves.map(({values}) => values ? gaps(values) : this.rows.map(() => null))], place);
+    }, [this.rows, ...curves.map(({values}) => values ? gaps(values) : this.rows.map(() => null))], holder);
     plot.here = here;
     return plot;
   }
@@ -146,7 +146,7 @@ export class Plots {
     ctx.restore();
   }
 
-  // Replays by the number of their model: {offset, where}, or undefined.
+  // Replays by the index of their model: {offset, where}, or undefined.
   setReplays(replays) {
     this.replays = replays;
     this.build();
@@ -180,8 +180,8 @@ export class Plots {
       this.setZoom(from, from + wide);
     }
     for (const {value, unit, digits, values} of this.shown) {
-      const number = values?.[row];
-      value.textContent = values == undefined ? "not known" : Number.isNaN(number) ? "not known here" : rounded(number, digits) + unit;
+      const here = values?.[row];
+      value.textContent = values == undefined ? "not known" : Number.isNaN(here) ? "not known here" : rounded(here, digits) + unit;
     }
     this.plots.forEach(plot => this.move(plot, plot.here));
   }

@@ -2,7 +2,7 @@
 import {ask, element, make, many, notice, onClick, renew} from "./common.js";
 import {askForReason, mark, showCuts, undo} from "./cuts.js";
 import {Frames} from "./frames.js";
-import {goTo, jump, play, PLACES, seek} from "./moving.js";
+import {goTo, jump, JUMPS, play, seek} from "./moving.js";
 import {Plots} from "./plots.js";
 import {cameras, nextAttention, nextLimit, showReplays} from "./replays.js";
 import {orderButton, page, say} from "./state.js";
@@ -18,9 +18,9 @@ export const KEYS = [
   ["I O", "mark the first, the last frame of a stretch"],
   ["X", "cut the marked stretch"],
   ["Z", "undo: the marks, or this page's last cut or deleted cut"],
-  ["F Shift+F", "next, previous of the places with the largest lateral offset"],
-  ["S Shift+S", "next, previous place with the steering at its stop"],
-  ["D Shift+D", "next, previous of the places where a model differs most from the human (with --model)"],
+  ["F Shift+F", "next, previous of the rows with the largest lateral offset"],
+  ["S Shift+S", "next, previous row with the steering at its stop"],
+  ["D Shift+D", "next, previous of the rows where a model differs most from the human (with --model)"],
   ["L", "replay with each model as the driver, at the next limit; off after the last (with --model)"],
   ["N Shift+N", "next, previous intervention of a replay"],
   ["A", "show what the next model looks at; off after the last (with --model)"],
@@ -55,7 +55,7 @@ export async function showRecording(id, row) {
   // What this page has done stays undoable when it reads again, and it shows the same replays.
   const count = columns.seconds.length, marks = again?.details.version == details.version ? again.marks : {};
   const now = page.open = {
-    id, details, columns, count, marks, done: again?.done ?? [], row: 0, playing: 0, places: {},
+    id, details, columns, count, marks, done: again?.done ?? [], row: 0, playing: 0, jumps: {},
     limit: again?.limit ?? null, attention: again?.attention ?? null, replays: [], update,
     query: () => now.limit ? `?limit=${now.limit}` : "",
     column: name => column(id, details.version, name),
@@ -86,7 +86,7 @@ async function update(details) {
     return;
   }
   now.details = details;
-  const analyses = [["offset", details.lane], ...details.models.map((model, number) => [`model-${number}`, model])];
+  const analyses = [["offset", details.lane], ...details.models.map((model, index) => [`model-${index}`, model])];
   const ready = analyses.filter(([name, analysis]) => analysis.state == "ready" && !now.columns[name]);
   for (const [name] of ready) now.columns[name] = await now.column(name);
   if (page.open != now) return;
@@ -122,14 +122,14 @@ async function refresh(now) {
 
 function showFindings() {
   const {details} = page.open, found = [];
-  for (const [kind, rows, line] of details.repairs) found.push(`line ${line}: ${kind} (${many(rows, "row")})`);
+  for (const [repair, rows, line] of details.repairs) found.push(`line ${line}: ${repair} (${many(rows, "row")})`);
   const listed = (count, first) => {
     for (const [line, detail] of first) found.push(`line ${line}: left out: ${detail}`);
     if (count > first.length) found.push(`… and ${many(count - first.length, "more row")} left out`);
   };
   listed(details.rejected, details.first_rejected);
   if (details.unusable) listed(details.unusable, details.first_unusable);
-  const columns = ["offset", ...details.models.map((_, number) => `model-${number}`)];
+  const columns = ["offset", ...details.models.map((_, index) => `model-${index}`)];
   [{name: "lateral offset", ...details.lane}, ...details.models].forEach(({name, state, progress, message}, at) => {
     if (state == "waiting") found.push(`${name}: waits for its turn`);
     if (state == "running") found.push(`${name}: ${(100 * progress).toFixed(0)} % analysed`);
@@ -145,11 +145,11 @@ function showFindings() {
 function buttons() {
   const {marks, details, done, replays} = page.open;
   const interventions = replays.flatMap(replay => replay?.where.map(([row]) => row) ?? []);
-  page.open.places = {...details.places, intervention: [...new Set(interventions)].sort((a, b) => a - b)};
+  page.open.jumps = {...details.jumps, intervention: [...new Set(interventions)].sort((a, b) => a - b)};
   element("cut").disabled = !(marks.first && marks.last);
   element("undo").disabled = !(marks.first || marks.last || done.length);
-  for (const kind of Object.keys(PLACES)) element(`jump-${kind}`).disabled = !page.open.places[kind]?.length;
-  for (const kind of ["difference", "intervention"]) element(`jump-${kind}`).hidden = !details.models.length;
+  for (const reason of Object.keys(JUMPS)) element(`jump-${reason}`).disabled = !page.open.jumps[reason]?.length;
+  for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -14,12 +14,12 @@ export function cameras() {
   const recorded = (canvas, caption, looks = []) => ({canvas, caption: () => caption, path: canvas, looks});
   const centre = recorded("center", isReplayed ? "Centre, driven by the human" : "Centre", attention == null ? [] : [attention]);
   if (!isReplayed) return [recorded("left", "Left"), centre, recorded("right", "Right")];
-  const views = replays.map((replay, number) => replay && {
-    canvas: `view-${number}`,
-    caption: row => `${details.models[number].name} at ${replay.limit} m: ${metres(replay.offset[row])}`,
+  const views = replays.map((replay, index) => replay && {
+    canvas: `view-${index}`,
+    caption: row => `${details.models[index].name} at ${replay.limit} m: ${metres(replay.offset[row])}`,
     has: row => !Number.isNaN(replay.offset[row]),
-    path: `replay-${number}-${replay.limit}`,
-    looks: attention == number ? [number] : [],
+    path: `replay-${index}-${replay.limit}`,
+    looks: attention == index ? [index] : [],
   }).filter(Boolean);
   for (const {canvas} of views) {
     element("cameras").append(make("figure", "", {class: "replayed"},
@@ -34,7 +34,7 @@ export async function showReplays() {
   const now = page.open, {details} = now;
   element("replaying").hidden = element("watching").hidden = !details.models.length;
   if (details.limit == now.limit) {
-    const replays = await Promise.all(details.replays.map((replay, number) => load(now, replay, number)));
+    const replays = await Promise.all(details.replays.map((replay, index) => load(now, replay, index)));
     if (page.open != now || details.limit != now.limit) return;
     const stamps = all => JSON.stringify(all.map(replay => replay && [replay.limit, replay.stamp]));
     const changed = stamps(replays) != stamps(now.replays);
@@ -47,12 +47,12 @@ export async function showReplays() {
   for (const button of document.querySelectorAll("[data-limit]")) {
     button.setAttribute("aria-pressed", button.dataset.limit == now.limit);
   }
-  renew(element("attention"), details.models.map(({name}) => name), () => details.models.map(({name}, number) => {
+  renew(element("attention"), details.models.map(({name}) => name), () => details.models.map(({name}, index) => {
     const button = make("button", name);
-    onClick(button, () => watch(page.open.attention == number ? null : number));
+    onClick(button, () => watch(page.open.attention == index ? null : index));
     return button;
   }));
-  [...element("attention").children].forEach((button, number) => button.setAttribute("aria-pressed", now.attention == number));
+  [...element("attention").children].forEach((button, index) => button.setAttribute("aria-pressed", now.attention == index));
   element("replays").hidden = !now.limit;
   if (now.limit && details.limit == now.limit) {
     renew(element("replay-list"), [now.id, details.version, details.limit, details.replays], () => details.replays.map(section));
@@ -60,22 +60,22 @@ export async function showReplays() {
 }
 
 // A replay with its column, if it is there; the one that is shown already, if it is still the same.
-async function load(now, replay, number) {
+async function load(now, replay, index) {
   if (replay.state != "ready") return undefined;
-  const limit = now.details.limit, before = now.replays[number];
+  const limit = now.details.limit, before = now.replays[index];
   if (before?.limit == limit && before.stamp == replay.stamp) return before;
-  return {...replay, limit, offset: await now.column(`replay-${number}-${limit}`)};
+  return {...replay, limit, offset: await now.column(`replay-${index}-${limit}`)};
 }
 
-function section(replay, number) {
-  const {details, limit} = page.open, {name} = details.models[number];
-  const heading = make("h3", `${name} at ${limit} m`, {style: `border-color: ${MODEL_COLOURS[number % MODEL_COLOURS.length]}`});
+function section(replay, index) {
+  const {details, limit} = page.open, {name} = details.models[index];
+  const heading = make("h3", `${name} at ${limit} m`, {style: `border-color: ${MODEL_COLOURS[index % MODEL_COLOURS.length]}`});
   const button = (text, method) => orderButton(text, method, `replays/${limit}`);
   const waiting = {
     none: ["Not replayed with these files and cuts. ", button("Replay", "POST")],
     waiting: ["Waits for its turn. ", button("Stop", "DELETE")],
     running: [`Replaying: ${(100 * replay.progress).toFixed(0)} % driven. `, button("Stop", "DELETE")],
-    failed: [`Failed: ${replay.message}. `, orderButton("Try again", "POST", `columns/replay-${number}-${limit}`)],
+    failed: [`Failed: ${replay.message}. `, orderButton("Try again", "POST", `columns/replay-${index}-${limit}`)],
   }[replay.state];
   if (waiting) return make("section", "", {}, heading, make("p", "", {}, ...waiting));
   const lines = Object.entries({
@@ -123,10 +123,10 @@ export function nextLimit() {
   else say("No model to replay with: start with --model.");
 }
 
-function watch(number) {
+function watch(index) {
   const now = page.open;
-  now.attention = number;
-  say(number == null ? "" : `In magenta, what ${now.details.models[number].name} looks at.`);
+  now.attention = index;
+  say(index == null ? "" : `In magenta, what ${now.details.models[index].name} looks at.`);
   now.frames.setPictures(cameras());
   showReplays();
 }

@@ -2,9 +2,9 @@
 import {element, make, many, notice, renew, request} from "./common.js";
 
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
-const KINDS = ["LRC_", "augmented-"]; // of pictures, in the order of the page
+const PICTURES = ["LRC_", "augmented-"]; // of pictures, in the order of the page
 const HEIGHT = 260; // px of the losses
-let open; // {id, run, at, plot, timer}; at: number of the picture that was chosen, undefined for the latest
+let open; // {id, run, at, plot, timer}; at: observations of the picture that was chosen, undefined for the latest
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
 export function leaveRun() {
@@ -57,7 +57,7 @@ function update(run) {
   const name = run.folder.split(/[\\/]/).at(-1), {history} = run, last = history.at(-1);
   const best = history.filter(row => row.val_loss != null).sort((a, b) => a.val_loss - b.val_loss)[0];
   element("title").textContent = `/ training run in ${name}`;
-  document.title = `${stateOf(run).split(":")[0]}: ${name}`;
+  document.title = `${run.state}: ${name}`;
   const share = run.state == "finished" ? 1 : (history.length + Math.min(1, run.images / run.samples_per_epoch)) / run.epochs;
   element("run-bar").value = Math.min(1, share);
   element("run-bar").setAttribute("aria-valuetext", stateOf(run));
@@ -83,11 +83,11 @@ function update(run) {
 
 const loss = value => value == null ? "not a number" : value.toFixed(4);
 
-// The losses by epoch; that of the epoch which is not finished yet is a point at its place in it.
+// The losses by epoch; that of the epoch which is not finished yet is a point as far into it.
 function draw() {
-  const {run, plot} = open, place = element("losses"), colours = getComputedStyle(document.body);
+  const {run, plot} = open, holder = element("losses"), colours = getComputedStyle(document.body);
   plot?.destroy();
-  place.replaceChildren();
+  holder.replaceChildren();
   const {history} = run, done = history.length;
   const now = run.loss == null ? [] : [done + Math.min(1, run.images / run.samples_per_epoch)];
   const x = [...history.map(row => row.epoch), ...now], none = now.map(() => null);
@@ -95,7 +95,7 @@ function draw() {
     grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
   const curve = (name, paint) => ({label: name, stroke: paint, width: 2, spanGaps: false, points: {show: true, size: 6, fill: paint}});
   open.plot = new uPlot({
-    width: Math.max(200, place.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
+    width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
     scales: {x: {time: false, range: [0, Math.max(1, run.epochs)]}, y: {range: (_, low, high) => [0, (high || 0.1) * 1.08]}},
     axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font, incrs: [1, 2, 5, 10, 20, 50, 100]}, {...axis, size: 56}],
     series: [{label: "epoch", value: (_, at) => at == null ? "–" : at.toFixed(Number.isInteger(at) ? 0 : 2)},
@@ -103,7 +103,7 @@ function draw() {
       {...curve("validation", "#d55e00"), value: (_, value) => value?.toFixed(4) ?? "–"},
       {...curve("this epoch so far", colour("--good")), value: (_, value) => value?.toFixed(4) ?? "–"}],
   }, [x, [...history.map(row => row.loss), ...none], [...history.map(row => row.val_loss), ...none],
-    [...history.map(() => null), ...now.map(() => run.loss)]], place);
+    [...history.map(() => null), ...now.map(() => run.loss)]], holder);
 }
 
 function showPictures() {
@@ -113,9 +113,9 @@ function showPictures() {
   element("run-which").textContent = shown == undefined ? "No picture yet."
     : `after ${many(shown, "observation")} (${pictures.indexOf(shown) + 1} of ${pictures.length})`;
   element("run-pictures").hidden = shown == undefined;
-  KINDS.forEach((kind, number) => {
-    const [picture, caption] = element("run-pictures").children[number].children;
-    const address = `/runs/${id}/training_generator_${kind}${shown}.png?of=${run.run}`; // another run's is another one
+  PICTURES.forEach((name, index) => {
+    const [picture, caption] = element("run-pictures").children[index].children;
+    const address = `/runs/${id}/training_generator_${name}${shown}.png?of=${run.run}`; // another run's is another one
     if (shown != undefined && picture.getAttribute("src") != address) Object.assign(picture, {src: address, alt: caption.textContent});
   });
 }

@@ -2,7 +2,7 @@
 import {ask, element, make, notice, onClick} from "./common.js";
 
 // Its details and columns, its frames and curves, marks, and the row; undefined while none is shown. recording.js
-// makes it; `update(details)` shows what the server tells anew.
+// makes it; `update(details)` shows what the server answers.
 export const page = {open: undefined};
 
 export function say(text) {

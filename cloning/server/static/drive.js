@@ -16,10 +16,11 @@ const WORDS = {
   gone: ["The simulator has gone", "What it sent last is shown. drive.py waits for the next one."],
   lost: ["drive.py does not answer", "It has ended, or too many pages are open. This page tries again by itself."],
 };
-// The columns of a row after its time. least: the scale reaches at least so far; both: as far below 0 as above.
+// The columns of a row after its time. least: the scale reaches at least so far; both: as far below 0 as above;
+// isSpeed: the set speed is shown with it.
 const GRAPHS = [
   {title: "Steering, right positive", unit: "", digits: 2, least: 0.1, both: true},
-  {title: "Speed", unit: " mph", digits: 1, least: 1},
+  {title: "Speed", unit: " mph", digits: 1, least: 1, isSpeed: true},
   {title: "Throttle", unit: "", digits: 2, least: 0.1},
   {title: "Latency", unit: " ms", digits: 1, least: 10},
   {title: "Distance from the centre, sign as sent", unit: " m", digits: 2, least: 0.5, both: true},
@@ -37,7 +38,7 @@ function say(state) {
   element("advice").textContent = advice;
 }
 
-function tell({rate, frames, unusable, reason, saving, saver, state}) {
+function showFigures({rate, frames, unusable, reason, saving, saver, state}) {
   element("rate").textContent = state == "driving" ? rate.toFixed(1) : "–";
   element("frames").textContent = frames ?? "–";
   element("unusable").textContent = unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–";
@@ -55,7 +56,7 @@ function hear(event) {
   if (live.image) element("image").src = live.image;
   element("image").hidden = !element("image").src;
   say(live.state);
-  tell(live);
+  showFigures(live);
   draw();
 }
 
@@ -77,13 +78,13 @@ function reach(values, least) {
 }
 
 // The lowest and the highest value of a graph's scale.
-function scale({least, both, title}, values) {
+function scale({least, both, isSpeed}, values) {
   const known = values.filter(value => value != null);
   if (both) {
     const bound = reach(known.map(Math.abs), least);
     return [-bound, bound];
   }
-  const target = title == "Speed" ? Math.min(live.set_speed ?? 0, TOP_SPEED) : 0;
+  const target = isSpeed ? Math.min(live.set_speed ?? 0, TOP_SPEED) : 0;
   const below = known.filter(value => value < 0).map(Math.abs);
   return [below.length ? -reach(below, least) : 0, reach(known, Math.max(least, target))];
 }
@@ -93,8 +94,8 @@ class Graph {
     Object.assign(this, graph, {column, range: [0, 1]});
     this.value = make("b");
     this.note = make("span", "", {class: "quiet"});
-    this.place = make("div", "", {role: "img", "aria-label": `${this.title} over the last minute`});
-    this.figure = make("figure", "", {}, make("figcaption", "", {}, make("span", this.title), this.value, this.note), this.place);
+    this.holder = make("div", "", {role: "img", "aria-label": `${this.title} over the last minute`});
+    this.figure = make("figure", "", {}, make("figcaption", "", {}, make("span", this.title), this.value, this.note), this.holder);
     element("plots").append(this.figure);
     this.build();
   }
@@ -113,7 +114,7 @@ class Graph {
         {...axis, size: LEFT, space: 20, values: (_, values) => values.map(value => `${value}${this.unit}`)},
       ],
       series: [{}, {...curve, stroke: colour("--line")}, {...curve, stroke: colour("--mark"), dash: [6, 4]}],
-    }, [[], [], []], this.place);
+    }, [[], [], []], this.holder);
   }
 
   size() {
@@ -127,7 +128,7 @@ class Graph {
     if (this.figure.hidden) return;
     this.range = scale(this, values);
     const [low, high] = this.range, clip = value => value == null ? null : Math.min(high, Math.max(low, value));
-    const target = this.title == "Speed" && live.set_speed ? Math.min(live.set_speed, high) : null;
+    const target = this.isSpeed && live.set_speed ? Math.min(live.set_speed, high) : null;
     this.plot.setData([times, at.map(row => clip(values[row])), times.map(() => target)]);
     const largest = values.reduce((most, value) => Math.abs(value) > Math.abs(most) ? value : most, 0);
     this.value.textContent = last == null ? "–" : rounded(last, this.digits) + this.unit;
