@@ -43,7 +43,7 @@ from cloning.network.network import CROP, UNITS, Network, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.frames import KEPT_FRAMES, FrameCache
-from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
+from cloning.recordings.log import CheckedRecording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import summary
 from cloning.training.checkpoint import Checkpoint, Progress, RunFiles, fingerprint, resumed_arguments
@@ -80,8 +80,7 @@ def read_observations(kind: type[Kind], folders: list[Path], arguments: Argument
     """
     parts, counts, frames = [], [], FrameCache(KEPT_FRAMES)
     for folder in folders:
-        recording = read_recording(folder)
-        check_images(recording, threads(), frames)
+        recording = check_images(read_recording(folder), threads(), frames)
         parts.append(kind.select(recording, arguments))
         counts.append(summary.Counts.of(recording, len(parts[-1])))
         print_findings(recording)
@@ -112,7 +111,7 @@ class ReportObservations(Observations):
         return f"throttle < {arguments.throttle_threshold:g}"
 
     @classmethod
-    def select(cls, recording: Recording, arguments: Arguments) -> Self:
+    def select(cls, recording: CheckedRecording, arguments: Arguments) -> Self:
         """Step 3: discard observations with little or no throttle; the label is the driver's steering."""
         rows = np.flatnonzero(recording.throttle >= arguments.throttle_threshold).astype(np.int32)
         number, digests = np.zeros(len(rows), np.int16), center_digests(recording, rows)

@@ -145,7 +145,7 @@ def main() -> None:
     sys.path[:0] = [str(ROOT)]
     # Imported, never used here: a library that has started threads would not survive a fork.
     for name in (
-        *("model", "video", "drive", "torch._dynamo", "av", "pandas", "matplotlib.backends.backend_agg"),
+        *("model", "video", "drive", "torch._dynamo", "av", "matplotlib.backends.backend_agg"),
         *("matplotlib.figure", "PIL.PngImagePlugin", "cloning.replay.command", "cloning.network.attention"),
         *("simulator.record", "simulator.report", "simulator.client", "simulator.film", "simulator.run"),
     ):

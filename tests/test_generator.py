@@ -49,8 +49,7 @@ def observations(steering, recordings=None, frame=None):
 
 
 def loaded(folder):
-    found = read_recording(folder)
-    check_images(found)
+    found = check_images(read_recording(folder))
     rows = np.arange(len(found), dtype=np.int32)
     return ReportObservations(
         [found], np.zeros(len(found), int), rows, found.steering, center_digests(found, rows), found.time

@@ -3,6 +3,7 @@
 import errno
 import shutil
 import threading
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,9 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
     monkeypatch.setattr(frames, "MAX_QUEUED", 2)
     saver, write, told = frames.FrameSaver(tmp_path / "run1"), Path.write_bytes, []
 
+    def tell(session: frames.SessionFolder) -> None:
+        told.append(session.summary())
+
     def fails_for_the_second_session(path, data):
         if data == b"lost":
             raise trouble
@@ -27,7 +31,7 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
         first.save(b"saved")
         second.save(b"lost" if n < 5 else b"saved")
     for session in (first, second):
-        session.when_written(lambda session=session: told.append(session.summary()))
+        session.when_written(partial(tell, session))
     reason = "No space left on device" if isinstance(trouble, OSError) else "ValueError: a bug"
     with pytest.raises(frames.FolderError, match=rf"run1: 5 of 40 frames were not saved \({reason}\); free"):
         saver.close()

@@ -24,7 +24,7 @@ import torch
 from cloning.base.arguments import number
 from cloning.base.errors import RecordingError, UserError
 from cloning.network.network import Network, load_model
-from cloning.recordings.log import Recording
+from cloning.recordings.log import CheckedRecording
 from cloning.replay.replay import load_recording
 from cloning.training.options import Arguments
 from cloning.training.robust import Poses, RobustObservations
@@ -40,7 +40,7 @@ BRIGHTNESS = (0, 50, 80, 110, 140, 256)  # mean of the view
 Sample = dict[str, np.ndarray]  # by column, one value for each view
 
 
-def sample(network: Network, recording: Recording, views: int, seed: int) -> Sample:
+def sample(network: Network, recording: CheckedRecording, views: int, seed: int) -> Sample:
     """Return what the network and the recovery steering say at random poses, and where these are: float64 (views,).
 
     wanted, shifted: the recovery steering, and with the lane's centre SHIFT further left; steering: the network's;

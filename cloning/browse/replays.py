@@ -1,6 +1,5 @@
 """Replays for the page: their figures, and what the replayed car sees in each row."""
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -42,8 +41,7 @@ class LineViews:
     def __init__(self, recording: Recording, result: Result, line: int):
         """line: its number in the result."""
         places = np.flatnonzero(result.columns["line"] == line)
-        part = copy.copy(recording)
-        part.keep(rows_driven(result, recording.images[:, 0])[places])
+        part = recording.take(rows_driven(result, recording.images[:, 0])[places])
         self.views = StretchViews(part, Stretch.of(part, slice(0, len(part))))
         self.right, self.yaw = result.columns["right"][places], result.columns["yaw"][places]
         self.steering = result.columns["steering"][places]

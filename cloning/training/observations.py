@@ -16,7 +16,7 @@ from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.network.network import CROP
 from cloning.recordings.format import DRIVE_GAP, PROBLEM_AREAS
 from cloning.recordings.images import decode, read_jpeg
-from cloning.recordings.log import Recording
+from cloning.recordings.log import CheckedRecording, Recording
 from cloning.training.options import Arguments
 
 SEEN_ROWS = slice(CROP[0], FRAME[0] - CROP[1])  # the rows of a frame that the network sees
@@ -147,7 +147,7 @@ class Observations(ABC):
 
     @classmethod
     @abstractmethod
-    def select(cls, recording: Recording, arguments: Arguments) -> Self:
+    def select(cls, recording: CheckedRecording, arguments: Arguments) -> Self:
         """Return the observations of a recording that training uses. Raises RecordingError, ModelError."""
 
     @abstractmethod
@@ -249,9 +249,8 @@ class Observations(ABC):
         return np.stack([self.read_cropped(at, 0) for at in rows])
 
 
-def center_digests(recording: Recording, rows: np.ndarray) -> np.ndarray:
-    """Return the digests of the centre images of these rows of a checked recording: uint64 (len(rows),)."""
-    assert recording.digests is not None, "check_images sets the digests"
+def center_digests(recording: CheckedRecording, rows: np.ndarray) -> np.ndarray:
+    """Return the digests of the centre images of these rows of a recording: uint64 (len(rows),)."""
     return recording.digests[recording.images[rows, 0]]
 
 

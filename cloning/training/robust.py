@@ -19,7 +19,7 @@ from cloning.lane.known import lane_position
 from cloning.lane.recovery import LOOKAHEAD, LaneAhead
 from cloning.network.network import CROP
 from cloning.recordings.format import CAMERAS, LANE_FILE
-from cloning.recordings.log import Recording
+from cloning.recordings.log import CheckedRecording, Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
 from cloning.road.motion import (
     AXLE_TO_CAMERA,
@@ -220,7 +220,7 @@ class RobustObservations(Observations):
         return "lane ahead unknown"
 
     @classmethod
-    def select(cls, recording: Recording, arguments: Arguments) -> Self:
+    def select(cls, recording: CheckedRecording, arguments: Arguments) -> Self:
         """Keep the rows whose lane ahead is known, labelled with the recovery steering from the recorded pose."""
         is_known = (recording.folder / LANE_FILE).exists()
         print(f"{'reading' if is_known else 'estimating'} the lane in {recording.folder}", flush=True)
