@@ -219,7 +219,7 @@ def test_rows_of_links_pipes_and_folders_are_left_out(copied):
     found = check_images(read_recording(copied))
     assert len(found) == 55
     missing, unusable = Finding.IMAGE_MISSING, Finding.IMAGE_UNUSABLE
-    reasons = ["missing; its link leads nowhere: copy the image in its place, or delete the row"] * 2
+    reasons = ["missing; its link leads nowhere: copy the image instead, or delete the row"] * 2
     reasons += [f"{why}; {COPY_OR_DELETE}" for why in ("not a regular file", "Is a directory", "not a regular file")]
     assert [row.finding for row in found.rejected] == [missing, missing, unusable, unusable, unusable]
     assert [row.detail for row in found.rejected] == [

@@ -317,14 +317,14 @@ def test_cameras_are_understood_by_whole_names_only(log, form, header):
 
 
 @pytest.mark.parametrize("extra", ["0.5", "1", "-0.1", "0", "1500000.5", "1%", "'1'", "30 mph"])
-@pytest.mark.parametrize("place", range(5))
-def test_an_unnamed_column_is_never_taken_for_another(log, extra, place):
+@pytest.mark.parametrize("column", range(5))
+def test_an_unnamed_column_is_never_taken_for_another(log, extra, column):
     fields = [row.split(",") for row in NUMBERS]
-    lines = [",".join([images(at), *row[:place], extra, *row[place:]]) for at, row in enumerate(fields)]
+    lines = [",".join([images(at), *row[:column], extra, *row[column:]]) for at, row in enumerate(fields)]
     with pytest.raises(RecordingError, match=r"line 1: .*5 numbers where 4 are expected.* name the columns"):
         log(*lines)
     names = HEADER.split(",")
-    names.insert(3 + place, "lap")
+    names.insert(3 + column, "lap")
     np.testing.assert_array_equal(numbers(log(",".join(names), *lines)), VALUES)
 
 

@@ -90,7 +90,7 @@ def _remedies(folder: Path) -> Callable[[str], str]:
         if similar != name:
             return f"rename {similar}, which differs in upper and lower case, or correct the csv"
         if (folder / name).is_symlink():
-            return "its link leads nowhere: copy the image in its place, or delete the row"
+            return "its link leads nowhere: copy the image instead, or delete the row"
         return COPY_OR_DELETE
 
     return remedy

@@ -4,10 +4,11 @@ Below a header, a column is taken if its whole name is understood. Without one, 
 writes: the images of the centre, left and right camera, then steering, throttle, brake and speed. An image is taken if
 its file's whole name tells its camera. What is not understood is refused, and the message has the remedy.
 
-Some things leave no evidence: without a header, another column in the place of a missing one; anywhere, values that are
-not what their column's name says, such as steering positive to the left, or a unit that stays within the ranges.
+Some things leave no evidence: without a header, or below one that was not meant for them, numbers in another order that
+stay within the ranges; anywhere, values that are not what their column's name says, such as steering in radians.
 """
 
+import itertools
 import os
 import re
 from collections.abc import Sequence
@@ -66,8 +67,12 @@ class Rejected(NamedTuple):
     detail: str
 
 
-class UnclearError(ValueError):
-    """A row or header that is not understood; the message says what would settle it."""
+class UnclearLogError(ValueError):
+    """What the columns of a log are is not understood; the message says in which line, and what would settle it."""
+
+
+class UnclearRowError(ValueError):
+    """A row is not understood; the message says what would settle it."""
 
     def __init__(self, finding: Finding, detail: str):
         """Keep the finding, and the detail as the message."""
@@ -86,20 +91,20 @@ def is_image(path: str) -> bool:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise UnclearError unless three file names are one moment's images of the centre, left and right camera."""
+    """Raise UnclearRowError unless three file names are one moment's images of the centre, left and right camera."""
     moments = set()
     for name, camera in zip(names, CAMERAS, strict=True):
         match = IMAGE.fullmatch(name)
         if not match or match[1].lower().replace("centre", "center") != camera or len(os.fsencode(name)) > MAX_NAME:
-            raise UnclearError(
+            raise UnclearRowError(
                 Finding.CAMERAS,
                 f"{name[:MAX_NAME]}: not understood as an image of the {camera} camera, such as "
-                f"{camera}_2018_07_16_17_11_43_382.jpg; rename it, here and in {IMAGE_FOLDER}/; if it is in the place "
-                f"of another camera's, {REMEDY}",
+                f"{camera}_2018_07_16_17_11_43_382.jpg; rename it, here and in {IMAGE_FOLDER}/; if it stands "
+                f"in another camera's column, {REMEDY}",
             )
         moments.add(match[2])
     if len(moments) > 1:
-        raise UnclearError(
+        raise UnclearRowError(
             Finding.CAMERAS,
             f"{', '.join(names)} are of different times: has a column been sorted or moved by itself? Copy the csv "
             "again, or delete the row",
@@ -117,11 +122,11 @@ def column_of(name: str) -> str:
     return MEANINGS.get(BETWEEN_WORDS.sub("", name.strip().lower()), "")
 
 
-def header_columns(fields: Sequence[str]) -> tuple[tuple[str, ...], bool]:
+def header_columns(line: int, fields: Sequence[str]) -> tuple[tuple[str, ...], bool]:
     """Return a header's columns, with other words for other columns, and whether the pedals' were taken without names.
 
-    They are if numbers or nothing stand for their names between steering and speed. Raises UnclearError unless each
-    column is named once.
+    They are if numbers or nothing stand for their names between steering and speed. line: in the csv, from 1. Raises
+    UnclearLogError unless each column is named once.
     """
     named = ",".join("" if not field or field.isdecimal() else column_of(field) or "?" for field in fields)
     filled = named.replace("center,left,right,steering,,,speed", ",".join(COLUMNS))
@@ -129,16 +134,15 @@ def header_columns(fields: Sequence[str]) -> tuple[tuple[str, ...], bool]:
     if wrong := [f"{name} {'twice' if name in columns else 'never'}" for name in COLUMNS if columns.count(name) != 1]:
         unknown = [repr(field) for field in fields if field and not column_of(field)]
         reason = f"; not understood: {', '.join(unknown)}" if unknown else ""
-        raise UnclearError(
-            Finding.COLUMNS,
-            f"neither a row nor a header, which names each column once: {','.join(fields)[:200]!r} names "
+        raise UnclearLogError(
+            f"line {line}: neither a row nor a header, which names each column once: {','.join(fields)[:200]!r} names "
             f"{', '.join(wrong)}{reason[:200]}; correct or delete this line; {REMEDY}",
         )
     return columns, filled != named
 
 
 def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> None:
-    """Raise UnclearError if the numbers of rows show that their columns are others than they are taken for.
+    """Raise UnclearLogError if the numbers of rows show that their columns are others than they are taken for.
 
     lines: int (n,), in the csv; numbers: float (n, 4), in the order of NUMBERS; is_named: by a header. A few steering
     angles or speeds out of range are taken for single errors. Negative pedals are not: they are what steering looks
@@ -151,8 +155,7 @@ def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> Non
         single = name == "steering" or (name == "speed" and column.min(initial=0) >= least)
         if outside.sum() > (max(1, MOST_ERRORS * len(column)) if single else 0):
             at = np.flatnonzero(outside)[np.argmin(lines[outside])]
-            raise UnclearError(
-                Finding.COLUMNS,
+            raise UnclearLogError(
                 f"line {lines[at]}: {name} is {column[at]:g} here, and not in {least}..{greatest} in {outside.sum()} "
                 f"of {len(column)} rows; if only they are wrong, delete them; if it is another column, {REMEDY}",
             )
@@ -161,8 +164,7 @@ def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> Non
     if not is_named and (both.any() or brake.sum() > throttle.sum()):
         at = lines[both if both.any() else brake > 0].min()
         doubt = "with the throttle" if both.any() else "more than the throttle in the rows without a header"
-        raise UnclearError(
-            Finding.COLUMNS,
+        raise UnclearLogError(
             f"line {at}: the brake is pressed {doubt}: are they other columns, or in another order? If not, {REMEDY}",
         )
 
@@ -172,15 +174,15 @@ def decimal_comma_readings(tokens: Sequence[str]) -> list[list[str]]:
 
     The simulator writes no trailing zeros: a fraction never ends with 0. It never has both pedals pressed.
     """
-    return [row for row in _joined(tokens, NUMBERS) if not (float(row[1]) and float(row[2]))]
-
-
-def _joined(tokens: Sequence[str], names: Sequence[str]) -> list[list[str]]:
-    if not tokens or not names:
-        return [] if tokens or names else [[]]
-    readings, (least, greatest) = [], RANGES[names[0]]
-    for size in range(1, min(len(tokens), 2) + 1):
-        joined = ".".join(tokens[:size])
-        if SIMULATOR_NUMBER.fullmatch(joined) and least <= float(joined) <= greatest:
-            readings += [[joined, *rest] for rest in _joined(tokens[size:], names[1:])]
+    readings = []
+    for sizes in itertools.product((1, 2), repeat=len(NUMBERS)):
+        ends = [0, *itertools.accumulate(sizes)]
+        row = [".".join(tokens[start:end]) for start, end in itertools.pairwise(ends)]
+        if ends[-1] == len(tokens) and all(map(SIMULATOR_NUMBER.fullmatch, row)):
+            values = [float(text) for text in row]
+            is_within = all(
+                least <= v <= greatest for v, (least, greatest) in zip(values, RANGES.values(), strict=True)
+            )
+            if is_within and not (values[1] and values[2]):
+                readings.append(row)
     return readings

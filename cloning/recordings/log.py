@@ -13,7 +13,7 @@ import numpy as np
 
 from cloning.base.errors import RecordingError
 from cloning.base.table import Column, Table
-from cloning.recordings.columns import Finding, Rejected
+from cloning.recordings.columns import Finding, Rejected, UnclearLogError
 from cloning.recordings.excluded import EXCLUDED, Cut, cut_rows, read_cuts
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE
 from cloning.recordings.frames import FrameCache
@@ -167,10 +167,13 @@ def read_uncut(folder: str | Path) -> Recording:
     """
     folder = Path(folder)
     path = folder / DRIVING_LOG
-    reader, line, text = RowReader(path), 0, ""
-    for line, text in enumerate(read_lines(path), 1):
-        reader.read_line(line, text)
-    image_names, numbers, lines = reader.finish(0 if text.endswith(("\n", "\r")) else line)
+    reader, line, text = RowReader(), 0, ""
+    try:
+        for line, text in enumerate(read_lines(path), 1):
+            reader.read_line(line, text)
+        image_names, numbers, lines = reader.finish(0 if text.endswith(("\n", "\r")) else line)
+    except UnclearLogError as error:
+        raise RecordingError(f"{path}: {error}") from None
     if not len(lines):
         reasons = {row.finding: f"line {row.line}: {row.detail}" for row in reversed(reader.rejected)}
         nothing = f"nothing was recorded; delete the folder {folder}, or record again"
@@ -178,27 +181,18 @@ def read_uncut(folder: str | Path) -> Recording:
     names, images = np.unique(image_names, return_inverse=True)
     images = images.reshape(image_names.shape).astype(np.int32)
     time = _time_stamps(names)[images[:, 0]]
+    steering, throttle, brake, speed = np.ascontiguousarray(numbers.astype(np.float32).T)
     if np.isnan(time).any():
         time = lines / float(SAMPLE_RATE)
-    steering, throttle, brake, speed = np.ascontiguousarray(numbers.astype(np.float32).T)
     contradicting = _contradicting(images[:, 0], steering)
     for row in np.flatnonzero(contradicting):
         name = os.fsdecode(image_names[row, 0])
         detail = f"{name} also has a row with another steering angle; delete the wrong one"
         reader.rejected.append(Rejected(int(lines[row]), Finding.CONTRADICTION, detail))
+    repairs = dict(sorted(reader.repairs.items(), key=lambda item: item[1][1]))
+    rows_read, rejected = reader.rows_read, sorted(reader.rejected)
     recording = Recording(
-        folder,
-        names,
-        images,
-        steering,
-        throttle,
-        brake,
-        speed,
-        time,
-        lines,
-        reader.rows_read,
-        dict(sorted(reader.repairs.items(), key=lambda item: item[1][1])),
-        sorted(reader.rejected),
+        folder, names, images, steering, throttle, brake, speed, time, lines, rows_read, repairs, rejected
     )
     order = np.lexsort((lines, time))  # sessions may have been merged in any order
     return recording.take(order[~contradicting[order]])

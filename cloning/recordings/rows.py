@@ -14,7 +14,7 @@ from cloning.recordings.columns import (
     REMEDY,
     Finding,
     Rejected,
-    UnclearError,
+    UnclearRowError,
     base_name,
     check_names,
     check_numbers,
@@ -44,13 +44,13 @@ def read_lines(path: Path) -> Iterator[str]:
     """Yield the csv's lines with their ends. Raises RecordingError if it cannot be read, or is not a text."""
     try:
         if path.exists() and not path.is_file():
-            raise RecordingError(f"{path}: not a regular file; copy the recording's {DRIVING_LOG} in its place")
+            raise RecordingError(f"{path}: not a regular file; put the real {DRIVING_LOG} there")
         encoding = _encoding(path)
         errors = "surrogateescape" if encoding == "utf-8" else "replace"
         with open(path, encoding=encoding, errors=errors, newline="") as text:
-            for number, line in enumerate(iter(partial(text.readline, LONGEST_LINE), ""), 1):
+            for at, line in enumerate(iter(partial(text.readline, LONGEST_LINE), ""), 1):
                 if len(line) == LONGEST_LINE:
-                    raise RecordingError(f"{path}: line {number}: longer than any row: not a csv; copy it again")
+                    raise RecordingError(f"{path}: line {at}: longer than any row: not a csv; copy it again")
                 yield line
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}; make it readable") from None
@@ -63,9 +63,7 @@ def _encoding(path: Path) -> str:
     if start[:2] == b"PK":
         raise RecordingError(f"{path}: line 1: an Excel workbook under a csv's name; open it and save it as CSV")
     if start == b"\x00\x05\x16\x07":
-        raise RecordingError(
-            f"{path}: line 1: a macOS resource file (AppleDouble), not the csv; copy the real {DRIVING_LOG}"
-        )
+        raise RecordingError(f"{path}: line 1: a macOS resource file (AppleDouble); copy the real {DRIVING_LOG}")
     if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
     if len(start) == 4 and any(start[0::2]) != any(start[1::2]):  # every other byte is 0
@@ -76,14 +74,14 @@ def _encoding(path: Path) -> str:
 class RowReader:
     """Reads the lines of a csv in their order, and then returns their rows.
 
-    rows_read  number of rows so far, usable or not
+    rows_read  rows so far, usable or not
     repairs    rows that were interpreted: how -> [rows, first line]
     rejected   rows that were left out
     """
 
-    def __init__(self, path: Path):
-        """path: the csv, which error messages name."""
-        self.path, self.rows_read = path, 0
+    def __init__(self) -> None:
+        """Begin a file."""
+        self.rows_read = 0
         self.repairs: dict[str, list[int]] = {}
         self.rejected: list[Rejected] = []
         self._columns: tuple[str, ...] = COLUMNS  # below the last header, as `header_columns` returns them
@@ -97,7 +95,7 @@ class RowReader:
     def read_line(self, line: int, text: str) -> None:
         """Read a line; line: its number in the csv, from 1.
 
-        Raises RecordingError if it is an unusable header, or the first line and neither a row nor a header.
+        Raises UnclearLogError if it is an unusable header, or the first line and neither a row nor a header.
         """
         text = text.rstrip("\r\n").removeprefix(BYTE_ORDER_MARK)
         if self._columns == COLUMNS and (plain := PLAIN_ROW.fullmatch(text)):
@@ -110,7 +108,7 @@ class RowReader:
         elif not NO_CONTENT.fullmatch(text):
             try:
                 self._read_odd_line(line, text)
-            except UnclearError as error:
+            except UnclearRowError as error:
                 self._reject(line, error.finding, str(error))
         elif "\0" in text:
             self._reject(line, Finding.NOT_A_ROW, "zeros: the file was cut off while it was written; delete the line")
@@ -119,7 +117,7 @@ class RowReader:
         """Return the usable rows, in any order; open_line: the last line if it has no end, else 0.
 
         They are the file names of their images, bytes (n, 3), in the order of CAMERAS; steering, throttle, brake and
-        speed, float64 (n, 4); and their lines in the csv, int32 (n,). Raises RecordingError if the numbers below a
+        speed, float64 (n, 4); and their lines in the csv, int32 (n,). Raises UnclearLogError if the numbers below a
         header, or without one, are not those of its columns.
         """
         self._read_decimal_commas()
@@ -127,10 +125,7 @@ class RowReader:
         below = np.searchsorted(self._headers, lines)
         for header in np.unique(below):
             rows = below == header
-            try:
-                check_numbers(lines[rows], numbers[rows], is_named=bool(header > 1))
-            except UnclearError as error:
-                raise RecordingError(f"{self.path}: {error}") from None
+            check_numbers(lines[rows], numbers[rows], is_named=bool(header > 1))
         least, greatest = np.array([*RANGES.values()], float).T
         outside = (numbers < least) | (numbers > greatest)
         usable = ~outside.any(1)
@@ -145,10 +140,10 @@ class RowReader:
         return names.reshape(-1, len(CAMERAS))[usable], numbers[usable], lines[usable]
 
     def _read_odd_line(self, line: int, text: str) -> None:
-        """Read a line that is not as the simulator writes it. Raises UnclearError, and RecordingError for a header."""
+        """Read a line that is not as the simulator writes it. Raises UnclearRowError, UnclearLogError."""
         if len(text) > LONGEST_ROW:
             self.rows_read += 1
-            raise UnclearError(Finding.NOT_A_ROW, f"a line of {len(text)} characters: {text[:40]!r}…; delete it")
+            raise UnclearRowError(Finding.NOT_A_ROW, f"a line of {len(text)} characters: {text[:40]!r}…; delete it")
         enough = [mark for mark in "\t;," if text.count(mark) >= len(COLUMNS) - 1]  # commas may also be decimal marks
         delimiter = enough[0] if enough else max(",;\t", key=text.count)
         folder = text[: text.find(CAMERAS[0])]
@@ -171,22 +166,19 @@ class RowReader:
     def _read_header(self, line: int, fields: list[str]) -> None:
         while fields and not fields[-1]:
             fields.pop()  # a comma at its end names no column: a value below it is not read
-        try:
-            self._columns, is_filled = header_columns(fields)
-        except UnclearError as error:
-            raise RecordingError(f"{self.path}: line {line}: {error}") from None
+        self._columns, is_filled = header_columns(line, fields)
         self._headers.append(line)
         if is_filled:
             self._repair("header lacks names; usual columns taken", line)
 
     def _read_row(self, line: int, fields: list[str], by_commas: bool) -> None:
-        """Read a row; by_commas: the fields are separated by them. Raises UnclearError if it is not understood."""
+        """Read a row; by_commas: the fields are separated by them. Raises UnclearRowError if it is not understood."""
         columns = self._columns
         while len(fields) > len(columns) and not fields[-1]:
             fields.pop()
         if len(fields) != len(columns):
             if ",".join(COLUMNS) not in ",".join(columns):
-                raise UnclearError(
+                raise UnclearRowError(
                     Finding.COLUMNS,
                     f"{len(fields)} fields below a header that names {len(columns)} in another order than the "
                     "simulator's; correct the header, or write one above these rows",
@@ -197,7 +189,7 @@ class RowReader:
         if not all(map(is_image, images)):
             count = sum(map(is_image, fields))
             found = f"{'1 image name' if count == 1 else f'{count} image names'} where {', '.join(CAMERAS)} belong"
-            raise UnclearError(Finding.NOT_A_ROW, f"{found}; record again, add them, or {REMEDY}")
+            raise UnclearRowError(Finding.NOT_A_ROW, f"{found}; record again, add them, or {REMEDY}")
         names, extra = [base_name(image) for image in images], fields[len(columns) :]
         check_names(names)
         tokens = [*numbers, *extra]
@@ -206,13 +198,13 @@ class RowReader:
             return
         self._has_points = self._has_points or any("." in token and NUMBER.fullmatch(token) for token in tokens)
         if any(map(str.isdigit, "".join(extra))):
-            raise UnclearError(
+            raise UnclearRowError(
                 Finding.COLUMNS,
                 f"{len(tokens)} numbers where {len(NUMBERS)} are expected: {','.join(tokens)[:80]!r}; {REMEDY}",
             )
         if not all(map(NUMBER.fullmatch, numbers)):
             detail = f"{','.join(numbers)[:80]!r} is not {', '.join(NUMBERS)}; correct or delete the row"
-            raise UnclearError(Finding.NOT_A_NUMBER, detail)
+            raise UnclearRowError(Finding.NOT_A_NUMBER, detail)
         if extra:
             self._repair("extra columns ignored", line)
         self._add(line, names, numbers)
