@@ -51,17 +51,11 @@ COMMENT = b"\xff\xfe\0\x15"
 HIDDEN = [marker + (len(HUGE) + 6).to_bytes(2) + HUGE + COMMENT for marker in (b"\xff\x01", b"\xff\xd0", b"\xff\xd8")]
 
 
-@pytest.mark.parametrize("piece", HIDDEN)
-def test_a_size_cannot_be_hidden_from_the_check_by_a_marker_without_length(piece):
-    with pytest.raises(ValueError, match="not a plain JPEG"):
-        decode(inserted(piece, HEADER))
-
-
-@pytest.mark.parametrize("marker", [b"", *MARKERS])
-@pytest.mark.parametrize("at", [2, HEADER, SCAN])
-def test_a_size_cannot_be_hidden_from_the_check(marker, at):
-    with pytest.raises(ValueError, match=r"not a plain JPEG|not a JPEG|pixels where"):
-        decode(inserted(marker + HUGE, at))
+@pytest.mark.parametrize("piece", [HUGE, *HIDDEN, *(marker + HUGE for marker in MARKERS)])
+def test_a_size_cannot_be_hidden_from_the_check(piece):
+    for at in (2, HEADER, SCAN):
+        with pytest.raises(ValueError, match=r"not a plain JPEG|not a JPEG|pixels where"):
+            decode(inserted(piece, at))
 
 
 def with_scans(count: int) -> bytes:
@@ -131,14 +125,8 @@ def test_the_orientation_in_exif_data_is_ignored(orientation):
 def mutations(count: int):
     """JPEGs with bytes of the header changed, and markers, huge frame headers and other segments put in between."""
     rng = random.Random(0)
-    pieces = [
-        *MARKERS,
-        *HIDDEN,
-        HUGE,
-        HUGE.replace(b"\xff\xc0", b"\xff\xc2"),
-        PLAIN[HEADER:SCAN],
-        PLAIN[SCAN : SCAN + 14],
-    ]
+    pieces = [*MARKERS, *HIDDEN, HUGE, HUGE.replace(b"\xff\xc0", b"\xff\xc2")]
+    pieces += [PLAIN[HEADER:SCAN], PLAIN[SCAN : SCAN + 14]]
     originals = [PLAIN, jpeg_of(progressive=True)]
     for _ in range(count):
         jpeg = bytearray(rng.choice(originals))
@@ -290,14 +278,13 @@ def test_the_cause_of_missing_images_is_named(copied, tmp_path, change, remedy, 
     assert first in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("encoding", ["ascii:strict"])
-def test_a_name_that_the_terminal_cannot_show_is_printed_as_escapes(copied, encoding):
+def test_a_name_that_the_terminal_cannot_show_is_printed_as_escapes(copied):
     log = copied / "driving_log.csv"
     log.write_bytes(log.read_bytes().replace(b"_2018", b"_\xff018", 18))
     done = subprocess.run(
         [sys.executable, "-m", "simulator", "replay", copied, "--model", SHIPPED_MODEL, "--reference", "human"],
         cwd=ROOT,
-        env={**os.environ, "PYTHONIOENCODING": encoding},
+        env={**os.environ, "PYTHONIOENCODING": "ascii:strict"},
         capture_output=True,
         timeout=300,
     )

@@ -212,6 +212,12 @@ def test_decimal_commas_that_can_be_read_in_two_ways_are_left_out(log):
     )
     assert findings(found) == [(3, Finding.COLUMNS)]  # 0 | 0,1 | 0 | 5 or 0 | 0 | 1 | 0,5
     assert "four numbers with decimal commas in 2 ways" in found.rejected[0].detail
+    for row in (
+        '"0","100001","0","0","0"',
+        "0,100001,0,0,0,",
+    ):  # a counter after steering, perhaps before an empty column
+        with pytest.raises(RecordingError, match="line 1: 5 numbers where 4 are expected"):
+            log(*usual(numbers=[row] * 3))
     rows = ["0,3333333,0,0,0,0", "1,0,0,0,1", "1,333333,0,0,0,0"]  # a lap before steering, throttle, brake and speed
     with pytest.raises(RecordingError, match=r"line 1: .* in 0 ways, but not those in line 1; write decimal points"):
         log(*usual(numbers=rows))
@@ -285,7 +291,9 @@ def test_a_header_is_understood_by_whole_names_only(log, name, written):
     line = HEADER.replace(name, written)
     unknown = "" if written == "0" else f"not understood: '{re.escape(written)}'"
     for rest in ("", ",lap", ",human"):
-        with pytest.raises(RecordingError, match=rf"line 1: .* names {name} never.*{unknown}.*{HEADER} in their order"):
+        with pytest.raises(
+            RecordingError, match=rf"line 1: .* names {name} never.*{unknown}.*{HEADER}, in their order"
+        ):
             log(line + rest, *[row + rest for row in usual()])
     with pytest.raises(RecordingError, match=rf"driving_log.csv: line 5: .* names {name} never"):
         log(*usual(), line, *usual(first=10))
@@ -340,7 +348,7 @@ def test_an_unnamed_column_is_never_taken_for_another(log, extra, column):
     ],
 )
 def test_numbers_that_show_other_columns_or_units(log, rows, why):
-    with pytest.raises(RecordingError, match=rf"driving_log.csv: {why}.*{HEADER} in their order"):
+    with pytest.raises(RecordingError, match=rf"driving_log.csv: {why}.*{HEADER}, in their order"):
         log(*usual(numbers=rows))
     if "brake" in why:  # which a header settles
         assert len(log(HEADER, *usual(numbers=rows))) == len(rows)

@@ -3,7 +3,7 @@
 import itertools
 import os
 import string
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,28 +26,20 @@ HEADER_NAMES = {
     "brake": ["brake", "Brake", "reverse"],
     "speed": ["speed", "Speed"],
 }
-# Names of other columns, and of columns with another sign, range or unit: column -> name -> what is written in it.
 OTHERS = ["lap", "predicted_steering", "steering_error", "angle_of_car", "target_speed", "throttle_limit", "left_wheel"]
-Conversion = Callable[[float], float]
-UNITS: dict[str, dict[str, Conversion]] = {
-    "steering": {
-        "steering_ccw": lambda value: -value,
-        "-steering": lambda value: -value,
-        "steering 0..1": lambda value: (value + 1) / 2,
-        "steering/4": lambda value: value / 4,
-        "steering (rad)": lambda value: value * 0.436,
-        "human": lambda value: value,
-    },
-    "throttle": {"throttle_pct": lambda value: value * 100, "throttle/2": lambda value: value / 2},
-    "brake": {"no brake": lambda value: 1 - value},
+# Names of columns with another sign, range or unit: column -> name -> factor and summand of what is written.
+UNITS: dict[str, dict[str, tuple[float, float]]] = {
+    "steering": {"steering_ccw": (-1, 0), "-steering": (-1, 0), "steering 0..1": (0.5, 0.5), "steering/4": (0.25, 0)},
+    "throttle": {"throttle_pct": (100, 0), "throttle/2": (0.5, 0)},
+    "brake": {"no brake": (-1, 1)},
     "speed": {
-        "speed_m_s": lambda value: value * 0.447,
-        "speed (metres/second)": lambda value: value * 0.447,
-        "speed ft/s": lambda value: value * 1.467,
-        "kmh": lambda value: value * 1.609,
+        "speed_m_s": (0.447, 0),
+        "speed (metres/second)": (0.447, 0),
+        "speed ft/s": (1.467, 0),
+        "kmh": (1.609, 0),
     },
 }
-IMAGES = ["{camera}_{stamp}.jpg", "{camera}_{stamp}.JPG", "Center_{at}.jpg", "{camera} {at}.jpeg"]
+IMAGES = ["{camera}_{stamp}.jpg", "{camera}_{stamp}.JPG", "{Camera}_{at}.jpg", "{camera} {at}.jpeg"]
 # Names that say the camera, but not as a whole, in another language, or not at all.
 UNCLEAR_IMAGES = [
     "a_{camera}_{stamp}.jpg",
@@ -56,8 +48,7 @@ UNCLEAR_IMAGES = [
     "{letter}_{at}.jpg",
     "{letter}x{stamp}.jpg",
     "{stamp}-{camera}.jpg",
-    "{mirrored}/{at}.jpg",
-    "{camera}/{number}.jpg",
+    "{camera}/{at}.jpg",
     "{german}_{stamp}.jpg",
 ]
 GERMAN = {"center": "mitte", "left": "links", "right": "rechts"}
@@ -70,14 +61,14 @@ class Part:
 
     order     the columns' names in their order; names that are no columns are extra ones
     header    its line, or None
-    units     column -> what is written for its value
+    units     column -> factor and summand of what is written
     values    of each row: column -> number, or text of an extra column
     images    of each row: camera -> file name, perhaps with a folder
     """
 
     order: tuple[str, ...]
     header: list[str] | None
-    units: dict[str, Conversion]
+    units: dict[str, tuple[float, float]]
     values: list[dict]
     images: list[dict[str, str]]
     folder: str
@@ -100,8 +91,8 @@ class Part:
                 elif isinstance(values[column], str):
                     fields.append(values[column])
                 else:
-                    value = self.units.get(column, float)(values[column])
-                    fields.append(self.written(value).replace(".", self.mark))
+                    factor, summand = self.units.get(column, (1, 0))
+                    fields.append(self.written(values[column] * factor + summand).replace(".", self.mark))
             names = [images[camera].rpartition("/")[2] for camera in CAMERAS]
             yield self.joined(fields), (names, [float(self.written(values[name])) for name in NUMBERS])
 
@@ -165,22 +156,11 @@ def image_names(draw, start, size):
     form = draw(st.sampled_from(IMAGES if draw(st.integers(0, 9)) else UNCLEAR_IMAGES))
     images = []
     for at in range(start, start + size):
-        stamp = f"2018_07_16_17_11_{at % 60:02d}_{at:03d}"
-        images.append(
-            {
-                camera: form.replace("Center", camera.title()).format(
-                    camera=camera,
-                    Camera=camera.title(),
-                    letter=camera[0],
-                    german=GERMAN[camera],
-                    mirrored=camera[::-1],
-                    stamp=stamp,
-                    at=at,
-                    number=3 * at + place,
-                )
-                for place, camera in enumerate(CAMERAS)
-            }
-        )
+        fields = {"stamp": f"2018_07_16_17_11_{at % 60:02d}_{at:03d}", "at": at}
+        words = [
+            {"camera": name, "Camera": name.title(), "letter": name[0], "german": GERMAN[name]} for name in CAMERAS
+        ]
+        images.append({each["camera"]: form.format(**each, **fields) for each in words})
     return images
 
 

@@ -37,7 +37,11 @@ def check_images(
     cache = cache_file(folder)
     digests, is_known = _read_cache(cache, names, states)
     is_missing = states[:, 0] < 0
-    reasons: dict[int, str] = {}  # why an image is unusable, by its index
+    reasons: dict[int, str] = {}  # why an image is unusable, by its index, and what to do
+    if is_missing.any():
+        remedy = _remedies(folder)
+        for image in np.flatnonzero(is_missing).tolist():
+            reasons[image] = f"missing; {remedy(os.fsdecode(names[image]))}"
     todo = np.flatnonzero(~is_known & ~is_missing)
 
     def examine(image: int) -> None:
@@ -46,32 +50,28 @@ def check_images(
             frames.put((recording.folder, image), decode(jpeg))
             digests[image] = int.from_bytes(hashlib.blake2b(jpeg, digest_size=8).digest(), "big")
         except ValueError as error:
-            reasons[image] = str(error)
+            reasons[image] = f"{error}; {COPY_OR_DELETE}"
 
-    title, shown = f"checking images of {recording.folder.name}", None if show_progress and len(todo) else True
+    title, is_hidden = f"checking images of {recording.folder.name}", None if show_progress and len(todo) else True
     with (
         ThreadPoolExecutor(threads) as pool,
-        tqdm(total=len(todo), desc=title, unit="image", leave=False, disable=shown) as bar,
+        tqdm(total=len(todo), desc=title, unit="image", leave=False, disable=is_hidden) as bar,
     ):
         remaining = iter(todo.tolist())
         while part := list(islice(remaining, 4096)):  # a future takes memory, and there may be millions of images
             for _ in pool.map(examine, part):
                 bar.update()
-    is_usable = ~is_missing
+    is_usable = np.ones(len(names), bool)
     is_usable[list(reasons)] = False
     if is_usable[todo].any():
         _write_cache(cache, names[is_usable], states[is_usable], digests[is_usable])
-    remedy = _remedies(folder) if is_missing.any() else None
     unusable = ~is_usable[recording.images]
     rejected = list(recording.rejected)
     for row in np.flatnonzero(unusable.any(1)):
         image = int(recording.images[row][unusable[row]][0])
-        name = os.fsdecode(names[image])
-        if remedy and is_missing[image]:
-            finding, reason = Finding.IMAGE_MISSING, f"missing; {remedy(name)}"
-        else:
-            finding, reason = Finding.IMAGE_UNUSABLE, f"{reasons[image]}; {COPY_OR_DELETE}"
-        rejected.append(Rejected(int(recording.lines[row]), finding, f"{IMAGE_FOLDER}/{name}: {reason}"))
+        finding = Finding.IMAGE_MISSING if is_missing[image] else Finding.IMAGE_UNUSABLE
+        detail = f"{IMAGE_FOLDER}/{os.fsdecode(names[image])}: {reasons[image]}"
+        rejected.append(Rejected(int(recording.lines[row]), finding, detail))
     checked = CheckedRecording(**{**vars(recording), "frames": frames, "rejected": rejected}, digests=digests)
     return checked.take(~unusable.any(1))
 

@@ -20,8 +20,8 @@ import numpy as np
 from cloning.recordings.format import CAMERAS, COLUMNS, IMAGE_FOLDER, MAX_NAME, NUMBERS, RANGES
 
 REMEDY = (
-    f"name the columns in a header line above the rows: {','.join(COLUMNS)} in their order, other words for others "
-    "(steering -1..1, right positive; pedals 0..1; speed in mph)"
+    f"name the columns in a header line above the rows: {','.join(COLUMNS)}, in their order, other words for others; "
+    "convert what is not steering -1..1, right positive, pedals 0..1, speed in mph"
 )
 NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE | re.ASCII)

@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -86,9 +86,7 @@ class RowReader:
         self.rejected: list[Rejected] = []
         self._columns: tuple[str, ...] = COLUMNS  # below the last header, as `header_columns` returns them
         self._headers = [0]  # their lines; 0 for none
-        self._names: list[Iterable[str]] = []
-        self._numbers: list[list[float]] = []
-        self._lines: list[int] = []
+        self._rows: list[tuple[int, Sequence[str], Sequence[str]]] = []  # line, names and numbers
         self._has_points = False  # a number with a decimal point has been seen
         self._with_commas: list[tuple[int, list[str], list[str]]] = []  # line, names and fields that may be numbers
 
@@ -102,7 +100,7 @@ class RowReader:
             self.rows_read += 1
             self._has_points = self._has_points or "." in text[plain.end(4) :]
             center, _, left, right, *numbers = plain.groups()
-            self._add(line, (center, left, right), numbers)
+            self._rows.append((line, (center, left, right), numbers))
         elif text.startswith(MERGE_MARKERS):
             self._reject(line, Finding.MERGE_CONFLICT, f"{text[:20]!r}: resolve the merge, delete the line")
         elif not NO_CONTENT.fullmatch(text):
@@ -121,7 +119,8 @@ class RowReader:
         header, or without one, are not those of its columns.
         """
         self._read_decimal_commas()
-        lines, numbers = np.array(self._lines, np.int32), np.reshape(self._numbers, (-1, len(NUMBERS)))
+        lines = np.array([line for line, *_ in self._rows], np.int32)
+        numbers = np.array([float(token) for *_, tokens in self._rows for token in tokens]).reshape(-1, len(NUMBERS))
         below = np.searchsorted(self._headers, lines)
         for header in np.unique(below):
             rows = below == header
@@ -136,7 +135,7 @@ class RowReader:
             self._reject(int(lines[row]), Finding.OUT_OF_RANGE, f"{what}{lost}; correct or delete the row")
         if open_line in lines[usable]:
             self._repair("the file ends within this line: its last number may be cut short", open_line)
-        names = np.array([name.encode(errors="surrogateescape") for row in self._names for name in row], bytes)
+        names = np.array([name.encode(errors="surrogateescape") for _, row, _ in self._rows for name in row], bytes)
         return names.reshape(-1, len(CAMERAS))[usable], numbers[usable], lines[usable]
 
     def _read_odd_line(self, line: int, text: str) -> None:
@@ -161,7 +160,8 @@ class RowReader:
             if with_points != fields:
                 self._repair("decimal commas", line)
                 fields = with_points
-        return self._read_row(line, fields, delimiter == ",")
+        has_decimal_commas = delimiter == "," and '"' not in text and fields[-1] != ""
+        return self._read_row(line, fields, has_decimal_commas)
 
     def _read_header(self, line: int, fields: list[str]) -> None:
         while fields and not fields[-1]:
@@ -171,8 +171,8 @@ class RowReader:
         if is_filled:
             self._repair("header lacks names; usual columns taken", line)
 
-    def _read_row(self, line: int, fields: list[str], by_commas: bool) -> None:
-        """Read a row; by_commas: the fields are separated by them. Raises UnclearRowError if it is not understood."""
+    def _read_row(self, line: int, fields: list[str], has_decimal_commas: bool) -> None:
+        """Read a row; has_decimal_commas: it may have been split at them. Raises UnclearRowError."""
         columns = self._columns
         while len(fields) > len(columns) and not fields[-1]:
             fields.pop()
@@ -193,7 +193,7 @@ class RowReader:
         names, extra = [base_name(image) for image in images], fields[len(columns) :]
         check_names(names)
         tokens = [*numbers, *extra]
-        if extra and by_commas and all(NUMBER.fullmatch(token) and "." not in token for token in tokens):
+        if extra and has_decimal_commas and all(NUMBER.fullmatch(token) and "." not in token for token in tokens):
             self._with_commas.append((line, names, tokens))
             return
         self._has_points = self._has_points or any("." in token and NUMBER.fullmatch(token) for token in tokens)
@@ -207,7 +207,7 @@ class RowReader:
             raise UnclearRowError(Finding.NOT_A_NUMBER, detail)
         if extra:
             self._repair("extra columns ignored", line)
-        self._add(line, names, numbers)
+        self._rows.append((line, names, numbers))
 
     def _read_decimal_commas(self) -> None:
         """Add the rows of more than four whole numbers, if they are surely four numbers with decimal commas.
@@ -228,16 +228,11 @@ class RowReader:
         for (line, names, tokens), found in zip(self._with_commas, readings, strict=True):
             if len(found) == 1 and not doubt:
                 self._repair("decimal commas", line)
-                self._add(line, names, found[0])
+                self._rows.append((line, names, found[0]))
             else:
                 reason = f"may be four numbers with decimal commas in {len(found)} ways{doubt}"
                 detail = f"{','.join(tokens)!r} {reason}; write decimal points, or {REMEDY}"
                 self._reject(line, Finding.COLUMNS, detail)
-
-    def _add(self, line: int, names: Iterable[str], tokens: Iterable[str]) -> None:
-        self._lines.append(line)
-        self._names.append(names)
-        self._numbers.append([float(token) for token in tokens])
 
     def _reject(self, line: int, finding: Finding, detail: str) -> None:
         self.rejected.append(Rejected(line, finding, detail))
