@@ -25,7 +25,7 @@ from cloning.recordings.columns import (
 )
 from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, NUMBERS, RANGES
 
-FOLDER = r'(?: *|[^,"]*[/\\])'  # of an image, or blanks
+FOLDER = r'(?:(?:[^,"/\\]*+[/\\])++| *)'  # of an image, or blanks
 # A row as the simulator writes it: nearly all are, so these are read at once.
 PLAIN_ROW = re.compile(
     rf"{FOLDER}(center(_[\d_]{{1,99}}\.jpg)) *,{FOLDER}(left\2) *,{FOLDER}(right\2) *"
@@ -99,8 +99,7 @@ class RowReader:
         if self._columns == COLUMNS and (plain := PLAIN_ROW.fullmatch(text)):
             self.rows_read += 1
             self._has_points = self._has_points or "." in text[plain.end(4) :]
-            center, _, left, right, *numbers = plain.groups()
-            self._rows.append((line, (center, left, right), numbers))
+            self._rows.append((line, plain.group(1, 3, 4), plain.group(5, 6, 7, 8)))
         elif text.startswith(MERGE_MARKERS):
             self._reject(line, Finding.MERGE_CONFLICT, f"{text[:20]!r}: resolve the merge, delete the line")
         elif not NO_CONTENT.fullmatch(text):
