@@ -1,5 +1,6 @@
 """excluded.csv: which rows a cut leaves out, what every reader says of it, and that cuts are never lost."""
 
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -112,7 +113,16 @@ def test_a_file_that_is_no_text_and_one_that_leaves_nothing(linked):
         read_recording(linked)
     (linked / "excluded.csv").unlink()
     (linked / "excluded.csv").mkdir()
-    with pytest.raises(RecordingError, match=r"excluded.csv: .*; make it a readable file"):
+    with pytest.raises(RecordingError, match=r"excluded.csv: not a regular file; make it a readable file"):
+        read_recording(linked)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among files")
+@pytest.mark.parametrize("name", ["driving_log.csv", "excluded.csv"])
+def test_a_named_pipe_is_refused_and_not_waited_for(linked, name):
+    (linked / name).unlink(missing_ok=True)
+    os.mkfifo(linked / name)
+    with pytest.raises(RecordingError, match=f"{name}: not a regular file; "):
         read_recording(linked)
 
 

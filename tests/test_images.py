@@ -228,7 +228,9 @@ def test_images_are_checked_named_and_left_out(copied, monkeypatch):
     }
     for at, (jpeg, _) in damaged.items():
         images[at].write_bytes(jpeg)
-    found = check_images(read_recording(copied))
+    given = read_recording(copied)
+    found = check_images(given)
+    assert len(given) == 60 and given.rejected == [], "not changed"
     expected = [Rejected(2, Finding.IMAGE_MISSING, f"IMG/{images[1].name}: missing; {COPY_OR_DELETE}")]
     for at, (_, reason) in damaged.items():
         detail = f"IMG/{images[at].name}: {reason}; {COPY_OR_DELETE}"

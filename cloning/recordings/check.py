@@ -106,13 +106,11 @@ def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
     states = np.full((len(names), 2), -1, np.int64)
     if not folder.is_dir():
         return states
+    wanted = {name: index for index, name in enumerate(names.tolist())}
     try:
         with os.scandir(folder) as entries:
-            while part := list(islice(entries, 8192)):
-                entry_names = np.array([os.fsencode(entry.name) for entry in part])
-                at = np.searchsorted(names, entry_names).clip(max=len(names) - 1)
-                is_wanted = names[at] == entry_names
-                for entry, index in zip(np.array(part)[is_wanted], at[is_wanted], strict=True):
+            for entry in entries:
+                if (index := wanted.get(os.fsencode(entry.name))) is not None:
                     with suppress(OSError):  # a link that leads nowhere
                         status = entry.stat()
                         states[index] = status.st_size, status.st_mtime_ns
