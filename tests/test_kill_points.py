@@ -114,7 +114,7 @@ def rows_of(folder: Path) -> list[tuple]:
     try:
         recording = read_recording(folder)
     except RecordingError as error:
-        assert "no usable row (line 1: " in str(error)
+        assert "no usable row: line 1: " in str(error)
         return []
     total = len((folder / "driving_log.csv").read_bytes().splitlines())
     recording = check_images(recording, show_progress=False)
