@@ -42,7 +42,7 @@ from cloning.network.network import CROP, NETWORKS, SEEN_SHAPE, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.frames import KEPT_FRAMES, FrameCache
-from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
+from cloning.recordings.log import CheckedRecording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import options, summary
 from cloning.training.batch import Batch, Choices
@@ -75,8 +75,7 @@ def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, 
     """
     parts, counts, frames = list[Observations](), [], FrameCache(KEPT_FRAMES)
     for folder in folders:
-        recording = read_recording(folder)
-        check_images(recording, threads(), frames)
+        recording = check_images(read_recording(folder), threads(), frames)
         parts.append(recipe.select(recording, recipe))
         counts.append(summary.Counts.of(recording, len(parts[-1])))
         print_findings(recording)
@@ -90,7 +89,7 @@ def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, 
     return observations
 
 
-def select_driven(recording: Recording, recipe: Recipe) -> Observations:
+def select_driven(recording: CheckedRecording, recipe: Recipe) -> Observations:
     """Step 3: discard observations with little or no throttle; the label is the driver's steering."""
     rows = np.flatnonzero(recording.throttle >= recipe.throttle_threshold)
     return Observations.of_rows(recording, rows, recording.steering[rows], Lanes.unknown(len(rows)))

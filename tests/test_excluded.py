@@ -1,5 +1,6 @@
 """excluded.csv: which rows a cut leaves out, what every reader says of it, and that cuts are never lost."""
 
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -52,11 +53,11 @@ def test_copies_of_a_cut_row_are_cut_with_it(linked):
 def test_without_time_stamps_a_stretch_ends_at_the_next_row_with_its_last_image(tmp_path):
     """Copies at the end of a log, as oversampling makes them, do not stretch a cut to there."""
     order = [0, 1, 2, 3, 4, 5, 3, 0]
-    rows = "".join(f"c{n}.jpg,l{n}.jpg,r{n}.jpg,0.{n + 1},0.5,0,20\n" for n in order)
+    rows = "".join(f"center{n}.jpg,left{n}.jpg,right{n}.jpg,0.{n + 1},0.5,0,20\n" for n in order)
     (tmp_path / "driving_log.csv").write_text(rows, encoding="utf-8")
-    (tmp_path / "excluded.csv").write_text("c2.jpg,c3.jpg,\n", encoding="utf-8")
+    (tmp_path / "excluded.csv").write_text("center2.jpg,center3.jpg,\n", encoding="utf-8")
     left = read_recording(tmp_path)
-    assert [left.name(row) for row in range(len(left))] == ["c0.jpg", "c1.jpg", "c4.jpg", "c5.jpg", "c0.jpg"]
+    assert [left.name(row) for row in range(len(left))] == [f"center{n}.jpg" for n in (0, 1, 4, 5, 0)]
 
 
 def test_every_command_honours_and_counts_cuts(copied, capsys):
@@ -112,7 +113,16 @@ def test_a_file_that_is_no_text_and_one_that_leaves_nothing(linked):
         read_recording(linked)
     (linked / "excluded.csv").unlink()
     (linked / "excluded.csv").mkdir()
-    with pytest.raises(RecordingError, match=r"excluded.csv: .*; make it a readable file"):
+    with pytest.raises(RecordingError, match=r"excluded.csv: not a regular file; make it a readable file"):
+        read_recording(linked)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among files")
+@pytest.mark.parametrize("name", ["driving_log.csv", "excluded.csv"])
+def test_a_named_pipe_is_refused_and_not_waited_for(linked, name):
+    (linked / name).unlink(missing_ok=True)
+    os.mkfifo(linked / name)
+    with pytest.raises(RecordingError, match=f"{name}: not a regular file; "):
         read_recording(linked)
 
 

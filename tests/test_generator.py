@@ -57,8 +57,7 @@ def observations(steering, recordings=None, frame=None):
 
 
 def loaded(folder):
-    found = read_recording(folder)
-    check_images(found)
+    found = check_images(read_recording(folder))
     n = len(found)
     return Observations.of_rows(found, np.arange(n), found.steering, Lanes.unknown(n))
 

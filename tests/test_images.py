@@ -6,6 +6,7 @@ import random
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -19,8 +20,9 @@ import simulator.__main__ as simulator
 from cloning.base.errors import RecordingError
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings import check
-from cloning.recordings.check import check_images
-from cloning.recordings.images import MAX_BYTES, decode, jpeg_size, read_frame, read_jpeg
+from cloning.recordings.check import COPY_OR_DELETE, check_images
+from cloning.recordings.columns import Finding, Rejected
+from cloning.recordings.images import MAX_BYTES, decode, encode, jpeg_size, read_frame, read_jpeg
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
 
@@ -50,17 +52,11 @@ COMMENT = b"\xff\xfe\0\x15"
 HIDDEN = [marker + (len(HUGE) + 6).to_bytes(2) + HUGE + COMMENT for marker in (b"\xff\x01", b"\xff\xd0", b"\xff\xd8")]
 
 
-@pytest.mark.parametrize("piece", HIDDEN)
-def test_a_size_cannot_be_hidden_from_the_check_by_a_marker_without_length(piece):
-    with pytest.raises(ValueError, match="not a plain JPEG"):
-        decode(inserted(piece, HEADER))
-
-
-@pytest.mark.parametrize("marker", [b"", *MARKERS])
-@pytest.mark.parametrize("at", [2, HEADER, SCAN])
-def test_a_size_cannot_be_hidden_from_the_check(marker, at):
-    with pytest.raises(ValueError, match=r"not a plain JPEG|not a JPEG|pixels where"):
-        decode(inserted(marker + HUGE, at))
+@pytest.mark.parametrize("piece", [HUGE, *HIDDEN, *(marker + HUGE for marker in MARKERS)])
+def test_a_size_cannot_be_hidden_from_the_check(piece):
+    for at in (2, HEADER, SCAN):
+        with pytest.raises(ValueError, match=r"not a plain JPEG|not a JPEG|pixels where"):
+            decode(inserted(piece, at))
 
 
 def with_scans(count: int) -> bytes:
@@ -108,6 +104,16 @@ def test_what_other_encoders_write_is_read_as_they_meant(jpeg):
     assert np.abs(decode(jpeg).astype(int) - expected).mean() < 1
 
 
+def test_a_jpeg_cut_at_any_byte_is_refused_and_colour_is_rgb():
+    assert jpeg_size(PLAIN) == (160, 320)
+    for length in range(0, len(PLAIN) - 1, 97):
+        with pytest.raises(ValueError, match=r"empty|cut short|not a JPEG"):
+            jpeg_size(PLAIN[:length])
+    blue = np.zeros((160, 320, 3), np.uint8)
+    blue[..., 0] = 255  # OpenCV writes BGR
+    assert decode(cv2.imencode(".jpg", blue)[1].tobytes())[80, 160].argmax() == 2
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_the_orientation_in_exif_data_is_ignored(orientation):
     exif = Image.Exif()
@@ -120,14 +126,8 @@ def test_the_orientation_in_exif_data_is_ignored(orientation):
 def mutations(count: int):
     """JPEGs with bytes of the header changed, and markers, huge frame headers and other segments put in between."""
     rng = random.Random(0)
-    pieces = [
-        *MARKERS,
-        *HIDDEN,
-        HUGE,
-        HUGE.replace(b"\xff\xc0", b"\xff\xc2"),
-        PLAIN[HEADER:SCAN],
-        PLAIN[SCAN : SCAN + 14],
-    ]
+    pieces = [*MARKERS, *HIDDEN, HUGE, HUGE.replace(b"\xff\xc0", b"\xff\xc2")]
+    pieces += [PLAIN[HEADER:SCAN], PLAIN[SCAN : SCAN + 14]]
     originals = [PLAIN, jpeg_of(progressive=True)]
     for _ in range(count):
         jpeg = bytearray(rng.choice(originals))
@@ -205,18 +205,45 @@ def test_rows_of_links_pipes_and_folders_are_left_out(copied):
     images[2].symlink_to("/dev/zero")
     images[3].mkdir()
     os.mkfifo(images[4])
-    found = read_recording(copied)
-    check_images(found)
+    found = check_images(read_recording(copied))
     assert len(found) == 55
-    assert sorted((line, kind) for line, kind, _ in found.rejected) == [
-        (1, "image missing"),
-        (2, "image missing"),
-        (3, "image not a regular file"),
-        (4, "image Is a directory"),
-        (5, "image not a regular file"),
+    missing, unusable = Finding.IMAGE_MISSING, Finding.IMAGE_UNUSABLE
+    reasons = ["missing; its link leads nowhere: copy the image instead, or delete the row"] * 2
+    reasons += [f"{why}; {COPY_OR_DELETE}" for why in ("not a regular file", "Is a directory", "not a regular file")]
+    assert [row.finding for row in found.rejected] == [missing, missing, unusable, unusable, unusable]
+    assert [row.detail for row in found.rejected] == [
+        f"IMG/{image.name}: {reason}" for image, reason in zip(images, reasons, strict=True)
     ]
-    assert all(f"IMG/{images[line - 1].name}" in detail for line, _, detail in found.rejected)
-    assert all("leads nowhere" in detail for line, _, detail in found.rejected if line < 3)
+
+
+def test_images_are_checked_named_and_left_out(copied, monkeypatch):
+    images = sorted((copied / "IMG").glob("center*"))
+    whole = images[4].read_bytes()
+    images[1].unlink()
+    damaged = {
+        2: (b"", "empty"),
+        3: (whole[: len(whole) // 2], "cut short"),
+        4: (whole[:-2000] + bytes(2000), "cut short"),  # what a crash leaves: the end is zeros
+        5: (b"not an image", "not a JPEG"),
+        6: (encode(np.zeros((480, 640, 3), np.uint8), 75), "640x480 pixels where 320x160 are expected"),
+    }
+    for at, (jpeg, _) in damaged.items():
+        images[at].write_bytes(jpeg)
+    given = read_recording(copied)
+    found = check_images(given)
+    assert len(given) == 60 and given.rejected == [], "not changed"
+    expected = [Rejected(2, Finding.IMAGE_MISSING, f"IMG/{images[1].name}: missing; {COPY_OR_DELETE}")]
+    for at, (_, reason) in damaged.items():
+        detail = f"IMG/{images[at].name}: {reason}; {COPY_OR_DELETE}"
+        expected.append(Rejected(at + 1, Finding.IMAGE_UNUSABLE, detail))
+    assert found.rejected == expected
+    assert set(found.lines) == set(range(1, 61)) - set(range(2, 8))
+    looked_at = Mock(side_effect=decode)
+    monkeypatch.setattr(check, "decode", looked_at)
+    again = check_images(read_recording(copied))
+    read_again = {jpeg for (jpeg,), _ in looked_at.call_args_list}
+    assert read_again == {jpeg for jpeg, _ in damaged.values()}, "unchanged images are not decoded again"
+    np.testing.assert_array_equal(again.digests, found.digests)
 
 
 def lower_case_folder(folder: Path) -> None:
@@ -254,14 +281,13 @@ def test_the_cause_of_missing_images_is_named(copied, tmp_path, change, remedy, 
     assert first in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("encoding", ["ascii:strict"])
-def test_a_name_that_the_terminal_cannot_show_is_printed_as_escapes(copied, encoding):
+def test_a_name_that_the_terminal_cannot_show_is_printed_as_escapes(copied):
     log = copied / "driving_log.csv"
-    log.write_bytes(log.read_bytes().replace(b"center_2018", b"center_\xff018", 6))
+    log.write_bytes(log.read_bytes().replace(b"_2018", b"_\xff018", 18))
     done = subprocess.run(
         [sys.executable, "-m", "simulator", "replay", copied, "--model", SHIPPED_MODEL, "--reference", "human"],
         cwd=ROOT,
-        env={**os.environ, "PYTHONIOENCODING": encoding},
+        env={**os.environ, "PYTHONIOENCODING": "ascii:strict"},
         capture_output=True,
         timeout=300,
     )
@@ -331,8 +357,7 @@ def checked(copied) -> tuple[Path, Path, Path]:
 
     Returns its folder, its cache, and the bad image.
     """
-    recording = read_recording(copied)
-    check_images(recording)
+    recording = check_images(read_recording(copied))
     image = copied / "IMG" / os.fsdecode(recording.names[7])
     state = image.stat()
     image.write_bytes(bytes(state.st_size))
@@ -351,6 +376,16 @@ def as_objects(images: np.ndarray) -> np.ndarray:
     return np.array([tuple(image) for image in images.tolist()], dtype=object)
 
 
+def as_array(cache: Path, images: np.ndarray) -> None:
+    np.save(f"{cache}.npy", images)
+    os.replace(f"{cache}.npy", cache)
+
+
+def as_folder(cache: Path, images: np.ndarray) -> None:
+    cache.unlink()
+    cache.mkdir()
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -364,25 +399,20 @@ def as_objects(images: np.ndarray) -> np.ndarray:
         lambda cache, images: rewritten(cache, images=images["name"]),
         lambda cache, images: rewritten(cache, images=as_objects(images)),
         lambda cache, images: np.savez(cache, names=images["name"], states=images["state"], reasons=b""),  # earlier
-        lambda cache, images: (np.save(f"{cache}.npy", images), os.replace(f"{cache}.npy", cache)),
+        as_array,
         lambda cache, images: cache.write_bytes(b""),
         lambda cache, images: cache.write_bytes(b"no cache"),
         lambda cache, images: cache.write_bytes(cache.read_bytes()[:-100]),
-        lambda cache, images: (cache.unlink(), cache.mkdir()),
+        as_folder,
     ],
 )
 def test_a_cache_that_this_version_has_not_written_is_not_believed(checked, damage, capsys):
     folder, cache, image = checked
-    recording = read_recording(folder)
-    check_images(recording)
-    assert len(recording) == 60, "what this version has written is believed"
+    assert len(check_images(read_recording(folder))) == 60, "what this version has written is believed"
     with np.load(cache) as file:
         damage(cache, file["images"])
-    recording = read_recording(folder)
-    check_images(recording)
-    assert [detail for *_, detail in recording.rejected] == [
-        f"IMG/{image.name}: not a JPEG; copy it again, or delete the row"
-    ]
+    (row,) = check_images(read_recording(folder)).rejected
+    assert row.detail == f"IMG/{image.name}: not a JPEG; copy it again, or delete the row"
     assert f"{cache}: unreadable" in capsys.readouterr().out
 
 
@@ -395,6 +425,5 @@ def test_no_damage_to_the_cache_makes_a_changed_image_usable(checked):
         for _ in range(rng.randint(1, 4)):
             damaged[rng.randrange(len(damaged))] = rng.randrange(256)
         cache.write_bytes(damaged[: rng.choice([len(damaged), rng.randrange(len(damaged))])])
-        recording = read_recording(folder)
-        check_images(recording)
+        recording = check_images(read_recording(folder))
         assert len(recording) == 59 and not any(recording.digests[7:8])

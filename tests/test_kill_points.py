@@ -108,10 +108,10 @@ def rows_of(folder: Path) -> list[tuple]:
     try:
         recording = read_recording(folder)
     except RecordingError as error:
-        assert "no usable row (line 1: " in str(error)
+        assert "no usable row: line 1: " in str(error)
         return []
     total = len((folder / "driving_log.csv").read_bytes().splitlines())
-    check_images(recording, show_progress=False)
+    recording = check_images(recording, show_progress=False)
     assert len(recording) + len(recording.rejected) == total
     images = [[bytes(name) for name in row] for row in recording.names[recording.images]]
     numbers = zip(recording.steering, recording.throttle, recording.speed, strict=True)

@@ -1,8 +1,9 @@
-"""Frames that cannot be saved are counted and told, and driving goes on."""
+"""Frames that cannot be saved are counted and reported, and driving goes on."""
 
 import errno
 import shutil
 import threading
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,10 @@ from cloning.recordings import saved_frames as frames
 def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_path, monkeypatch, trouble):
     """Whatever the trouble, the thread goes on: driving would wait for it for ever once its queue is full."""
     monkeypatch.setattr(frames, "MAX_QUEUED", 2)
-    saver, write, told = frames.FrameSaver(tmp_path / "run1"), Path.write_bytes, []
+    saver, write, reports = frames.FrameSaver(tmp_path / "run1"), Path.write_bytes, []
+
+    def tell(session: frames.SessionFolder) -> None:
+        reports.append(session.summary())
 
     def fails_for_the_second_session(path, data):
         if data == b"lost":
@@ -27,11 +31,11 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
         first.save(b"saved")
         second.save(b"lost" if n < 5 else b"saved")
     for session in (first, second):
-        session.when_written(lambda session=session: told.append(session.summary()))
+        session.when_written(partial(tell, session))
     reason = "No space left on device" if isinstance(trouble, OSError) else "ValueError: a bug"
     with pytest.raises(frames.FolderError, match=rf"run1: 5 of 40 frames were not saved \({reason}\); free"):
         saver.close()
-    assert told == [
+    assert reports == [
         f"driven frames saved in {tmp_path / 'run1'}",
         f"15 frames saved in {tmp_path / 'run1-2'}, 5 LOST ({reason})",
     ]

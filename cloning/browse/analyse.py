@@ -6,7 +6,6 @@ python -m cloning.browse.analyse RECORDING replay model.pt 1    # a drive with t
 """
 
 import argparse
-import copy
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +28,7 @@ from cloning.lane.reader import LaneNetwork, detect_centres, read_strips
 from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
 from cloning.recordings.check import check_images
+from cloning.recordings.columns import IMAGE_FINDINGS
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_uncut
 from cloning.replay.model_driver import ModelDriver
@@ -56,9 +56,7 @@ def main() -> int:
         if analysis.kind == "replay":
             result = replayed(load_recording(folder), analysis)
         else:
-            recording = read_uncut(folder)
-            check_images(recording, threads(), show_progress=False)
-            recording.drop_copies()
+            recording = check_images(read_uncut(folder), threads(), show_progress=False).without_copies()
             result = lane(recording) if analysis.kind == "lane" else steering(recording, analysis.model)
         write_result(folder, analysis, before, result)
     except (UserError, OSError) as error:
@@ -155,14 +153,12 @@ def parts(recording: Recording) -> Iterator[Recording]:
     """Yield a recording in parts of PART_ROWS, and print how much of it is done before each."""
     for start in range(0, len(recording), PART_ROWS):
         print(f"{PROGRESS}{start / len(recording):.3f}", flush=True)
-        part = copy.copy(recording)
-        part.keep(np.arange(start, min(start + PART_ROWS, len(recording))))
-        yield part
+        yield recording.take(slice(start, start + PART_ROWS))
 
 
 def rejected(recording: Recording) -> dict[str, object]:
     """Return how many rows have an unusable image, and the first of them: [line, detail]."""
-    unusable = [(line, detail) for line, kind, detail in recording.rejected if kind.startswith("image ")]
+    unusable = [(row.line, row.detail) for row in recording.rejected if row.finding in IMAGE_FINDINGS]
     return {"unusable": len(unusable), "first_unusable": unusable[:SHOWN_REJECTED]}
 
 

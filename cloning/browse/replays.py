@@ -1,6 +1,5 @@
 """Replays for the page: their figures, and what the replayed car sees in each row."""
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -50,8 +49,7 @@ class LineViews:
     def __init__(self, recording: Recording, result: Result, line: int):
         """line: its index among the reference lines."""
         indices = np.flatnonzero(result.columns["line"] == line)
-        part = copy.copy(recording)
-        part.keep(rows_driven(result, recording.images[:, 0])[indices])
+        part = recording.take(rows_driven(result, recording.images[:, 0])[indices])
         self.views = StretchViews(part, Stretch.of(part, slice(0, len(part))))
         self.right, self.yaw, self.steering = (result.columns[name][indices] for name in ("right", "yaw", "steering"))
         self.first = int(indices[0])

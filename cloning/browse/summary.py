@@ -6,7 +6,7 @@ import numpy as np
 
 from cloning.browse.analyses import Result
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.log import SHOWN_PER_KIND, Recording
+from cloning.recordings.log import SHOWN_REJECTED, Recording
 from cloning.road.motion import MAX_GAP
 
 BINS = 41  # of the histogram of steering, from -1 to 1; the middle one is around 0
@@ -80,7 +80,7 @@ def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
         "rows_read": recording.rows_read,
         "repairs": [[repair, rows, line] for repair, (rows, line) in recording.repairs.items()],
         "rejected": len(recording.rejected),
-        "first_rejected": [[line, detail] for line, _, detail in recording.rejected[:SHOWN_PER_KIND]],
+        "first_rejected": [[row.line, row.detail] for row in recording.rejected[:SHOWN_REJECTED]],
     }
 
 

@@ -13,76 +13,67 @@ from tqdm import tqdm
 
 from cloning.base.errors import RecordingError
 from cloning.base.files import written_whole
+from cloning.recordings.columns import Finding, Rejected
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
 from cloning.recordings.frames import FrameCache
 from cloning.recordings.images import RULES, decode, read_jpeg
-from cloning.recordings.log import Recording
+from cloning.recordings.log import CheckedRecording, Recording
 
-MISSING = "missing"
 COPY_OR_DELETE = "copy it again, or delete the row"
 
 
 def check_images(
     recording: Recording, threads: int = 2, frames: FrameCache | None = None, show_progress: bool = True
-) -> None:
-    """Decode every image of a recording; remove the rows that have an unusable image.
+) -> CheckedRecording:
+    """Decode every image of a recording, and return its rows without those that have an unusable image.
 
     Usable images are remembered in the user's cache folder: one whose file has not changed since (same size and time of
-    change) is not decoded again. Sets `recording.digests`; adds line, kind and detail of each removed row to
-    `recording.rejected`. threads: that decode at the same time; frames: becomes the recording's, and keeps what is
-    decoded. Raises RecordingError if `IMG/` cannot be listed.
+    change) is not decoded again. threads: that decode at the same time; frames: becomes the recording's, and keeps what
+    is decoded. Raises RecordingError if `IMG/` cannot be listed.
     """
-    recording.frames = frames or FrameCache()
+    frames = frames or FrameCache()
     names, folder = recording.names, recording.folder / IMAGE_FOLDER
     states = _file_states(folder, names)
     cache = cache_file(folder)
     digests, is_known = _read_cache(cache, names, states)
     is_missing = states[:, 0] < 0
-    reasons: dict[int, str] = dict.fromkeys(np.flatnonzero(is_missing).tolist(), MISSING)
+    reasons: dict[int, str] = {}  # why an image is unusable, by its index, and what to do
+    if is_missing.any():
+        remedy = _remedies(folder)
+        for image in np.flatnonzero(is_missing).tolist():
+            reasons[image] = f"missing; {remedy(os.fsdecode(names[image]))}"
     todo = np.flatnonzero(~is_known & ~is_missing)
-    if len(todo):
 
-        def examine(at: int) -> tuple[str, int]:
-            try:
-                jpeg = read_jpeg(folder / os.fsdecode(names[at]))
-                recording.frames.put((recording.folder, at), decode(jpeg))
-            except ValueError as error:
-                return str(error), 0
-            return "", int.from_bytes(hashlib.blake2b(jpeg, digest_size=8).digest(), "big")
+    def examine(image: int) -> None:
+        try:
+            jpeg = read_jpeg(folder / os.fsdecode(names[image]))
+            frames.put((recording.folder, image), decode(jpeg))
+            digests[image] = int.from_bytes(hashlib.blake2b(jpeg, digest_size=8).digest(), "big")
+        except ValueError as error:
+            reasons[image] = f"{error}; {COPY_OR_DELETE}"
 
-        with (
-            ThreadPoolExecutor(threads) as pool,
-            tqdm(
-                total=len(todo),
-                desc=f"checking images of {recording.folder.name}",
-                unit="image",
-                leave=False,
-                disable=None if show_progress else True,
-            ) as bar,
-        ):
-            remaining = iter(todo.tolist())
-            while part := list(
-                islice(remaining, 4096)
-            ):  # in parts, because a future takes memory and there may be millions of images
-                for at, (reason, digest) in zip(part, pool.map(examine, part), strict=True):
-                    digests[at] = digest
-                    if reason:
-                        reasons[at] = reason
-                    bar.update()
+    title, is_hidden = f"checking images of {recording.folder.name}", None if show_progress and len(todo) else True
+    with (
+        ThreadPoolExecutor(threads) as pool,
+        tqdm(total=len(todo), desc=title, unit="image", leave=False, disable=is_hidden) as bar,
+    ):
+        remaining = iter(todo.tolist())
+        while part := list(islice(remaining, 4096)):  # a future takes memory, and there may be millions of images
+            for _ in pool.map(examine, part):
+                bar.update()
     is_usable = np.ones(len(names), bool)
     is_usable[list(reasons)] = False
     if is_usable[todo].any():
         _write_cache(cache, names[is_usable], states[is_usable], digests[is_usable])
-    recording.digests = digests
-    remedy = _remedies(folder) if is_missing.any() else None
     unusable = ~is_usable[recording.images]
+    rejected = list(recording.rejected)
     for row in np.flatnonzero(unusable.any(1)):
         image = int(recording.images[row][unusable[row]][0])
-        name, reason = os.fsdecode(names[image]), reasons[image]
-        what_to_do = remedy(name) if remedy and reason == MISSING else COPY_OR_DELETE
-        detail = f"{IMAGE_FOLDER}/{name}: {reason}; {what_to_do}"
-        recording.rejected.append((int(recording.lines[row]), f"image {reason}", detail))
-    recording.keep(~unusable.any(1))
+        finding = Finding.IMAGE_MISSING if is_missing[image] else Finding.IMAGE_UNUSABLE
+        detail = f"{IMAGE_FOLDER}/{os.fsdecode(names[image])}: {reasons[image]}"
+        rejected.append(Rejected(int(recording.lines[row]), finding, detail))
+    checked = CheckedRecording(**{**vars(recording), "frames": frames, "rejected": rejected}, digests=digests)
+    return checked.take(~unusable.any(1))
 
 
 def _remedies(folder: Path) -> Callable[[str], str]:
@@ -99,7 +90,7 @@ def _remedies(folder: Path) -> Callable[[str], str]:
         if similar != name:
             return f"rename {similar}, which differs in upper and lower case, or correct the csv"
         if (folder / name).is_symlink():
-            return "its link leads nowhere: copy the image in its place, or delete the row"
+            return "its link leads nowhere: copy the image instead, or delete the row"
         return COPY_OR_DELETE
 
     return remedy
@@ -115,13 +106,11 @@ def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
     states = np.full((len(names), 2), -1, np.int64)
     if not folder.is_dir():
         return states
+    wanted = {name: index for index, name in enumerate(names.tolist())}
     try:
         with os.scandir(folder) as entries:
-            while part := list(islice(entries, 8192)):
-                entry_names = np.array([os.fsencode(entry.name) for entry in part])
-                at = np.searchsorted(names, entry_names).clip(max=len(names) - 1)
-                is_wanted = names[at] == entry_names
-                for entry, index in zip(np.array(part)[is_wanted], at[is_wanted], strict=True):
+            for entry in entries:
+                if (index := wanted.get(os.fsencode(entry.name))) is not None:
                     with suppress(OSError):  # a link that leads nowhere
                         status = entry.stat()
                         states[index] = status.st_size, status.st_mtime_ns
@@ -130,14 +119,14 @@ def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
     return states
 
 
-def cache_file(folder: Path, of: str = "") -> Path:
+def cache_file(folder: Path, analysis: str = "") -> Path:
     """Return the file in the user's cache folder in which the results of a slow look at a folder are remembered.
 
-    of: what looked, as part of the file's name; empty for `check_images`.
+    analysis: what looked, as part of the file's name; empty for `check_images`.
     """
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
-    return home / "behavioral-cloning" / f"{name}{of}.npz"
+    return home / "behavioral-cloning" / f"{name}{analysis}.npz"
 
 
 def _cache_columns(names: np.dtype) -> np.dtype:
@@ -146,7 +135,7 @@ def _cache_columns(names: np.dtype) -> np.dtype:
 
 
 def _read_cache(cache: Path, names: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the digest of each file, uint64 (m,), and whether it is known to be usable and unchanged, bool (m,)."""
+    """Return each file's digest, uint64 (m,), else 0, and whether it is known to be usable and unchanged, bool (m,)."""
     try:
         with np.load(cache) as file:
             if "rules" not in file or file["rules"] != RULES:
@@ -155,7 +144,8 @@ def _read_cache(cache: Path, names: np.ndarray, states: np.ndarray) -> tuple[np.
         if known.ndim != 1 or known.dtype != _cache_columns(known.dtype["name"]):
             raise ValueError("other columns")
         at = np.searchsorted(known["name"], names).clip(max=len(known) - 1)
-        return known["digest"][at], (known["name"][at] == names) & (known["state"][at] == states).all(1)
+        is_known = (known["name"][at] == names) & (known["state"][at] == states).all(1)
+        return known["digest"][at] * is_known, is_known
     except FileNotFoundError:
         pass  # the first run on this folder
     except Exception as error:  # whatever a damaged file makes NumPy raise

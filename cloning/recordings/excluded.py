@@ -152,6 +152,8 @@ def _locked(log: Path) -> Iterator[None]:
 def _lines(path: Path) -> list[str]:
     """Return the file's lines with their ends, none if there is no file. Raises RecordingError if it is not text."""
     try:
+        if path.exists() and not path.is_file():  # a pipe would never end
+            raise RecordingError(f"{path}: not a regular file; make it a readable file")
         data = path.read_bytes()
     except FileNotFoundError:
         return []
@@ -165,22 +167,22 @@ def _lines(path: Path) -> list[str]:
 def _parse(path: Path, lines: list[str]) -> list[Cut]:
     """Return the cuts in the file's lines. Raises RecordingError."""
     cuts = []
-    for number, line in enumerate(lines, 1):
+    for at, line in enumerate(lines, 1):
         text = line.removeprefix("\ufeff").strip()
         try:
             fields = next(csv.reader([text], strict=True, skipinitialspace=True), [])
         except csv.Error as error:
-            raise RecordingError(f"{path}: line {number}: {error}; a line is {_line(HEADER).strip()}") from None
+            raise RecordingError(f"{path}: line {at}: {error}; a line is {_line(HEADER).strip()}") from None
         fields = [field.strip() for field in fields]
-        if not any(fields) or (number == 1 and tuple(field.lower() for field in fields) == HEADER):
+        if not any(fields) or (at == 1 and tuple(field.lower() for field in fields) == HEADER):
             continue
         if len(fields) != len(HEADER):
             raise RecordingError(
-                f"{path}: line {number}: {len(fields)} fields where {len(HEADER)} are expected: "
+                f"{path}: line {at}: {len(fields)} fields where {len(HEADER)} are expected: "
                 f"{_line(HEADER).strip()}; put a reason that has commas in double quotes"
             )
         first, last = (name.replace("\\", "/").rpartition("/")[2] for name in fields[:2])
-        cuts.append(Cut(first, last, fields[2], number))
+        cuts.append(Cut(first, last, fields[2], at))
     return cuts
 
 

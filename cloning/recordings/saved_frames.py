@@ -71,7 +71,7 @@ class FrameSaver:
         empty_folder(path)
         self._path = path
         resolved = path.resolve()  # "." has no name
-        numbered = (resolved.with_name(f"{resolved.name}-{number}") for number in itertools.count(2))
+        numbered = (resolved.with_name(f"{resolved.name}-{session}") for session in itertools.count(2))
         # os.path, because Path.exists raises an error where it may not look; saving then counts what it loses.
         self._folders = itertools.chain([path], (folder for folder in numbered if not os.path.exists(folder)))
         self._sessions: list[SessionFolder] = []

@@ -17,7 +17,7 @@ from cloning.lane.recovery import LaneAhead, LanePosition
 from cloning.recordings.check import check_images
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.images import compress, compressed_rows, encode
-from cloning.recordings.log import Recording, print_findings, read_recording
+from cloning.recordings.log import CheckedRecording, Recording, print_findings, read_recording
 from cloning.replay.views import StretchViews
 from cloning.road.autonomy import autonomy
 from cloning.road.camera import VIEW_JPEG_QUALITY
@@ -94,18 +94,16 @@ class Drive:
         return autonomy(len(self.interventions), sum(self.seconds))
 
 
-def load_recording(folder: str | Path) -> Recording:
+def load_recording(folder: str | Path) -> CheckedRecording:
     """Read a recording without unusable rows, which are printed, and without repetitions of the row before.
 
     Raises RecordingError if the recording cannot be read, or no row is left.
     """
-    recording = read_recording(folder)
-    check_images(recording)
+    recording = check_images(read_recording(folder))
     print_findings(recording)
     if not len(recording):
         raise RecordingError(f"{recording.folder / DRIVING_LOG}: no usable row is left to replay")
-    recording.drop_copies()
-    return recording
+    return recording.without_copies()
 
 
 def reference_lines(recording: Recording, by_lane: bool = True) -> list[ReferenceLine]:

@@ -2,14 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from cloning.recordings.format import SAMPLE_RATE
-
-if TYPE_CHECKING:
-    from cloning.recordings.log import Recording  # which loads pandas, and driving needs none
+from cloning.recordings.log import Recording
 
 MPH = 0.44704  # m/s
 TOP_SPEED_MPH = 30  # the simulator clamps the car's speed to it

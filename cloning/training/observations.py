@@ -17,7 +17,7 @@ from cloning.base.table import Column, Table
 from cloning.network.network import SEEN_ROWS
 from cloning.recordings.format import CAMERAS, DRIVE_GAP, PROBLEM_AREAS
 from cloning.recordings.images import decode, read_jpeg
-from cloning.recordings.log import Recording
+from cloning.recordings.log import CheckedRecording, Recording
 from cloning.training.lanes import Lanes
 from cloning.training.recipe import Recipe
 
@@ -90,9 +90,8 @@ class Observations(Table):
     lanes: Lanes
 
     @classmethod
-    def of_rows(cls, recording: Recording, rows: np.ndarray, steering: np.ndarray, lanes: Lanes) -> Self:
-        """Return the observations of these rows of a checked recording, int (n,), with these labels."""
-        assert recording.digests is not None, "check_images sets the digests"
+    def of_rows(cls, recording: CheckedRecording, rows: np.ndarray, steering: np.ndarray, lanes: Lanes) -> Self:
+        """Return the observations of these rows of a recording, int (n,), with these labels."""
         frame = recording.digests[recording.images[rows, 0]]
         number = np.zeros(len(rows), np.int16)
         return cls([recording], number, rows.astype(np.int32), steering, frame, recording.time[rows], lanes)

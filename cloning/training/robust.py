@@ -12,7 +12,7 @@ import numpy as np
 
 from cloning.network.network import CROP, SEEN_SHAPE
 from cloning.recordings.format import CAMERAS, LANE_FILE
-from cloning.recordings.log import Recording
+from cloning.recordings.log import CheckedRecording
 from cloning.road.warp import with_alpha
 from cloning.training.lanes import Lanes, Poses
 from cloning.training.observations import Example, Observations, ValidationSet
@@ -72,7 +72,7 @@ def robust(report: Recipe) -> Recipe:
     )
 
 
-def select_known_lane(recording: Recording, recipe: Recipe) -> Observations:
+def select_known_lane(recording: CheckedRecording, recipe: Recipe) -> Observations:
     """Keep the rows whose lane ahead is known, labelled with the recovery steering from the recorded pose."""
     is_known = (recording.folder / LANE_FILE).exists()
     print(f"{'reading' if is_known else 'estimating'} the lane in {recording.folder}", flush=True)

@@ -1,0 +1,240 @@
+"""Read the rows of `driving_log.csv`, whatever other programs have done to it: quotes, tabs, decimal commas, damage."""
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from cloning.base.errors import RecordingError
+from cloning.recordings.columns import (
+    NUMBER,
+    REMEDY,
+    Finding,
+    Rejected,
+    UnclearRowError,
+    base_name,
+    check_names,
+    check_numbers,
+    decimal_comma_readings,
+    header_columns,
+    is_header,
+    is_image,
+)
+from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, NUMBERS, RANGES
+
+FOLDER = r'(?:(?:[^,"/\\]*+[/\\])++| *)'  # of an image, or blanks
+# A row as the simulator writes it: nearly all are, so these are read at once.
+PLAIN_ROW = re.compile(
+    rf"{FOLDER}(center(_[\d_]{{1,99}}\.jpg)) *,{FOLDER}(left\2) *,{FOLDER}(right\2) *"
+    + rf", *({NUMBER.pattern}) *" * len(NUMBERS),
+    re.ASCII,
+)
+MERGE_MARKERS = ("<<<<<<<", "|||||||", "=======", ">>>>>>>")  # what git leaves in a file with a conflict
+BYTE_ORDER_MARK = "\ufeff"  # which some programs write at the beginning; files are also joined
+NO_CONTENT = re.compile(r"(sep=.)?[\s\0\x1a,;]*", re.IGNORECASE)  # Excel's first line; \x1a: what copy adds at the end
+DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)$", re.ASCII)
+LONGEST_ROW = 20_000  # characters: more than three paths and some columns can have
+LONGEST_LINE = 1 << 20  # at the end of a file that a crash has filled with zeros, there may be far more
+
+
+def read_lines(path: Path) -> Iterator[str]:
+    """Yield the csv's lines with their ends. Raises RecordingError if it cannot be read, or is not a text."""
+    try:
+        if path.exists() and not path.is_file():
+            raise RecordingError(f"{path}: not a regular file; put the real {DRIVING_LOG} there")
+        encoding = _encoding(path)
+        errors = "surrogateescape" if encoding == "utf-8" else "replace"
+        with open(path, encoding=encoding, errors=errors, newline="") as text:
+            for at, line in enumerate(iter(partial(text.readline, LONGEST_LINE), ""), 1):
+                if len(line) == LONGEST_LINE:
+                    raise RecordingError(f"{path}: line {at}: longer than any row: not a csv; copy it again")
+                yield line
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}; make it readable") from None
+
+
+def _encoding(path: Path) -> str:
+    """Return the csv's encoding, judged by its first bytes. Raises RecordingError if it is not text."""
+    with open(path, "rb") as file:
+        start = file.read(4)
+    if start[:2] == b"PK":
+        raise RecordingError(f"{path}: line 1: an Excel workbook under a csv's name; open it and save it as CSV")
+    if start == b"\x00\x05\x16\x07":
+        raise RecordingError(f"{path}: line 1: a macOS resource file (AppleDouble); copy the real {DRIVING_LOG}")
+    if start[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if len(start) == 4 and any(start[0::2]) != any(start[1::2]):  # every other byte is 0
+        raise RecordingError(f"{path}: line 1: UTF-16 without a byte-order mark; save it as CSV in UTF-8")
+    return "utf-8"
+
+
+class RowReader:
+    """Reads the lines of a csv in their order, and then returns their rows.
+
+    rows_read  rows so far, usable or not
+    repairs    rows that were interpreted: how -> [rows, first line]
+    rejected   rows that were left out
+    """
+
+    def __init__(self) -> None:
+        """Begin a file."""
+        self.rows_read = 0
+        self.repairs: dict[str, list[int]] = {}
+        self.rejected: list[Rejected] = []
+        self._columns: tuple[str, ...] = COLUMNS  # below the last header, as `header_columns` returns them
+        self._headers = [0]  # their lines; 0 for none
+        self._rows: list[tuple[int, Sequence[str], Sequence[str]]] = []  # line, names and numbers
+        self._has_points = False  # a number with a decimal point has been seen
+        self._with_commas: list[tuple[int, list[str], list[str]]] = []  # line, names and fields that may be numbers
+
+    def read_line(self, line: int, text: str) -> None:
+        """Read a line; line: its number in the csv, from 1.
+
+        Raises UnclearLogError if it is an unusable header, or the first line and neither a row nor a header.
+        """
+        text = text.rstrip("\r\n").removeprefix(BYTE_ORDER_MARK)
+        if self._columns == COLUMNS and (plain := PLAIN_ROW.fullmatch(text)):
+            self.rows_read += 1
+            self._has_points = self._has_points or "." in text[plain.end(4) :]
+            self._rows.append((line, plain.group(1, 3, 4), plain.group(5, 6, 7, 8)))
+        elif text.startswith(MERGE_MARKERS):
+            self._reject(line, Finding.MERGE_CONFLICT, f"{text[:20]!r}: resolve the merge, delete the line")
+        elif not NO_CONTENT.fullmatch(text):
+            try:
+                self._read_odd_line(line, text)
+            except UnclearRowError as error:
+                self._reject(line, error.finding, str(error))
+        elif "\0" in text:
+            self._reject(line, Finding.NOT_A_ROW, "zeros: the file was cut off while it was written; delete the line")
+
+    def finish(self, open_line: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the usable rows, in any order; open_line: the last line if it has no end, else 0.
+
+        They are the file names of their images, bytes (n, 3), in the order of CAMERAS; steering, throttle, brake and
+        speed, float64 (n, 4); and their lines in the csv, int32 (n,). Raises UnclearLogError if the numbers below a
+        header, or without one, are not those of its columns.
+        """
+        self._read_decimal_commas()
+        lines = np.array([line for line, *_ in self._rows], np.int32)
+        numbers = np.array([float(token) for *_, tokens in self._rows for token in tokens]).reshape(-1, len(NUMBERS))
+        below = np.searchsorted(self._headers, lines)
+        for header in np.unique(below):
+            rows = below == header
+            check_numbers(lines[rows], numbers[rows], is_named=bool(header > 1))
+        least, greatest = np.array([*RANGES.values()], float).T
+        outside = (numbers < least) | (numbers > greatest)
+        usable = ~outside.any(1)
+        for row in np.flatnonzero(~usable):
+            column = outside[row].argmax()
+            what = f"{NUMBERS[column]} {numbers[row, column]:g} is not in {least[column]:g}..{greatest[column]:g}"
+            lost = " (has its decimal point been lost?)" if NUMBERS[column] == "speed" else ""
+            self._reject(int(lines[row]), Finding.OUT_OF_RANGE, f"{what}{lost}; correct or delete the row")
+        if open_line in lines[usable]:
+            self._repair("the file ends within this line: its last number may be cut short", open_line)
+        names = np.array([name.encode(errors="surrogateescape") for _, row, _ in self._rows for name in row], bytes)
+        return names.reshape(-1, len(CAMERAS))[usable], numbers[usable], lines[usable]
+
+    def _read_odd_line(self, line: int, text: str) -> None:
+        """Read a line that is not as the simulator writes it. Raises UnclearRowError, UnclearLogError."""
+        if len(text) > LONGEST_ROW:
+            self.rows_read += 1
+            raise UnclearRowError(Finding.NOT_A_ROW, f"a line of {len(text)} characters: {text[:40]!r}…; delete it")
+        enough = [mark for mark in "\t;," if text.count(mark) >= len(COLUMNS) - 1]  # commas may also be decimal marks
+        delimiter = enough[0] if enough else max(",;\t", key=text.count)
+        folder = text[: text.find(CAMERAS[0])]
+        if "," in folder and folder.endswith(("/", "\\")) and text.count(folder) == len(CAMERAS):
+            text = text.replace(folder, "")  # "Doe, John"
+        fields = [value.strip() for value in next(csv.reader([text], delimiter=delimiter, skipinitialspace=True))]
+        is_first = not self.rows_read and len(self._headers) == 1
+        if not any(map(is_image, fields)) and (is_header(fields) or is_first):
+            return self._read_header(line, fields)
+        self.rows_read += 1
+        if delimiter != ",":
+            self._repair("tab-separated" if delimiter == "\t" else "separated by semicolons", line)
+        if delimiter != "," or '"' in text:  # else no field has a comma
+            with_points = [DECIMAL_COMMA.sub(r"\1.\2", value) for value in fields]
+            if with_points != fields:
+                self._repair("decimal commas", line)
+                fields = with_points
+        has_decimal_commas = delimiter == "," and '"' not in text and fields[-1] != ""
+        return self._read_row(line, fields, has_decimal_commas)
+
+    def _read_header(self, line: int, fields: list[str]) -> None:
+        while fields and not fields[-1]:
+            fields.pop()  # a comma at its end names no column: a value below it is not read
+        self._columns, is_filled = header_columns(line, fields)
+        self._headers.append(line)
+        if is_filled:
+            self._repair("header lacks names; usual columns taken", line)
+
+    def _read_row(self, line: int, fields: list[str], has_decimal_commas: bool) -> None:
+        """Read a row; has_decimal_commas: it may have been split at them. Raises UnclearRowError."""
+        columns = self._columns
+        while len(fields) > len(columns) and not fields[-1]:
+            fields.pop()
+        if len(fields) != len(columns):
+            if ",".join(COLUMNS) not in ",".join(columns):
+                raise UnclearRowError(
+                    Finding.COLUMNS,
+                    f"{len(fields)} fields below a header that names {len(columns)} in another order than the "
+                    "simulator's; correct the header, or write one above these rows",
+                )
+            columns = COLUMNS
+        by_name = dict(zip(columns, fields, strict=False))
+        images, numbers = ([by_name.get(name, "") for name in names] for names in (CAMERAS, NUMBERS))
+        if not all(map(is_image, images)):
+            count = sum(map(is_image, fields))
+            found = f"{'1 image name' if count == 1 else f'{count} image names'} where {', '.join(CAMERAS)} belong"
+            raise UnclearRowError(Finding.NOT_A_ROW, f"{found}; record again, add them, or {REMEDY}")
+        names, extra = [base_name(image) for image in images], fields[len(columns) :]
+        check_names(names)
+        tokens = [*numbers, *extra]
+        if extra and has_decimal_commas and all(NUMBER.fullmatch(token) and "." not in token for token in tokens):
+            self._with_commas.append((line, names, tokens))
+            return
+        self._has_points = self._has_points or any("." in token and NUMBER.fullmatch(token) for token in tokens)
+        if any(map(str.isdigit, "".join(extra))):
+            raise UnclearRowError(
+                Finding.COLUMNS,
+                f"{len(tokens)} numbers where {len(NUMBERS)} are expected: {','.join(tokens)[:80]!r}; {REMEDY}",
+            )
+        if not all(map(NUMBER.fullmatch, numbers)):
+            detail = f"{','.join(numbers)[:80]!r} is not {', '.join(NUMBERS)}; correct or delete the row"
+            raise UnclearRowError(Finding.NOT_A_NUMBER, detail)
+        if extra:
+            self._repair("extra columns ignored", line)
+        self._rows.append((line, names, numbers))
+
+    def _read_decimal_commas(self) -> None:
+        """Add the rows of more than four whole numbers, if they are surely four numbers with decimal commas.
+
+        They are if no number in the file has a decimal point, each such row can be read in this way, and in one of them
+        digits follow as only fractions have them: more than three, or after a zero.
+        """
+        readings = [decimal_comma_readings(tokens) for *_, tokens in self._with_commas]
+        others = [line for (line, *_), found in zip(self._with_commas, readings, strict=True) if not found]
+        later = [token for *_, tokens in self._with_commas for token in tokens[1:] if token.isdigit()]
+        doubt = ""
+        if self._has_points:
+            doubt = ", but the file also has decimal points"
+        elif others:
+            doubt = f", but not those in line {others[0]}"
+        elif not any(len(token) > 3 or token[0] == "0" < token[1:] for token in later):
+            doubt = ", or more columns"
+        for (line, names, tokens), found in zip(self._with_commas, readings, strict=True):
+            if len(found) == 1 and not doubt:
+                self._repair("decimal commas", line)
+                self._rows.append((line, names, found[0]))
+            else:
+                reason = f"may be four numbers with decimal commas in {len(found)} ways{doubt}"
+                detail = f"{','.join(tokens)!r} {reason}; write decimal points, or {REMEDY}"
+                self._reject(line, Finding.COLUMNS, detail)
+
+    def _reject(self, line: int, finding: Finding, detail: str) -> None:
+        self.rejected.append(Rejected(line, finding, detail))
+
+    def _repair(self, repair: str, line: int) -> None:
+        self.repairs.setdefault(repair, [0, line])[0] += 1
