@@ -134,8 +134,9 @@ def test_attention_comes_from_a_process_that_is_started_again_when_it_has_ended(
 
 HELD = """
 import sys
+from cloning.training.distributed import Ranks
 from cloning.training.run_files import RunFiles
-with RunFiles(sys.argv[1]).claimed():
+with RunFiles(sys.argv[1]).claimed(Ranks()):
     print("held", flush=True)
     sys.stdin.read()
 """

@@ -329,10 +329,10 @@ def test_an_image_that_changes_during_training_is_named_and_can_be_restored(
 ):
     images, split = {path: path.read_bytes() for path in (copied / "IMG").iterdir()}, model.split
 
-    def change_then_split(observations, seed):
+    def change_then_split(*arguments):
         for image in images:
             change(image)
-        return split(observations, seed)
+        return split(*arguments)
 
     with monkeypatch.context() as patch:
         patch.setattr(model, "split", change_then_split)

@@ -19,7 +19,7 @@ from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
 from cloning.network.network import CROP, SEEN_SHAPE, Network
-from cloning.recordings.log import Recording
+from cloning.recordings.log import CheckedRecording, Recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
 from cloning.road.warp import ground_mask, with_alpha
@@ -418,7 +418,7 @@ def test_the_label_is_the_recovery_steering_and_not_the_drivers(monkeypatch):
     """Rows whose lane is 1 m to the left of a car that a human drives straight on."""
     reading = LanePosition(np.full(N, 1.0), np.zeros(N), np.ones(N, bool))
     monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
-    checked = replace(recording(0.0), digests=np.zeros(1, np.uint64))
+    checked = CheckedRecording(**vars(recording(0.0)), digests=np.zeros(1, np.uint64))
     selected = select_known_lane(checked, ROBUST)
     assert (selected.steering < -0.1).all()
     assert selected.steering == pytest.approx(selected.lanes.steering(1.0, 0.0), abs=1e-4)
