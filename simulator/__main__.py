@@ -16,6 +16,7 @@ from cloning.base.arguments import MAX_PORT, address, number
 from cloning.base.errors import UserError
 from cloning.base.outputs import check_folders, run_all, write_json
 from cloning.recordings.format import PROBLEM_AREAS
+from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.road.track import ROADS, Track
@@ -253,18 +254,23 @@ def run_drive(args: argparse.Namespace) -> int:
 
 def run_correct(args: argparse.Namespace) -> int:
     """Let drive.py drive with corrections by the expert; print a lap report and what was recorded."""
-    from simulator import report
-    from simulator.correct import connect
+    from simulator import report, scenery
+    from simulator.correct import CorrectedClient
+    from simulator.run import Run
+    from simulator.world import Scene
 
-    track = Track(args.track, args.direction)
-    client = connect(args.folder, track, args.look, args.speed, args.host, args.port, args.wait)
+    check_name_of_corrections(args.folder)
+    run = Run(Track(args.track, args.direction), "autonomous")
+    with RecordingWriter(args.folder) as recording:
+        scene = Scene(scenery.build(args.track, args.look))
+        client = CorrectedClient(run, scene, args.speed, recording, args.host, args.port, args.wait)
 
-    def print_report() -> None:
-        if client.run.time:
-            print(f"{report.report_text(report.lap_report(client.run, client))}\n{client.summary()}")
+        def print_report() -> None:
+            if run.time:
+                print(f"{report.report_text(report.lap_report(run, client))}\n{client.summary()}")
 
-    run_all(lambda: client.drive(args.laps), print_report, client.recording.close, client.recording.remove_if_empty)
-    return program.INCOMPLETE if client.run.departures else program.DONE
+        run_all(lambda: client.drive(args.laps), print_report)
+    return program.INCOMPLETE if run.departures else program.DONE
 
 
 def run_replay(args: argparse.Namespace) -> int:

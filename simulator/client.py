@@ -4,6 +4,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from typing import Literal
 
 from tqdm import tqdm
 
@@ -31,8 +32,8 @@ RECONNECT_INTERVAL = 1.0  # s between two attempts of the window to connect
 WINDOW_SEND_TIMEOUT = 0.1  # s that the window waits for a server that does not read
 
 
-class Standstill(SimulatorError):
-    """The server answers, but the car stays where it is."""
+# Why a drive ended: its laps were driven; the server answers, but the car stays where it is; another error, or Ctrl-C.
+DriveEnd = Literal["laps", "stood_still", "failed"]
 
 
 def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
@@ -51,6 +52,7 @@ class Client(ClientSession):
         self.watch: Callable[[], None] | None = None  # called after each physics step
         self.steering = self.throttle = 0.0  # as last commanded
         self.frames = 0  # number of frames sent
+        self.ended: DriveEnd = "failed"  # until it has ended in another way
         self.own_time = 0.0  # s of wall time that the simulator itself used, in lock-step
         self._moved_at, self._moved_to = 0.0, 0.0  # s and m travelled when the car had last moved by a metre
 
@@ -65,14 +67,15 @@ class Client(ClientSession):
             self.steering, self.throttle = answer.steering, answer.throttle
 
     def step(self) -> None:
-        """Drive for one physics step. Raises Standstill."""
+        """Drive for one physics step. Raises SimulatorError if the car stands still."""
         self.run.step(self.steering, self.throttle)
         if self.watch:
             self.watch()
         if abs(self.run.travelled - self._moved_to) > 1:
             self._moved_at, self._moved_to = self.run.time, self.run.travelled
         elif self.run.time - self._moved_at > STANDSTILL_TIME:
-            raise Standstill(
+            self.ended = "stood_still"
+            raise SimulatorError(
                 f"the car has stood still for {STANDSTILL_TIME:.0f} s (throttle {self.throttle:g}, "
                 f"{self.unusable} unusable answers)"
             )
@@ -86,6 +89,7 @@ class Client(ClientSession):
                 self.connect()
                 try:
                     drive(goal, bar)
+                    self.ended = "laps"
                     return
                 except ConnectionLost as error:
                     self.count_reconnection(error)

@@ -95,11 +95,6 @@ class Run:
         return self.offset, wrap_angle(self.track.at(self.s).heading - self.car.heading)  # headings grow to the left
 
     @property
-    def throttle_and_brake(self) -> tuple[float, float]:
-        """Throttle and brake of the last step, each 0..1, as recordings have them."""
-        return max(0.0, self.throttle), max(0.0, -self.throttle)
-
-    @property
     def laps(self) -> int:
         """Number of finished laps."""
         return len(self.lap_times)

@@ -201,15 +201,13 @@ class Window(ShowBase):
         (self.help.show if self.help.is_hidden() else self.help.hide)()
 
     def do_quit(self) -> None:
-        """Close the window and end the program."""
-        self.finish()
+        """End the program; `finish` follows, as after any other end."""
         self.userExit()
 
     def finish(self) -> None:
         """Close the recording and the connection."""
         if self.recording:
             self.recording.close()
-            self.recording.remove_if_empty()
         if self.remote:
             self.remote.close()
 

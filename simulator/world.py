@@ -21,6 +21,7 @@ from panda3d.core import (
     InternalName,
     NodePath,
     Point3,
+    RenderState,
     SamplerState,
     Texture,
     TextureStage,
@@ -186,6 +187,12 @@ class MeshGroup:
         for cell in self.cells:
             cell.set_colours(rgba[cell.used])
             cell.node.modify_geom(0).set_vertex_data(cell.data)
+
+
+def free_unused() -> None:
+    """Let the engine free the textures of scenes that are not used any more, which its cache would keep."""
+    RenderState.clear_cache()
+    RenderState.garbage_collect()
 
 
 class Scene:

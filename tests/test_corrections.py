@@ -2,6 +2,7 @@
 
 import re
 import socket
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -154,6 +155,9 @@ class Seat(Window):
     def show(self, by_hand):
         pass
 
+    def userExit(self):
+        sys.exit()
+
     def ticks(self, seconds, monkeypatch):
         """Let so many seconds pass, in frames of a tenth."""
         for _ in range(round(10 * seconds)):
@@ -188,6 +192,8 @@ def test_the_window_removes_a_recording_without_rows(tmp_path, monkeypatch):
     seat = Seat(tmp_path / "x-corrections")
     seat.do_record()
     seat.ticks(0.5, monkeypatch)
+    with pytest.raises(SystemExit):
+        seat.do_quit()
     seat.finish()
     assert not any(tmp_path.iterdir())
 

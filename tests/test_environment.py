@@ -7,8 +7,9 @@ import textwrap
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from panda3d.core import RenderState
 
 from cloning.base.errors import SimulatorError, TrackError
 from cloning.recordings.format import SAMPLE_RATE
@@ -146,6 +147,8 @@ def test_environments_in_processes_of_their_own_see_the_same(lake):
         ({"look": math.inf}, "a whole number"),
         ({"speed": 31}, r"1 to 30 \(mph\)"),
         ({"laps": math.nan}, "a number above 0"),
+        ({"track": 3}, "a name, such as 'lake'"),
+        ({"speed": "fast"}, r"1 to 30 \(mph\)"),
     ],
 )
 def test_wrong_arguments_are_reported(arguments, message):
@@ -163,7 +166,10 @@ def test_wrong_arguments_are_reported(arguments, message):
         ({"s": math.nan}, "less than 1137.9"),
         ({"offset": -3.5, "s": 300}, "the road's left edge; at 300.0 m the edges are at -3.95 and 3.95 m"),
         ({"offset": math.inf}, "it must be a number"),
-        ({"speed": 3}, "option speed: the options of reset are s and offset"),
+        ({"speed": 3}, "the options of reset are s and offset"),
+        ({"s": "300"}, "less than 1137.9"),
+        ({"offset": None}, "it must be a number"),
+        ([300], "the options of reset are s and offset"),
     ],
 )
 def test_wrong_options_are_reported_and_begin_no_episode(lake, options, message):
@@ -174,11 +180,28 @@ def test_wrong_options_are_reported_and_begin_no_episode(lake, options, message)
         lake.step(np.float32([0, 1]))
 
 
-@pytest.mark.parametrize("action", [[math.nan, 1], [0, math.inf], [0], 0.5])
+@pytest.mark.parametrize("action", [[math.nan, 1], [0, math.inf], [0], 0.5, "left", None, [[0, 1], [0]]])
 def test_an_action_that_is_not_two_finite_numbers_is_refused(lake, action):
     lake.reset()
     with pytest.raises(InvalidAction, match="two finite numbers"):
         lake.step(action)
+
+
+def test_a_closed_environment_frees_its_scene_and_says_that_it_is_closed():
+    before = None
+    for _ in range(3):
+        env = environment.Drive(render_mode="rgb_array")
+        with pytest.raises(ResetNeeded, match="before render"):
+            env.render()
+        env.reset()
+        env.render()
+        env.close()
+        env.close()
+        states, before = RenderState.get_num_states(), before or RenderState.get_num_states()
+        assert states <= before, "panda3d keeps no texture of it"
+    for call in (env.reset, env.render, lambda: env.step(np.zeros(2))):
+        with pytest.raises(ClosedEnvironmentError, match="make another"):
+            call()
 
 
 def test_the_documented_example_drives_the_shipped_network(capsys):

@@ -302,6 +302,23 @@ def test_a_kill_leaves_a_readable_folder(tmp_path):
         time.sleep(0.1)
 
 
+INTERRUPTED = """
+import os, runpy, signal, sys
+os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))
+sys.argv[1:] = ["record", sys.argv[1], "--laps", "0.01"]
+runpy.run_module("simulator", run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "register_at_fork"), reason="this system does not fork")
+def test_ctrl_c_while_rendering_processes_are_started_leaves_no_recording(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, str(tmp_path / "x")], cwd=ROOT, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (130, "simulator: stopped; the files that it has written are complete\n")
+    assert not any(tmp_path.iterdir())
+
+
 def command_lines():
     for file in Path("/proc").glob("[0-9]*/cmdline"):
         try:

@@ -44,6 +44,7 @@ def test_report_says_what_happened(tmp_path):
         client = drive(server, laps=0.05)
     figures = report.lap_report(client.run, client)
     assert figures["departures"]
+    assert figures["ended"] == "laps"
     assert figures["autonomy"] == pytest.approx(
         1 - 6 * len(figures["departures"]) / figures["simulated_seconds"], abs=1e-3
     )

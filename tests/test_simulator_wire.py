@@ -17,7 +17,8 @@ from cloning.base.errors import SimulatorError
 from cloning.road.track import Track
 from cloning.wire.client import Answer, parse_answer
 from cloning.wire.protocol import FRAGMENT
-from simulator.client import Client, RemoteDriver, Standstill
+from simulator.client import Client, RemoteDriver
+from simulator.report import lap_report
 from simulator.run import Run
 
 
@@ -224,8 +225,10 @@ def test_pings_and_leaves_a_server_that_does_not_answer_them(monkeypatch):
 
 def test_a_car_that_is_never_driven_is_reported(monkeypatch):
     monkeypatch.setattr("simulator.client.STANDSTILL_TIME", 5.0)
-    with (
-        Server(lambda packet, n: [STEER % ("0", "0")]) as server,
-        pytest.raises(Standstill, match="stood still"),
-    ):
-        drive(server)
+    run = Run(Track("lake"), "autonomous")
+    with Server(lambda packet, n: [STEER % ("0", "0")]) as server:
+        client = Client(run, Blank(), "127.0.0.1", server.port, 5.0, False)
+        assert lap_report(run, client)["ended"] == "failed"
+        with pytest.raises(SimulatorError, match="stood still"):
+            client.drive(0.1)
+    assert lap_report(run, client)["ended"] == "stood_still"

@@ -116,12 +116,12 @@ def drive_laps(ports: SimpleQueue[int], mph: int, laps: float, place: tuple[str,
             file = Path(folder) / "report.json"
             road = ("--track", track, "--direction", direction, "--look", str(look))
             status, errors = simulate(file, "drive", *road, "--laps", str(laps), "--port", str(port))
-            # A car that stands still is the model's fault, anything else is not.
-            if not file.exists() or (status == program.FAILED and "the car has stood still" not in errors):
-                raise UserError(f"{track} {direction}, {mph} mph, look {look}: {errors}")
-            report: LapReport = json.loads(file.read_text(encoding="utf-8"))
+            report: LapReport | None = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
     finally:
         ports.put(port)
+    # A car that stands still is the model's fault, any other failure is not.
+    if report is None or (status == program.FAILED and report.get("ended") != "stood_still"):
+        raise UserError(f"{track} {direction}, {mph} mph, look {look}: {errors}")
     return driven(report, mph, look, laps, finished=status != program.FAILED)
 
 
