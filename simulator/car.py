@@ -76,11 +76,11 @@ class Car:
         self.torque = 0.0
         self.speed_limit = TOP_SPEED
 
-    def place(self, place: Place) -> None:
+    def place(self, pose: Place) -> None:
         """Place the car at rest at a pose, parallel to the road."""
-        pitch = math.atan(place.grade)
-        self.node.set_hpr(math.degrees(place.heading) - 90, math.degrees(pitch), 0)
-        self.node.set_pos(place.x, place.y, place.z)
+        pitch = math.atan(pose.grade)
+        self.node.set_hpr(math.degrees(pose.heading) - 90, math.degrees(pitch), 0)
+        self.node.set_pos(pose.x, pose.y, pose.z)
         self.body.set_linear_velocity(Vec3(0))
         self.body.set_angular_velocity(Vec3(0))
         self.body.clear_forces()

@@ -78,8 +78,8 @@ class Run:
 
         offset: lateral, m, right positive; speed: m/s, along its heading; turn: radians from the road to the right.
         """
-        place = self.track.at(self.s, offset)
-        self.car.place(replace(place, heading=place.heading - turn))  # headings grow to the left
+        pose = self.track.at(self.s, offset)
+        self.car.place(replace(pose, heading=pose.heading - turn))  # headings grow to the left
         self.car.settle()
         self.car.body.set_linear_velocity(self.car.node.get_quat().get_forward() * speed)
         self.offset = offset
