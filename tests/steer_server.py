@@ -129,7 +129,7 @@ class Blank:
         return self.noise[None]
 
 
-def drive(server, laps=0.02, wait=5.0, realtime=False):
+def drive(server, laps=0.01, wait=5.0, realtime=False):
     run = Run(Track("lake"), "autonomous")
     client = Client(run, Blank(), "127.0.0.1", server.port, wait, realtime)
     client.drive(laps)

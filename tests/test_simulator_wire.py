@@ -5,7 +5,6 @@ import json
 import re
 import select
 import socket
-import threading
 import time
 
 import cv2
@@ -17,6 +16,7 @@ from cloning.base.errors import SimulatorError
 from cloning.road.track import Track
 from cloning.wire.client import Answer, parse_answer
 from cloning.wire.protocol import FRAGMENT
+from simulator.__main__ import main
 from simulator.client import Client, RemoteDriver
 from simulator.report import lap_report
 from simulator.run import Run
@@ -95,66 +95,20 @@ def test_steering_goes_out_in_degrees_and_the_car_obeys():
     assert client.run.departures[0].side == "left"
 
 
-@pytest.mark.parametrize(
-    "packet",
-    [
-        "",
-        "3",
-        "40",
-        "42",
-        "42[",
-        '42["steer"]',
-        '42["steer",{}]',
-        '42["steer",{"steering_angle":0.1,"throttle":0.2}]',
-        '42["steer",{"steering_angle":"0.1","throttle":0.2}]',
-        '42["steer",{"steering_angle":"nan","throttle":"0.2"}]',
-        '42["steer",{"steering_angle":"left","throttle":"0.2"}]',
-        '42["telemetry",{}]',
-        "42[1,2,3]",
-        '42{"a":1}',
-        "42null",
-    ],
-)
-def test_what_the_real_client_drops_is_dropped(packet):
-    assert parse_answer(packet) is None
-
-
 def test_answers_are_read():
     assert parse_answer(STEER % ("-0.05", "0.2")) == Answer(-0.05, 0.2)
     assert parse_answer(STEER % ("-7", "2")) == Answer(-1.0, 1.0)
     assert parse_answer('42["manual",{}]') == Answer()
 
 
-def test_a_lost_reply_is_reported_with_what_came_instead():
-    numbers = '42["steer",{"steering_angle":0.0,"throttle":0.5}]'
-    with Server(lambda packet, n: [numbers]) as server, pytest.raises(SimulatorError, match="3 unusable"):
-        drive(server, wait=0.5)
+def unused_port():
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        return closed.getsockname()[1]
 
 
-def test_a_missing_server_is_waited_for_then_reported():
-    closed = socket.create_server(("127.0.0.1", 0))
-    port = closed.getsockname()[1]
-    closed.close()
-    run = Run(Track("lake"), "autonomous")
-    with pytest.raises(SimulatorError, match=r"no server at 127\.0\.0\.1.*drive\.py"):
-        Client(run, Blank(), "127.0.0.1", port, 0.5, False).drive(1)
-
-
-def test_a_server_that_is_not_a_websocket_is_reported():
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-
-        def refuse():
-            client, _ = listener.accept()
-            with client:
-                client.recv(4096)
-                client.sendall(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n")
-
-        thread = threading.Thread(target=refuse)
-        thread.start()
-        run = Run(Track("lake"), "autonomous")
-        with pytest.raises(SimulatorError, match="404"):
-            Client(run, Blank(), "127.0.0.1", listener.getsockname()[1], 0.0, False).drive(1)
-        thread.join(5)
+def test_a_missing_server_is_waited_for_then_reported(capsys):
+    assert main(["drive", "--wait", "0.5", "--port", str(unused_port())]) == 2
+    assert re.search(r"^simulator: no server at 127\.0\.0\.1.*drive\.py", capsys.readouterr().err, re.MULTILINE)
 
 
 @pytest.mark.parametrize("realtime", [False, True])
@@ -168,7 +122,7 @@ def test_reconnects_and_continues(realtime, death):
     with Server(dies_once, sessions=2) as server:
         client = drive(server, realtime=realtime)
     assert client.reconnections == 1
-    assert client.run.travelled >= 0.02 * client.run.track.length
+    assert client.run.travelled >= 0.01 * client.run.track.length
     assert len(server.requests) == 2
 
 
@@ -196,10 +150,7 @@ def test_the_window_sends_null_while_a_person_steers_and_is_never_held_up():
 
 
 def test_the_window_looks_for_a_server_without_waiting():
-    closed = socket.create_server(("127.0.0.1", 0))
-    port = closed.getsockname()[1]
-    closed.close()
-    remote = RemoteDriver("127.0.0.1", port, Blank())
+    remote = RemoteDriver("127.0.0.1", unused_port(), Blank())
     run, until = Run(Track("lake"), "autonomous"), time.monotonic() + 10
     while remote.state == "not connected":
         remote.poll(False, run)
