@@ -11,6 +11,7 @@ import threading
 import numpy as np
 
 from cloning.road.track import Track
+from simulator.cameras import Cameras
 from simulator.client import Client
 from simulator.run import Run
 
@@ -26,7 +27,7 @@ def accept_websocket(client, headers=b""):
     request = b""
     while not request.endswith(b"\r\n\r\n"):
         request += client.recv(1) or lost()
-    key = re.search(rb"(?i)sec-websocket-key: (.*)\r", request)[1]
+    key = re.findall(rb"(?i)sec-websocket-key: (.*)\r", request)[0]
     accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
     client.sendall(
         b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -120,8 +121,11 @@ class Server:
                         self.send(client, packet)
 
 
-class Blank:
+class Blank(Cameras):
     """Cameras that see grey noise, so that frames are as large as real ones."""
+
+    def __init__(self):
+        pass
 
     noise = np.random.default_rng(0).integers(60, 190, (160, 320, 3), np.uint8)
 

@@ -24,15 +24,14 @@ STRAIGHT = {"s": 300.0}  # where the lake's road is straight for 50 m
 
 @pytest.fixture(scope="module")
 def lake():
-    """The lake without Gymnasium's wrappers."""
-    return gymnasium.make(environment.ID, laps=0.01).unwrapped
+    return environment.Drive(laps=0.01)
 
 
 def drive(env, actions, **reset):
     """The frames and the infos of an episode's first steps."""
     steps = [env.reset(**reset)]
     for action in actions:
-        frame, _, _, _, info = env.step(np.float32(action))
+        frame, _, _, _, info = env.step(np.asarray(action))
         steps.append((frame, info))
     return np.stack([frame for frame, _ in steps]), [info for _, info in steps]
 
@@ -42,7 +41,7 @@ def test_gymnasium_finds_no_fault():
     env = gymnasium.make(environment.ID, track="jungle", random_start=True, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.reset(seed=0)
-    assert env.render().shape == (360, 640, 3)
+    assert np.shape(env.render()) == (360, 640, 3)
 
 
 def test_the_observation_is_the_centre_cameras_frame(lake):
@@ -60,7 +59,7 @@ def test_a_step_lasts_until_the_next_of_15_frames_a_second(lake):
     lake.reset()
     times = []
     for _ in range(20):
-        lake.step(np.float32([0, 0]))
+        lake.step(np.asarray([0, 0]))
         times.append(lake.run.time)
     assert times == pytest.approx([STEP * math.ceil(n / SAMPLE_RATE / STEP - 1e-9) for n in range(1, 21)])
 
@@ -70,7 +69,7 @@ def test_rewards_are_the_metres_driven_and_steering_is_right_positive(lake):
         _, before = lake.reset(options=STRAIGHT)
         rewards, truncated = [], False
         while not truncated:
-            _, reward, terminated, truncated, info = lake.step(np.float32([side * 0.1, 1]))
+            _, reward, terminated, truncated, info = lake.step(np.asarray([side * 0.1, 1]))
             assert not terminated
             rewards.append(reward)
         assert sum(rewards) == pytest.approx(info["s"] - before["s"], abs=1e-6)
@@ -83,7 +82,7 @@ def test_the_episode_ends_where_the_car_leaves_the_road(lake):
     lake.reset(options={**STRAIGHT, "offset": 2})
     rewards, terminated = [], False
     while not terminated:
-        frame, reward, terminated, truncated, info = lake.step(np.float32([0.5, 1]))
+        frame, reward, terminated, truncated, info = lake.step(np.asarray([0.5, 1]))
         assert not truncated
         rewards.append(reward)
     assert min(rewards[:-1]) > -0.01
@@ -98,19 +97,19 @@ def test_the_episode_ends_where_the_car_leaves_the_road(lake):
     assert info["offset"] == run.trajectory.offset[-1] > 2  # it has not been set back
     assert info["speed"] > 3
     with pytest.raises(ResetNeeded):
-        lake.step(np.float32([0, 1]))
+        lake.step(np.asarray([0, 1]))
     again, info = lake.reset()
     assert info["departures"] == info["offset"] == 0
     assert not np.array_equal(frame, again)
 
 
 def test_the_car_never_exceeds_the_set_speed_and_a_lap_is_counted():
-    env = gymnasium.make(environment.ID, speed=10, laps=2).unwrapped
+    env = environment.Drive(speed=10, laps=2)
     env.reset()
     env.run.travelled = env.track.length - 8
-    speeds = [env.step(np.float32([0, 2]))[4]["speed"] for _ in range(45)]
+    speeds = [env.step(np.asarray([0, 2]))[4]["speed"] for _ in range(45)]
     assert max(speeds) == pytest.approx(10, abs=0.01)
-    assert env.step(np.float32([0, 1]))[4]["laps"] == 1
+    assert env.step(np.asarray([0, 1]))[4]["laps"] == 1
 
 
 def test_seeds_choose_the_start_and_two_environments_do_not_disturb_each_other():
@@ -121,8 +120,8 @@ def test_seeds_choose_the_start_and_two_environments_do_not_disturb_each_other()
     for env in (one, two):
         env.reset(seed=5)
     for action, frame in zip(actions, frames[1:], strict=True):
-        assert np.array_equal(one.step(np.float32(action))[0], frame)
-        assert np.array_equal(two.step(np.float32(action))[0], frame)
+        assert np.array_equal(one.step(np.asarray(action))[0], frame)
+        assert np.array_equal(two.step(np.asarray(action))[0], frame)
     starts = [infos[0]["s"], *(one.reset(seed=seed)[1]["s"] for seed in (6, 7))]
     assert len(set(starts)) == 3
     assert one.reset(options=STRAIGHT)[1]["s"] == 300
@@ -177,7 +176,7 @@ def test_wrong_options_are_reported_and_begin_no_episode(lake, options, message)
     with pytest.raises(SimulatorError, match=message):
         lake.reset(options=options)
     with pytest.raises(ResetNeeded):
-        lake.step(np.float32([0, 1]))
+        lake.step(np.asarray([0, 1]))
 
 
 @pytest.mark.parametrize("action", [[math.nan, 1], [0, math.inf], [0], 0.5, "left", None, [[0, 1], [0]]])
@@ -205,6 +204,6 @@ def test_a_closed_environment_frees_its_scene_and_says_that_it_is_closed():
 
 
 def test_the_documented_example_drives_the_shipped_network(capsys):
-    example = re.search(r"\n((?: {4}.*\n|\n)+)", environment.__doc__)[1]
+    example = re.findall(r"\n((?: {4}.*\n|\n)+)", environment.__doc__ or "")[0]
     exec(textwrap.dedent(example).replace("speed=15", "speed=15, laps=0.015"), {})
     assert re.match(r"drove a lap \{'s': .*'departures': 0", capsys.readouterr().out)

@@ -30,8 +30,9 @@ def test_the_shadowed_twin_has_the_same_things_in_the_same_places(track):
 @pytest.mark.parametrize("track", ["lake", "jungle"])
 def test_shadows_only_darken_and_are_as_deep_as_their_style(track):
     road = np.s_[105:130, 80:240]
-    factor = cameras(track, SHADOWED).scene.scenery.shade.factor
-    for s, expected in ((LIT[track], np.ones(3)), (DARK[track], factor)):
+    shade = cameras(track, SHADOWED).scene.scenery.shade
+    assert shade
+    for s, expected in ((LIT[track], np.ones(3)), (DARK[track], shade.factor)):
         plain, twin = centre(track, 0, s), centre(track, SHADOWED, s)
         assert (twin <= plain + 1).mean() > 0.999
         ratio = twin[road].mean(axis=(0, 1)) / plain[road].mean(axis=(0, 1))
@@ -52,8 +53,9 @@ def test_shadows_lie_where_the_sun_throws_them():
     crown = plants(foot_of_tree, size, size / 20, np.ones((1, 3)), opaque, np.random.default_rng(0))
     shade = Shade(track, [post, crown], light, ShadeStyle(depth=1.0, softness=0.02), 45.0)
     assert shade.factor == pytest.approx(0.5)  # as much light from the sky as from the sun
-    picture = shade.on_road(int(s / STRETCH))[::-1, :, 0]  # from its start on
-    rows, columns = np.nonzero(picture < 150)
+    picture = shade.on_road(int(s / STRETCH))
+    assert picture is not None
+    rows, columns = np.nonzero(picture[::-1, :, 0] < 150)  # from its start on
     along = (rows + 0.5) / PICTURE_SHAPE[0] * LENGTH - OVERLAP - s % STRETCH
     right = ((columns + 0.5) / PICTURE_SHAPE[1] * 2 - 1) * HALF_WIDTH
     for thing, start, end in ((np.abs(along) < 5, -5.25, -2.0), (np.abs(along - 20) < 5, -1.0, 3.0)):
@@ -89,7 +91,7 @@ def test_no_look_makes_the_road_darker_than_the_darkest_real_frame():
     dark = np.array([60.0, 50.0, 40.0])
     for tone in (None, tone_matrix(1.25, 0.5, np.array([-22.0, -18.0, -20.0]))):
         lifted = expose(tone, dark / 5)
-        assert (lifted @ np.r_[dark / 5, 1]).mean() == pytest.approx(DARKEST, abs=0.01)
+        assert lifted is not None and (lifted @ np.r_[dark / 5, 1]).mean() == pytest.approx(DARKEST, abs=0.01)
         if tone is not None:
             np.testing.assert_array_equal(lifted[:, :3], tone[:, :3])
     assert expose(None, dark) is None

@@ -34,14 +34,14 @@ def test_keys_throttle_and_brake_and_cruise_holds_the_throttle_until_the_brake()
         controls.step({held} if "arrow" in held else set(held))
         assert controls.throttle == throttle
     controls.press("space")
-    for held, throttle in (("", 0.4), ("w", 1), ("", 0.4), ("s", -1), ("", 0)):
-        controls.step(set(held))
-        assert controls.throttle == throttle
+    for key, push in (("", 0.4), ("w", 1), ("", 0.4), ("s", -1), ("", 0)):
+        controls.step(set(key))
+        assert controls.throttle == push
 
 
 def test_the_mouse_steers_by_how_far_it_is_dragged():
     controls = Controls()
-    for mouse, steering in ((0.2, 0), (0.7, 0.5), (-1.0, -1), (None, -0.95)):
+    for mouse, steering in ((0.2, 0.0), (0.7, 0.5), (-1.0, -1.0), (None, -0.95)):
         controls.step(set(), mouse=mouse)
         assert controls.steering == pytest.approx(steering)
 

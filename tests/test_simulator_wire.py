@@ -7,12 +7,11 @@ import select
 import socket
 import time
 
-import cv2
-import numpy as np
 import pytest
 from steer_server import STEER, Blank, Server, ahead, drive
 
 from cloning.base.errors import SimulatorError
+from cloning.recordings.images import decode
 from cloning.road.track import Track
 from cloning.wire.client import Answer, parse_answer
 from cloning.wire.protocol import FRAGMENT
@@ -45,7 +44,7 @@ def test_follows_the_transcript(realtime):
     assert set(data) == {"steering_angle", "throttle", "speed", "image"}
     assert [data[key] for key in ("steering_angle", "throttle")] == ["0.0000", "0.0000"]
     assert re.fullmatch(r"0\.0\d{3}", data["speed"])
-    frame = cv2.imdecode(np.frombuffer(base64.b64decode(data["image"]), np.uint8), cv2.IMREAD_COLOR)
+    frame = decode(base64.b64decode(data["image"]))
     assert frame.shape == (160, 320, 3)
 
 
@@ -79,10 +78,13 @@ def test_open_counts_twice_and_each_answer_once(realtime, greet):
         return [] if n < expected else [STEER % ("0", "1.0")]
 
     server_socket = []
-    server = Server(withhold, greet)
-    session = server.session
-    server.session = lambda client: (server_socket.append(client), session(client))
-    with server:
+
+    class Noting(Server):
+        def session(self, client):
+            server_socket.append(client)
+            super().session(client)
+
+    with Noting(withhold, greet) as server:
         drive(server, realtime=realtime)
     assert len(waiting) > 10
 
@@ -164,10 +166,12 @@ def test_pings_and_leaves_a_server_that_does_not_answer_them(monkeypatch):
     monkeypatch.setattr("cloning.wire.client.PONG_TIMEOUT", 0.5)
     monkeypatch.setattr("cloning.wire.client.CONNECT_TIMEOUT", 0.5)
 
-    server = Server(ahead, sessions=2)
-    send = server.send
-    server.send = lambda client, text: None if text == "3" else send(client, text)
-    with server, pytest.raises(SimulatorError):
+    class Mute(Server):
+        def send(self, client, text):
+            if text != "3":
+                super().send(client, text)
+
+    with Mute(ahead, sessions=2) as server, pytest.raises(SimulatorError):
         client = Client(Run(Track("lake"), "autonomous"), Blank(), "127.0.0.1", server.port, 1.5, False)
         client.drive(1)
     assert client.reconnections >= 1
