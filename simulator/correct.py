@@ -29,7 +29,7 @@ class CorrectedClient(Client):
     A correction also ends when the car leaves the road in spite of the expert and is set back. Each is a drive of its
     own in the recording. As in the real simulator while a person drives, the telemetry is then null.
 
-    corrections  number of them
+    corrections  how many there were
     expert_time  simulated seconds that the expert has driven
     """
 

@@ -18,7 +18,7 @@ from simulator import scenery
 from simulator.cameras import FAR_PLANE, NEAR_PLANE, Cameras
 from simulator.car import STEP
 from simulator.client import RemoteDriver
-from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks
+from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks, balance
 from simulator.film import place_chase_camera
 from simulator.record import write_row
 from simulator.run import Run
@@ -126,7 +126,7 @@ class Window(ShowBase):
         """Simulate the time since the last frame and show the result; panda3d calls this before each frame."""
         now = time.monotonic()
         held, mouse, pad = self.held(), self.mouse(), self.gamepad.read()
-        by_hand = not self.remote or self.controls.pedals(held) != 0
+        by_hand = not self.remote or balance(held, "up", "down") != 0
         if not self.started:
             self.simulated_until = now
             self.controls.step(held, mouse, pad)

@@ -3,6 +3,7 @@
 import math
 import re
 import textwrap
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -41,7 +42,8 @@ def test_gymnasium_finds_no_fault():
     env = gymnasium.make(environment.ID, track="jungle", random_start=True, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.reset(seed=0)
-    assert np.shape(env.render()) == (360, 640, 3)
+    frame: Any = env.render()
+    assert frame.shape == (360, 640, 3)
 
 
 def test_the_observation_is_the_centre_cameras_frame(lake):

@@ -10,7 +10,7 @@ from simulator.scenery.textures import ASPHALT_LEVEL
 
 Palette = dict[str, Colour]
 SHADOWED = 10_000  # look n + SHADOWED is look n with shadows; with n + 2 * SHADOWED and so on, they are other ones
-# The first two kinds of shadows of look 0 resemble two real recordings of the jungle, in which the road's median colour
+# The first two styles of look 0's shadows resemble two real recordings of the jungle, in which the road's median colour
 # in the shade is (0.26, 0.30, 0.39) and (0.18, 0.22, 0.30) of that in the sun; in these it is (0.29, 0.31, 0.34) and
 # (0.20, 0.22, 0.25).
 REAL_STYLES = (ShadeStyle(depth=1.35, softness=0.08), ShadeStyle(depth=1.75, softness=0.08))
@@ -56,11 +56,11 @@ class Look:
     tone: np.ndarray | None = None
 
 
-def make_look(number: int, light: Light, palette: Palette) -> Look:
+def make_look(look: int, light: Light, palette: Palette) -> Look:
     """Return a look of a track; light and palette are those of the real simulator, which look 0 uses as they are."""
-    if not number:
+    if not look:
         return Look(light, palette)
-    rng = np.random.default_rng([number, 7])
+    rng = np.random.default_rng([look, 7])
     azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(18, 70))
     sun = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
     overcast = rng.uniform(0, 0.7)  # share of the sunlight that clouds scatter over the sky
@@ -85,14 +85,14 @@ def make_look(number: int, light: Light, palette: Palette) -> Look:
     )
 
 
-def make_shade_style(number: int) -> ShadeStyle | None:
+def make_shade_style(look: int) -> ShadeStyle | None:
     """Return the shadows of a look, random except for look 0's first two; None for a look without shadows."""
-    edition, base = divmod(number, SHADOWED)
+    edition, base = divmod(look, SHADOWED)
     if not edition:
         return None
     if not base and edition <= len(REAL_STYLES):
         return REAL_STYLES[edition - 1]
-    rng = np.random.default_rng([number, 11])
+    rng = np.random.default_rng([look, 11])
     return ShadeStyle(
         depth=float(np.exp(rng.uniform(*np.log(DEPTHS)))),
         softness=float(np.exp(rng.uniform(*np.log((0.05, 0.8))))),
