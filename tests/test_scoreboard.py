@@ -4,6 +4,7 @@ import argparse
 import json
 import subprocess
 import sys
+from queue import SimpleQueue
 
 import pytest
 import torch
@@ -237,3 +238,22 @@ def test_drives_share_a_server_and_are_replaced(tmp_path, measured, model_file):
     assert {drive["laps"] for drive in drives} == {0.02} and {drive["speed_mph"] for drive in drives} == {20}
     [cell] = cells((tmp_path / "table.md").read_text(encoding="utf-8"), "20 mph, looks without shadows, held out")
     assert cell.startswith("1 road: ")
+
+
+@pytest.mark.parametrize("ended", ["stood_still", "failed"])
+def test_only_a_car_that_stands_still_is_the_models_fault(ended, monkeypatch):
+    def simulate(report, *arguments):
+        figures = {"track": "lake", "direction": "cw", "laps": 0, "seconds_a_lap": [], "distance_m": 1.0}
+        figures |= {"offset_mean_m": 0.1, "offset_max_m": 0.2, "steering_roughness_per_s": 0.3, "departures": []}
+        report.write_text(json.dumps(figures | {"ended": ended}), encoding="utf-8")
+        return 2, "simulator: it ended"
+
+    monkeypatch.setattr(scoreboard, "simulate", simulate)
+    ports = SimpleQueue[int]()
+    ports.put(1)
+    if ended == "failed":
+        with pytest.raises(UserError, match="lake cw, 9 mph, look 0: simulator: it ended"):
+            scoreboard.drive_laps(ports, 9, 1.0, ("lake", "cw", 0))
+    else:
+        assert scoreboard.drive_laps(ports, 9, 1.0, ("lake", "cw", 0))["laps"] == 1
+    assert ports.get() == 1

@@ -21,6 +21,7 @@ from simulator.scenery.shapes import (
     Mesh,
     boulder,
     box,
+    distances,
     flatness,
     illuminate,
     merge,
@@ -29,7 +30,6 @@ from simulator.scenery.shapes import (
     sheet,
     surface,
     wall,
-    whole_lap,
 )
 from simulator.scenery.textures import Line
 
@@ -248,7 +248,7 @@ def road(track: Track, marking: str, rng: Generator, look: Look, soil: np.ndarra
         "white": (Line(edge - 0.12, 0.12, palette["white"]), Line(0.0, 0.11, palette["white"], DASH / (DASH + GAP))),
     }.get(marking, ())
     asphalt = textures.asphalt(rng, grain=rng.uniform(0.03, 0.12) * look.grain, spots=look.spots)
-    s, painted = whole_lap(track, 2.0), textures.paint_lines(asphalt, palette["asphalt"], end, lines)
+    s, painted = distances(0, track.length, 2.0), textures.paint_lines(asphalt, palette["asphalt"], end, lines)
     material = Material(palette["asphalt"], painted, DASH + GAP)
     meshes = [replace(surface(track, s, end, material), sheen=look.sheen)]
     for side in (LEFT, RIGHT):
@@ -262,10 +262,10 @@ def road(track: Track, marking: str, rng: Generator, look: Look, soil: np.ndarra
 
 def border(track: Track, marking: str, side: int, look: Look, soil: np.ndarray) -> list[Mesh]:
     """Return what marks the road's edge on one side, where lines or grass do not."""
-    s, edge, palette = whole_lap(track, 2.0), float(track.edges[0, 0]), look.palette
+    s, edge, palette = distances(0, track.length, 2.0), float(track.edges[0, 0]), look.palette
     if marking == "kerb":
         stripes = Material(palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
-        return [roadside(track, whole_lap(track), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
+        return [roadside(track, distances(0, track.length), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
     if marking == "dirt":
         dirt = Material(palette["dirt"], soil, 5.0)
         return [roadside(track, s, side, (edge - 0.02, edge + 1.3), (0.0, -0.02), dirt)]

@@ -26,7 +26,6 @@ from simulator.scenery.shapes import (
     roadside,
     sheet,
     surface,
-    whole_lap,
 )
 from simulator.scenery.textures import Line
 
@@ -165,7 +164,7 @@ def road(terrain: JungleTerrain, rng: Generator, look: Look) -> list[Mesh]:
     track, plain, soil = terrain.track, textures.plain(), textures.soil(rng)
     light, palette = look.light, look.palette
     asphalt = Material(palette["asphalt"], road_texture(rng, look), DASH + GAP)
-    meshes = [surface(track, whole_lap(track, 1.5), ASPHALT_EDGE, asphalt)]
+    meshes = [surface(track, distances(0, track.length, 1.5), ASPHALT_EDGE, asphalt)]
     grass, deck = Material(palette["grass"], soil, 9.0), Material(palette["deck"], plain, 4.0, across=(0, 1))
     for start, end in ((0.0, ROAD.bridge[0]), (ROAD.bridge[1], track.length)):
         for side in (LEFT, RIGHT):

@@ -24,7 +24,6 @@ from simulator.scenery.shapes import (
     roadside,
     surface,
     wall,
-    whole_lap,
 )
 from simulator.scenery.textures import Line
 
@@ -88,7 +87,7 @@ def road_texture(rng: Generator, look: Look) -> np.ndarray:
 
 def road(track: Track, rng: Generator, look: Look, soil: np.ndarray, shadows: Sequence[Shadow]) -> list[Mesh]:
     """Return the asphalt with its lines, the roadside, the kerbs and the bridge."""
-    s, palette = whole_lap(track, 2.0), look.palette
+    s, palette = distances(0, track.length, 2.0), look.palette
     offsets = np.linspace(-ASPHALT_EDGE, ASPHALT_EDGE, 7)
     shade = np.ones((len(s), len(offsets), 3))
     for shadow in shadows:

@@ -174,13 +174,8 @@ def wall(track: Track, s: ArrayLike, side: int, outline: ArrayLike, material: Ma
     ]
 
 
-def whole_lap(track: Track, spacing: float = 1.0) -> np.ndarray:
-    """Return distances about `spacing` metres apart round the track, which begin and end at its first point."""
-    return np.linspace(0, track.length, round(track.length / spacing) + 1)
-
-
 def distances(start: float, end: float, spacing: float = 1.0) -> np.ndarray:
-    """Return distances about `spacing` metres apart along the track, from start to end."""
+    """Return distances s about `spacing` metres apart, from start to end, both included."""
     return np.linspace(start, end, max(2, round((end - start) / spacing) + 1))
 
 
