@@ -206,9 +206,9 @@ def digest(folder):
 
 
 def test_recordings_are_as_the_simulators_and_the_same_in_two_processes(tmp_path):
-    done = command("record", tmp_path / "a", "--laps", 0.03, "--seed", 5)
+    done = command("record", tmp_path / "a", "--laps", 0.015, "--seed", 5)
     assert done.returncode == 0, done.stderr
-    record.record(tmp_path / "b", Track("lake"), laps=0.03, seed=5)
+    record.record(tmp_path / "b", Track("lake"), laps=0.015, seed=5)
     assert digest(tmp_path / "a") == digest(tmp_path / "b")
     rows = list(csv.reader((tmp_path / "a" / "driving_log.csv").read_text(encoding="utf-8").splitlines()))
     times = []

@@ -80,7 +80,7 @@ def test_a_round_trip_in_real_time_is_that_of_the_telemetry_that_is_answered():
 @pytest.mark.parametrize(("steering", "status"), [("0", 0), ("1", 1)])
 def test_the_exit_status_tells_whether_the_car_left_the_road(steering, status, capsys):
     with Server(lambda packet, n: [STEER % (steering if n > 15 else "0", "1")]) as server:
-        assert main(["drive", "--laps", "0.015", "--port", str(server.port)]) == status
+        assert main(["drive", "--laps", "0.012", "--port", str(server.port)]) == status
     departures = int(re.findall(r"departures: (\d+)", capsys.readouterr().out)[0])
     assert bool(departures) == bool(status)
 
