@@ -4,7 +4,7 @@ import argparse
 import functools
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cloning.base import program
 
@@ -16,6 +16,7 @@ from cloning.base.arguments import MAX_PORT, address, number
 from cloning.base.errors import UserError
 from cloning.base.outputs import check_folders, run_all, write_json
 from cloning.recordings.format import PROBLEM_AREAS
+from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.road.track import ROADS, Track
@@ -24,13 +25,56 @@ from cloning.wire.protocol import PORT
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
+# What several commands have: the options' names, and the arguments with which argparse adds them
+Options = dict[str, dict[str, Any]]
+LAPS: Options = {
+    "--laps": {"type": number(float, 1e-6, 1e5), "default": 1, "help": "laps to drive, such as 0.5 (default 1)"}
+}
+SERVER: Options = {
+    "--host": {"type": address, "default": "127.0.0.1", "help": "address of drive.py (default %(default)s)"},
+    "--port": {"type": number(int, 1, MAX_PORT), "default": PORT, "help": "port of drive.py (default %(default)s)"},
+}
+WAIT: Options = {
+    "--wait": {
+        "type": number(float, 0.01, 1e6),
+        "default": 60.0,
+        "help": "seconds to wait for drive.py, or for an answer that the car can use (default 60)",
+    }
+}
+ROAD: Options = {
+    "--track": {
+        "default": "lake",
+        "help": f"{', '.join(ROADS)}, or a road generated from its number: road-1, road-2 and so on (default lake)",
+    },
+    "--direction": {
+        "choices": ("ccw", "cw"),
+        "help": "default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads",
+    },
+    "--look": {
+        "type": number(int, 0),
+        "default": 0,
+        "help": "look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
+        "textures and plants; 10000 more: the same with shadows, as at the real simulator's higher graphics quality",
+    },
+}
+
+
+def add_command(
+    commands: "Subparsers", run: Callable, help: str, *shared: Options, epilog: str | None = None
+) -> argparse.ArgumentParser:
+    """Add the command that the function run_NAME runs, with these shared options, and return its parser."""
+    parser = commands.add_parser(run.__name__.removeprefix("run_"), help=help, epilog=epilog)
+    parser.set_defaults(run=run)
+    for options in shared:
+        for name, settings in options.items():
+            parser.add_argument(name, **settings)
+    return parser
+
 
 def add_record(commands: "Subparsers") -> None:
-    """Add the options of `record`."""
-    parser = commands.add_parser("record", help="record an expert driver, faster than real time")
-    parser.set_defaults(run=run_record)
+    """Add `record`."""
+    parser = add_command(commands, run_record, "record an expert driver, faster than real time", LAPS, ROAD)
     parser.add_argument("folder", help="folder for the new recording: IMG/ and driving_log.csv")
-    add_laps(parser)
     parser.add_argument(
         "--speed",
         type=number(float, 1, TOP_SPEED_MPH),
@@ -46,46 +90,40 @@ def add_record(commands: "Subparsers") -> None:
         default=0,
         help="seed of the expert's random lateral offsets, and of the dates in the image names (default 0)",
     )
-    add_road(parser)
 
 
 def add_drive(commands: "Subparsers") -> None:
-    """Add the options of `drive`."""
-    parser = commands.add_parser(
-        "drive",
-        help="let drive.py drive, and print a lap report",
+    """Add `drive`."""
+    parser = add_command(
+        commands,
+        run_drive,
+        "let drive.py drive, and print a lap report",
+        *(LAPS, SERVER, WAIT, ROAD),
         epilog="Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if an error ended the drive "
         "or a file could not be written.",
     )
-    parser.set_defaults(run=run_drive)
-    add_laps(parser)
-    add_server(parser)
-    add_wait(parser)
-    pace = parser.add_mutually_exclusive_group()
-    pace.add_argument(
-        "--lockstep",
+    parser.add_argument(
+        "--realtime",
         action="store_true",
-        help="simulated time waits for each answer, so that a drive is repeatable (default)",
+        help="simulated time follows the wall clock; by default it waits for each answer, and a drive is repeatable",
     )
-    pace.add_argument("--realtime", action="store_true", help="simulated time follows the wall clock")
     parser.add_argument("--report", metavar="FILE", help="write the lap report as JSON")
     parser.add_argument("--picture", metavar="FILE.png", help="plot the track from above with the path driven")
     parser.add_argument("--film", metavar="FILE.mp4", help="film the drive from behind the car")
-    add_road(parser)
 
 
 def add_correct(commands: "Subparsers") -> None:
-    """Add the options of `correct`."""
-    parser = commands.add_parser(
-        "correct",
-        help="let drive.py drive, and record the expert, who takes over where the car is off the lane's centre",
+    """Add `correct`."""
+    parser = add_command(
+        commands,
+        run_correct,
+        "let drive.py drive, and record the expert, who takes over where the car is off the lane's centre",
+        *(LAPS, SERVER, WAIT, ROAD),
         epilog="Exit status: as that of drive.",
     )
-    parser.set_defaults(run=run_correct)
     parser.add_argument(
         "folder", help=f"folder for the new recording; its name must end in {' or '.join(PROBLEM_AREAS)}"
     )
-    add_laps(parser)
     parser.add_argument(
         "--speed",
         type=number(float, 1, TOP_SPEED_MPH),
@@ -93,17 +131,12 @@ def add_correct(commands: "Subparsers") -> None:
         help="the expert's set speed in mph, which the car never exceeds: give drive.py the same (default %(default)g, "
         "as that of drive.py)",
     )
-    add_server(parser)
-    add_wait(parser)
-    add_road(parser)
 
 
 def add_replay(commands: "Subparsers") -> None:
-    """Add the options of `replay`."""
-    parser = commands.add_parser(
-        "replay", help="let a model drive real recordings, and print its autonomy and distance from the lane centre"
-    )
-    parser.set_defaults(run=run_replay)
+    """Add `replay`."""
+    help_text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
+    parser = add_command(commands, run_replay, help_text, SERVER, WAIT)
     parser.add_argument("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
     parser.add_argument("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
     parser.add_argument(
@@ -111,6 +144,8 @@ def add_replay(commands: "Subparsers") -> None:
         type=number(float, 0.01, 1000),
         nargs="+",
         default=LIMITS,
+        dest="limits",
+        metavar="LIMIT",
         help="distance in m from the lane centre at which a human would take over; each limit is a drive of its own "
         "(default 1, as in NVIDIA's evaluation, and 2.5, where the side of the car is on the edge line)",
     )
@@ -121,17 +156,14 @@ def add_replay(commands: "Subparsers") -> None:
         help="measure offsets from the lane centre, estimated from the frames (default), or from the human "
         "driver's path",
     )
-    add_server(parser)
-    add_wait(parser)
     parser.add_argument("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
     parser.add_argument("--picture", metavar="FILE.png", help="plot lateral offset and steering over time")
     parser.add_argument("--film", metavar="FILE.mp4", help="film what the model sees in the drives at the last limit")
 
 
 def add_window(commands: "Subparsers") -> None:
-    """Add the options of `window`."""
-    parser = commands.add_parser("window", help="drive and record by hand, or watch drive.py drive")
-    parser.set_defaults(run=run_window)
+    """Add `window`."""
+    parser = add_command(commands, run_window, "drive and record by hand, or watch drive.py drive", SERVER, ROAD)
     parser.add_argument(
         "--folder",
         help="folder for the recording (default data/window-DATE-TIME, or data/window-DATE-TIME-corrections with "
@@ -141,54 +173,6 @@ def add_window(commands: "Subparsers") -> None:
         "--autonomous",
         action="store_true",
         help="let drive.py drive; W or S takes over, and only then is anything recorded",
-    )
-    add_server(parser)
-    add_road(parser)
-
-
-def add_laps(parser: argparse.ArgumentParser) -> None:
-    """Add --laps."""
-    parser.add_argument(
-        "--laps", type=number(float, 1e-6, 1e5), default=1, help="laps to drive, such as 0.5 (default 1)"
-    )
-
-
-def add_server(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say where drive.py is."""
-    parser.add_argument("--host", type=address, default="127.0.0.1", help="address of drive.py (default %(default)s)")
-    parser.add_argument(
-        "--port", type=number(int, 1, MAX_PORT), default=PORT, help="port of drive.py (default %(default)s)"
-    )
-
-
-def add_wait(parser: argparse.ArgumentParser) -> None:
-    """Add --wait."""
-    parser.add_argument(
-        "--wait",
-        type=number(float, 0.01, 1e6),
-        default=60.0,
-        help="seconds to wait for drive.py, or for an answer that the car can use (default 60)",
-    )
-
-
-def add_road(parser: argparse.ArgumentParser) -> None:
-    """Add the options that choose a track and its look."""
-    parser.add_argument(
-        "--track",
-        default="lake",
-        help=f"{', '.join(ROADS)}, or a road generated from its number: road-1, road-2 and so on (default %(default)s)",
-    )
-    parser.add_argument(
-        "--direction",
-        choices=("ccw", "cw"),
-        help="default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads",
-    )
-    parser.add_argument(
-        "--look",
-        type=number(int, 0),
-        default=0,
-        help="look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
-        "textures and plants; 10000 more: the same with shadows, as at the real simulator's higher graphics quality",
     )
 
 
@@ -206,21 +190,23 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
 # Each function imports what its command needs, because `--help` and wrong arguments need neither panda3d nor torch.
 
 
-def run_record(args: argparse.Namespace) -> int:
+def run_record(arguments: argparse.Namespace) -> int:
     """Record the expert; print its departures and how fast it was recorded."""
     from simulator.record import record
 
-    track = Track(args.track, args.direction)
+    track = Track(arguments.track, arguments.direction)
     begin = time.perf_counter()
-    run, rows = record(args.folder, track, args.laps, args.speed, args.seed, args.look, args.recovery)
+    run, rows = record(
+        arguments.folder, track, arguments.laps, arguments.speed, arguments.seed, arguments.look, arguments.recovery
+    )
     pace = run.time / (time.perf_counter() - begin)
     for departure in run.departures:
         print(f"left the road at {departure.s:.0f} m after {departure.time:.1f} s")
-    print(f"{args.folder}: {rows} rows from {run.time:.0f} simulated seconds, at {pace:.1f} times real time")
+    print(f"{arguments.folder}: {rows} rows from {run.time:.0f} simulated seconds, at {pace:.1f} times real time")
     return program.INCOMPLETE if run.departures else program.DONE
 
 
-def run_drive(args: argparse.Namespace) -> int:
+def run_drive(arguments: argparse.Namespace) -> int:
     """Let drive.py drive, and write the requested files even if the drive ends early."""
     from simulator import report, scenery
     from simulator.cameras import Cameras
@@ -229,89 +215,84 @@ def run_drive(args: argparse.Namespace) -> int:
     from simulator.run import Run
     from simulator.world import Scene
 
-    check_folders(args.report, args.picture, args.film)
-    run = Run(Track(args.track, args.direction), "autonomous")
-    scene = Scene(scenery.build(args.track, args.look))
-    client = Client(run, Cameras(scene, ("center",)), args.host, args.port, args.wait, args.realtime)
+    check_folders(arguments.report, arguments.picture, arguments.film)
+    run = Run(Track(arguments.track, arguments.direction), "autonomous")
+    scene = Scene(scenery.build(arguments.track, arguments.look))
+    client = Client(
+        run, Cameras(scene, ("center",)), arguments.host, arguments.port, arguments.wait, arguments.realtime
+    )
 
     def print_report() -> None:
         if run.time:
             print(report.report_text(report.lap_report(run, client)))
 
-    steps: list[Callable[[], object]] = [lambda: client.drive(args.laps), print_report]
-    if args.film:
-        film = ChaseFilm(args.film, scene)
+    steps: list[Callable[[], object]] = [lambda: client.drive(arguments.laps), print_report]
+    if arguments.film:
+        film = ChaseFilm(arguments.film, scene)
         client.watch = functools.partial(film.watch, run)
         steps.append(film.close)
-    if args.report:
-        steps.append(lambda: write_json(args.report, report.lap_report(run, client)))
-    if args.picture:
-        steps.append(lambda: report.write_picture(args.picture, run))
+    if arguments.report:
+        steps.append(lambda: write_json(arguments.report, report.lap_report(run, client)))
+    if arguments.picture:
+        steps.append(lambda: report.write_picture(arguments.picture, run))
     run_all(*steps)
     return program.INCOMPLETE if run.departures else program.DONE
 
 
-def run_correct(args: argparse.Namespace) -> int:
+def run_correct(arguments: argparse.Namespace) -> int:
     """Let drive.py drive with corrections by the expert; print a lap report and what was recorded."""
-    from simulator import report
-    from simulator.correct import connect
+    from simulator import report, scenery
+    from simulator.correct import CorrectedClient
+    from simulator.run import Run
+    from simulator.world import Scene
 
-    track = Track(args.track, args.direction)
-    client = connect(args.folder, track, args.look, args.speed, args.host, args.port, args.wait)
+    check_name_of_corrections(arguments.folder)
+    run = Run(Track(arguments.track, arguments.direction), "autonomous")
+    with RecordingWriter(arguments.folder) as recording:
+        scene = Scene(scenery.build(arguments.track, arguments.look))
+        client = CorrectedClient(run, scene, arguments.speed, recording, arguments.host, arguments.port, arguments.wait)
 
-    def print_report() -> None:
-        if client.run.time:
-            print(f"{report.report_text(report.lap_report(client.run, client))}\n{client.summary()}")
+        def print_report() -> None:
+            if run.time:
+                print(f"{report.report_text(report.lap_report(run, client))}\n{client.summary()}")
 
-    run_all(lambda: client.drive(args.laps), print_report, client.recording.close, client.recording.remove_if_empty)
-    return program.INCOMPLETE if client.run.departures else program.DONE
+        run_all(lambda: client.drive(arguments.laps), print_report)
+    return program.INCOMPLETE if run.departures else program.DONE
 
 
-def run_replay(args: argparse.Namespace) -> int:
+def run_replay(arguments: argparse.Namespace) -> int:
     """Let a model drive real recordings."""
     from cloning.replay import command
 
-    command.run(
-        command.Options(
-            folders=args.folders,
-            model=args.model,
-            host=args.host,
-            port=args.port,
-            wait=args.wait,
-            limits=args.limit,
-            reference=args.reference,
-            report=args.report,
-            picture=args.picture,
-            film=args.film,
-        )
-    )
-    return 0
+    options = {name: value for name, value in vars(arguments).items() if name != "run"}
+    command.run(command.Options(**options))
+    return program.DONE
 
 
-def run_window(args: argparse.Namespace) -> int:
+def run_window(arguments: argparse.Namespace) -> int:
     """Open the window in which a person drives or watches."""
     from datetime import datetime
 
     from simulator.controls import HELP
     from simulator.window import Window
 
-    kind = PROBLEM_AREAS[-1] if args.autonomous else ""
-    folder = args.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}{kind}"
-    server = (args.host, args.port) if args.autonomous else None
-    opened = Window(Track(args.track, args.direction), folder, args.look, server)
+    ending = PROBLEM_AREAS[-1] if arguments.autonomous else ""
+    folder = arguments.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}{ending}"
+    server = (arguments.host, arguments.port) if arguments.autonomous else None
+    opened = Window(Track(arguments.track, arguments.direction), folder, arguments.look, server)
     print(HELP, flush=True)
     try:
         opened.run()
     finally:
         opened.finish()
-    return 0
+    return program.DONE
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run a command and return its exit status."""
-    args = parse_arguments(argv)
+    arguments = parse_arguments(argv)
     try:
-        return args.run(args)
+        return arguments.run(arguments)
     except UserError as error:
         return program.failed("simulator", error)
 

@@ -2,20 +2,7 @@
 
 import cv2
 import numpy as np
-from panda3d.core import (
-    Camera,
-    FrameBufferProperties,
-    GraphicsEngine,
-    GraphicsOutput,
-    GraphicsPipe,
-    GraphicsPipeSelection,
-    NodePath,
-    PerspectiveLens,
-    Texture,
-    TransformState,
-    WindowProperties,
-    load_prc_file_data,
-)
+from panda3d import core
 
 from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
@@ -29,19 +16,10 @@ ROWS, COLUMNS = FRAME[:2]
 # For each row of a frame two are rendered and averaged; with one, the road far ahead flickers, unlike the real one.
 FINE_ROWS = 2 * ROWS
 
-# The transform cache is off, because it replaces transforms by nearly equal earlier ones: a frame would depend on the
-# frames before it.
-load_prc_file_data(
-    "",
-    "window-type none\naudio-library-name null\nsync-video false\nprint-pipe-types false\n"
-    "notify-level-display error\nnotify-level-device fatal\n"
-    "load-display p3tinydisplay\nuniquify-transforms false\ntransform-cache false\n",
-)
 
-
-def lens(rows: int = ROWS, columns: int = COLUMNS) -> PerspectiveLens:
+def lens(rows: int = ROWS, columns: int = COLUMNS) -> core.PerspectiveLens:
     """Return a lens with the cameras' vertical field of view for images of this shape."""
-    perspective = PerspectiveLens()
+    perspective = core.PerspectiveLens()
     perspective.set_near_far(NEAR_PLANE, FAR_PLANE)
     horizontal_field = 2 * np.degrees(np.arctan(np.tan(np.radians(VERTICAL_FIELD / 2)) * columns / rows))
     perspective.set_fov(horizontal_field, VERTICAL_FIELD)
@@ -50,16 +28,9 @@ def lens(rows: int = ROWS, columns: int = COLUMNS) -> PerspectiveLens:
 
 def jpeg(frame: np.ndarray) -> bytes:
     """Encode a frame, uint8 (rows, columns, 3) RGB, like the real simulator."""
-    encoded, data = cv2.imencode(
-        ".jpg",
-        cv2.cvtColor(frame, cv2.COLOR_RGB2BGR),
-        [
-            cv2.IMWRITE_JPEG_QUALITY,
-            JPEG_QUALITY,
-            cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-            cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420,
-        ],
-    )
+    sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420)
+    options = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, *sampling)
+    encoded, data = cv2.imencode(".jpg", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), options)
     if not encoded:
         raise ValueError("OpenCV cannot encode the frame as JPEG")
     return data.tobytes()
@@ -68,22 +39,22 @@ def jpeg(frame: np.ndarray) -> bytes:
 class Buffer:
     """An image rendered without a screen, with a region for each camera, one below another."""
 
-    def __init__(self, rows: int, columns: int, cameras: list[NodePath]):
+    def __init__(self, rows: int, columns: int, cameras: list[core.NodePath]):
         """rows, columns: of each region. Raises SimulatorError if the renderer cannot be loaded."""
-        pipe = GraphicsPipeSelection.get_global_ptr().make_pipe("TinyOffscreenGraphicsPipe", "p3tinydisplay")
+        pipe = core.GraphicsPipeSelection.get_global_ptr().make_pipe("TinyOffscreenGraphicsPipe", "p3tinydisplay")
         if not pipe:
             raise SimulatorError(
                 "panda3d's software renderer cannot be loaded: on Linux it needs libX11.so.6 (apt-get install libx11-6)"
             )
-        properties = FrameBufferProperties()
+        properties = core.FrameBufferProperties()
         properties.set_rgba_bits(8, 8, 8, 0)
         properties.set_depth_bits(24)
         self.shape = (len(cameras), rows, columns, 3)
-        self.engine = GraphicsEngine(pipe)
-        size = WindowProperties.size(columns, rows * len(cameras))
-        buffer = self.engine.make_output(pipe, "buffer", 0, properties, size, GraphicsPipe.BF_refuse_window)
-        self.image = Texture()
-        buffer.add_render_texture(self.image, GraphicsOutput.RTM_copy_ram, GraphicsOutput.RTP_color)
+        self.engine = core.GraphicsEngine(pipe)
+        size = core.WindowProperties.size(columns, rows * len(cameras))
+        buffer = self.engine.make_output(pipe, "buffer", 0, properties, size, core.GraphicsPipe.BF_refuse_window)
+        self.image = core.Texture()
+        buffer.add_render_texture(self.image, core.GraphicsOutput.RTM_copy_ram, core.GraphicsOutput.RTP_color)
         for i, camera in enumerate(cameras):
             region = buffer.make_display_region(0, 1, 1 - (i + 1) / len(cameras), 1 - i / len(cameras))
             region.set_camera(camera)
@@ -103,14 +74,14 @@ class Cameras:
         self.scene = scene
         mounted = []
         for name in names:
-            camera = scene.car.attach_new_node(Camera(name, lens()))
+            camera = scene.car.attach_new_node(core.Camera(name, lens()))
             camera.node().set_camera_mask(INSIDE)
             camera.set_pos(*CAMERA_POSITIONS[name])
             camera.set_hpr(-CAMERA_YAW, -MOUNT_PITCH, -CAMERA_ROLL)
             mounted.append(camera)
         self.buffer = Buffer(FINE_ROWS, COLUMNS, mounted)
 
-    def frames(self, transform: TransformState) -> np.ndarray:
+    def frames(self, transform: core.TransformState) -> np.ndarray:
         """Render the frames with the car at the transform: uint8 (cameras, 160, 320, 3), RGB, in the names' order."""
         self.scene.move_car(transform)
         rows = self.buffer.render().reshape(-1, COLUMNS, 3)

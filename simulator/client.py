@@ -4,6 +4,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from typing import Literal
 
 from tqdm import tqdm
 
@@ -31,8 +32,8 @@ RECONNECT_INTERVAL = 1.0  # s between two attempts of the window to connect
 WINDOW_SEND_TIMEOUT = 0.1  # s that the window waits for a server that does not read
 
 
-class Standstill(SimulatorError):
-    """The server answers, but the car stays where it is."""
+# Why a drive ended: its laps were driven; the server answers, but the car stays where it is; another error, or Ctrl-C.
+DriveEnd = Literal["laps", "stood_still", "failed"]
 
 
 def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
@@ -41,7 +42,18 @@ def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: flo
     return telemetry_packet(steering, throttle, run.speed_mph, jpeg(frame))
 
 
-class Client(ClientSession):
+class Driven:
+    """What a server has a car do: steering and throttle as last commanded, -1..1."""
+
+    steering = throttle = 0.0
+
+    def apply(self, answer: Answer) -> None:
+        """Use the steering and throttle of an answer from now on, if it has any."""
+        if answer.steering is not None and answer.throttle is not None:
+            self.steering, self.throttle = answer.steering, answer.throttle
+
+
+class Client(Driven, ClientSession):
     """Drives the car as a server answers, and connects again when the connection is lost."""
 
     def __init__(self, run: Run, cameras: Cameras, host: str, port: int, wait: float, realtime: bool):
@@ -49,8 +61,8 @@ class Client(ClientSession):
         super().__init__(host, port, wait, real_timing=realtime)
         self.run, self.cameras, self.realtime = run, cameras, realtime
         self.watch: Callable[[], None] | None = None  # called after each physics step
-        self.steering = self.throttle = 0.0  # as last commanded
         self.frames = 0  # number of frames sent
+        self.ended: DriveEnd = "failed"  # until it has ended in another way
         self.own_time = 0.0  # s of wall time that the simulator itself used, in lock-step
         self._moved_at, self._moved_to = 0.0, 0.0  # s and m travelled when the car had last moved by a metre
 
@@ -59,20 +71,16 @@ class Client(ClientSession):
         self.frames += 1
         return current_telemetry(self.run, self.cameras, self.steering, self.throttle)
 
-    def apply(self, answer: Answer) -> None:
-        """Use the steering and throttle of an answer from now on, if it has any."""
-        if answer.steering is not None and answer.throttle is not None:
-            self.steering, self.throttle = answer.steering, answer.throttle
-
     def step(self) -> None:
-        """Drive for one physics step. Raises Standstill."""
+        """Drive for one physics step. Raises SimulatorError if the car stands still."""
         self.run.step(self.steering, self.throttle)
         if self.watch:
             self.watch()
         if abs(self.run.travelled - self._moved_to) > 1:
             self._moved_at, self._moved_to = self.run.time, self.run.travelled
         elif self.run.time - self._moved_at > STANDSTILL_TIME:
-            raise Standstill(
+            self.ended = "stood_still"
+            raise SimulatorError(
                 f"the car has stood still for {STANDSTILL_TIME:.0f} s (throttle {self.throttle:g}, "
                 f"{self.unusable} unusable answers)"
             )
@@ -86,6 +94,7 @@ class Client(ClientSession):
                 self.connect()
                 try:
                     drive(goal, bar)
+                    self.ended = "laps"
                     return
                 except ConnectionLost as error:
                     self.count_reconnection(error)
@@ -156,7 +165,7 @@ class Client(ClientSession):
             sent.append(time.perf_counter())
 
 
-class RemoteDriver:
+class RemoteDriver(Driven):
     """drive.py as the window's driver; while it cannot be reached, it is tried again every second.
 
     It never holds the window up: connecting, which can take long, is done in a thread.
@@ -164,7 +173,6 @@ class RemoteDriver:
 
     def __init__(self, host: str, port: int, cameras: Cameras):
         self.address, self.cameras = (host, port), cameras
-        self.steering = self.throttle = 0.0  # as last commanded
         self.connection: Connection | None = None
         self.state, self.next_try = "not connected", 0.0
         self._connecting: threading.Thread | None = None
@@ -184,8 +192,7 @@ class RemoteDriver:
                 answer = parse_answer(packet) if packet else None
                 if answer is None:
                     continue
-                if answer.steering is not None and answer.throttle is not None:
-                    self.steering, self.throttle = answer.steering, answer.throttle
+                self.apply(answer)
                 connection.send(
                     MANUAL_TELEMETRY if by_hand else current_telemetry(run, self.cameras, self.steering, self.throttle)
                 )

@@ -98,10 +98,6 @@ class Controls:
         actions, self.actions = self.actions, []
         return actions
 
-    def pedals(self, held: AbstractSet[str]) -> float:
-        """Return 1 for W, -1 for S, 0 for neither or both."""
-        return balance(held, "up", "down")
-
     def step(self, held: AbstractSet[str], mouse: float | None = None, pad: Sticks | None = None) -> None:
         """Update the commands for one physics step.
 
@@ -123,7 +119,7 @@ class Controls:
             self.steering += max(-KEY_STEP, min(KEY_STEP, wanted - self.steering))
         if mouse is None:
             self.drag = None
-        pedal = self.pedals(held)
+        pedal = balance(held, "up", "down")
         push = apply_dead_zone(pad.throttle) if pad else 0.0
         if pedal < 0 or push < 0:
             self.cruise = False

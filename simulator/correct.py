@@ -5,13 +5,10 @@ So the network learns, where it gets to by its own faults, how to come back. Thi
 """
 
 import math
-from pathlib import Path
 
-from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
+from cloning.recordings.writer import RecordingWriter
 from cloning.road.motion import MPH
-from cloning.road.track import Track
 from cloning.wire.client import MANUAL_TELEMETRY
-from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.car import STEP
 from simulator.client import Client
@@ -32,7 +29,7 @@ class CorrectedClient(Client):
     A correction also ends when the car leaves the road in spite of the expert and is set back. Each is a drive of its
     own in the recording. As in the real simulator while a person drives, the telemetry is then null.
 
-    corrections  number of them
+    corrections  how many there were
     expert_time  simulated seconds that the expert has driven
     """
 
@@ -65,7 +62,7 @@ class CorrectedClient(Client):
         return MANUAL_TELEMETRY if self.correcting else super().next_frame()
 
     def step(self) -> None:
-        """Drive for one physics step. Raises Standstill."""
+        """Drive for one physics step. Raises SimulatorError if the car stands still."""
         commands = self.expert.drive(self.run)  # all the time, so that its steering has settled when it takes over
         if self.correcting:
             self.steering, self.throttle = commands
@@ -82,17 +79,3 @@ class CorrectedClient(Client):
             f"corrections: {self.corrections}, the expert drove {share:.1f} % of the time; "
             f"{self.recording.rows} rows in {self.recording.folder}"
         )
-
-
-def connect(
-    folder: str | Path, track: Track, look: int, speed: float, host: str, port: int, wait: float
-) -> CorrectedClient:
-    """Begin a recording of corrections in a new folder, and return the client that makes them.
-
-    Raises RecordingError if the folder's name does not say what it holds, it holds a recording, or cannot be written.
-    """
-    check_name_of_corrections(folder)
-    recording = RecordingWriter(folder)
-    return CorrectedClient(
-        Run(track, "autonomous"), Scene(scenery.build(track.name, look)), speed, recording, host, port, wait
-    )

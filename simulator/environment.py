@@ -19,11 +19,13 @@ step's time goes into rendering the frame in software, on one core.
 """
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 
 from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
@@ -35,11 +37,21 @@ from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.film import ChaseView
 from simulator.run import Run
-from simulator.world import Scene
+from simulator.world import Scene, free_unused
 
 ID = "behavioral-cloning/Drive-v0"
 MAX_STEPS = 10 * 60 * SAMPLE_RATE  # ten simulated minutes, so that the episode of a car that stands still ends, too
 DEPARTURE_PENALTY = 100.0  # m of progress; Gymnasium's CarRacing gives the same for leaving its playfield
+
+
+def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> None:
+    """Raise SimulatorError if a value is not valid, or of a type that cannot be compared; allowed: what is valid."""
+    try:
+        accepted = valid(value)
+    except (TypeError, ValueError):
+        accepted = False
+    if not accepted:
+        raise SimulatorError(f"{name} {value!r}: it must be {allowed}")
 
 
 class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -74,25 +86,22 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         track: "lake", "jungle", "road-1", "road-2", …; direction: "ccw", "cw" or None for that of the real simulator;
         look: 0 like the real simulator, any greater number in other light, colours, textures and plants; speed: set
         speed in mph, 1 to 30, which the car never exceeds; laps: after which an episode is truncated, such as 0.5;
-        random_start: begin each episode at a random place on the centre line instead of where the autonomous mode does;
+        random_start: begin each episode anywhere on the centre line instead of where the autonomous mode does;
         render_mode: "rgb_array" (a view from behind the car) or None.
         """
-        for name, value, valid, allowed in (
-            ("direction", direction, direction in ("ccw", "cw", None), "'ccw', 'cw' or None"),
-            ("look", look, look >= 0 and look % 1 == 0, "a whole number from 0"),
-            ("speed", speed, 1 <= speed <= TOP_SPEED_MPH, f"1 to {TOP_SPEED_MPH} (mph)"),
-            ("laps", laps, 0 < laps < math.inf, "a number above 0"),
-            ("render_mode", render_mode, render_mode in (None, "rgb_array"), "'rgb_array' or None"),
-        ):
-            if not valid:
-                raise SimulatorError(f"{name} {value!r}: it must be {allowed}")
+        check("track", track, lambda name: isinstance(name, str), "a name, such as 'lake', 'jungle' or 'road-1'")
+        check("direction", direction, lambda name: name in ("ccw", "cw", None), "'ccw', 'cw' or None")
+        check("look", look, lambda number: number >= 0 and number % 1 == 0, "a whole number from 0")
+        check("speed", speed, lambda mph: 1 <= mph <= TOP_SPEED_MPH, f"1 to {TOP_SPEED_MPH} (mph)")
+        check("laps", laps, lambda number: 0 < number < math.inf, "a number above 0")
+        check("render_mode", render_mode, lambda mode: mode in ("rgb_array", None), "'rgb_array' or None")
         self.observation_space = spaces.Box(0, 255, FRAME, np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.track, self.speed, self.laps, self.random_start = Track(track, direction), speed, laps, random_start
         scene = Scene(scenery.build(track, look))
         self.cameras = Cameras(scene, ("center",))
         self.render_mode, self.view = render_mode, ChaseView(scene) if render_mode else None
-        self.ended = True  # until the first reset
+        self.state: Literal["new", "driving", "ended", "closed"] = "new"
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -100,29 +109,34 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         """Begin an episode, with the car at rest on its springs; return the first frame and info.
 
         seed: of the random starts; options: "s", m along the track, 0 up to its length, and "offset", lateral offset in
-        m, right positive (default 0), say where to start. Raises SimulatorError if the road is not there.
+        m, right positive (default 0), say where to start. Raises SimulatorError if the road is not there, and
+        gymnasium's ClosedEnvironmentError after `close`.
         """
+        self._check_open()
         super().reset(seed=seed)
-        self.ended = True  # until the car stands on the road
+        self.state = "ended"  # until the car stands on the road
         self.run = Run(self.track, "autonomous")
         self.run.car.speed_limit = self.speed * MPH
         if self.random_start:
             self.run.s = self.np_random.uniform(0, self.track.length)
-        self._place(**(options or {}))
+        self._set_on_road(options or {})
         self.clock = SampleClock(1 / SAMPLE_RATE)
-        self.ended = False
+        self.state = "driving"
         return self._frame(), self._info()
 
-    def _place(self, s: float | None = None, offset: float = 0.0, **unknown: object) -> None:
-        """Place the car on the road; s, offset: see `reset`, None for where it is. Raises SimulatorError."""
-        if unknown:
-            raise SimulatorError(f"option {', '.join(unknown)}: the options of reset are s and offset")
-        if s is not None:
-            if not 0 <= s < self.track.length:
-                raise SimulatorError(f"s {s!r}: it must be at least 0 and less than {self.track.length:.1f} (m)")
-            self.run.s = float(s)
-        if not math.isfinite(offset):
-            raise SimulatorError(f"offset {offset!r}: it must be a number (m)")
+    def _check_open(self) -> None:
+        if self.state == "closed":
+            raise ClosedEnvironmentError("the environment is closed: make another one")
+
+    def _set_on_road(self, options: dict[str, Any]) -> None:
+        """Set the car on the road; options: see `reset`. Raises SimulatorError."""
+        if not isinstance(options, dict) or options.keys() - {"s", "offset"}:
+            raise SimulatorError(f"options {options!r}: the options of reset are s and offset, in a dict")
+        s, offset = options.get("s", self.run.s), options.get("offset", 0.0)
+        length = self.track.length
+        check("s", s, lambda metres: 0 <= metres < length, f"at least 0 and less than {length:.1f} (m)")
+        check("offset", offset, math.isfinite, "a number (m)")
+        self.run.s = float(s)
         self.run.set_back(float(offset))
         if side := self.run.off_road():
             left, right = self.track.edges[self.track.index(self.run.s)]
@@ -134,14 +148,18 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Drive until the next frame is due, or the car leaves the road; return what the class describes.
 
-        Raises gymnasium's InvalidAction for an action that is not two finite numbers, and its ResetNeeded before the
-        first `reset` and after the end of an episode.
+        Raises gymnasium's InvalidAction for an action that is not two finite numbers, its ResetNeeded before the first
+        `reset` and after the end of an episode, and its ClosedEnvironmentError after `close`.
         """
-        if self.ended:
-            raise gymnasium.error.ResetNeeded("call reset() before the first step and after the end of an episode")
-        commands = np.asarray(action, float)
+        self._check_open()
+        if self.state != "driving":
+            raise ResetNeeded("call reset() before the first step and after the end of an episode")
+        try:
+            commands = np.asarray(action, float)
+        except (TypeError, ValueError):
+            commands = np.empty(0)
         if commands.shape != (2,) or not np.isfinite(commands).all():
-            raise gymnasium.error.InvalidAction(f"{action!r}: an action is two finite numbers, steering and throttle")
+            raise InvalidAction(f"{action!r}: an action is two finite numbers, steering and throttle")
         steering, throttle = np.clip(commands, -1, 1).tolist()
         before = self.run.travelled
         stayed = self.run.advance(steering, throttle)
@@ -149,7 +167,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
             stayed = self.run.advance(steering, throttle)
         reward = float(self.run.travelled - before) - (0 if stayed else DEPARTURE_PENALTY)
         finished = bool(self.run.travelled >= self.laps * self.track.length)
-        self.ended = finished or not stayed
+        self.state = "ended" if finished or not stayed else "driving"
         return self._frame(), reward, not stayed, finished, self._info()
 
     def _frame(self) -> np.ndarray:
@@ -167,8 +185,21 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         }
 
     def render(self) -> np.ndarray | None:
-        """Render the view from behind the car: uint8 (360, 640, 3), RGB; None without a render mode."""
+        """Render the view from behind the car: uint8 (360, 640, 3), RGB; None without a render mode.
+
+        Raises gymnasium's ResetNeeded before the first `reset`, and its ClosedEnvironmentError after `close`.
+        """
+        self._check_open()
+        if self.state == "new":
+            raise ResetNeeded("call reset() before render()")
         return self.view.frame(self.run) if self.view else None
+
+    def close(self) -> None:
+        """Free the scene and the rendered images; after this only `close` may be called again."""
+        if self.state != "closed":
+            self.state = "closed"
+            del self.cameras, self.view
+            free_unused()
 
 
 gymnasium.register(ID, entry_point=f"{__name__}:{Drive.__name__}", max_episode_steps=MAX_STEPS)

@@ -41,11 +41,11 @@ class Expert:
         """top_speed: m/s; wander: standard deviation of the lateral offset in m; seed: of the lateral offsets."""
         self.track, self.top_speed = track, min(top_speed, TOP_SPEED)
         self.limits = speed_limits(track, self.top_speed)
-        random = np.random.default_rng([seed, 1])
+        rng = np.random.default_rng([seed, 1])
         waves = np.arange(1, max(2, int(track.length / MIN_WAVELENGTH)) + 1)
         # Wavelengths that do not divide the track's length, so that laps differ; in radians per m.
-        self.waves = 2 * np.pi * (waves * random.uniform(0.9, 1.1, len(waves))) / track.length
-        self.phases = random.uniform(0, 2 * np.pi, len(waves))
+        self.waves = 2 * np.pi * (waves * rng.uniform(0.9, 1.1, len(waves))) / track.length
+        self.phases = rng.uniform(0, 2 * np.pi, len(waves))
         self.amplitude = wander * math.sqrt(2 / len(waves))
         self.max_wander = min(MAX_WANDER, float(track.edges.min()) - WANDER_MARGIN)
         self.recordable = True
@@ -89,21 +89,21 @@ class Recovery(Expert):
     def __init__(self, track: Track, seed: int = 0, top_speed: float = TOP_SPEED):
         """top_speed: m/s."""
         super().__init__(track, seed, top_speed, wander=0.0)
-        self.random = np.random.default_rng([seed, 2])
-        self.goal, self.until, self.recordable = 0.0, self.random.uniform(*self.CENTRED_TIME), False
+        self.rng = np.random.default_rng([seed, 2])
+        self.goal, self.until, self.recordable = 0.0, self.rng.uniform(*self.CENTRED_TIME), False
 
     def drive(self, run: Run) -> tuple[float, float]:
         """Return steering and throttle for the next step of the run, and set `recordable` during a return."""
         if self.recordable:
             if abs(run.offset) < 0.25 and self.target == 0:
-                self.recordable, self.until = False, run.time + self.random.uniform(*self.CENTRED_TIME)
+                self.recordable, self.until = False, run.time + self.rng.uniform(*self.CENTRED_TIME)
         elif self.goal:
             if abs(run.offset - self.goal) < 0.2 or run.time > self.until:
                 self.goal, self.recordable = 0.0, True
         elif run.time > self.until:
-            side = self.random.choice((LEFT, RIGHT))
+            side = self.rng.choice((LEFT, RIGHT))
             edge = self.track.edges[self.track.index(run.s), 0 if side == LEFT else 1]
-            self.goal = side * self.random.uniform(*self.TURNING_POINT) * (edge - self.MARGIN)
+            self.goal = side * self.rng.uniform(*self.TURNING_POINT) * (edge - self.MARGIN)
             self.until = run.time + self.MAX_OUTWARD_TIME
         change = (self.RETURN_SPEED if self.recordable else self.OUTWARD_SPEED) * STEP
         self.target += max(-change, min(change, self.goal - self.target))

@@ -7,13 +7,15 @@ import signal
 import threading
 from collections import deque
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from contextlib import ExitStack
 from datetime import timedelta
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from panda3d.core import TransformState
 from tqdm import tqdm
 
+from cloning.base import program
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError
 from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
@@ -26,18 +28,6 @@ from simulator.run import Run
 from simulator.world import Scene
 
 MAX_RENDERERS = 3  # processes; each uses one core and 50 MB
-
-
-class Row(NamedTuple):
-    """A row of the recording whose images are being rendered; its fields: see `RecordingWriter.add`."""
-
-    time: float
-    images: Future[list[bytes]]
-    steering: float
-    throttle: float
-    brake: float
-    speed: float
-    lane: tuple[float, float]
 
 
 def _start_renderer() -> None:
@@ -58,15 +48,31 @@ def _cameras(track: str, look: int) -> Cameras:
     return Cameras(Scene(scenery.build(track, look)))
 
 
+def _prepare(track: str, look: int) -> None:
+    _cameras(track, look)
+
+
 def _render(track: str, look: int, transform: TransformState) -> list[bytes]:
     """Return the three cameras' JPEGs, which depend on the car's pose alone; runs in a rendering process."""
     return [jpeg(frame) for frame in _cameras(track, look).frames(transform)]
 
 
+def sample(run: Run) -> dict[str, Any]:
+    """Return what a recording keeps of the run's present state besides the images, as RecordingWriter.add takes it."""
+    return {
+        "time": run.time,
+        "steering": run.steering,
+        "throttle": max(0.0, run.throttle),
+        "brake": max(0.0, -run.throttle),
+        "speed": run.speed_mph,
+        "lane": run.lane,
+    }
+
+
 def write_row(recording: RecordingWriter, cameras: Cameras, run: Run) -> None:
     """Render the three cameras, and add a row of the run's present state to a recording. Raises RecordingError."""
-    images = [jpeg(frame) for frame in cameras.frames(run.car.node.get_transform())]
-    recording.add(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph, run.lane)
+    frames = cameras.frames(run.car.node.get_transform())
+    recording.add(images=[jpeg(frame) for frame in frames], **sample(run))
 
 
 def record(
@@ -78,7 +84,7 @@ def record(
     look: int = 0,
     recovery: bool = False,
 ) -> tuple[Run, int]:
-    """Record the expert's laps into a new folder; return the run and the number of rows.
+    """Record the expert's laps into a new folder; return the run and the number of rows. Call it in the main thread.
 
     speed: set speed in mph; recovery: record only returns from the road's edges. The dates in the images' names depend
     on the seed, not on today's date, so that the same arguments give the same files. Raises RecordingError if the
@@ -89,24 +95,25 @@ def record(
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
     clock = SampleClock()
     renderers = min(MAX_RENDERERS, threads())
-    with (
-        RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)) as recording,
-        ProcessPoolExecutor(renderers, initializer=_start_renderer) as pool,
-        tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None) as bar,
-    ):
-        pending: deque[Row] = deque()
+    pending: deque[tuple[Future[list[bytes]], dict[str, Any]]] = deque()  # images being rendered, and their samples
+    with ExitStack() as stack:
+        with program.interrupt_deferred():
+            recording = stack.enter_context(RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)))
+            pool = stack.enter_context(ProcessPoolExecutor(renderers, initializer=_start_renderer))
+            for _ in range(renderers):  # each starts a process
+                pool.submit(_prepare, track.name, look)
+        bar = stack.enter_context(tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None))
 
         def write() -> None:
-            row = pending.popleft()
-            recording.add(row.time, row.images.result(), row.steering, row.throttle, row.brake, row.speed, row.lane)
+            images, row = pending.popleft()
+            recording.add(images=images.result(), **row)
 
         try:
             while run.travelled < laps * track.length:
                 run.step(*expert.drive(run))
                 if clock.due(run.time) and expert.recordable:
                     images = pool.submit(_render, track.name, look, run.car.node.get_transform())
-                    row = Row(run.time, images, run.steering, *run.throttle_and_brake, run.speed_mph, run.lane)
-                    pending.append(row)
+                    pending.append((images, sample(run)))
                     if len(pending) > 2 * renderers:
                         write()
                     bar.update(round(max(0.0, run.travelled)) - bar.n)

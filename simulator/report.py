@@ -11,7 +11,7 @@ from cloning.base.outputs import write_output
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import STEP
-from simulator.client import Client
+from simulator.client import Client, DriveEnd
 from simulator.run import Run
 
 if TYPE_CHECKING:
@@ -44,8 +44,8 @@ class RoundTrips(TypedDict):
 class LapReport(TypedDict):
     """The metrics of a drive; offsets are absolute distances from the centre line, steering is -1..1.
 
-    The keys from `frames` on exist if a server drove. own_ms_a_frame is the time that the simulator itself used, which
-    is measured in lock-step only.
+    The keys from `ended` on exist if a server drove, those after it if it has answered. own_ms_a_frame is the time that
+    the simulator itself used, which is measured in lock-step only.
     """
 
     track: str
@@ -60,6 +60,7 @@ class LapReport(TypedDict):
     offset_mean_m: float
     offset_max_m: float
     steering_roughness_per_s: float
+    ended: NotRequired[DriveEnd]
     frames: NotRequired[int]
     frames_per_simulated_second: NotRequired[float]
     round_trip_ms: NotRequired[RoundTrips]
@@ -96,6 +97,8 @@ def lap_report(run: Run, client: Client | None = None) -> LapReport:
         "offset_max_m": round(float(offset.max()), 3),
         "steering_roughness_per_s": round(run.roughness(), 3),
     }
+    if client is not None:
+        report["ended"] = client.ended
     if client is not None and client.round_trips:
         milliseconds = np.array(client.round_trips) * 1000
         report |= {

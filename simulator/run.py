@@ -78,8 +78,8 @@ class Run:
 
         offset: lateral, m, right positive; speed: m/s, along its heading; turn: radians from the road to the right.
         """
-        place = self.track.at(self.s, offset)
-        self.car.place(replace(place, heading=place.heading - turn))  # headings grow to the left
+        pose = self.track.at(self.s, offset)
+        self.car.place(replace(pose, heading=pose.heading - turn))  # headings grow to the left
         self.car.settle()
         self.car.body.set_linear_velocity(self.car.node.get_quat().get_forward() * speed)
         self.offset = offset
@@ -93,11 +93,6 @@ class Run:
     def lane(self) -> tuple[float, float]:
         """Lateral offset, m, and heading error, radians, both positive to the right, as recordings have them."""
         return self.offset, wrap_angle(self.track.at(self.s).heading - self.car.heading)  # headings grow to the left
-
-    @property
-    def throttle_and_brake(self) -> tuple[float, float]:
-        """Throttle and brake of the last step, each 0..1, as recordings have them."""
-        return max(0.0, self.throttle), max(0.0, -self.throttle)
 
     @property
     def laps(self) -> int:

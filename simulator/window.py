@@ -7,15 +7,7 @@ from pathlib import Path
 from direct.gui.OnscreenText import OnscreenText
 from direct.showbase.ShowBase import ShowBase
 from direct.task.Task import Task
-from panda3d.core import (
-    GamepadButton,
-    InputDevice,
-    InputDeviceManager,
-    KeyboardButton,
-    MouseButton,
-    TextNode,
-    WindowProperties,
-)
+from panda3d import core
 
 from cloning.base.errors import SimulatorError
 from cloning.recordings.writer import RecordingWriter, SampleClock, check_name_of_corrections
@@ -26,42 +18,42 @@ from simulator import scenery
 from simulator.cameras import FAR_PLANE, NEAR_PLANE, Cameras
 from simulator.car import STEP
 from simulator.client import RemoteDriver
-from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks
+from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks, balance
 from simulator.film import place_chase_camera
 from simulator.record import write_row
 from simulator.run import Run
-from simulator.world import INSIDE, OUTSIDE, Scene
+from simulator.world import INSIDE, OUTSIDE, Scene, configure_engine
 
 SIZE = 960, 540
 FIELD_OF_VIEW = 80  # degrees, horizontal
 MAX_DELAY = 0.2  # s of physics that are caught up after a slow frame; the rest is skipped
 
 BUTTONS = {
-    "a": GamepadButton.face_a(),
-    "b": GamepadButton.face_b(),
-    "x": GamepadButton.face_x(),
-    "y": GamepadButton.face_y(),
-    "up": GamepadButton.dpad_up(),
-    "down": GamepadButton.dpad_down(),
+    "a": core.GamepadButton.face_a(),
+    "b": core.GamepadButton.face_b(),
+    "x": core.GamepadButton.face_x(),
+    "y": core.GamepadButton.face_y(),
+    "up": core.GamepadButton.dpad_up(),
+    "down": core.GamepadButton.dpad_down(),
 }
 
 
 class Gamepad:
     """The first gamepad that panda3d finds."""
 
-    def __init__(self, manager: InputDeviceManager | None = None):
+    def __init__(self, manager: core.InputDeviceManager | None = None):
         """manager: finds the devices; panda3d's own by default."""
-        self.manager = manager or InputDeviceManager.get_global_ptr()
+        self.manager = manager or core.InputDeviceManager.get_global_ptr()
 
     def read(self) -> Sticks | None:
         """Return the state of sticks and buttons, or None while no gamepad is connected."""
         self.manager.update()
-        pads = self.manager.get_devices(InputDevice.DeviceClass.gamepad)
+        pads = self.manager.get_devices(core.InputDevice.DeviceClass.gamepad)
         if not len(pads):
             return None
         pad = pads[0]
         pad.poll()
-        throttle, steering = pad.find_axis(InputDevice.Axis.left_y), pad.find_axis(InputDevice.Axis.right_x)
+        throttle, steering = pad.find_axis(core.InputDevice.Axis.left_y), pad.find_axis(core.InputDevice.Axis.right_x)
         held = {name for name, handle in BUTTONS.items() if pad.find_button(handle).pressed}
         return Sticks(throttle.value, steering.value, held)
 
@@ -77,11 +69,12 @@ class Window(ShowBase):
         """
         if server:
             check_name_of_corrections(folder)
+        configure_engine()
         try:
             super().__init__(windowType="onscreen")
         except Exception as error:
             raise SimulatorError("cannot open a window: connect a screen (on Linux, set DISPLAY)") from error
-        properties = WindowProperties()
+        properties = core.WindowProperties()
         properties.set_title(f"{track.name} {track.direction}")
         properties.set_size(*SIZE)
         self.win.request_properties(properties)
@@ -103,24 +96,10 @@ class Window(ShowBase):
         self.chase = True
         self.camLens.set_near_far(NEAR_PLANE, FAR_PLANE)
         self.camLens.set_fov(FIELD_OF_VIEW)
-        self.text = OnscreenText(
-            "",
-            pos=(-1.7, 0.9),
-            scale=0.06,
-            fg=(1, 1, 1, 1),
-            bg=(0, 0, 0, 0.5),
-            align=TextNode.A_left,
-            mayChange=True,
-        )
-        self.help = OnscreenText(
-            HELP,
-            pos=(-1.1, 0.55),
-            scale=0.06,
-            fg=(1, 1, 1, 1),
-            bg=(0, 0, 0, 0.7),
-            align=TextNode.A_left,
-            font=self.loader.load_font("cmtt12"),
-        )
+        style = {"scale": 0.06, "fg": (1, 1, 1, 1), "align": core.TextNode.A_left}
+        self.text = OnscreenText("", pos=(-1.7, 0.9), bg=(0, 0, 0, 0.5), mayChange=True, **style)
+        font = self.loader.load_font("cmtt12")
+        self.help = OnscreenText(HELP, pos=(-1.1, 0.55), bg=(0, 0, 0, 0.7), font=font, **style)
         self.help.hide()
         for key in ACTIONS:
             if not key.startswith("pad "):
@@ -132,14 +111,14 @@ class Window(ShowBase):
         """Return the driving keys that are down."""
         watcher, keys = self.mouseWatcherNode, {}
         for arrow, letter in HELD.values():
-            keys[arrow] = getattr(KeyboardButton, arrow.removeprefix("arrow_"))()
-            keys[letter] = KeyboardButton.ascii_key(letter)
+            keys[arrow] = getattr(core.KeyboardButton, arrow.removeprefix("arrow_"))()
+            keys[letter] = core.KeyboardButton.ascii_key(letter)
         return {name for name, handle in keys.items() if watcher.is_button_down(handle)}
 
     def mouse(self) -> float | None:
         """Return the mouse's horizontal position in the window, -1..1, or None while its left button is up."""
         watcher = self.mouseWatcherNode
-        if watcher.has_mouse() and watcher.is_button_down(MouseButton.one()):
+        if watcher.has_mouse() and watcher.is_button_down(core.MouseButton.one()):
             return float(watcher.get_mouse_x())
         return None
 
@@ -147,7 +126,7 @@ class Window(ShowBase):
         """Simulate the time since the last frame and show the result; panda3d calls this before each frame."""
         now = time.monotonic()
         held, mouse, pad = self.held(), self.mouse(), self.gamepad.read()
-        by_hand = not self.remote or self.controls.pedals(held) != 0
+        by_hand = not self.remote or balance(held, "up", "down") != 0
         if not self.started:
             self.simulated_until = now
             self.controls.step(held, mouse, pad)
@@ -201,15 +180,13 @@ class Window(ShowBase):
         (self.help.show if self.help.is_hidden() else self.help.hide)()
 
     def do_quit(self) -> None:
-        """Close the window and end the program."""
-        self.finish()
+        """End the program; `finish` follows, as after any other end."""
         self.userExit()
 
     def finish(self) -> None:
         """Close the recording and the connection."""
         if self.recording:
             self.recording.close()
-            self.recording.remove_if_empty()
         if self.remote:
             self.remote.close()
 

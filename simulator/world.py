@@ -1,33 +1,10 @@
 """A track in the engine: the ground that the car drives on and the scene that the cameras see."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
-from panda3d.bullet import (
-    BulletPlaneShape,
-    BulletRigidBodyNode,
-    BulletTriangleMesh,
-    BulletTriangleMeshShape,
-    BulletWorld,
-)
-from panda3d.core import (
-    BitMask32,
-    Geom,
-    GeomNode,
-    GeomTriangles,
-    GeomVertexArrayFormat,
-    GeomVertexData,
-    GeomVertexFormat,
-    InternalName,
-    NodePath,
-    Point3,
-    SamplerState,
-    Texture,
-    TextureStage,
-    TransformState,
-    TransparencyAttrib,
-    Vec3,
-)
+from panda3d import bullet, core
 
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.scenery.parts import Haze, Scenery
@@ -38,65 +15,80 @@ GRAVITY = 9.81  # m/s²
 GROUND_HALF_WIDTH = 8.0  # m of ground on each side of a road with climbs; the car is set back before it gets so far
 CELL = 120.0  # m: meshes are divided into square cells, so that the engine can skip those that are out of view
 UNDER_CAR = 0.5  # share of the light that the ground under the car lacks in a scene without shadows
-INSIDE, OUTSIDE = BitMask32.bit(0), BitMask32.bit(1)  # cameras in the car, which see its bonnet; others, its body
+# Cameras in the car, which see its bonnet; others, which see its body.
+INSIDE, OUTSIDE = core.BitMask32.bit(0), core.BitMask32.bit(1)
 HAZE_STEP, SHEEN_STEP = 25.0, 2.0  # m of camera movement after which haze and sheen are computed again
-SHADE = InternalName.get_texcoord_name("shade")  # texture coordinates in the pictures of the shadows on the road
+SHADE = core.InternalName.get_texcoord_name("shade")  # texture coordinates in the pictures of the shadows on the road
 SHEEN_START = 3.0  # m from the camera: closer asphalt, seen from above, has no sheen
 
 
-def build_physics(track: Track) -> BulletWorld:
+@functools.cache
+def configure_engine() -> None:
+    """Set up panda3d for this process, before it makes anything; simulated cars and rendered scenes call this.
+
+    The transform cache is off, because it replaces transforms by nearly equal earlier ones: a frame would depend on the
+    frames before it.
+    """
+    core.load_prc_file_data(
+        "",
+        "window-type none\naudio-library-name null\nsync-video false\nprint-pipe-types false\n"
+        "notify-level-display error\nnotify-level-device fatal\n"
+        "load-display p3tinydisplay\nuniquify-transforms false\ntransform-cache false\n",
+    )
+
+
+def build_physics(track: Track) -> bullet.BulletWorld:
     """Return a physics world with the track's ground: a plane for a flat track, else a mesh along it."""
-    physics = BulletWorld()
-    physics.set_gravity(Vec3(0, 0, -GRAVITY))
-    body = BulletRigidBodyNode("ground")
+    configure_engine()
+    physics = bullet.BulletWorld()
+    physics.set_gravity(core.Vec3(0, 0, -GRAVITY))
+    body = bullet.BulletRigidBodyNode("ground")
     if track.points[:, 2].any():
-        mesh = BulletTriangleMesh()
+        mesh = bullet.BulletTriangleMesh()
         across = np.c_[track.rightward, np.zeros(len(track.rightward))] * GROUND_HALF_WIDTH
-        left, right = ([Point3(*point) for point in (track.points + side * across).tolist()] for side in (LEFT, RIGHT))
+        edges = (track.points + side * across for side in (LEFT, RIGHT))
+        left, right = ([core.Point3(*point) for point in edge.tolist()] for edge in edges)
         for i in range(len(left)):
             j = (i + 1) % len(left)
             mesh.add_triangle(left[i], right[i], right[j])
             mesh.add_triangle(left[i], right[j], left[j])
-        body.add_shape(BulletTriangleMeshShape(mesh, False))
+        body.add_shape(bullet.BulletTriangleMeshShape(mesh, False))
     else:
-        body.add_shape(BulletPlaneShape(Vec3(0, 0, 1), 0))
+        body.add_shape(bullet.BulletPlaneShape(core.Vec3(0, 0, 1), 0))
     physics.attach(body)
     return physics
 
 
-def _column(name: InternalName, size: int, number_type: int, contents: int) -> GeomVertexArrayFormat:
-    array = GeomVertexArrayFormat()
-    array.add_column(name, size, number_type, contents)
-    return array
-
-
-def _vertex_format(on_road: bool) -> GeomVertexFormat:
+def _vertex_format(on_road: bool) -> core.GeomVertexFormat:
     """Return a format with positions, colours and texture coordinates in one array each.
 
     So the colours can be replaced on their own. on_road: whether there are texture coordinates for shadows, too.
     """
-    vertex_format = GeomVertexFormat()
-    vertex_format.add_array(_column(InternalName.get_vertex(), 3, Geom.NT_float32, Geom.C_point))
-    vertex_format.add_array(_column(InternalName.get_color(), 4, Geom.NT_uint8, Geom.C_color))
-    vertex_format.add_array(_column(InternalName.get_texcoord(), 2, Geom.NT_float32, Geom.C_texcoord))
-    if on_road:
-        vertex_format.add_array(_column(SHADE, 2, Geom.NT_float32, Geom.C_texcoord))
-    return GeomVertexFormat.register_format(vertex_format)
+    columns = [
+        (core.InternalName.get_vertex(), 3, core.Geom.NT_float32, core.Geom.C_point),
+        (core.InternalName.get_color(), 4, core.Geom.NT_uint8, core.Geom.C_color),
+        (core.InternalName.get_texcoord(), 2, core.Geom.NT_float32, core.Geom.C_texcoord),
+        (SHADE, 2, core.Geom.NT_float32, core.Geom.C_texcoord),
+    ]
+    vertex_format = core.GeomVertexFormat()
+    for column in columns if on_road else columns[:-1]:
+        vertex_format.add_array(core.GeomVertexArrayFormat(*column))
+    return core.GeomVertexFormat.register_format(vertex_format)
 
 
-def make_texture(image: np.ndarray, repeat: bool, mipmaps: bool) -> Texture:
+def make_texture(image: np.ndarray, repeat: bool, mipmaps: bool) -> core.Texture:
     """Return an engine texture with an image, uint8 (rows, columns, 3 RGB or 4 RGBA)."""
     rows, columns, channels = image.shape
-    texture = Texture()
-    texture_format = Texture.F_rgba if channels == 4 else Texture.F_rgb
-    texture.setup_2d_texture(columns, rows, Texture.T_unsigned_byte, texture_format)
+    texture = core.Texture()
+    texture_format = core.Texture.F_rgba if channels == 4 else core.Texture.F_rgb
+    texture.setup_2d_texture(columns, rows, core.Texture.T_unsigned_byte, texture_format)
     bgr = image[::-1][..., [2, 1, 0, 3][:channels]]  # bottom row first
     texture.set_ram_image(np.ascontiguousarray(bgr).tobytes())
-    wrap = SamplerState.WM_repeat if repeat else SamplerState.WM_clamp
+    wrap = core.SamplerState.WM_repeat if repeat else core.SamplerState.WM_clamp
     texture.set_wrap_u(wrap)
     texture.set_wrap_v(wrap)
-    texture.set_minfilter(SamplerState.FT_linear_mipmap_linear if mipmaps else SamplerState.FT_nearest)
-    texture.set_magfilter(SamplerState.FT_linear)
+    texture.set_minfilter(core.SamplerState.FT_linear_mipmap_linear if mipmaps else core.SamplerState.FT_nearest)
+    texture.set_magfilter(core.SamplerState.FT_linear)
     return texture
 
 
@@ -107,38 +99,41 @@ def _rgba(colours: np.ndarray) -> np.ndarray:
     return rgba
 
 
+def _fill(array: core.GeomVertexArrayData, values: np.ndarray) -> None:
+    memoryview(array).cast("B")[:] = values.tobytes()
+
+
 class MeshCell:
     """The engine's geometry for the faces of a mesh in one cell; `used` are the indices of their points."""
 
     def __init__(self, mesh: Mesh, faces: np.ndarray, shade_uv: np.ndarray | None = None):
         """faces: int (m, 3), indices into the mesh's points; shade_uv: (n, 2), the points' SHADE coordinates."""
         self.used, faces = np.unique(faces, return_inverse=True)
-        self.data = GeomVertexData("cell", _vertex_format(shade_uv is not None), Geom.UH_static)
+        self.data = core.GeomVertexData("cell", _vertex_format(shade_uv is not None), core.Geom.UH_static)
         self.data.unclean_set_num_rows(len(self.used))
-        memoryview(self.data.modify_array(0)).cast("B")[:] = mesh.points[self.used].astype(np.float32).tobytes()
-        memoryview(self.data.modify_array(2)).cast("B")[:] = mesh.uv[self.used].astype(np.float32).tobytes()
-        if shade_uv is not None:
-            memoryview(self.data.modify_array(3)).cast("B")[:] = shade_uv[self.used].astype(np.float32).tobytes()
+        for i, values in ((0, mesh.points), (2, mesh.uv), (3, shade_uv)):
+            if values is not None:
+                _fill(self.data.modify_array(i), values[self.used].astype(np.float32))
         self.set_colours(_rgba(mesh.colours[self.used] * 255))
-        triangles = GeomTriangles(Geom.UH_static)
-        triangles.set_index_type(Geom.NT_uint32)
+        triangles = core.GeomTriangles(core.Geom.UH_static)
+        triangles.set_index_type(core.Geom.NT_uint32)
         index = triangles.modify_vertices()
         index.unclean_set_num_rows(faces.size)
-        memoryview(index).cast("B")[:] = faces.astype(np.uint32).tobytes()
-        geom = Geom(self.data)
+        _fill(index, faces.astype(np.uint32))
+        geom = core.Geom(self.data)
         geom.add_primitive(triangles)
-        self.node = GeomNode("cell")
+        self.node = core.GeomNode("cell")
         self.node.add_geom(geom)
 
     def set_colours(self, colours: np.ndarray) -> None:
         """Set the used points' colours: uint8 (n, 4), RGBA."""
-        memoryview(self.data.modify_array(1)).cast("B")[:] = colours.tobytes()
+        _fill(self.data.modify_array(1), colours)
 
 
 class MeshGroup:
     """A mesh in the engine, divided into cells: a mesh along the road that has shadows into stretches of the road."""
 
-    def __init__(self, mesh: Mesh, parent: NodePath, shade: Shade | None = None):
+    def __init__(self, mesh: Mesh, parent: core.NodePath, shade: Shade | None = None):
         """shade: the scene's shadows, if the mesh is part of the scene and the scene has any."""
         if shade and mesh.road is None:
             mesh = replace(mesh, colours=mesh.colours * shade.on_mesh(mesh))
@@ -158,7 +153,7 @@ class MeshGroup:
             self.cells.append(mesh_cell)
             node = root.attach_new_node(mesh_cell.node)
             if on_road is not None:
-                stage = TextureStage("shade")  # after the default one, by whose colours its own are multiplied
+                stage = core.TextureStage("shade")  # after the default one, by whose colours its own are multiplied
                 stage.set_sort(1)
                 stage.set_texcoord_name(SHADE)
                 node.set_texture(stage, make_texture(on_road, repeat=False, mipmaps=True))
@@ -166,7 +161,7 @@ class MeshGroup:
         root.set_texture(make_texture(mesh.texture, repeat=not plant, mipmaps=not plant))
         root.set_two_sided(True)
         if plant:
-            root.set_transparency(TransparencyAttrib.M_binary)
+            root.set_transparency(core.TransparencyAttrib.M_binary)
         self.root = root
         self.points, self.colours = mesh.points.astype(np.float32), mesh.colours.astype(np.float32) * 255
         self.brightness = float(mesh.texture[..., :3].mean()) / 255
@@ -188,6 +183,12 @@ class MeshGroup:
             cell.node.modify_geom(0).set_vertex_data(cell.data)
 
 
+def free_unused() -> None:
+    """Let the engine free the textures of scenes that are not used any more, which its cache would keep."""
+    core.RenderState.clear_cache()
+    core.RenderState.garbage_collect()
+
+
 class Scene:
     """The scenery, the car and its shadow in the engine.
 
@@ -195,8 +196,9 @@ class Scene:
     """
 
     def __init__(self, scenery: Scenery):
+        configure_engine()
         self.scenery = scenery
-        self.root = NodePath("scene")
+        self.root = core.NodePath("scene")
         shade, together = scenery.shade, dict[tuple[int, bool], list[Mesh]]()
         for mesh in scenery.meshes:
             key = (id(mesh.texture), shade is not None and mesh.road is not None)
@@ -215,7 +217,7 @@ class Scene:
         MeshGroup(scenery.body, self.car).root.hide(INSIDE)
         self.car_shadow = (self.root if shade else self.car).attach_new_node("car's shadow")
         darkness = float(1 - shade.factor.mean()) if shade else UNDER_CAR
-        MeshGroup(car_shadow(darkness), self.car_shadow).root.set_transparency(TransparencyAttrib.M_alpha)
+        MeshGroup(car_shadow(darkness), self.car_shadow).root.set_transparency(core.TransparencyAttrib.M_alpha)
         self.car_shadow.set_bin("fixed", len(self.groups))
         self.car_shadow.set_depth_write(False)
         if not shade:  # the real simulator's lower qualities have none, but a car seen from outside seems to float
@@ -223,7 +225,7 @@ class Scene:
         # Step -> the grid point for which colours were computed last.
         self.viewpoints: dict[float, tuple[int, int]] = {}
 
-    def move_car(self, transform: TransformState) -> None:
+    def move_car(self, transform: core.TransformState) -> None:
         """Move the car, and update haze, sheen and sky for its position.
 
         They depend on this position alone, not on earlier ones.

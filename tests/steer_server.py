@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from cloning.road.track import Track
+from simulator.cameras import Cameras
 from simulator.client import Client
 from simulator.run import Run
 
@@ -33,8 +34,8 @@ def accept_websocket(client, headers=b""):
     request = b""
     while not request.endswith(b"\r\n\r\n"):
         request += client.recv(1) or lost()
-    key = re.findall(rb"(?i)sec-websocket-key: (.*)\r", request)
-    accept = base64.b64encode(hashlib.sha1(key[0] + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
+    key = re.findall(rb"(?i)sec-websocket-key: (.*)\r", request)[0]
+    accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
     client.sendall(
         b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         + headers
@@ -121,8 +122,11 @@ class Server:
                         self.send(client, packet)
 
 
-class Blank:
+class Blank(Cameras):
     """Cameras that see grey noise, so that frames are as large as real ones."""
+
+    def __init__(self):
+        pass
 
     noise = np.random.default_rng(0).integers(60, 190, (160, 320, 3), np.uint8)
 
@@ -130,7 +134,7 @@ class Blank:
         return self.noise[None]
 
 
-def drive(server, laps=0.02, wait=5.0, realtime=False):
+def drive(server, laps=0.01, wait=5.0, realtime=False):
     run, cameras = Run(Track("lake"), "autonomous"), cast(Any, Blank())
     client = Client(run, cameras, "127.0.0.1", server.port, wait, realtime)
     client.drive(laps)

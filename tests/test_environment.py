@@ -3,12 +3,14 @@
 import math
 import re
 import textwrap
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from panda3d.core import RenderState
 
 from cloning.base.errors import SimulatorError, TrackError
 from cloning.recordings.format import SAMPLE_RATE
@@ -23,15 +25,14 @@ STRAIGHT = {"s": 300.0}  # where the lake's road is straight for 50 m
 
 @pytest.fixture(scope="module")
 def lake():
-    """The lake without Gymnasium's wrappers."""
-    return gymnasium.make(environment.ID, laps=0.01).unwrapped
+    return environment.Drive(laps=0.01)
 
 
 def drive(env, actions, **reset):
     """The frames and the infos of an episode's first steps."""
     steps = [env.reset(**reset)]
     for action in actions:
-        frame, _, _, _, info = env.step(np.float32(action))
+        frame, _, _, _, info = env.step(np.asarray(action))
         steps.append((frame, info))
     return np.stack([frame for frame, _ in steps]), [info for _, info in steps]
 
@@ -41,7 +42,8 @@ def test_gymnasium_finds_no_fault():
     env = gymnasium.make(environment.ID, track="jungle", random_start=True, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.reset(seed=0)
-    assert env.render().shape == (360, 640, 3)
+    frame: Any = env.render()
+    assert frame.shape == (360, 640, 3)
 
 
 def test_the_observation_is_the_centre_cameras_frame(lake):
@@ -59,7 +61,7 @@ def test_a_step_lasts_until_the_next_of_15_frames_a_second(lake):
     lake.reset()
     times = []
     for _ in range(20):
-        lake.step(np.float32([0, 0]))
+        lake.step(np.asarray([0, 0]))
         times.append(lake.run.time)
     assert times == pytest.approx([STEP * math.ceil(n / SAMPLE_RATE / STEP - 1e-9) for n in range(1, 21)])
 
@@ -69,7 +71,7 @@ def test_rewards_are_the_metres_driven_and_steering_is_right_positive(lake):
         _, before = lake.reset(options=STRAIGHT)
         rewards, truncated = [], False
         while not truncated:
-            _, reward, terminated, truncated, info = lake.step(np.float32([side * 0.1, 1]))
+            _, reward, terminated, truncated, info = lake.step(np.asarray([side * 0.1, 1]))
             assert not terminated
             rewards.append(reward)
         assert sum(rewards) == pytest.approx(info["s"] - before["s"], abs=1e-6)
@@ -82,7 +84,7 @@ def test_the_episode_ends_where_the_car_leaves_the_road(lake):
     lake.reset(options={**STRAIGHT, "offset": 2})
     rewards, terminated = [], False
     while not terminated:
-        frame, reward, terminated, truncated, info = lake.step(np.float32([0.5, 1]))
+        frame, reward, terminated, truncated, info = lake.step(np.asarray([0.5, 1]))
         assert not truncated
         rewards.append(reward)
     assert min(rewards[:-1]) > -0.01
@@ -97,19 +99,19 @@ def test_the_episode_ends_where_the_car_leaves_the_road(lake):
     assert info["offset"] == run.trajectory.offset[-1] > 2  # it has not been set back
     assert info["speed"] > 3
     with pytest.raises(ResetNeeded):
-        lake.step(np.float32([0, 1]))
+        lake.step(np.asarray([0, 1]))
     again, info = lake.reset()
     assert info["departures"] == info["offset"] == 0
     assert not np.array_equal(frame, again)
 
 
 def test_the_car_never_exceeds_the_set_speed_and_a_lap_is_counted():
-    env = gymnasium.make(environment.ID, speed=10, laps=2).unwrapped
+    env = environment.Drive(speed=10, laps=2)
     env.reset()
     env.run.travelled = env.track.length - 8
-    speeds = [env.step(np.float32([0, 2]))[4]["speed"] for _ in range(45)]
+    speeds = [env.step(np.asarray([0, 2]))[4]["speed"] for _ in range(45)]
     assert max(speeds) == pytest.approx(10, abs=0.01)
-    assert env.step(np.float32([0, 1]))[4]["laps"] == 1
+    assert env.step(np.asarray([0, 1]))[4]["laps"] == 1
 
 
 def test_seeds_choose_the_start_and_two_environments_do_not_disturb_each_other():
@@ -120,8 +122,8 @@ def test_seeds_choose_the_start_and_two_environments_do_not_disturb_each_other()
     for env in (one, two):
         env.reset(seed=5)
     for action, frame in zip(actions, frames[1:], strict=True):
-        assert np.array_equal(one.step(np.float32(action))[0], frame)
-        assert np.array_equal(two.step(np.float32(action))[0], frame)
+        assert np.array_equal(one.step(np.asarray(action))[0], frame)
+        assert np.array_equal(two.step(np.asarray(action))[0], frame)
     starts = [infos[0]["s"], *(one.reset(seed=seed)[1]["s"] for seed in (6, 7))]
     assert len(set(starts)) == 3
     assert one.reset(options=STRAIGHT)[1]["s"] == 300
@@ -146,6 +148,8 @@ def test_environments_in_processes_of_their_own_see_the_same(lake):
         ({"look": math.inf}, "a whole number"),
         ({"speed": 31}, r"1 to 30 \(mph\)"),
         ({"laps": math.nan}, "a number above 0"),
+        ({"track": 3}, "a name, such as 'lake'"),
+        ({"speed": "fast"}, r"1 to 30 \(mph\)"),
     ],
 )
 def test_wrong_arguments_are_reported(arguments, message):
@@ -163,7 +167,10 @@ def test_wrong_arguments_are_reported(arguments, message):
         ({"s": math.nan}, "less than 1137.9"),
         ({"offset": -3.5, "s": 300}, "the road's left edge; at 300.0 m the edges are at -3.95 and 3.95 m"),
         ({"offset": math.inf}, "it must be a number"),
-        ({"speed": 3}, "option speed: the options of reset are s and offset"),
+        ({"speed": 3}, "the options of reset are s and offset"),
+        ({"s": "300"}, "less than 1137.9"),
+        ({"offset": None}, "it must be a number"),
+        ([300], "the options of reset are s and offset"),
     ],
 )
 def test_wrong_options_are_reported_and_begin_no_episode(lake, options, message):
@@ -171,17 +178,34 @@ def test_wrong_options_are_reported_and_begin_no_episode(lake, options, message)
     with pytest.raises(SimulatorError, match=message):
         lake.reset(options=options)
     with pytest.raises(ResetNeeded):
-        lake.step(np.float32([0, 1]))
+        lake.step(np.asarray([0, 1]))
 
 
-@pytest.mark.parametrize("action", [[math.nan, 1], [0, math.inf], [0], 0.5])
+@pytest.mark.parametrize("action", [[math.nan, 1], [0, math.inf], [0], 0.5, "left", None, [[0, 1], [0]]])
 def test_an_action_that_is_not_two_finite_numbers_is_refused(lake, action):
     lake.reset()
     with pytest.raises(InvalidAction, match="two finite numbers"):
         lake.step(action)
 
 
+def test_a_closed_environment_frees_its_scene_and_says_that_it_is_closed():
+    before = None
+    for _ in range(3):
+        env = environment.Drive(render_mode="rgb_array")
+        with pytest.raises(ResetNeeded, match="before render"):
+            env.render()
+        env.reset()
+        env.render()
+        env.close()
+        env.close()
+        states, before = RenderState.get_num_states(), before or RenderState.get_num_states()
+        assert states <= before, "panda3d keeps no texture of it"
+    for call in (env.reset, env.render, lambda: env.step(np.zeros(2))):
+        with pytest.raises(ClosedEnvironmentError, match="make another"):
+            call()
+
+
 def test_the_documented_example_drives_the_shipped_network(capsys):
-    example = re.search(r"\n((?: {4}.*\n|\n)+)", environment.__doc__)[1]
+    example = re.findall(r"\n((?: {4}.*\n|\n)+)", environment.__doc__ or "")[0]
     exec(textwrap.dedent(example).replace("speed=15", "speed=15, laps=0.015"), {})
     assert re.match(r"drove a lap \{'s': .*'departures': 0", capsys.readouterr().out)

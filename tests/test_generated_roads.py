@@ -12,14 +12,12 @@ from cloning.road.generated import MARKINGS, generate
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import __main__ as simulator
-from simulator import report, scenery
-from simulator.cameras import Cameras
+from simulator import report
 from simulator.expert import Expert
 from simulator.run import Run
 from simulator.scenery.generated import LANDS, Terrain, weather
 from simulator.scenery.generated import road as road_meshes
 from simulator.scenery.looks import Look
-from simulator.world import Scene
 
 NUMBERS = range(1, 101)
 NO_ROADS = ["road-0", "road--1", "road-1.5", "road-x", "road-01", "road-", "road-1e3", "Road-1", "moon", ""]
@@ -83,7 +81,7 @@ def test_bends_grades_and_widths_stay_within_limits_and_come_near_them(roads):
     assert 9.5 < max(widths) <= 10
 
 
-def test_every_kind_of_marking_occurs_and_no_two_roads_are_alike(roads):
+def test_every_marking_occurs_and_no_two_roads_are_alike(roads):
     assert {road.marking for road in roads[:10]} == set(MARKINGS)
     assert len({road.points.tobytes() for road in roads}) == len(roads)
     assert len({road.width for road in roads}) > 80
@@ -171,7 +169,7 @@ def test_the_land_never_covers_the_road(number):
 
 
 @pytest.mark.parametrize("number", range(1, len(MARKINGS) + 1))
-def test_roads_are_marked_as_their_kind_says(number):
+def test_roads_are_marked_as_they_say(number):
     """The colours painted across the road, and what stands or lies at its right edge."""
     marking, track = generate(number).marking, Track(f"road-{number}")
     light, palette = weather(np.random.default_rng(0), LANDS[0])
@@ -184,23 +182,10 @@ def test_roads_are_marked_as_their_kind_says(number):
     white = (paint - paint.mean(axis=1, keepdims=True)).min(axis=2) > 30
     assert yellow.any() == (marking == "yellow double")
     assert np.all(np.abs(np.abs(offset[yellow]) - edge + 0.25) < 0.3)
-    at_the_edges, at_the_centre = (white[:, np.abs(np.abs(offset) - at) < 0.05] for at in (edge - 0.12, 0.0))
+    at_the_edges, at_the_centre = (white[:, np.abs(np.abs(offset) - line) < 0.05] for line in (edge - 0.12, 0.0))
     assert (at_the_edges.mean() > 0.95) == (marking == "white")
     assert (at_the_centre.mean() == pytest.approx(0.5, abs=0.05)) == (marking == "white")
     at_edge = track.at(0.0, edge)
     near = [mesh.points - (at_edge.x, at_edge.y, at_edge.z) for mesh in others]
     height = max(points[np.hypot(points[:, 0], points[:, 1]) < 0.8, 2].max(initial=-1) for points in near)
     assert height == pytest.approx({"kerb": 0.06, "wall": 0.8, "rail": 0.8}.get(marking, 0.0), abs=0.02)
-
-
-def test_a_look_changes_a_generated_road_and_another_road_looks_different():
-    def frame(name, look):
-        run = Run(Track(name))
-        return (
-            Cameras(Scene(scenery.build(name, look)), ("center",)).frames(run.car.node.get_transform())[0].astype(int)
-        )
-
-    one, other_look, other_road = frame("road-9", 0), frame("road-9", 4), frame("road-6", 0)
-    assert np.array_equal(one, frame("road-9", 0))
-    assert np.abs(one - other_look).mean() > 15
-    assert np.abs(one - other_road).mean() > 15

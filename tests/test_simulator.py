@@ -1,5 +1,6 @@
 """The stand-in simulator's roads, car, expert and recordings, against figures measured on the real one."""
 
+import contextlib
 import csv
 import functools
 import hashlib
@@ -11,20 +12,21 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import warm
+from scenes import cameras, load
 
-from cloning.base.errors import RecordingError
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.writer import RecordingWriter, csharp_number
+from cloning.recordings.writer import csharp_number
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
 from simulator import record
+from simulator.__main__ import main
 from simulator.car import STEP
-from simulator.expert import Expert, Recovery
+from simulator.expert import Expert
 from simulator.run import Run
 from simulator.scenery.lake_terrain import LakeTerrain, in_sections
 from simulator.scenery.shapes import Material, ribbon, roadside
@@ -34,7 +36,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def free(track="lake"):
     """A car that cannot leave its road."""
-    run = Run(Track(track))
+    run: Any = Run(Track(track))
     run.off_road = lambda: ""
     return run
 
@@ -64,8 +66,8 @@ def test_lake_turns_once_in_the_named_direction(direction):
 def test_a_position_is_located_where_it_was_placed(name, offset):
     track = Track(name)
     for s in np.linspace(0, track.length, 40, endpoint=False):
-        place = track.at(s, offset)
-        located, right = track.locate(place.x, place.y, near=s + 4)
+        pose = track.at(s, offset)
+        located, right = track.locate(pose.x, pose.y, near=s + 4)
         assert abs((located - s + 50) % track.length - 50) < 0.03
         assert right == pytest.approx(offset, abs=0.001)
 
@@ -73,22 +75,22 @@ def test_a_position_is_located_where_it_was_placed(name, offset):
 def test_right_is_positive_for_offsets_edges_and_scenery():
     """At the lake's first point, which it passes northwards, right is east."""
     track = Track("lake")
-    place = track.at(0.0)
-    right = np.array([math.sin(place.heading), -math.cos(place.heading)])
+    pose = track.at(0.0)
+    right = np.array([math.sin(pose.heading), -math.cos(pose.heading)])
     moved = track.at(0.0, 2.0)
-    assert (moved.x - place.x, moved.y - place.y) == pytest.approx(2 * right)
+    assert (moved.x - pose.x, moved.y - pose.y) == pytest.approx(2 * right)
     white = np.full((4, 4, 3), 255, np.uint8)
     strip = ribbon(track, [0.0, 1.0], (-1.0, 3.0), 0.0, Material((1, 1, 1), white, 1.0))
-    assert (strip.points[:2, :2] - (place.x, place.y)) @ right == pytest.approx([-1.0, 3.0], abs=1e-6)
+    assert (strip.points[:2, :2] - (pose.x, pose.y)) @ right == pytest.approx([-1.0, 3.0], abs=1e-6)
     for side in (LEFT, RIGHT):
         beside = roadside(track, [0.0, 1.0], side, (5.0, 7.0), (0.0, 1.0), Material((1, 1, 1), white, 1.0))
         outwards = sorted([side * 5.0, side * 7.0])
-        assert (beside.points[:2, :2] - (place.x, place.y)) @ right == pytest.approx(outwards, abs=1e-6)
+        assert (beside.points[:2, :2] - (pose.x, pose.y)) @ right == pytest.approx(outwards, abs=1e-6)
     terrain = LakeTerrain(track, np.random.default_rng(0))
-    _, s, side = terrain.nearest_road(np.array([(moved.x, moved.y)]))
-    assert side == RIGHT
-    assert in_sections([Section(RIGHT, -5, 5)], s, side, track.length)
-    assert not in_sections([Section(LEFT, -5, 5)], s, side, track.length)
+    _, s, sides = terrain.nearest_road(np.array([(moved.x, moved.y)]))
+    assert sides == RIGHT
+    assert in_sections([Section(RIGHT, -5, 5)], s, sides, track.length)
+    assert not in_sections([Section(LEFT, -5, 5)], s, sides, track.length)
 
 
 @pytest.mark.parametrize("direction", ["ccw", "cw"])
@@ -192,26 +194,9 @@ def test_expert_drives_a_lap_on_the_road(name, direction):
     assert np.mean(steering_in_bends(run) == 0) < 0.01
 
 
-def test_only_the_recovery_driver_pauses_the_recording():
-    track = Track("lake")
-    assert Expert(track).recordable
-    assert not Recovery(track).recordable
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.0, "0"),
-        (-0.0, "0"),
-        (1.0, "1"),
-        (6.9e-05, "6.9E-05"),
-        (30.1903, "30.1903"),
-        (-0.0597, "-0.0597"),
-        (1 / 3, "0.3333333"),
-    ],
-)
-def test_numbers_are_written_as_the_simulators(value, text):
-    assert csharp_number(value) == text
+def test_numbers_are_written_as_the_simulators():
+    values = (0.0, -0.0, 1.0, 6.9e-05, 30.1903, -0.0597, 1 / 3)
+    assert [csharp_number(value) for value in values] == ["0", "0", "1", "6.9E-05", "30.1903", "-0.0597", "0.3333333"]
 
 
 def digest(folder):
@@ -222,9 +207,9 @@ def digest(folder):
 
 
 def test_recordings_are_as_the_simulators_and_the_same_in_two_processes(tmp_path):
-    done = command("record", tmp_path / "a", "--laps", 0.1, "--seed", 5)
+    done = command("record", tmp_path / "a", "--laps", 0.015, "--seed", 5)
     assert done.returncode == 0, done.stderr
-    record.record(tmp_path / "b", Track("lake"), laps=0.1, seed=5)
+    record.record(tmp_path / "b", Track("lake"), laps=0.015, seed=5)
     assert digest(tmp_path / "a") == digest(tmp_path / "b")
     rows = list(csv.reader((tmp_path / "a" / "driving_log.csv").read_text(encoding="utf-8").splitlines()))
     times = []
@@ -234,44 +219,26 @@ def test_recordings_are_as_the_simulators_and_the_same_in_two_processes(tmp_path
             assert Path(path).parent == tmp_path / "a" / "IMG"
             match = re.fullmatch(rf"{camera}_\d{{4}}(_\d\d){{4}}_(\d\d)_(\d{{3}})\.jpg", Path(path).name)
             assert match, path
-            assert cv2.imread(path).shape == (160, 320, 3)
-        times.append(int(match[2]) + int(match[3]) / 1000)
+            times.append(int(match[2]) + int(match[3]) / 1000)
+            assert load(path).shape == (160, 320, 3)
         assert -1 <= float(row[3]) <= 1
-    pauses = np.diff(times) % 60
+    pauses = np.diff(times[::3]) % 60
     assert pauses.mean() == pytest.approx(1 / 15, abs=0.001)
     assert np.median(pauses) == pytest.approx(1 / 15, abs=0.0075)  # a whole number of physics steps
     quality_75 = bytes([8, 6, 6, 7, 6, 5, 8, 7])  # how the JPEG standard's luminance table at quality 75 begins
     assert quality_75 in (tmp_path / "a" / "IMG" / rows[0][0]).read_bytes()[:64]
-    assert len(rows) == pytest.approx(0.1 * 1138 / 12.4 * 15, rel=0.15)
     closing = re.search(r"a: (\d+) rows from (\d+) simulated seconds, at [\d.]+ times real time\n$", done.stdout)
     assert closing and int(closing[1]) == len(rows) and int(closing[2]) == pytest.approx(len(rows) / 15, abs=0.6)
 
 
-def test_renders_on_as_many_cores_as_the_process_may_use(tmp_path, monkeypatch):
-    workers = []
-
-    class Executor(record.ProcessPoolExecutor):
-        def __init__(self, max_workers, **keywords):
-            workers.append(max_workers)
-            super().__init__(max_workers, **keywords)
-
-    monkeypatch.setattr(record, "ProcessPoolExecutor", Executor)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
-    record.record(tmp_path / "one", Track("lake"), laps=0.001)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.delattr(os, "sched_getaffinity")
-    record.record(tmp_path / "two", Track("lake"), laps=0.001)
-    assert workers == [1, 2]
-    assert digest(tmp_path / "one") == digest(tmp_path / "two")
-
-
-def test_recordings_are_the_same_where_processes_cannot_fork(tmp_path, monkeypatch):
-    """macOS and Windows start every process with a fresh interpreter."""
-    record.record(tmp_path / "default", Track("jungle"), laps=0.005)
+def test_recordings_are_the_same_where_processes_cannot_fork_or_there_is_only_one(tmp_path, monkeypatch):
+    """macOS and Windows start every process with a fresh interpreter. The look has shadows."""
+    record.record(tmp_path / "default", Track("jungle"), laps=0.003, look=10_000)
     spawn = functools.partial(record.ProcessPoolExecutor, mp_context=multiprocessing.get_context("spawn"))
     monkeypatch.setattr(record, "ProcessPoolExecutor", spawn)
-    record.record(tmp_path / "spawn", Track("jungle"), laps=0.005)
-    assert len(list((tmp_path / "spawn" / "IMG").iterdir())) > 30
+    monkeypatch.setattr(record, "MAX_RENDERERS", 1)
+    record.record(tmp_path / "spawn", Track("jungle"), laps=0.003, look=10_000)
+    assert len(list((tmp_path / "spawn" / "IMG").iterdir())) > 20
     assert digest(tmp_path / "default") == digest(tmp_path / "spawn")
 
 
@@ -281,26 +248,36 @@ def test_recording_does_not_load_pytorch():
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
-def test_a_kill_leaves_a_readable_folder(tmp_path):
-    folder = tmp_path / "killed"
-    process = subprocess.Popen([sys.executable, "-m", "simulator", "record", str(folder)], stderr=subprocess.DEVNULL)
-    log = folder / "driving_log.csv"
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="without /proc processes cannot be listed")
+def test_the_rendering_processes_of_a_killed_recording_end(tmp_path):
+    process = subprocess.Popen([sys.executable, "-m", "simulator", "record", str(tmp_path)], stderr=subprocess.DEVNULL)
+    log = tmp_path / "driving_log.csv"
     while not log.exists() or log.stat().st_size < 3000:
         assert process.poll() is None
         time.sleep(0.01)
     process.kill()
     process.wait()
-    text = log.read_text(encoding="utf-8")
-    assert text.endswith("\n")
-    for row in csv.reader(text.splitlines()):
-        assert len(row) == 7
-        assert all(cv2.imread(path) is not None for path in row[:3])
-    if not Path("/proc/self/cmdline").exists():
-        pytest.skip("rows are whole; without /proc the rendering processes cannot be listed")
     ends = time.monotonic() + 60
-    while any(str(folder).encode() in line for line in command_lines()):
-        assert time.monotonic() < ends  # the rendering processes end with it
+    while any(str(tmp_path).encode() in line for line in command_lines()):
+        assert time.monotonic() < ends
         time.sleep(0.1)
+
+
+INTERRUPTED = """
+import os, runpy, signal, sys
+os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))
+sys.argv[1:] = ["record", sys.argv[1], "--laps", "0.01"]
+runpy.run_module("simulator", run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "register_at_fork"), reason="this system does not fork")
+def test_ctrl_c_while_rendering_processes_are_started_leaves_no_recording(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, str(tmp_path / "x")], cwd=ROOT, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (130, "simulator: stopped; the files that it has written are complete\n")
+    assert not any(tmp_path.iterdir())
 
 
 def command_lines():
@@ -311,40 +288,17 @@ def command_lines():
             continue
 
 
-RENDER = """
-import sys, zlib
-from cloning.road.track import Track
-from simulator import cameras, run, scenery, world
-drive, eyes = run.Run(Track("lake")), cameras.Cameras(world.Scene(scenery.build("lake", 0)))
-for i in range(1000):
-    drive.step(0.0004 * (i % 100 - 20), 1)
-    if i % int(sys.argv[1]) == 0:
-        print(i, zlib.crc32(eyes.frames(drive.car.node.get_transform())))
-"""
-
-
 def test_a_frame_depends_on_the_pose_alone():
-    few, many = (
-        subprocess.Popen([sys.executable, "-c", RENDER, step], stdout=subprocess.PIPE, text=True, cwd=ROOT)
-        for step in ("8", "4")
-    )
-    few, many = (process.communicate()[0].splitlines() for process in (few, many))
-    assert len(few) == 125
-    assert few == many[::2]
-
-
-def test_a_full_disk_is_reported_and_leaves_whole_rows(tmp_path, monkeypatch):
-    images = [b"a whole JPEG"] * 3
-    with RecordingWriter(tmp_path / "full") as recording:
-        recording.add(0, images, 0, 1, 0, 10, (0.5, 0.1))
-
-        def full(*_):
-            raise OSError(28, os.strerror(28))
-
-        monkeypatch.setattr("pathlib.Path.write_bytes", full)
-        with pytest.raises(RecordingError, match="No space left"):
-            recording.add(1, images, 0, 1, 0, 10, (0.5, 0.1))
-    assert len((tmp_path / "full" / "driving_log.csv").read_text(encoding="utf-8").splitlines()) == 1
+    """Not on the frames before it, as with panda3d's cache of transforms."""
+    run, poses = Run(Track("lake")), []
+    for i in range(400):
+        run.step(0.0004 * (i % 100 - 20), 1)
+        if i % 8 == 0:
+            poses.append(run.car.node.get_transform())
+    eyes = cameras("lake", 0)
+    frames = [eyes.frames(pose) for pose in poses]
+    for pose, frame in list(zip(poses, frames, strict=True))[::-1]:
+        assert np.array_equal(eyes.frames(pose), frame)
 
 
 @pytest.mark.parametrize(
@@ -358,16 +312,17 @@ def test_a_full_disk_is_reported_and_leaves_whole_rows(tmp_path, monkeypatch):
         (["record", "x", "--seed", "-1"], "at least 0"),
     ],
 )
-def test_bad_arguments_are_reported(arguments, message):
-    done = command(*arguments)
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr
+def test_bad_arguments_are_reported(arguments, message, capsys):
+    with contextlib.suppress(SystemExit):  # argparse's, with the same status
+        assert main(arguments) == 2
+    assert message in capsys.readouterr().err
 
 
-def test_an_existing_recording_is_kept(tmp_path):
-    (tmp_path / "driving_log.csv").write_text("precious\n", encoding="utf-8")
-    done = command("record", tmp_path)
-    assert done.returncode == 2
-    assert "exists already" in done.stderr
-    assert (tmp_path / "driving_log.csv").read_text(encoding="utf-8") == "precious\n"
+def test_an_existing_recording_is_kept(tmp_path, capsys):
+    for command in ("record", "correct"):
+        folder = tmp_path / f"{command}-corrections"
+        folder.mkdir()
+        (folder / "driving_log.csv").write_text("precious\n", encoding="utf-8")
+        assert main([command, str(folder)]) == 2
+        assert "exists already; name another folder" in capsys.readouterr().err
+        assert (folder / "driving_log.csv").read_text(encoding="utf-8") == "precious\n"

@@ -5,6 +5,8 @@ import shutil
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from panda3d.core import GamepadButton, InputDevice
@@ -26,136 +28,84 @@ def test_keys_steer_a_twentieth_a_step_and_let_go_as_fast():
     assert controls.steering == pytest.approx(0)
 
 
-@pytest.mark.parametrize(
-    ("held", "throttle"),
-    [({"w"}, 1), ({"arrow_up"}, 1), ({"s"}, -1), ({"arrow_down"}, -1), ({"w", "s"}, 0), (set(), 0)],
-)
-def test_keys_throttle_and_brake(held, throttle):
+def test_keys_throttle_and_brake_and_cruise_holds_the_throttle_until_the_brake():
     controls = Controls()
-    controls.step(held)
-    assert controls.throttle == throttle
+    for held, throttle in (("w", 1), ("arrow_up", 1), ("s", -1), ("arrow_down", -1), ("ws", 0), ("", 0)):
+        controls.step({held} if "arrow" in held else set(held))
+        assert controls.throttle == throttle
+    controls.press("space")
+    for key, push in (("", 0.4), ("w", 1), ("", 0.4), ("s", -1), ("", 0)):
+        controls.step(set(key))
+        assert controls.throttle == push
 
 
 def test_the_mouse_steers_by_how_far_it_is_dragged():
     controls = Controls()
-    controls.step(set(), mouse=0.2)
-    assert controls.steering == 0
-    controls.step(set(), mouse=0.7)
-    assert controls.steering == pytest.approx(0.5)
-    controls.step(set(), mouse=-1.0)
-    assert controls.steering == -1
-    controls.step(set())
-    assert controls.steering == pytest.approx(-0.95)
-
-
-def test_cruise_holds_the_throttle_until_the_brake():
-    controls = Controls()
-    controls.press("space")
-    controls.step(set())
-    assert controls.throttle == 0.4
-    controls.step({"w"})
-    assert controls.throttle == 1
-    controls.step({"s"})
-    controls.step(set())
-    assert controls.throttle == 0
+    for mouse, steering in ((0.2, 0.0), (0.7, 0.5), (-1.0, -1.0), (None, -0.95)):
+        controls.step(set(), mouse=mouse)
+        assert controls.steering == pytest.approx(steering)
 
 
 class Device:
     """A Logitech F310 as panda3d presents it: axes and buttons by name."""
 
     def __init__(self):
-        self.axes = {
-            InputDevice.Axis.left_x: 0.9,
-            InputDevice.Axis.left_y: 0.0,
-            InputDevice.Axis.right_x: 0.0,
-            InputDevice.Axis.right_y: -0.9,
-        }
+        axes = InputDevice.Axis
+        self.axes = {axes.left_x: 0.9, axes.left_y: 0.0, axes.right_x: 0.0, axes.right_y: -0.9}
         self.down = set()
 
     def poll(self):
         pass
 
     def find_axis(self, axis):
-        return type("Axis", (), {"value": self.axes[axis]})
+        return SimpleNamespace(value=self.axes[axis])
 
     def find_button(self, handle):
-        return type("Button", (), {"pressed": handle in self.down})
+        return SimpleNamespace(pressed=handle in self.down)
 
 
-class Manager:
-    def __init__(self, *devices):
-        self.devices = devices
-
-    def update(self):
-        pass
-
-    def get_devices(self, kind):
-        assert kind == InputDevice.DeviceClass.gamepad
-        return self.devices
+def pad_of(*devices):
+    manager: Any = SimpleNamespace(
+        update=lambda: None, get_devices=lambda wanted: devices if wanted == InputDevice.DeviceClass.gamepad else None
+    )
+    return Gamepad(manager)
 
 
-def test_no_gamepad_is_no_trouble():
-    assert Gamepad(Manager()).read() is None
+def press(controls, pad, device, *buttons, steps=1):
+    """Hold each button for so many steps, one after another."""
+    for button in buttons:
+        for down in [{button}] * steps + [set()]:
+            device.down = down
+            controls.step(set(), pad=pad.read())
 
 
-def test_the_f310s_sticks():
+def test_the_f310s_sticks_and_none():
+    assert pad_of().read() is None
     device, controls = Device(), Controls()
-    pad = Gamepad(Manager(device))
+    pad = pad_of(device)
     controls.step(set(), pad=pad.read())
     assert (controls.steering, controls.throttle) == (0, 0)  # the other axes drive nothing
-    device.axes[InputDevice.Axis.left_y] = 1.0
-    device.axes[InputDevice.Axis.right_x] = -1.0
+    device.axes |= {InputDevice.Axis.left_y: 1.0, InputDevice.Axis.right_x: -1.0}
     controls.step(set(), pad=pad.read())
     assert (controls.steering, controls.throttle) == (-1, 1)
     device.axes[InputDevice.Axis.right_x] = 0.05  # a stick that does not quite come back
     for _ in range(25):
         controls.step(set(), pad=pad.read())
     assert controls.steering == pytest.approx(0)
+    controls.step(set(), pad=Sticks(throttle=-0.5, steering=0.5))
+    assert controls.throttle < -0.4 and controls.steering > 0.4
 
 
-@pytest.mark.parametrize(
-    ("button", "action"),
-    [
-        (GamepadButton.face_x(), "save"),
-        (GamepadButton.face_y(), "jump"),
-        (GamepadButton.face_b(), "record"),
-    ],
-)
-def test_the_f310s_buttons_act_once_a_press(button, action):
+def test_the_f310s_buttons_act_once_a_press():
     device, controls = Device(), Controls()
-    pad = Gamepad(Manager(device))
-    device.down = {button}
-    for _ in range(5):
-        controls.step(set(), pad=pad.read())
-    assert controls.take_actions() == [action]
-    device.down = set()
-    controls.step(set(), pad=pad.read())
-    device.down = {button}
-    controls.step(set(), pad=pad.read())
-    assert controls.take_actions() == [action]
-
-
-def test_the_f310s_cruise_and_set_speed():
-    device, controls = Device(), Controls()
-    pad = Gamepad(Manager(device))
-    for button in [GamepadButton.dpad_down()] * 6 + [GamepadButton.dpad_up()] * 2 + [GamepadButton.face_a()]:
-        device.down = {button}
-        controls.step(set(), pad=pad.read())
-        device.down = set()
-        controls.step(set(), pad=pad.read())
+    pad = pad_of(device)
+    for button, action in (("face_x", "save"), ("face_y", "jump"), ("face_b", "record")):
+        press(controls, pad, device, *[getattr(GamepadButton, button)()] * 2, steps=5)
+        assert controls.take_actions() == [action] * 2
+    press(controls, pad, device, *[GamepadButton.dpad_down()] * 6, *[GamepadButton.dpad_up()] * 2)
     assert controls.set_speed == 30 - 6 + 2
-    assert controls.throttle == 0.4
-    for _ in range(40):
-        controls.press("pad up")
-    assert controls.set_speed == 30
-
-
-def test_other_pads_come_through_the_same_mapping():
-    controls = Controls()
-    controls.step(set(), pad=Sticks(throttle=-0.5, steering=0.5, buttons={"b"}))
-    assert controls.throttle < -0.4
-    assert controls.steering > 0.4
-    assert controls.take_actions() == ["record"]
+    press(controls, pad, device, GamepadButton.face_a(), *[GamepadButton.dpad_up()] * 40)
+    assert (controls.set_speed, controls.throttle) == (30, 0.4)
 
 
 def until(condition, seconds=40):
@@ -165,55 +115,57 @@ def until(condition, seconds=40):
         time.sleep(0.05)
 
 
-@pytest.mark.skipif(not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool")
-def test_the_window_is_driven_and_records(tmp_path):
+@pytest.fixture
+def screen():
+    """The environment of programs that use a screen of their own."""
+    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
+        pytest.skip("needs Xvfb and xdotool")
     read, write = os.pipe()
-    server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1024x640x24"],
-        pass_fds=[write],
-        stderr=subprocess.DEVNULL,
-    )
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1024x640x24"]
+    server = subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL)
     os.close(write)
     try:
-        display = ":" + os.read(read, 16).decode().strip()
-        environment = {**os.environ, "DISPLAY": display}
-
-        def press(*arguments):
-            subprocess.run(["xdotool", *arguments], env=environment, check=True, stdout=subprocess.DEVNULL)
-
-        folder = tmp_path / "driven"
-        window = subprocess.Popen(
-            [sys.executable, "-m", "simulator", "window", "--folder", str(folder)],
-            env=environment,
-            stderr=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
-        try:
-            press("search", "--sync", "--name", "lake ccw")
-            log = folder / "driving_log.csv"
-
-            def recording():
-                press("key", "r")
-                end = time.monotonic() + 2
-                while not log.exists() and time.monotonic() < end:
-                    time.sleep(0.05)
-                return log.exists()
-
-            until(recording)  # the first presses may come before the window listens
-            press("keydown", "w", "keydown", "d")
-
-            def row():
-                rows = log.read_text(encoding="utf-8").splitlines()
-                return [float(value) for value in rows[-1].split(",")[3:]] if rows else [0, 0, 0, 0]
-
-            until(lambda: row()[0] > 0.1 and row()[1] == 1 and row()[3] > 0.1)
-            press("keyup", "w", "keyup", "d", "key", "Escape")
-            assert window.wait(20) == 0
-        finally:
-            window.kill()
+        yield {**os.environ, "DISPLAY": ":" + os.read(read, 16).decode().strip()}
     finally:
         server.kill()
         server.wait()
+
+
+@pytest.mark.parametrize("drives", [True, False])
+def test_the_window_is_driven_and_records(screen, tmp_path, drives):
+    """R and Esc before the car has driven leave no recording."""
+    folder = tmp_path / "driven"
+    command = [sys.executable, "-m", "simulator", "window", "--folder", str(folder)]
+    window = subprocess.Popen(command, env=screen, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    log = folder / "driving_log.csv"
+
+    def xdotool(*arguments):
+        subprocess.run(["xdotool", *arguments], env=screen, check=True, stdout=subprocess.DEVNULL)
+
+    def recording():
+        xdotool("key", "r")
+        end = time.monotonic() + 2
+        while not log.exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        return log.exists()
+
+    def row():
+        rows = log.read_text(encoding="utf-8").splitlines()
+        return [float(value) for value in rows[-1].split(",")[3:]] if rows else [0, 0, 0, 0]
+
+    try:
+        xdotool("search", "--sync", "--name", "lake ccw")
+        until(recording)  # the first presses may come before the window listens
+        if drives:
+            xdotool("keydown", "w", "keydown", "d")
+            until(lambda: row()[0] > 0.1 and row()[1] == 1 and row()[3] > 0.1)
+            xdotool("keyup", "w", "keyup", "d")
+        xdotool("key", "Escape")
+        errors = window.communicate(timeout=20)[1]
+        assert (window.returncode, "Traceback" in errors) == (0, False)
+        assert folder.exists() == drives
+    finally:
+        window.kill()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux names its screen in $DISPLAY")

@@ -108,12 +108,12 @@ def drive_laps(ports: SimpleQueue[int], mph: int, laps: float, on: tuple[str, st
     (track, direction, look), port = on, ports.get()
     road = ("--track", track, "--direction", direction, "--look", look)
     try:
-        report: LapReport
+        report: LapReport | None
         report, status, errors = simulate("drive", *road, "--laps", laps, "--port", port)
     finally:
         ports.put(port)
-    # A car that stands still is the model's fault, anything else is not.
-    if report is None or (status == program.FAILED and "the car has stood still" not in errors):
+    # A car that stands still is the model's fault, any other failure is not.
+    if report is None or (status == program.FAILED and report.get("ended") != "stood_still"):
         raise UserError(f"{track} {direction}, {mph} mph, look {look}: {errors}")
     return driven(report, mph, look, laps, finished=status != program.FAILED)
 

@@ -10,7 +10,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
@@ -40,6 +41,30 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
     # A shell has its background processes ignore Ctrl-C; leave it so.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, stop)
+
+
+@contextmanager
+def interrupt_deferred() -> Iterator[None]:
+    """A context in which processes are started; Ctrl-C raises KeyboardInterrupt at its end, and not in the processes.
+
+    Python would ignore an exception from its own code around a fork. Call it in the main thread.
+    """
+    # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    received: list[int] = []  # another thread may still receive it
+    handler = signal.getsignal(signal.SIGINT)
+    if callable(handler):
+        signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        if sys.platform != "win32":
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        if callable(handler):
+            signal.signal(signal.SIGINT, handler)
+    if received:
+        raise KeyboardInterrupt
 
 
 def run(main: Callable[[], int | None]) -> NoReturn:

@@ -114,12 +114,11 @@ class RecordingWriter:
         self.start += timedelta(seconds=DRIVE_GAP)
 
     def close(self) -> None:
-        """Close driving_log.csv and lane.csv."""
+        """Close the files, and remove a recording without a row, which no program could read; other files stay."""
+        if self.log.closed:
+            return
         self.log.close()
         self.lane.close()
-
-    def remove_if_empty(self) -> None:
-        """Remove a closed recording without a row, which no program could read; what else is in its folder stays."""
         if not self.rows:
             for name in (DRIVING_LOG, LANE_FILE):
                 (self.folder / name).unlink()

@@ -9,6 +9,7 @@ from multiprocessing.process import BaseProcess
 from typing import Self
 
 from cloning.base.errors import SimulatorError, UserError
+from cloning.base.program import interrupt_deferred
 from cloning.replay.replay import Drive
 
 CAN_FORK = sys.platform == "linux"  # elsewhere there is no fork, or libraries do not survive it
@@ -23,28 +24,18 @@ class ForkedDrives:
         self.processes: list[BaseProcess] = []
         self.pending: dict[Connection, int] = {}  # where a drive's result will come from -> its index
         self.results: dict[int, Drive] = {}
-        # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        # Another thread may still receive it, and an exception from Python's own code around a fork would be ignored.
-        received: list[int] = []
-        handler = signal.getsignal(signal.SIGINT)
-        if callable(handler):
-            signal.signal(signal.SIGINT, lambda signal_number, _: received.append(signal_number))
         try:
-            for index, drive in enumerate(drives):
-                receiver, sender = context.Pipe(duplex=False)
-                process = context.Process(target=_send_result, args=(drive, sender), daemon=True)
-                process.start()
-                sender.close()
-                self.processes.append(process)
-                self.pending[receiver] = index
-        finally:
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-            if callable(handler):
-                signal.signal(signal.SIGINT, handler)
-        if received:
+            with interrupt_deferred():
+                for index, drive in enumerate(drives):
+                    receiver, sender = context.Pipe(duplex=False)
+                    process = context.Process(target=_send_result, args=(drive, sender), daemon=True)
+                    process.start()
+                    sender.close()
+                    self.processes.append(process)
+                    self.pending[receiver] = index
+        except KeyboardInterrupt:
             self.__exit__()
-            raise KeyboardInterrupt
+            raise
 
     def __enter__(self) -> Self:
         return self

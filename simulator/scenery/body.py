@@ -3,7 +3,7 @@
 import numpy as np
 
 from simulator.scenery import textures
-from simulator.scenery.shapes import Colour, Light, Mesh, box, grid, illuminate, merge
+from simulator.scenery.shapes import Colour, Light, Mesh, box, illuminate, merge, sheet
 
 GLASS, TYRE, RIM, RED, WHITE = (0.07, 0.08, 0.10), (0.05, 0.05, 0.05), (0.45, 0.46, 0.48), (0.7, 0.06, 0.05), (0.9,) * 3
 # m, from the rear to the front: y, half the width, height of the upper edge.
@@ -46,10 +46,7 @@ def loft(sections: np.ndarray, colours: np.ndarray) -> Mesh:
     """
     ends = [np.broadcast_to(end.mean(axis=0), end.shape) for end in (sections[0], sections[-1])]
     points = np.concatenate([ends[:1], sections, ends[1:]])
-    shades = np.concatenate([colours[:1], colours, colours[-1:]])
-    rows, columns = points.shape[:2]
-    uv = np.zeros((rows * columns, 2))
-    return Mesh(points.reshape(-1, 3), shades.reshape(-1, 3), uv, grid(rows, columns), textures.plain())
+    return sheet(points, np.concatenate([colours[:1], colours, colours[-1:]]), (0, 0), textures.plain())
 
 
 def shell(colour: Colour) -> Mesh:
@@ -68,31 +65,26 @@ def shell(colour: Colour) -> Mesh:
 def cabin(colour: Colour) -> Mesh:
     """Return windows and roof."""
     sections, colours = [], []
-    for number, (y, foot, roof, top) in enumerate(CABIN):
+    for i, (y, foot, roof, top) in enumerate(CABIN):
         across = [(-foot, 0.78), (-roof, top - 0.05), (-roof * 0.86, top), (0.0, top + 0.02)]
         across += [(-x, z) for x, z in reversed(across[:3])]
         sections.append([(x, y, z) for x, z in across])
-        is_roof = 0 < number < len(CABIN) - 1
-        colours.append([colour if is_roof and 1 < column < 5 else GLASS for column in range(7)])
+        has_roof = 0 < i < len(CABIN) - 1
+        colours.append([colour if has_roof and 1 < column < 5 else GLASS for column in range(7)])
     return loft(np.array(sections), np.array(colours, float))
 
 
 def wheel(x: float, y: float) -> Mesh:
-    """Return a wheel with its axle at this place."""
+    """Return a wheel; x, y: the middle of its axle."""
     angle = np.linspace(0, 2 * np.pi, SPOKES + 1)
     # From the left hub over the tread to the right hub: x from the wheel's middle, and radius.
     profile = [(-0.40, 0.62), (-0.48, 0.66), (-0.50, 1.0), (0.50, 1.0), (0.48, 0.66), (0.40, 0.62)]
-    colours = np.array([RIM, TYRE, TYRE, TYRE, TYRE, RIM], float)
+    colours = np.array([RIM, TYRE, TYRE, TYRE, TYRE, RIM])
     sections = [
         [(x + TREAD * side, y - RADIUS * r * np.cos(a), RADIUS + RADIUS * r * np.sin(a)) for side, r in profile]
         for a in angle
     ]
-    shades = np.broadcast_to(colours, (len(angle), *colours.shape))
-    rows, columns = len(angle), len(profile)
-    points = np.array(sections).reshape(-1, 3)
-    tread = Mesh(
-        points, shades.reshape(-1, 3).copy(), np.zeros((len(points), 2)), grid(rows, columns), textures.plain()
-    )
+    tread = sheet(np.array(sections), colours, (0, 0), textures.plain())
     return merge([tread, *(hub(x + TREAD * side, y, side > 0) for side in (-0.40, 0.40))])
 
 
@@ -103,8 +95,7 @@ def hub(x: float, y: float, outwards_right: bool) -> Mesh:
     points = np.vstack([[(x, y, RADIUS)], rim])
     here = np.arange(SPOKES) + 1
     faces = np.stack([np.zeros(SPOKES, int), here, here % SPOKES + 1], axis=1)
-    colours = np.tile(np.array(RIM, float), (len(points), 1))
+    colours = np.tile(np.array(RIM), (len(points), 1))
     colours[1::3] *= 0.5  # spokes
-    return Mesh(
-        points, colours, np.zeros((len(points), 2)), faces[:, ::-1] if outwards_right else faces, textures.plain()
-    )
+    faces = faces[:, ::-1] if outwards_right else faces
+    return Mesh(points, colours, np.zeros((len(points), 2)), faces, textures.plain())

@@ -1,4 +1,4 @@
-"""The scenery of generated roads: one of several kinds of land, and the road's own kind of edge."""
+"""The scenery of generated roads: one of five lands, and what the road's own marking puts at its edges."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,14 +21,15 @@ from simulator.scenery.shapes import (
     Mesh,
     boulder,
     box,
+    distances,
     flatness,
-    grid,
     illuminate,
     merge,
     plants,
-    ribbon,
     roadside,
-    whole_lap,
+    sheet,
+    surface,
+    wall,
 )
 from simulator.scenery.textures import Line
 
@@ -49,37 +50,35 @@ PLANT_TEXTURES: dict[str, Callable[[Generator], np.ndarray]] = {
 
 @dataclass(frozen=True)
 class Plant:
-    """A kind of plant.
+    """A species in a land.
 
-    kind     key of PLANT_TEXTURES
+    species  key of PLANT_TEXTURES
     height   m: least and greatest
     width    relative to the height
     nearest  least distance from the road's centre line, m
     """
 
-    kind: str
+    species: str
     colour: Colour
     count: int
     height: tuple[float, float]
     width: float
-    nearest: float = 12.0
+    nearest: float
 
 
 @dataclass(frozen=True)
 class Land:
-    """A kind of land.
+    """The land around a road.
 
-    ground, patch, steep  colours of level ground, of patches on it, and of steep ground
-    hills                 m: mean and spread of the hills' heights above the road
-    slope                 m from the centre line to the hills' feet, and from there to their full height
-    terrace               m: height of the hills' steps; 0 for none
-    boulders              their number
-    haze                  largest share of the haze
+    ground    colours of level ground, of patches on it, and of steep ground
+    hills     m: mean and spread of the hills' heights above the road
+    slope     m from the centre line to the hills' feet, and from there to their full height
+    terrace   m: height of the hills' steps; 0 for none
+    boulders  how many there are
+    haze      largest share of the haze
     """
 
-    ground: Colour
-    patch: Colour
-    steep: Colour
+    ground: tuple[Colour, Colour, Colour]
     hills: tuple[float, float]
     slope: tuple[float, float]
     plants: tuple[Plant, ...]
@@ -89,9 +88,7 @@ class Land:
 
 
 MEADOW = Land(
-    (0.62, 0.70, 0.30),
-    (0.86, 0.80, 0.42),
-    (0.80, 0.68, 0.48),
+    ((0.62, 0.70, 0.30), (0.86, 0.80, 0.42), (0.80, 0.68, 0.48)),
     hills=(1.5, 3.0),
     slope=(11, 50),
     plants=(
@@ -101,9 +98,7 @@ MEADOW = Land(
     ),
 )
 FOREST = Land(
-    (0.42, 0.46, 0.22),
-    (0.58, 0.46, 0.28),
-    (0.52, 0.46, 0.36),
+    ((0.42, 0.46, 0.22), (0.58, 0.46, 0.28), (0.52, 0.46, 0.36)),
     hills=(5.0, 6.0),
     slope=(11, 26),
     plants=(
@@ -114,9 +109,7 @@ FOREST = Land(
     haze=0.7,
 )
 DESERT = Land(
-    (0.96, 0.82, 0.58),
-    (0.88, 0.66, 0.44),
-    (0.84, 0.60, 0.42),
+    ((0.96, 0.82, 0.58), (0.88, 0.66, 0.44), (0.84, 0.60, 0.42)),
     hills=(3.0, 5.0),
     slope=(11, 45),
     plants=(
@@ -127,9 +120,7 @@ DESERT = Land(
     haze=0.8,
 )
 CANYON = Land(
-    (0.78, 0.52, 0.34),
-    (0.66, 0.56, 0.32),
-    (0.74, 0.42, 0.28),
+    ((0.78, 0.52, 0.34), (0.66, 0.56, 0.32), (0.74, 0.42, 0.28)),
     hills=(13.0, 9.0),
     slope=(12, 5),
     plants=(
@@ -140,9 +131,7 @@ CANYON = Land(
     haze=0.4,
 )
 HIGHLAND = Land(
-    (0.56, 0.58, 0.42),
-    (0.68, 0.66, 0.56),
-    (0.62, 0.62, 0.60),
+    ((0.56, 0.58, 0.42), (0.68, 0.66, 0.56), (0.62, 0.62, 0.60)),
     hills=(2.0, 15.0),
     slope=(11, 38),
     plants=(
@@ -170,15 +159,15 @@ COMMON_COLOURS: Palette = {
 SUNLIGHT, FILL = np.array((0.80, 0.75, 0.62)), np.array((0.48, 0.51, 0.54))
 
 
-def weather(random: Generator, land: Land) -> tuple[Light, Palette]:
+def weather(rng: Generator, land: Land) -> tuple[Light, Palette]:
     """Draw a road's own light and colours."""
-    azimuth, elevation = random.uniform(0, 2 * np.pi), np.radians(random.uniform(28, 65))
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(28, 65))
     sun = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
-    sunlight, fill = (colour * random.uniform(0.9, 1.05) for colour in (SUNLIGHT, FILL))
-    base = COMMON_COLOURS | {"ground": land.ground, "patch": land.patch, "steep": land.steep}
-    base |= {plant.kind: plant.colour for plant in land.plants}
-    palette = {name: tuple(np.clip(np.array(c) * random.uniform(0.94, 1.06, 3), 0, 1)) for name, c in base.items()}
-    palette["asphalt"] = tuple(random.uniform(0.55, 0.9) * random.uniform(0.97, 1.03, 3))
+    sunlight, fill = (colour * rng.uniform(0.9, 1.05) for colour in (SUNLIGHT, FILL))
+    base = COMMON_COLOURS | dict(zip(("ground", "patch", "steep"), land.ground, strict=True))
+    base |= {plant.species: plant.colour for plant in land.plants}
+    palette = {name: tuple(np.clip(np.array(c) * rng.uniform(0.94, 1.06, 3), 0, 1)) for name, c in base.items()}
+    palette["asphalt"] = tuple(rng.uniform(0.55, 0.9) * rng.uniform(0.97, 1.03, 3))
     return Light(sun, tuple(sunlight), tuple(fill)), palette
 
 
@@ -198,7 +187,7 @@ class Terrain:
     height_at
     """
 
-    def __init__(self, track: Track, land: Land, random: Generator, relief: float):
+    def __init__(self, track: Track, land: Land, rng: Generator, relief: float):
         """relief: factor of the hills' heights."""
         road = track.points[::3]
         low, high = road[:, :2].min(axis=0) - GROUND_MARGIN, road[:, :2].max(axis=0) + GROUND_MARGIN
@@ -209,8 +198,8 @@ class Terrain:
         self.distance = away.min(axis=-1)
         weight = 1 / np.maximum(away, 1.0) ** 4
         level = (weight * road[:, 2]).sum(axis=-1) / weight.sum(axis=-1)
-        slow = sample(textures.clouds(random, 256, 24, 4), self.positions)
-        rough = sample(textures.clouds(random, 256, 6, 3), self.positions)
+        slow = sample(textures.clouds(rng, 256, 24, 4), self.positions)
+        rough = sample(textures.clouds(rng, 256, 6, 3), self.positions)
         foot, reach = land.slope
         rise = np.clip((self.distance - foot) / reach, 0, 1)
         rise = rise * rise * (3 - 2 * rise)
@@ -234,19 +223,19 @@ def grid_axis(low: float, high: float) -> np.ndarray:
     return np.r_[low - outside[::-1], inside, inside[-1] + outside]
 
 
-def ground(terrain: Terrain, random: Generator, light: Light, palette: Palette, soil: np.ndarray) -> Mesh:
+def ground(terrain: Terrain, rng: Generator, light: Light, palette: Palette, soil: np.ndarray) -> Mesh:
     """Return the ground: level or steep, in patches of two colours."""
-    points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1).reshape(-1, 3)
-    mesh = Mesh(points, np.ones_like(points), points[:, :2] / 11.0, grid(*terrain.distance.shape), soil)
+    points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1)
+    mesh = sheet(points, (1, 1, 1), terrain.positions / 11.0, soil)
     steep = np.clip((0.90 - flatness(mesh)) * 5, 0, 1)
-    tone = sample(textures.clouds(random, 256, 12, 5), points[:, :2])[:, None]
+    tone = sample(textures.clouds(rng, 256, 12, 5), terrain.positions).reshape(-1, 1)
     patch = np.clip(0.25 + 0.5 * tone, 0, 1)
     level = np.array(palette["ground"]) * (1 - patch) + np.array(palette["patch"]) * patch
     mesh.colours[:] = (level * (1 - steep) + np.array(palette["steep"]) * steep) * (1 + 0.08 * tone)
     return illuminate(mesh, light, face_up=True)
 
 
-def road(track: Track, marking: str, random: Generator, look: Look, soil: np.ndarray) -> list[Mesh]:
+def road(track: Track, marking: str, rng: Generator, look: Look, soil: np.ndarray) -> list[Mesh]:
     """Return the asphalt with its lines, what stands or lies at its edges, and the verges."""
     palette, light, edge = look.palette, look.light, float(track.edges[0, 0])
     end = edge + (HARD_SHOULDER if marking in ("yellow double", "white", "rail") else 0.0)
@@ -258,101 +247,97 @@ def road(track: Track, marking: str, random: Generator, look: Look, soil: np.nda
         ),
         "white": (Line(edge - 0.12, 0.12, palette["white"]), Line(0.0, 0.11, palette["white"], DASH / (DASH + GAP))),
     }.get(marking, ())
-    asphalt = textures.asphalt(random, grain=random.uniform(0.03, 0.12) * look.grain, spots=look.spots)
-    s, offsets = whole_lap(track, 2.0), np.linspace(-end, end, 7)
-    painted = textures.paint_lines(asphalt, palette["asphalt"], end, lines)
-    surface = Material(palette["asphalt"], painted, DASH + GAP, across=0.5 + offsets / (2 * end))
-    meshes = [replace(ribbon(track, s, offsets, 0.0, surface), sheen=look.sheen)]
+    asphalt = textures.asphalt(rng, grain=rng.uniform(0.03, 0.12) * look.grain, spots=look.spots)
+    s, painted = distances(0, track.length, 2.0), textures.paint_lines(asphalt, palette["asphalt"], end, lines)
+    material = Material(palette["asphalt"], painted, DASH + GAP)
+    meshes = [replace(surface(track, s, end, material), sheen=look.sheen)]
     for side in (LEFT, RIGHT):
         inner = (end - 0.02, end + 1.4) if marking != "dirt" else (end + 1.2, end + 2.0)
         verge = Material(palette["grass" if marking == "grass" else "ground"], soil, 6.0)
-        meshes.append(
-            illuminate(roadside(track, s, side, (*inner, VERGE_EDGE), (-0.01, -0.06, -0.8), verge), light, face_up=True)
-        )
-        meshes += [illuminate(mesh, light, face_up=True) for mesh in border(track, marking, side, look, soil)]
+        verge_mesh = roadside(track, s, side, (*inner, VERGE_EDGE), (-0.01, -0.06, -0.8), verge)
+        beside = [verge_mesh, *border(track, marking, side, look, soil)]
+        meshes += [illuminate(mesh, light, face_up=True) for mesh in beside]
     return meshes + (posts(track, look) if marking == "rail" else [])
 
 
 def border(track: Track, marking: str, side: int, look: Look, soil: np.ndarray) -> list[Mesh]:
     """Return what marks the road's edge on one side, where lines or grass do not."""
-    s, edge, palette = whole_lap(track, 2.0), float(track.edges[0, 0]), look.palette
+    s, edge, palette = distances(0, track.length, 2.0), float(track.edges[0, 0]), look.palette
     if marking == "kerb":
         stripes = Material(palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
-        return [roadside(track, whole_lap(track), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
+        return [roadside(track, distances(0, track.length), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
     if marking == "dirt":
         dirt = Material(palette["dirt"], soil, 5.0)
         return [roadside(track, s, side, (edge - 0.02, edge + 1.3), (0.0, -0.02), dirt)]
     if marking == "wall":
         stone = Material(palette["wall"], soil, 3.0, across=(0, 0.3))
-        faces = (((0.0, 0.0), (0, 1)), ((0.0, 0.4), (1, 1)), ((0.4, 0.4), (1, -2)))
-        return [
-            roadside(track, s, side, np.add(edge, across), WALL_HEIGHT * np.array(up), stone) for across, up in faces
-        ]
+        outline = [(0.0, 0.0), (0.0, WALL_HEIGHT), (0.4, WALL_HEIGHT), (0.4, -2 * WALL_HEIGHT)]
+        return wall(track, s, side, np.add(outline, (edge, 0)), stone)
     if marking == "rail":
         metal = Material(palette["rail"], textures.plain(), 4.0, across=(0, 1))
-        at = edge + RAIL_DISTANCE
-        return [roadside(track, s, side, (at, at), (0.45, 0.8), metal)]
+        rail = edge + RAIL_DISTANCE
+        return [roadside(track, s, side, (rail, rail), (0.45, 0.8), metal)]
     return []
 
 
 def posts(track: Track, look: Look) -> list[Mesh]:
     """Return the posts of the rails on both sides."""
-    at, white, boxes = float(track.edges[0, 0]) + RAIL_DISTANCE + 0.06, textures.plain(), []
+    offset, white, boxes = float(track.edges[0, 0]) + RAIL_DISTANCE + 0.06, textures.plain(), []
     for s in np.arange(0, track.length - POST_SPACING / 2, POST_SPACING):
         for side in (LEFT, RIGHT):
-            place = track.at(s, side * at)
-            foot = (place.x, place.y, place.z - 0.5)
-            boxes.append(box(foot, (0.10, 0.10, 1.3), place.heading, look.palette["rail"], white))
+            pose = track.at(s, side * offset)
+            foot = (pose.x, pose.y, pose.z - 0.5)
+            boxes.append(box(foot, (0.10, 0.10, 1.3), pose.heading, look.palette["rail"], white))
     return [illuminate(merge(boxes), look.light)]
 
 
-def vegetation(terrain: Terrain, land: Land, random: Generator, palette: Palette, density: float) -> list[Mesh]:
+def vegetation(terrain: Terrain, land: Land, rng: Generator, palette: Palette, density: float) -> list[Mesh]:
     """Return the land's plants, most of them near the road; density: factor of their number."""
     meshes = []
     low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
     for plant in land.plants:
-        positions = random.uniform(low, high, (12 * round(plant.count * density), 2))
+        positions = rng.uniform(low, high, (12 * round(plant.count * density), 2))
         distance = terrain.distance_at(positions[:, ::-1])
         chance = np.clip(1.5 - distance / 60, 0.05, 1)
-        keep = (distance > plant.nearest) & (distance < 160) & (random.uniform(size=len(distance)) < chance)
+        keep = (distance > plant.nearest) & (distance < 160) & (rng.uniform(size=len(distance)) < chance)
         positions = positions[keep][: round(plant.count * density)]
         feet = np.c_[positions, terrain.height_at(positions[:, ::-1]) - 0.1]
-        heights = random.uniform(*plant.height, len(feet))
-        colours = np.clip(np.array(palette[plant.kind]) * random.uniform(0.75, 1.25, (len(feet), 1)), 0, 1)
-        texture = PLANT_TEXTURES[plant.kind](random)
-        meshes.append(plants(feet, heights, plant.width * heights, colours, texture, random))
+        heights = rng.uniform(*plant.height, len(feet))
+        colours = np.clip(np.array(palette[plant.species]) * rng.uniform(0.75, 1.25, (len(feet), 1)), 0, 1)
+        texture = PLANT_TEXTURES[plant.species](rng)
+        meshes.append(plants(feet, heights, plant.width * heights, colours, texture, rng))
     return meshes
 
 
-def boulders(terrain: Terrain, land: Land, random: Generator, light: Light, palette: Palette) -> list[Mesh]:
+def boulders(terrain: Terrain, land: Land, rng: Generator, light: Light, palette: Palette) -> list[Mesh]:
     """Return boulders on the land beside the road."""
-    texture = textures.rock(random)
+    texture = textures.rock(rng)
     meshes: list[Mesh] = []
     low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
     while len(meshes) < land.boulders:
-        (x, y), size = random.uniform(low, high), random.uniform(2, 8)
+        (x, y), size = rng.uniform(low, high), rng.uniform(2, 8)
         if size + 12 < terrain.distance_at((y, x)).item() < 90:
             z = terrain.height_at((y, x)).item()
-            meshes.append(boulder((x, y, z), (size, 0.8 * size, 0.6 * size), random, palette["rock"], texture))
+            meshes.append(boulder((x, y, z), (size, 0.8 * size, 0.6 * size), rng, palette["rock"], texture))
     return [illuminate(merge(meshes), light)] if meshes else []
 
 
 def scenery(number: int, look: int) -> Scenery:
     """Return the scenery of a generated road in a look; 0 is the road's own.
 
-    The calls share a random generator, so their order matters.
+    The calls draw from one generator, so their order matters.
     """
     track, marking, land = Track(f"road-{number}"), generate(number).marking, LANDS[(number - 1) % len(LANDS)]
     appearance = looks.make_look(look, *weather(np.random.default_rng([number, 1]), land))
     light, palette = appearance.light, appearance.palette
-    random = np.random.default_rng([number, look])
-    terrain = Terrain(track, land, random, appearance.relief)
-    soil = textures.soil(random)
+    rng = np.random.default_rng([number, look])
+    terrain = Terrain(track, land, rng, appearance.relief)
+    soil = textures.soil(rng)
     meshes = [
-        ground(terrain, random, light, palette, soil),
-        *road(track, marking, random, appearance, soil),
-        planting.mountains(random, light, palette | {"grass": palette["ground"]}, soil),
-        *boulders(terrain, land, random, light, palette),
-        *vegetation(terrain, land, random, palette, appearance.plants),
+        ground(terrain, rng, light, palette, soil),
+        *road(track, marking, rng, appearance, soil),
+        planting.mountains(rng, light, palette["ground"], soil),
+        *boulders(terrain, land, rng, light, palette),
+        *vegetation(terrain, land, rng, palette, appearance.plants),
     ]
     return assemble(meshes, appearance, Haze(palette["horizon"], (100, 600), land.haze))

@@ -18,14 +18,14 @@ from simulator.scenery.shapes import (
     box,
     distances,
     flatness,
-    grid,
     ground_grid,
     illuminate,
     merge,
     plants,
     ribbon,
     roadside,
-    whole_lap,
+    sheet,
+    surface,
 )
 from simulator.scenery.textures import Line
 
@@ -78,7 +78,7 @@ class JungleTerrain:
     bridge     float64 (n, 3): the centre line's points on the bridge, m; `distance` leaves them out
     """
 
-    def __init__(self, track: Track, random: Generator):
+    def __init__(self, track: Track, rng: Generator):
         self.track = track
         self.positions = ground_grid(track, GROUND_MARGIN, GRID_SPACING)
         on_ground = np.ones(len(track.points), bool)
@@ -89,8 +89,8 @@ class JungleTerrain:
         level = (weight * points[near, 2]).sum(axis=-1) / weight.sum(axis=-1)
         self.distance = away[..., 0]
         rows, columns = self.distance.shape
-        rough = textures.clouds(random, 256, 16, 5)[:rows, :columns]
-        slow = textures.clouds(random, 256, 40, 3)[:rows, :columns]
+        rough = textures.clouds(rng, 256, 16, 5)[:rows, :columns]
+        slow = textures.clouds(rng, 256, 40, 3)[:rows, :columns]
         rise = np.clip((self.distance - CLIFF_DISTANCE - 4 * np.clip(slow, -0.6, 1.5)) / CLIFF_WIDTH, 0, 1)
         tall = 9 + 8 * np.clip(slow + 0.8, 0, 2.5) + 2 * rough
         crest = np.clip((self.distance - 38) / 12, 0, 1) * (12 + 9 * np.abs(rough))
@@ -140,34 +140,31 @@ class JungleTerrain:
         return mesh
 
 
-def ground(terrain: JungleTerrain, random: Generator, light: Light, palette: Palette) -> Mesh:
+def ground(terrain: JungleTerrain, rng: Generator, light: Light, palette: Palette) -> Mesh:
     """Return the ground: grass where it is level, rock where it is steep."""
     rows, columns = terrain.distance.shape
-    points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1).reshape(-1, 3)
-    uv = terrain.positions.reshape(-1, 2) / 9.0
-    mesh = Mesh(points, np.ones_like(points), uv, grid(rows, columns), textures.rock(random, streak=1.0))
+    points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1)
+    mesh = sheet(points, (1, 1, 1), terrain.positions / 9.0, textures.rock(rng, streak=1.0))
     steep = np.clip((0.86 - flatness(mesh)) * 5, 0, 1)
-    tone = 1 + 0.16 * textures.clouds(random, 256, 10, 4)[:rows, :columns].reshape(-1, 1)
+    tone = 1 + 0.16 * textures.clouds(rng, 256, 10, 4)[:rows, :columns].reshape(-1, 1)
     mesh.colours[:] = (np.array(palette["grass"]) * (1 - steep) + np.array(palette["cliff"]) * steep) * tone
     return terrain.cast_shadows(illuminate(mesh, light, face_up=True), light, 0.55)
 
 
-def road_texture(random: Generator, look: Look) -> np.ndarray:
+def road_texture(rng: Generator, look: Look) -> np.ndarray:
     """Return asphalt with its lines, as wide as the road and as long as a dash and a gap of the centre line."""
     white = look.palette["line"]
     lines = (Line(EDGE_LINE, 0.10, white), Line(0.0, 0.11, white, share=DASH / (DASH + GAP)))
-    asphalt = textures.asphalt(random, grain=0.03 * look.grain, spots=0.35 * look.spots)
+    asphalt = textures.asphalt(rng, grain=0.03 * look.grain, spots=0.35 * look.spots)
     return textures.paint_lines(asphalt, look.palette["asphalt"], ASPHALT_EDGE, lines)
 
 
-def road(terrain: JungleTerrain, random: Generator, look: Look) -> list[Mesh]:
+def road(terrain: JungleTerrain, rng: Generator, look: Look) -> list[Mesh]:
     """Return the asphalt with its lines, the grassy verges, and the sides of the bridge."""
-    track, plain, soil = terrain.track, textures.plain(), textures.soil(random)
+    track, plain, soil = terrain.track, textures.plain(), textures.soil(rng)
     light, palette = look.light, look.palette
-    offsets = np.linspace(-ASPHALT_EDGE, ASPHALT_EDGE, 7)
-    across = 0.5 + offsets / (2 * ASPHALT_EDGE)
-    asphalt = Material(palette["asphalt"], road_texture(random, look), DASH + GAP, across)
-    meshes = [ribbon(track, whole_lap(track, 1.5), offsets, 0.0, asphalt)]
+    asphalt = Material(palette["asphalt"], road_texture(rng, look), DASH + GAP)
+    meshes = [surface(track, distances(0, track.length, 1.5), ASPHALT_EDGE, asphalt)]
     grass, deck = Material(palette["grass"], soil, 9.0), Material(palette["deck"], plain, 4.0, across=(0, 1))
     for start, end in ((0.0, ROAD.bridge[0]), (ROAD.bridge[1], track.length)):
         for side in (LEFT, RIGHT):
@@ -176,12 +173,8 @@ def road(terrain: JungleTerrain, random: Generator, look: Look) -> list[Mesh]:
             meshes.append(illuminate(verge, light, face_up=True))
     outer = ASPHALT_EDGE + 0.25
     for side in (LEFT, RIGHT):
-        for face, heights in (
-            ((outer, outer), (0.15, -1.3)),
-            ((ASPHALT_EDGE, outer), (0.15, 0.15)),
-            ((0, outer), (-1.3, -1.3)),
-        ):
-            meshes.append(roadside(track, distances(*ROAD.bridge), side, face, heights, deck))
+        faces = (((outer, outer), (0.15, -1.3)), ((ASPHALT_EDGE, outer), (0.15, 0.15)), ((0, outer), (-1.3, -1.3)))
+        meshes += [roadside(track, distances(*ROAD.bridge), side, face, heights, deck) for face, heights in faces]
     return [terrain.cast_shadows(mesh, light, 0.68) for mesh in meshes]
 
 
@@ -191,8 +184,8 @@ def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
 
     def add_box(s: float, right: float, bottom: float, size: tuple[float, float, float], colour: str) -> None:
         """Add a box aligned with the road; bottom: metres above the road."""
-        place = track.at(s, right)
-        meshes.append(box((place.x, place.y, place.z + bottom), size, place.heading, palette[colour], white))
+        pose = track.at(s, right)
+        meshes.append(box((pose.x, pose.y, pose.z + bottom), size, pose.heading, palette[colour], white))
 
     rail = Material(palette["rail"], white, 4.0, across=(0, 1))
     for section in RAILS:
@@ -215,40 +208,40 @@ def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
     return [illuminate(merge(meshes), light)]
 
 
-def palms(terrain: JungleTerrain, random: Generator, light: Light, palette: Palette) -> list[Mesh]:
+def palms(terrain: JungleTerrain, rng: Generator, light: Light, palette: Palette) -> list[Mesh]:
     """Return palms and bushes on the grass next to the road and on the cliffs."""
     low, high = terrain.positions[0, 0], terrain.positions[-1, -1]
-    positions = random.uniform(low, high, (5200, 2))
+    positions = rng.uniform(low, high, (5200, 2))
     column, row = terrain.grid_coordinates(positions).astype(int)
     distance = terrain.distance[row, column]
     chance = np.where(distance < 10.5, 0, np.where(distance < 20, 0.22, 0.16))
-    keep = random.uniform(size=len(positions)) < chance
+    keep = rng.uniform(size=len(positions)) < chance
     feet = np.c_[positions, terrain.height_at(positions) - 0.2][keep]
     sunlit = terrain.sunlit(feet + np.array([0, 0, 4]), light)[:, None]
-    heights = random.uniform(4.5, 9.0, len(feet))
+    heights = rng.uniform(4.5, 9.0, len(feet))
     fits = feet[:, 2] + heights < terrain.deck_at(feet[:, :2])  # others would grow through the bridge
-    brightness = random.uniform(0.8, 1.5, (len(feet), 1))
+    brightness = rng.uniform(0.8, 1.5, (len(feet), 1))
     colours = np.clip(np.array(palette["palm"]) * brightness * (0.55 + 0.75 * sunlit), 0, 1)
     meshes = []
-    for kind in range(4):
-        chosen = fits & (np.arange(len(feet)) % 4 == kind)
-        bush = kind == 3
-        texture = textures.bush(random) if bush else textures.palm(random)
+    for i in range(4):
+        chosen = fits & (np.arange(len(feet)) % 4 == i)
+        bush = i == 3
+        texture = textures.bush(rng) if bush else textures.palm(rng)
         height = heights[chosen] * (0.3 if bush else 1.0)
-        meshes.append(plants(feet[chosen], height, (2.0 if bush else 0.9) * height, colours[chosen], texture, random))
+        meshes.append(plants(feet[chosen], height, (2.0 if bush else 0.9) * height, colours[chosen], texture, rng))
     return meshes
 
 
 def scenery(look: int) -> Scenery:
-    """Return the jungle's scenery in a look; the calls share a random generator, so their order matters."""
-    random = np.random.default_rng(look)
+    """Return the jungle's scenery in a look; the calls draw from one generator, so their order matters."""
+    rng = np.random.default_rng(look)
     appearance = looks.make_look(look, LIGHT, PALETTE)
     light, palette = appearance.light, appearance.palette
-    terrain = JungleTerrain(Track("jungle"), random)
+    terrain = JungleTerrain(Track("jungle"), rng)
     meshes = [
-        ground(terrain, random, light, palette),
-        *road(terrain, random, appearance),
+        ground(terrain, rng, light, palette),
+        *road(terrain, rng, appearance),
         *rails_and_posts(terrain.track, light, palette),
-        *palms(terrain, random, light, palette),
+        *palms(terrain, rng, light, palette),
     ]
     return assemble(meshes, appearance)

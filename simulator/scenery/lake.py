@@ -14,7 +14,17 @@ from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
 from simulator.scenery import lake_terrain, looks, planting, textures
 from simulator.scenery.looks import Look, Palette
 from simulator.scenery.parts import Haze, Scenery, assemble
-from simulator.scenery.shapes import Light, Material, Mesh, distances, illuminate, ribbon, roadside, whole_lap
+from simulator.scenery.shapes import (
+    Light,
+    Material,
+    Mesh,
+    distances,
+    illuminate,
+    ribbon,
+    roadside,
+    surface,
+    wall,
+)
 from simulator.scenery.textures import Line
 
 ROAD = ROADS["lake"]
@@ -34,18 +44,6 @@ class Shadow(NamedTuple):
     half_width: float
 
 
-SHADOWS = (
-    Shadow(22, 0, 0.5, 9),
-    Shadow(29, 1.5, 0.6, 6),
-    Shadow(62, -3, 0.4, 8),
-    Shadow(628, -4, 5, 3.5),
-    Shadow(632, -2.5, 3, 2),
-    Shadow(884, 0, 4, 5),
-    Shadow(915, 1, 6, 4),
-    Shadow(1070, 0, 0.4, 9),
-    Shadow(1104, 0, 0.5, 9),
-    Shadow(1111, 2, 0.7, 8),
-)
 PALETTE: Palette = {
     "zenith": (0.19, 0.31, 0.55),
     "horizon": (0.62, 0.74, 0.88),
@@ -75,7 +73,7 @@ LIGHT = Light(sun=(0.78, -0.10, 0.62), sunlight=(0.74, 0.68, 0.50), fill=(0.56, 
 HAZE = Haze((0.41, 0.60, 0.85), (100, 600), 0.8)
 
 
-def road_texture(random: Generator, look: Look) -> np.ndarray:
+def road_texture(rng: Generator, look: Look) -> np.ndarray:
     """Return asphalt as wide as the road, with its double lines and the seam between them."""
     palette = look.palette
     lines = (
@@ -83,39 +81,33 @@ def road_texture(random: Generator, look: Look) -> np.ndarray:
         Line(INNER_LINE, 0.05, palette["line"]),
         Line(ROAD.edge, 0.04, palette["outer line"]),
     )
-    asphalt = textures.asphalt(random, grain=0.15 * look.grain, spots=look.spots)
+    asphalt = textures.asphalt(rng, grain=0.15 * look.grain, spots=look.spots)
     return textures.paint_lines(asphalt, palette["asphalt"], ASPHALT_EDGE, lines)
 
 
-def road(track: Track, random: Generator, look: Look, soil: np.ndarray, shadows: Sequence[Shadow]) -> list[Mesh]:
+def road(track: Track, rng: Generator, look: Look, soil: np.ndarray, shadows: Sequence[Shadow]) -> list[Mesh]:
     """Return the asphalt with its lines, the roadside, the kerbs and the bridge."""
-    s, palette = whole_lap(track, 2.0), look.palette
+    s, palette = distances(0, track.length, 2.0), look.palette
     offsets = np.linspace(-ASPHALT_EDGE, ASPHALT_EDGE, 7)
     shade = np.ones((len(s), len(offsets), 3))
     for shadow in shadows:
         along = ((s - shadow.s + track.length / 2) % track.length - track.length / 2)[:, None] / shadow.half_length
         inside = np.clip(1.6 - np.hypot(along, (offsets - shadow.right) / shadow.half_width) * 1.2, 0, 1)[..., None]
         shade *= 1 - 0.5 * inside
-    asphalt = Material(
-        np.array(palette["asphalt"]) * shade,
-        road_texture(random, look),
-        2 * ASPHALT_EDGE,
-        across=0.5 + offsets / (2 * ASPHALT_EDGE),
-    )
-    surface = replace(ribbon(track, s, offsets, 0.0, asphalt), sheen=look.sheen)
-    slabs = Material(palette["slab"], textures.concrete(random), 3.0, across=(0, 0.5, 0.9, 1))
+    asphalt = Material(np.array(palette["asphalt"]) * shade, road_texture(rng, look), 2 * ASPHALT_EDGE)
+    slabs = Material(palette["slab"], textures.concrete(rng), 3.0, across=(0, 0.5, 0.9, 1))
     return [
-        surface,
+        replace(surface(track, s, ASPHALT_EDGE, asphalt), sheen=look.sheen),
         *slabs_and_verges(track, look, slabs, soil),
         *kerbs(track, look),
-        *bridge(track, random, palette, offsets),
+        *bridge(track, rng, palette, offsets),
     ]
 
 
 def slabs_and_verges(track: Track, look: Look, slabs: Material, soil: np.ndarray) -> list[Mesh]:
     """Return the concrete slabs on both sides of the road and the verges between them."""
     light = look.light
-    bright = Light(light.sun, scaled(light.sunlight, 1.25), scaled(light.fill, 0.75))
+    bright = Light(light.sun, tuple(1.25 * np.array(light.sunlight)), tuple(0.75 * np.array(light.fill)))
     earth = Material(look.palette["earth"], soil, 9.0)
     meshes = []
     for side in (LEFT, RIGHT):
@@ -135,12 +127,6 @@ def slabs_and_verges(track: Track, look: Look, slabs: Material, soil: np.ndarray
     return meshes
 
 
-def scaled(colour: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
-    """Return a colour multiplied by a factor."""
-    red, green, blue = colour
-    return factor * red, factor * green, factor * blue
-
-
 def kerbs(track: Track, look: Look) -> list[Mesh]:
     """Return the red and white kerbs."""
     material = Material(look.palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
@@ -150,48 +136,50 @@ def kerbs(track: Track, look: Look) -> list[Mesh]:
     ]
 
 
-def bridge(track: Track, random: Generator, palette: Palette, offsets: np.ndarray) -> list[Mesh]:
+def bridge(track: Track, rng: Generator, palette: Palette, offsets: np.ndarray) -> list[Mesh]:
     """Return the cobbles on the bridge and its low black walls."""
     s = distances(*ROAD.bridge)
-    cobbles = Material(palette["cobbles"], textures.cobbles(random), 4.5)
+    cobbles = Material(palette["cobbles"], textures.cobbles(rng), 4.5)
     black = Material((0.02, 0.02, 0.02), textures.plain(), 4.0, across=(0, 1))
     meshes = [ribbon(track, s, offsets, 0.02, cobbles)]
     for side in (LEFT, RIGHT):
-        for wall, heights in (((4.9, 4.9), (0, 0.75)), ((4.9, 5.5), (0.75, 0.75)), ((5.5, 5.5), (0.75, -2))):
-            meshes.append(roadside(track, s, side, wall, heights, black))
+        meshes += wall(track, s, side, [(4.9, 0), (4.9, 0.75), (5.5, 0.75), (5.5, -2)], black)
     return meshes
 
 
-def random_shadows(random: Generator, length: float, count: int) -> list[Shadow]:
-    """Return shadows at random places on a track of this length."""
+def random_shadows(rng: Generator, length: float, count: int) -> list[Shadow]:
+    """Return shadows anywhere on a track of this length."""
     return [
         Shadow(
-            s=random.uniform(0, length),
-            right=-random.uniform(-4, 4),
-            half_length=random.choice((0.5, 0.5, 3.0, 5.0, 12.0)),
-            half_width=random.uniform(2, 9),
+            s=rng.uniform(0, length),
+            right=-rng.uniform(-4, 4),
+            half_length=rng.choice((0.5, 0.5, 3.0, 5.0, 12.0)),
+            half_width=rng.uniform(2, 9),
         )
         for _ in range(count)
     ]
 
 
 def scenery(look: int) -> Scenery:
-    """Return the lake's scenery in a look; the calls share a random generator, so their order matters."""
-    random = np.random.default_rng(look)
+    """Return the lake's scenery in a look; the calls draw from one generator, so their order matters."""
+    rng = np.random.default_rng(look)
     track, appearance = Track("lake"), looks.make_look(look, LIGHT, PALETTE)
     light, palette = appearance.light, appearance.palette
-    terrain = lake_terrain.LakeTerrain(track, random, appearance.relief, appearance.shift)
-    water = lake_terrain.water(random, palette)
-    soil = textures.soil(random)
-    shadows = SHADOWS if appearance.shadows is None else random_shadows(random, track.length, appearance.shadows)
+    terrain = lake_terrain.LakeTerrain(track, rng, appearance.relief, appearance.shift)
+    water = lake_terrain.water(rng, palette)
+    soil = textures.soil(rng)
+    if appearance.shadows is None:
+        shadows = [Shadow(*row) for row in lake_terrain.read_table("lake_shadows.csv")]
+    else:
+        shadows = random_shadows(rng, track.length, appearance.shadows)
     meshes = [
-        *lake_terrain.ground(terrain, random, light, palette, soil),
-        *road(track, random, appearance, soil, shadows),
+        *lake_terrain.ground(terrain, rng, light, palette, soil),
+        *road(track, rng, appearance, soil, shadows),
         water,
-        planting.mountains(random, light, palette, soil),
-        planting.boulders(terrain, random, light, palette),
-        *planting.pines(terrain, random, palette, appearance.plants),
-        *planting.undergrowth(terrain, random, palette, appearance.plants),
-        *planting.pylons(),
+        planting.mountains(rng, light, palette["grass"], soil),
+        planting.boulders(terrain, rng, light, palette),
+        *planting.pines(terrain, rng, palette, appearance.plants),
+        *planting.undergrowth(terrain, rng, palette, appearance.plants),
+        planting.pylons(),
     ]
     return assemble(meshes, appearance, HAZE)

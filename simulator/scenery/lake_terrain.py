@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,7 +10,7 @@ from scipy.spatial import cKDTree
 from cloning.road.track import LEFT, RIGHT, Section, Track
 from simulator.scenery import textures
 from simulator.scenery.looks import Palette
-from simulator.scenery.shapes import Light, Mesh, flatness, grid, ground_grid, illuminate
+from simulator.scenery.shapes import Light, Mesh, flatness, ground_grid, illuminate, sheet
 
 GRID_SPACING = 7.0  # m between the ground's points
 WATER_LEVEL = -1.2  # m
@@ -23,62 +24,14 @@ EARTH = (
     Section(RIGHT, 843, 864),
     Section(LEFT, 150, 240),
 )
-# Metres along the road, and the height in metres of the land 25 m to this side of it
-HEIGHTS_LEFT = (
-    (-20, 2),
-    (25, 3),
-    (60, 1.5),
-    (110, 2.5),
-    (135, -1),
-    (160, -3),
-    (215, -3),
-    (245, 2.5),
-    (300, 2.5),
-    (350, 1.5),
-    (420, 1),
-    (470, 0.5),
-    (500, -3),
-    (790, -3),
-    (805, 0.5),
-    (865, 2),
-    (905, 3),
-    (940, 2),
-    (960, -3),
-    (1018, -3),
-    (1032, 1.5),
-    (1085, 2),
-)
-HEIGHTS_RIGHT = (
-    (-60, 7),
-    (-40, 9),
-    (40, 9),
-    (62, 5),
-    (75, 2),
-    (110, 3),
-    (150, 7),
-    (200, 11),
-    (300, 14),
-    (420, 15),
-    (500, 13),
-    (535, 5),
-    (560, 0),
-    (585, -3),
-    (790, -3),
-    (805, 1),
-    (850, 1.5),
-    (880, 4),
-    (930, 6),
-    (958, 1.5),
-    (1000, 1.5),
-    (1024, 4),
-    (1075, 3.5),
-)
 
 
-def interpolate_round(table: tuple[tuple[float, float], ...], s: np.ndarray, length: float) -> np.ndarray:
-    """Interpolate a table of (s, value) at the distances s along a closed track of this length."""
-    known, value = np.array(table, float).T
-    return np.interp(s, np.r_[known - length, known, known + length], np.tile(value, 3))
+def read_table(name: str) -> np.ndarray:
+    """Return what was read off frames of the real simulator, from a csv file beside this one: float64 (rows, columns).
+
+    Lengths, heights and distances are in m, s along the road; side -1 is left of it, 1 right.
+    """
+    return np.loadtxt(Path(__file__).with_name(name), delimiter=",", skiprows=1)
 
 
 def in_sections(sections: Iterable[Section], s: np.ndarray, side: np.ndarray, length: float) -> np.ndarray:
@@ -92,11 +45,13 @@ def in_sections(sections: Iterable[Section], s: np.ndarray, side: np.ndarray, le
 class LakeTerrain:
     """The height of the ground, and the nearest point of the road, at any position."""
 
-    def __init__(self, track: Track, random: np.random.Generator, relief: float = 1.0, shift: float = 0.0):
+    def __init__(self, track: Track, rng: np.random.Generator, relief: float = 1.0, shift: float = 0.0):
         """relief: factor of the heights; shift: m by which the land is shifted backwards along the road."""
         self.track, self.relief, self.shift = track, relief, shift
         self.tree = cKDTree(track.points[:, :2])
-        self.rolling = textures.clouds(random, 256, 24, 5)  # a pixel is 4 m; `height` scales the values
+        heights = read_table("lake_heights.csv")  # of the land 25 m from the road
+        self.heights = [heights[heights[:, 0] == side, 1:].T for side in (LEFT, RIGHT)]
+        self.rolling = textures.clouds(rng, 256, 24, 5)  # a pixel is 4 m; `height` scales the values
 
     def nearest_road(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return distance to the centre line, s in the land's tables, and side, for positions (n, 2), all in m."""
@@ -108,7 +63,10 @@ class LakeTerrain:
         """Return the heights above the road, (n,), at positions (n, 2), in m."""
         distance, s, side = self.nearest_road(positions)
         length = self.track.length
-        left, right = (interpolate_round(table, s, length) for table in (HEIGHTS_LEFT, HEIGHTS_RIGHT))
+        left, right = (
+            np.interp(s, np.r_[known - length, known, known + length], np.tile(heights, 3))
+            for known, heights in self.heights
+        )
         near = np.where(side == LEFT, left, right)
         near = np.where(near > 0, self.relief * near, near)
         cliff = in_sections((CLIFF,), s, side, length)
@@ -126,20 +84,19 @@ class LakeTerrain:
 
 
 def ground(
-    terrain: LakeTerrain, random: np.random.Generator, light: Light, palette: Palette, soil: np.ndarray
+    terrain: LakeTerrain, rng: np.random.Generator, light: Light, palette: Palette, soil: np.ndarray
 ) -> list[Mesh]:
     """Return two sheets of ground: a fine one near the road, and a coarse one further away and slightly lower."""
-    tone = textures.clouds(random, 256, 12, 4)
+    tone = textures.clouds(rng, 256, 12, 4)
     length = terrain.track.length
     sheets = []
     for spacing, nearest, farthest, lower in ((GRID_SPACING, 0, 66, 0.0), (2.5 * GRID_SPACING, 48, 400, 0.4)):
         positions = ground_grid(terrain.track, 230, spacing)
-        rows, columns = positions.shape[:2]
-        positions = positions.reshape(-1, 2)
+        shape, positions = positions.shape, positions.reshape(-1, 2)
         distance, s, side = terrain.nearest_road(positions)
         points = np.c_[positions, terrain.height(positions) - lower]
-        sheet = Mesh(points, np.ones_like(points), positions / 14.0, grid(rows, columns), soil)
-        steep = np.clip((0.93 - flatness(sheet)) * 6, 0, 1)
+        mesh = sheet(points.reshape(*shape[:2], 3), (1, 1, 1), positions.reshape(shape) / 14.0, soil)
+        steep = np.clip((0.93 - flatness(mesh)) * 6, 0, 1)
         patch = tone[tuple((np.floor(positions / 5).astype(int) % 256).T)][:, None]
         green = 0.35 * np.clip(0.5 + 0.35 * patch, 0, 1)
         colour = np.array(palette["grass"]) * (1 - green) + np.array(palette["green"]) * green
@@ -147,22 +104,17 @@ def ground(
         colour = np.where(earth[:, None], np.array(palette["earth"]), colour)
         colour = colour * (1 - steep) + np.array(palette["sand"]) * (1 + 0.10 * patch) * steep
         cliff = in_sections((CLIFF,), s, side, length) & (distance > 14) & (distance < 32)
-        sheet.colours[:] = np.where(cliff[:, None], np.array(palette["cliff"]), colour)
-        corners = distance[sheet.faces]
-        visible = (points[sheet.faces, 2].max(axis=1) > WATER_LEVEL - 0.4) & (corners.max(axis=1) > nearest)
+        mesh.colours[:] = np.where(cliff[:, None], np.array(palette["cliff"]), colour)
+        corners = distance[mesh.faces]
+        visible = (points[mesh.faces, 2].max(axis=1) > WATER_LEVEL - 0.4) & (corners.max(axis=1) > nearest)
         visible &= corners.min(axis=1) < farthest
-        sheets.append(replace(illuminate(sheet, light, face_up=True), faces=sheet.faces[visible]))
+        sheets.append(replace(illuminate(mesh, light, face_up=True), faces=mesh.faces[visible]))
     return sheets
 
 
-def water(random: np.random.Generator, palette: Palette) -> Mesh:
+def water(rng: np.random.Generator, palette: Palette) -> Mesh:
     """Return the lake's surface."""
     side = np.linspace(-760, 760, 27)
-    flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    return Mesh(
-        np.c_[flat, np.full(len(flat), WATER_LEVEL)],
-        np.tile(np.array(palette["water"]), (len(flat), 1)),
-        flat / 40,
-        grid(27, 27),
-        textures.grey(0.97, 0.02 * textures.noise(random, (64, 64), 3)),
-    )
+    points = np.stack(np.meshgrid(side, side, WATER_LEVEL), axis=-1)[:, :, 0]
+    texture = textures.grey(0.97, 0.02 * textures.noise(rng, (64, 64), 3))
+    return sheet(points, palette["water"], points[..., :2] / 40, texture)

@@ -10,18 +10,18 @@ from simulator.scenery.textures import ASPHALT_LEVEL
 
 Palette = dict[str, Colour]
 SHADOWED = 10_000  # look n + SHADOWED is look n with shadows; with n + 2 * SHADOWED and so on, they are other ones
-# The first two kinds of shadows of look 0 resemble two real recordings of the jungle, in which the road's median colour
+# The first two styles of look 0's shadows resemble two real recordings of the jungle, in which the road's median colour
 # in the shade is (0.26, 0.30, 0.39) and (0.18, 0.22, 0.30) of that in the sun; in these it is (0.29, 0.31, 0.34) and
 # (0.20, 0.22, 0.25).
 REAL_STYLES = (ShadeStyle(depth=1.35, softness=0.08), ShadeStyle(depth=1.75, softness=0.08))
-# The least and the greatest depth of random ones. With depths of up to 6 the jungle's road came out black in the shade
-# in one of ten looks, of 400, so that nothing could be seen of it; with these it keeps at least a twelfth of its light.
+# The least and the greatest depth of the other, random ones. With depths of up to 6, in one of ten looks, of 400, the
+# jungle's road came out black in the shade; with these it keeps at least a twelfth of its light.
 DEPTHS = (0.8, 3)
 # The least mean value, of 255, of the road where it is darkest. In the darkest of 135 real frames its median value is
 # 29, and hardly a pixel is black; without this limit it came out black in one of fifty looks with shadows.
 DARKEST = 29
 # Paint on a road is at least so many times as bright as its asphalt, by the brightest of red, green and blue; on the
-# real tracks it is 1.45 to 1.8 times as bright. Without this limit, one random look in six had lines darker than the
+# real tracks it is 1.45 to 1.8 times as bright. Without this limit, one look in six had lines darker than the
 # road, as neither of these has, and there the network steered restlessly.
 PAINT = ("line", "outer line", "white", "yellow")
 PAINT_CONTRAST = 1.35
@@ -39,7 +39,7 @@ class Look:
     relief   factor of the heights next to the road
     shift    metres by which hills, soils and water are shifted along the road
     plants   factor of the number of trees and bushes
-    shadows  number of shadows at random places on the road; None: those of the real simulator
+    shadows  number of shadows anywhere on the road; None: those of the real simulator
     tone     float32 (3, 4): the camera's colour matrix, applied to (r, g, b, 1), 0..255; None: unchanged colours
     """
 
@@ -56,47 +56,47 @@ class Look:
     tone: np.ndarray | None = None
 
 
-def make_look(number: int, light: Light, palette: Palette) -> Look:
+def make_look(look: int, light: Light, palette: Palette) -> Look:
     """Return a look of a track; light and palette are those of the real simulator, which look 0 uses as they are."""
-    if not number:
+    if not look:
         return Look(light, palette)
-    random = np.random.default_rng([number, 7])
-    azimuth, elevation = random.uniform(0, 2 * np.pi), np.radians(random.uniform(18, 70))
+    rng = np.random.default_rng([look, 7])
+    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(18, 70))
     sun = (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
-    overcast = random.uniform(0, 0.7)  # share of the sunlight that clouds scatter over the sky
-    strength = random.uniform(0.65, 1.15) * random.uniform(0.92, 1.08, 3)
+    overcast = rng.uniform(0, 0.7)  # share of the sunlight that clouds scatter over the sky
+    strength = rng.uniform(0.65, 1.15) * rng.uniform(0.92, 1.08, 3)
     sunlight = np.array(light.sunlight) * strength * (1 - overcast)
-    fill = (np.array(light.fill) * random.uniform(0.8, 1.1) + 0.5 * overcast * np.array(light.sunlight)) * strength
-    colours = {name: vary(random, np.array(colour)) for name, colour in palette.items()}
+    fill = (np.array(light.fill) * rng.uniform(0.8, 1.1) + 0.5 * overcast * np.array(light.sunlight)) * strength
+    colours = {name: vary(rng, np.array(colour)) for name, colour in palette.items()}
     colours |= {name: brighten(colours[name], colours["asphalt"]) for name in PAINT if name in colours}
-    contrast, saturation = random.uniform(0.75, 1.25), random.uniform(0.1, 1.3)
+    contrast, saturation = rng.uniform(0.75, 1.25), rng.uniform(0.1, 1.3)
     return Look(
         Light(sun, tuple(sunlight), tuple(fill)),
         colours,
-        grain=random.uniform(0.25, 1.3),
-        spots=random.uniform(0.3, 2.5),
-        sheen=random.uniform(0, 0.5),
-        stripes=random.uniform(0.4, 1.6),
-        relief=random.uniform(0.2, 1.5),
-        shift=random.uniform(0, 1000),
-        plants=random.uniform(0.3, 1.2),
-        shadows=int(random.integers(5, 60)),
-        tone=tone_matrix(contrast, saturation, random.uniform(-18, 18) + random.uniform(-4, 4, 3)),
+        grain=rng.uniform(0.25, 1.3),
+        spots=rng.uniform(0.3, 2.5),
+        sheen=rng.uniform(0, 0.5),
+        stripes=rng.uniform(0.4, 1.6),
+        relief=rng.uniform(0.2, 1.5),
+        shift=rng.uniform(0, 1000),
+        plants=rng.uniform(0.3, 1.2),
+        shadows=int(rng.integers(5, 60)),
+        tone=tone_matrix(contrast, saturation, rng.uniform(-18, 18) + rng.uniform(-4, 4, 3)),
     )
 
 
-def make_shade_style(number: int) -> ShadeStyle | None:
-    """Return the shadows of a look, at random except for look 0's first two; None for a look without shadows."""
-    edition, base = divmod(number, SHADOWED)
+def make_shade_style(look: int) -> ShadeStyle | None:
+    """Return the shadows of a look, random except for look 0's first two; None for a look without shadows."""
+    edition, base = divmod(look, SHADOWED)
     if not edition:
         return None
     if not base and edition <= len(REAL_STYLES):
         return REAL_STYLES[edition - 1]
-    random = np.random.default_rng([number, 11])
+    rng = np.random.default_rng([look, 11])
     return ShadeStyle(
-        depth=float(np.exp(random.uniform(*np.log(DEPTHS)))),
-        softness=float(np.exp(random.uniform(*np.log((0.05, 0.8))))),
-        elevation=random.uniform(0.7, 1.2),
+        depth=float(np.exp(rng.uniform(*np.log(DEPTHS)))),
+        softness=float(np.exp(rng.uniform(*np.log((0.05, 0.8))))),
+        elevation=rng.uniform(0.7, 1.2),
     )
 
 
@@ -110,15 +110,15 @@ def expose(tone: np.ndarray | None, darkest: np.ndarray) -> np.ndarray | None:
     return tone if lacking <= 0 else np.c_[matrix[:, :3], matrix[:, 3] + lacking].astype(np.float32)
 
 
-def vary(random: np.random.Generator, colour: np.ndarray) -> Colour:
+def vary(rng: np.random.Generator, colour: np.ndarray) -> Colour:
     """Return a variant of a colour (3,): darker or lighter, greyer, and tinted.
 
     It is greyer, because a network that recognises the road only by its grey fails on the real road, whose edges are
     grey or blue, too.
     """
-    greyer = random.uniform(0, 0.9)
+    greyer = rng.uniform(0, 0.9)
     colour = (1 - greyer) * colour + greyer * colour.mean()
-    red, green, blue = np.clip(colour * random.uniform(0.5, 1.3) * random.uniform(0.92, 1.08, 3), 0, 1)
+    red, green, blue = np.clip(colour * rng.uniform(0.5, 1.3) * rng.uniform(0.92, 1.08, 3), 0, 1)
     return red, green, blue
 
 

@@ -1,6 +1,6 @@
 """The parts that all sceneries share: sky, haze, and the car's own bonnet."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from simulator.scenery import textures
 from simulator.scenery.body import body
 from simulator.scenery.looks import Look
 from simulator.scenery.shade import Shade
-from simulator.scenery.shapes import Colour, Light, Mesh, grid, illuminate
+from simulator.scenery.shapes import Colour, Light, Mesh, illuminate, sheet
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,7 @@ def dome(texture: np.ndarray, radius: float = 900.0) -> Mesh:
     flat = np.cos(elevation)
     points = radius * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
     height = np.clip(elevation / np.radians(40), 0.01, 0.99)
-    uv = np.stack([azimuth, height], axis=-1).reshape(-1, 2)
-    return Mesh(points.reshape(-1, 3), np.ones((azimuth.size, 3)), uv, grid(*azimuth.shape), texture)
+    return sheet(points, (1, 1, 1), np.stack([azimuth, height], axis=-1), texture)
 
 
 def bonnet(colour: Colour, light: Light) -> Mesh:
@@ -82,11 +81,5 @@ def bonnet(colour: Colour, light: Light) -> Mesh:
     colours = np.broadcast_to(colours, points.shape).copy()
     lamps = np.abs(np.abs(x + 0.03) - 0.50) < 0.035
     colours[2:4, lamps] = 0.85
-    mesh = Mesh(
-        points.reshape(-1, 3),
-        colours.reshape(-1, 3),
-        np.zeros((points[..., 0].size, 2)),
-        grid(*y.shape)[:, ::-1],
-        textures.plain(),
-    )
-    return illuminate(mesh, light, face_up=True)
+    mesh = sheet(points, colours, (0, 0), textures.plain())
+    return illuminate(replace(mesh, faces=mesh.faces[:, ::-1]), light, face_up=True)

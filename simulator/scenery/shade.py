@@ -101,9 +101,8 @@ def car_shadow(darkness: float) -> Mesh:
     x, y = np.array([-1, 1, 1, -1]) * CAR_SHADOW[0] / 2, np.array([-1, -1, 1, 1]) * CAR_SHADOW[1] / 2
     texture = np.zeros((64, 32, 4), np.uint8)
     texture[6:-6, 6:-6, 3] = round(255 * darkness)
-    uv, faces = quads(1)
-    points = np.c_[x, y, np.full(4, CAR_SHADOW_HEIGHT)]
-    return Mesh(points, np.ones((4, 3)), uv, faces, cv2.GaussianBlur(texture, (0, 0), 2))
+    corners = np.c_[x, y, np.full(4, CAR_SHADOW_HEIGHT)]
+    return quads(corners[None], (1, 1, 1), cv2.GaussianBlur(texture, (0, 0), 2))
 
 
 class Shade:

@@ -84,14 +84,29 @@ def ground_grid(track: Track, margin: float, spacing: float) -> np.ndarray:
     return np.stack(np.meshgrid(xs, ys), axis=-1)
 
 
-def quads(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return texture coordinates and faces of `count` separate quadrangles of four points each.
+def sheet(
+    points: np.ndarray, colours: ArrayLike, uv: ArrayLike, texture: np.ndarray, road: np.ndarray | None = None
+) -> Mesh:
+    """Return a mesh of points (rows, columns, 3); colours, uv and road: as in Mesh, broadcast to rows and columns."""
+    rows, columns = points.shape[:2]
 
-    uv: float (4 * count, 2), from the bottom left corner counter-clockwise; faces: int (2 * count, 3).
+    def column(values: ArrayLike, size: int) -> np.ndarray:
+        return np.broadcast_to(np.asarray(values, float), (rows, columns, size)).reshape(-1, size).copy()
+
+    along = None if road is None else column(road, 2)
+    return Mesh(points.reshape(-1, 3), column(colours, 3), column(uv, 2), grid(rows, columns), texture, road=along)
+
+
+def quads(corners: np.ndarray, colours: ArrayLike, texture: np.ndarray) -> Mesh:
+    """Return a mesh of separate quadrangles (n, 4, 3), each from the texture's bottom left corner counter-clockwise.
+
+    colours: (3,), or (n, 1, 3).
     """
+    count = len(corners)
     uv = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), (count, 1))
     faces = np.arange(count)[:, None, None] * 4 + np.array([[0, 1, 2], [0, 2, 3]])
-    return uv, faces.reshape(-1, 3)
+    colours = np.broadcast_to(np.asarray(colours, float), corners.shape).reshape(-1, 3).copy()
+    return Mesh(corners.reshape(-1, 3), colours, uv, faces.reshape(-1, 3), texture)
 
 
 def normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -130,17 +145,15 @@ def ribbon(track: Track, s: ArrayLike, offsets: ArrayLike, heights: ArrayLike, m
     points[:, :, :2] = track.points[index, None, :2] + track.rightward[index, None] * offsets[None, :, None]
     points[:, :, 2] = track.points[index, None, 2] + np.broadcast_to(heights, (n, k))
     across = offsets / material.metres if material.across is None else np.asarray(material.across, float)
-    uv = np.stack(np.broadcast_arrays(across[None, :], (s / material.metres)[:, None]), axis=-1)
-    colours = np.broadcast_to(np.asarray(material.colour, float), (n, k, 3))
-    road = np.stack(np.broadcast_arrays(s[:, None], offsets[None, :]), axis=-1)
-    return Mesh(
-        points.reshape(-1, 3),
-        colours.reshape(-1, 3).copy(),
-        uv.reshape(-1, 2),
-        grid(n, k),
-        material.texture,
-        road=road.reshape(-1, 2),
-    )
+    uv = np.stack(np.broadcast_arrays(across, (s / material.metres)[:, None]), axis=-1)
+    road = np.stack(np.broadcast_arrays(s[:, None], offsets), axis=-1)
+    return sheet(points, material.colour, uv, material.texture, road)
+
+
+def surface(track: Track, s: np.ndarray, half_width: float, material: Material) -> Mesh:
+    """Return the road's surface: a ribbon on both sides of the centre line, with its texture once across it."""
+    offsets = np.linspace(-half_width, half_width, 7)
+    return ribbon(track, s, offsets, 0.0, replace(material, across=0.5 + offsets / (2 * half_width)))
 
 
 def roadside(track: Track, s: ArrayLike, side: int, offsets: ArrayLike, heights: ArrayLike, material: Material) -> Mesh:
@@ -152,58 +165,57 @@ def roadside(track: Track, s: ArrayLike, side: int, offsets: ArrayLike, heights:
     return ribbon(track, s, offsets, heights, replace(material, across=across))
 
 
-def whole_lap(track: Track, spacing: float = 1.0) -> np.ndarray:
-    """Return distances about `spacing` metres apart round the track, which begin and end at its first point."""
-    return np.linspace(0, track.length, round(track.length / spacing) + 1)
+def wall(track: Track, s: ArrayLike, side: int, outline: ArrayLike, material: Material) -> list[Mesh]:
+    """Return the faces of a wall on one side of the road; outline: (n, 2), offset and height of its edges, outwards."""
+    corners = np.array(outline, float)
+    return [
+        roadside(track, s, side, offsets, heights, material)
+        for offsets, heights in np.stack([corners[:-1], corners[1:]], axis=-1)
+    ]
 
 
 def distances(start: float, end: float, spacing: float = 1.0) -> np.ndarray:
-    """Return distances about `spacing` metres apart along the track, from start to end."""
+    """Return distances s about `spacing` metres apart, from start to end, both included."""
     return np.linspace(start, end, max(2, round((end - start) / spacing) + 1))
 
 
 def plants(
-    places: np.ndarray,
+    feet: np.ndarray,
     heights: np.ndarray,
     widths: np.ndarray,
     colours: np.ndarray,
     texture: np.ndarray,
-    random: np.random.Generator,
+    rng: np.random.Generator,
 ) -> Mesh:
-    """Return two crossed upright images of a plant at each place.
+    """Return two crossed upright images of a plant at each foot.
 
-    places: (n, 3), m, the point on the ground; heights, widths: (n,), m; colours: (n, 3).
+    feet: (n, 3), m, on the ground; heights, widths: (n,), m; colours: (n, 3).
     """
-    turn = random.uniform(0, np.pi, len(places))[:, None] + np.array([0, np.pi / 2])
+    turn = rng.uniform(0, np.pi, len(feet))[:, None] + np.array([0, np.pi / 2])
     sideways = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)  # (n, 2, 3)
     sideways = sideways * (widths / 2)[:, None, None]
-    foot, up = places[:, None], np.zeros((len(places), 1, 3))
+    foot, up = feet[:, None], np.zeros((len(feet), 1, 3))
     up[:, 0, 2] = heights
     corners = np.stack([foot - sideways, foot + sideways, foot + sideways + up, foot - sideways + up], axis=2)
-    uv, faces = quads(2 * len(places))
-    return Mesh(corners.reshape(-1, 3), np.repeat(colours, 8, axis=0), uv, faces, texture)
+    return quads(corners.reshape(-1, 4, 3), np.repeat(colours, 2, axis=0)[:, None], texture)
 
 
 def boulder(
     centre: tuple[float, float, float],
     half_axes: tuple[float, float, float],
-    random: np.random.Generator,
+    rng: np.random.Generator,
     colour: Colour,
     texture: np.ndarray,
 ) -> Mesh:
     """Return an uneven ellipsoid; centre and half axes in metres."""
-    rows = 9
-    polar, turn = np.meshgrid(np.linspace(0, np.pi, rows), np.linspace(0, 2 * np.pi, 2 * rows), indexing="ij")
+    polar, turn = np.meshgrid(np.linspace(0, np.pi, 9), np.linspace(0, 2 * np.pi, 18), indexing="ij")
     waves = sum(
-        random.normal() * np.cos(random.integers(1, 4) * turn + random.uniform(0, 6)) * np.sin(polar) ** 2
-        for _ in range(5)
+        rng.normal() * np.cos(rng.integers(1, 4) * turn + rng.uniform(0, 6)) * np.sin(polar) ** 2 for _ in range(5)
     )
     radius = 1 + 0.15 * waves / 2
     ball = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=-1)
-    points = (ball * radius[..., None] * np.array(half_axes) + np.array(centre)).reshape(-1, 3)
-    uv = np.column_stack([turn.ravel() / np.pi * 2, -polar.ravel() / np.pi])
-    faces = grid(*polar.shape)
-    return Mesh(points, np.tile(np.array(colour, float), (len(points), 1)), uv, faces, texture)
+    points = ball * radius[..., None] * np.array(half_axes) + np.array(centre)
+    return sheet(points, colour, np.stack([turn / np.pi * 2, -polar / np.pi], axis=-1), texture)
 
 
 def box(
@@ -218,18 +230,11 @@ def box(
     foot: centre of its base, m; size: length along `heading` (radians), width and height, m.
     """
     corner = np.array([[x, y, z] for z in (0, 1) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))])
-    sides = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7))
-    points = corner[np.array(sides).ravel()] * size
+    sides = np.array([(0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7)])
+    points = corner[sides.ravel()] * size
     cos, sin = np.cos(heading), np.sin(heading)
     points[:, :2] = points[:, :2] @ np.array([[cos, sin], [-sin, cos]])
-    uv, faces = quads(5)
-    return Mesh(
-        points + np.array(foot),
-        np.tile(np.array(colour, float), (20, 1)),
-        uv,
-        faces,
-        texture,
-    )
+    return quads((points + np.array(foot)).reshape(-1, 4, 3), colour, texture)
 
 
 def merge(meshes: list[Mesh]) -> Mesh:
