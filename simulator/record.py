@@ -4,11 +4,13 @@ import functools
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import ExitStack
 from datetime import timedelta
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,17 @@ from simulator.run import Run
 from simulator.world import Scene
 
 MAX_RENDERERS = 3  # processes; each uses one core and 50 MB
+
+
+def _renderers_context() -> BaseContext:
+    """Return how rendering processes are started: on Linux as copies of one that has only imported this module.
+
+    A copy of this process could wait for ever for a lock that one of its threads held at that moment, as torch's and
+    OpenCV's do.
+    """
+    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else None)
+    context.set_forkserver_preload([__name__])
+    return context
 
 
 def _start_renderer() -> None:
@@ -99,7 +112,7 @@ def record(
     with ExitStack() as stack:
         with program.interrupt_deferred():
             recording = stack.enter_context(RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)))
-            pool = stack.enter_context(ProcessPoolExecutor(renderers, initializer=_start_renderer))
+            pool = stack.enter_context(ProcessPoolExecutor(renderers, _renderers_context(), _start_renderer))
             for _ in range(renderers):  # each starts a process
                 pool.submit(_prepare, track.name, look)
         bar = stack.enter_context(tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None))

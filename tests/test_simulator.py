@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import functools
 import hashlib
 import math
 import multiprocessing
@@ -234,8 +233,7 @@ def test_recordings_are_as_the_simulators_and_the_same_in_two_processes(tmp_path
 def test_recordings_are_the_same_where_processes_cannot_fork_or_there_is_only_one(tmp_path, monkeypatch):
     """macOS and Windows start every process with a fresh interpreter. The look has shadows."""
     record.record(tmp_path / "default", Track("jungle"), laps=0.003, look=10_000)
-    spawn = functools.partial(record.ProcessPoolExecutor, mp_context=multiprocessing.get_context("spawn"))
-    monkeypatch.setattr(record, "ProcessPoolExecutor", spawn)
+    monkeypatch.setattr(record, "_renderers_context", lambda: multiprocessing.get_context("spawn"))
     monkeypatch.setattr(record, "MAX_RENDERERS", 1)
     record.record(tmp_path / "spawn", Track("jungle"), laps=0.003, look=10_000)
     assert len(list((tmp_path / "spawn" / "IMG").iterdir())) > 20
@@ -248,44 +246,51 @@ def test_recording_does_not_load_pytorch():
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
-@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="without /proc processes cannot be listed")
+def descendants(process: int) -> list[int]:
+    """The processes that a process has started, and those that they have."""
+    children = [
+        int(child) for file in Path(f"/proc/{process}/task").glob("*/children") for child in file.read_text().split()
+    ]
+    return [*children, *(each for child in children for each in descendants(child))]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="without /proc processes cannot be listed")
 def test_the_rendering_processes_of_a_killed_recording_end(tmp_path):
     process = subprocess.Popen([sys.executable, "-m", "simulator", "record", str(tmp_path)], stderr=subprocess.DEVNULL)
     log = tmp_path / "driving_log.csv"
     while not log.exists() or log.stat().st_size < 3000:
         assert process.poll() is None
         time.sleep(0.01)
+    started = descendants(process.pid)
+    assert len(started) > 1
     process.kill()
     process.wait()
     ends = time.monotonic() + 60
-    while any(str(tmp_path).encode() in line for line in command_lines()):
+    while any(Path(f"/proc/{each}").exists() for each in started):
         assert time.monotonic() < ends
         time.sleep(0.1)
 
 
 INTERRUPTED = """
 import os, runpy, signal, sys
-os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))
+from multiprocessing.process import BaseProcess
+start = BaseProcess.start
+def interrupted(process):
+    start(process)
+    os.kill(os.getpid(), signal.SIGINT)
+BaseProcess.start = interrupted
 sys.argv[1:] = ["record", sys.argv[1], "--laps", "0.01"]
 runpy.run_module("simulator", run_name="__main__", alter_sys=True)
 """
 
 
-@pytest.mark.skipif(not hasattr(os, "register_at_fork"), reason="this system does not fork")
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
 def test_ctrl_c_while_rendering_processes_are_started_leaves_no_recording(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", INTERRUPTED, str(tmp_path / "x")], cwd=ROOT, capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (130, "simulator: stopped; the files that it has written are complete\n")
     assert not any(tmp_path.iterdir())
-
-
-def command_lines():
-    for file in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            yield file.read_bytes()
-        except OSError:  # a process that has just ended
-            continue
 
 
 def test_a_frame_depends_on_the_pose_alone():
