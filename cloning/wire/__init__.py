@@ -1,1 +1,1 @@
-"""Wire: both ends of the socket between server and simulator."""
+"""Wire: the simulator's end of the socket between server and simulator."""
