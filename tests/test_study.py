@@ -109,10 +109,10 @@ def test_laps_and_recovery_in_the_simulator(monkeypatch, steering, departures):
     monkeypatch.setattr(
         simulator, "steering", lambda run: follow(run) if steering is None else steering
     )  # without rendering
-    found = simulator.lap(0.05)
-    assert (found["departures"] > 0) == departures
-    assert (found["offset_max"] < 1) == (not departures)
-    assert found["metres"] >= 0.05 * simulator.track.length * (not departures)
+    run, _ = simulator.lap(0.05)
+    assert (len(run.departures) > 0) == departures
+    assert (np.abs(run.trajectory.offset).max() < 1) == (not departures)
+    assert run.distance >= 0.05 * simulator.track.length * (not departures)
     assert simulator.recovery(6) == (0 if departures else 1)
 
 

@@ -17,11 +17,10 @@ import argparse
 import csv
 import io
 import json
+import multiprocessing
 import shutil
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+import signal
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from cloning.base import program
@@ -36,11 +35,10 @@ from cloning.base.outputs import write_json, write_output
 from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record
+from tools.command import command_line, run_tool
 from tools.study.figures import Row, correlation_picture, recovery_picture, report, row
-from tools.study.network import RESULT
+from tools.study.measures import measure
 from tools.study.networks import EPOCH_IMAGES, RENDERED, TRACKS, Variant, plan
-
-ROOT = Path(__file__).resolve().parent.parent.parent
 
 
 def prepare(options: argparse.Namespace) -> None:
@@ -65,21 +63,6 @@ def prepare(options: argparse.Namespace) -> None:
         unfinished.rename(rendered)
 
 
-def result(variant: Variant, options: argparse.Namespace) -> dict[str, float]:
-    """Return a network's measures; train and measure it first if that is still to be done. Raises UserError."""
-    folder = options.folder / variant.name
-    file = folder / RESULT
-    if not file.exists():
-        command = [variant.name, options.recordings, folder, options.images, options.laps, options.starts]
-        done = subprocess.run(
-            [sys.executable, "-m", "tools.study.network", *map(str, command)], cwd=ROOT, capture_output=True, text=True
-        )
-        if done.returncode:
-            raise UserError(f"{folder}: status {done.returncode}: {done.stderr.strip()[-500:]}")
-        print(f"{variant.name} is measured", flush=True)
-    return json.loads(file.read_text(encoding="utf-8"))
-
-
 def write_study(rows: list[Row], folder: Path) -> None:
     """Write the table, the report and the pictures of the networks measured so far. Raises OutputError."""
     text = io.StringIO(newline="")
@@ -92,40 +75,45 @@ def write_study(rows: list[Row], folder: Path) -> None:
         write_output(folder / f"study_{picture.__name__.removesuffix('_picture')}.png", picture(rows))
 
 
+def measure_all(variants: list[Variant], options: argparse.Namespace) -> list[dict[str, float]]:
+    """Train and measure the networks that are not measured yet, and return all measures. Raises UserError, OSError."""
+    files = {variant: options.folder / variant.name / "result.json" for variant in variants}
+    context = multiprocessing.get_context("spawn")
+    default = signal.signal, (signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a process at once, or saves its training
+    with ProcessPoolExecutor(options.jobs, context, *default, max_tasks_per_child=1) as pool:
+        begun = [
+            pool.submit(measure, variant, options.recordings, file, options.images, options.laps, options.starts)
+            for variant, file in files.items()
+            if not file.exists()
+        ]
+        try:
+            for network in begun:
+                network.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [json.loads(file.read_text(encoding="utf-8")) for file in files.values()]
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Train and measure all networks that are not measured yet, and write the study; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="study", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("recordings", type=Path, help="the folder of the real recordings")
-    parser.add_argument("--networks", type=number(int, 1), help="measure only the first ones of the plan")
-    parser.add_argument("--images", type=number(int, 1), default=EPOCH_IMAGES, help="in an epoch (default %(default)s)")
-    parser.add_argument(
-        "--laps", type=number(float, 0.01, 100), default=1, help="in each direction (default %(default)s)"
-    )
-    parser.add_argument("--starts", type=number(int, 1), default=24, help="of the recovery (default %(default)s)")
-    parser.add_argument(
-        "--jobs", type=number(int, 1), default=threads(), help="networks at a time (default: one for each core)"
-    )
-    parser.add_argument("--folder", type=Path, default=Path("study"), help="where to write (default %(default)s)")
+    """Measure all networks and write the study; return the exit status. Raises UserError, OSError."""
+    parser = command_line("study", __doc__)
+    add = parser.add_argument
+    add("recordings", type=Path, help="the folder of the real recordings")
+    add("--networks", type=number(int, 1), help="measure only the first ones of the plan")
+    add("--images", type=number(int, 1), default=EPOCH_IMAGES, help="in an epoch (default %(default)s)")
+    add("--laps", type=number(float, 0.01, 100), default=1, help="in each direction (default %(default)s)")
+    add("--starts", type=number(int, 1), default=24, help="of the recovery (default %(default)s)")
+    add("--jobs", type=number(int, 1), default=threads(), help="networks at a time (default: one for each core)")
+    add("--folder", type=Path, default=Path("study"), help="where to write (default %(default)s)")
     options = parser.parse_args(argv)
-    options.folder = options.folder.resolve()  # the networks' processes run in another folder
-    options.recordings = options.recordings.resolve()
     variants = plan()[: options.networks]
-    try:
-        prepare(options)
-        with ThreadPoolExecutor(options.jobs) as pool:
-            try:
-                results = list(pool.map(partial(result, options=options), variants))
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-        write_study([row(variant, found) for variant, found in zip(variants, results, strict=True)], options.folder)
-    except (UserError, OSError) as error:
-        return program.failed("study", error)
+    prepare(options)
+    found = measure_all(variants, options)
+    write_study([row(*pair) for pair in zip(variants, found, strict=True)], options.folder)
     print(f"{options.folder / 'study.md'}, study.csv and pictures")
     return program.DONE
 
 
 if __name__ == "__main__":
-    program.run(main)
+    run_tool("study", main)

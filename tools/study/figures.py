@@ -1,15 +1,15 @@
 """What the study found: rank correlations of each measure with driving, tables and pictures."""
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
 from cloning.road.motion import MPH
+from tools import command
 from tools.study.measures import RECOVERY_SECONDS, RECOVERY_SPEED
 from tools.study.networks import RECOVERING, TRACKS, Variant
 
@@ -116,26 +116,24 @@ def report(rows: Sequence[Row]) -> str:
     for name, words in DRIVING.items():
         found = [correlations(part, name) for part in compared.values()]
         lines += ["", f"## Rank correlation with laps in the stand-in simulator: {words}", ""]
-        heads = [f"{title}, {len(part)} networks" for title, part in compared.items()]
-        lines += [f"| {' | '.join(['measure', *heads])} |", "|---" * (1 + len(heads)) + "|"]
+        lines.append(command.head("measure", *(f"{title}, {len(part)} networks" for title, part in compared.items())))
         for measure in MEASURES:
             cells = ["{:.2f} ({:.2f} to {:.2f})".format(*each[measure.name]) for each in found]
-            lines.append(f"| {' | '.join([measure.title, *cells])} |")
+            lines.append(command.row(measure.title, *cells))
         lines += ["", "Spearman's, signed so that 1 is perfect foresight; in brackets, 95 % of a bootstrap's draws."]
     seconds, metres = RECOVERY_SECONDS, RECOVERY_SPEED * MPH
     lines += ["", f"## Back in the lane within {seconds:g} s, at {metres:.0f} m/s", ""]
-    lines += ["| trained with | of its starts, by seed | mean |", "|---|---|---|"]
+    lines.append(command.head("trained with", "of its starts, by seed", "mean"))
     for method, shares in recovery(rows).items():
         by_seed = ", ".join(f"{100 * share:.0f} %" for share in shares)
-        lines.append(f"| {method} | {by_seed} | {100 * np.mean(shares):.0f} % |")
-    lines += ["", "## All networks", "", "| network | mse | autonomy at 1 m | mean distance | departures per km |"]
-    lines.append("|---|---|---|---|---|")
+        lines.append(command.row(method, by_seed, f"{100 * np.mean(shares):.0f} %"))
+    columns = {"mse": "{:.4f}", "autonomy_1": "{:.0%}", "offset_mean": "{:.2f} m", "departures_per_km": "{:.1f}"}
+    lines += ["", "## All networks", ""]
+    lines.append(command.head("network", "mse", "autonomy at 1 m", "mean distance", "departures per km"))
     for each in rows:
         network = f"{each['track']}, {each['method']}, seed {each['seed']}"
-        figures = (
-            f"{float(each['mse']):.4f} | {100 * float(each['autonomy_1']):.0f} % | {float(each['offset_mean']):.2f} m"
-        )
-        lines.append(f"| {network} | {figures} | {float(each['departures_per_km']):.1f} |")
+        cells = [words.format(float(each[name])).replace("%", " %") for name, words in columns.items()]
+        lines.append(command.row(network, *cells))
     return "\n".join(lines) + "\n"
 
 
@@ -146,11 +144,8 @@ def recovery(rows: Sequence[Row]) -> dict[str, list[float]]:
     return {method: shares for method, shares in found.items() if shares}
 
 
-def png(draw: Callable[[Figure], None], width: float, height: float) -> bytes:
-    """Return a picture as PNG; width, height: inches."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    draw(figure)
+def png(figure: Figure) -> bytes:
+    """Return a picture as PNG."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DPI)
     return file.getvalue()
@@ -158,40 +153,31 @@ def png(draw: Callable[[Figure], None], width: float, height: float) -> bytes:
 
 def correlation_picture(rows: Sequence[Row]) -> bytes:
     """Return bars of each measure's correlation with driving, in each group, with their intervals."""
-    compared = groups(rows)
-
-    def draw(figure: Figure) -> None:
-        for axes, (title, part) in zip(figure.subplots(1, len(compared), sharey=True), compared.items(), strict=True):
-            found = correlations(part, "driving") if len(part) > 2 else {}
-            for at, measure in enumerate(MEASURES):
-                value, low, high = found.get(measure.name, (np.nan,) * 3)
-                axes.barh(at, value, color=COLOURS[measure.group], alpha=0.8, height=0.7)
-                axes.plot([low, high], [at, at], color="black", linewidth=1.2)
-            axes.axvline(0, color="black", linewidth=0.8)
-            axes.set(
-                yticks=range(len(MEASURES)),
-                yticklabels=[measure.title for measure in MEASURES],
-                xlim=(-1, 1),
-                title=f"{title}\n{len(part)} networks",
-            )
-            axes.grid(axis="x", alpha=0.3)
-        axes.invert_yaxis()
-        figure.supxlabel("rank correlation with driving: 1 is perfect foresight")
-
-    return png(draw, 12, 4.6)
+    compared, figure = groups(rows), Figure((12, 4.6), layout="constrained")
+    every_axes = figure.subplots(1, len(compared), sharey=True)
+    for axes, (title, part) in zip(every_axes, compared.items(), strict=True):
+        found = correlations(part, "driving") if len(part) > 2 else {}
+        for at, measure in enumerate(MEASURES):
+            value, low, high = found.get(measure.name, (np.nan,) * 3)
+            axes.barh(at, value, color=COLOURS[measure.group], alpha=0.8, height=0.7)
+            axes.plot([low, high], [at, at], color="black", linewidth=1.2)
+        axes.axvline(0, color="black", linewidth=0.8)
+        axes.set(xlim=(-1, 1), title=f"{title}\n{len(part)} networks")
+        axes.grid(axis="x", alpha=0.3)
+    every_axes[0].set_yticks(range(len(MEASURES)), [measure.title for measure in MEASURES])
+    every_axes[0].invert_yaxis()
+    figure.supxlabel("rank correlation with driving: 1 is perfect foresight")
+    return png(figure)
 
 
 def recovery_picture(rows: Sequence[Row]) -> bytes:
     """Return the share of starts from which the networks of each method come back: bars for means, dots for seeds."""
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for at, shares in enumerate(recovery(rows).values()):
-            axes.bar(at, 100 * np.mean(shares), color="tab:blue", alpha=0.5)
-            axes.plot([at] * len(shares), 100 * np.array(shares), "o", color="black", markersize=4)
-        methods = list(recovery(rows))
-        axes.set(xticks=range(len(methods)), xticklabels=methods, ylim=(0, 105), ylabel="% of starts")
-        axes.set_title(f"back in the lane within {RECOVERY_SECONDS:g} s")
-        axes.grid(axis="y", alpha=0.3)
-
-    return png(draw, 7, 4)
+    figure, found = Figure((7, 4), layout="constrained"), recovery(rows)
+    axes = figure.subplots()
+    for at, shares in enumerate(found.values()):
+        axes.bar(at, 100 * np.mean(shares), color="tab:blue", alpha=0.5)
+        axes.plot([at] * len(shares), 100 * np.array(shares), "o", color="black", markersize=4)
+    axes.set(xticks=range(len(found)), xticklabels=list(found), ylim=(0, 105), ylabel="% of starts")
+    axes.set_title(f"back in the lane within {RECOVERY_SECONDS:g} s")
+    axes.grid(axis="y", alpha=0.3)
+    return png(figure)

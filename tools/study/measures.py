@@ -1,11 +1,20 @@
-"""What the study measures of a network: its errors on a recording, its replays, its laps, and how it recovers."""
+"""Train a network of the study and measure it: its errors on a recording, its replays, its laps, its recovery."""
 
+import contextlib
+import csv
+import io
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
+import model
+from cloning.base.errors import UserError
+from cloning.base.outputs import write_json
 from cloning.network.network import Network, steer
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import read_frame
@@ -14,7 +23,7 @@ from cloning.recordings.writer import SampleClock
 from cloning.replay.command import drive_at_limits
 from cloning.replay.drift import drifts, held_out
 from cloning.replay.model_driver import ModelDriver
-from cloning.replay.replay import ReferenceLine
+from cloning.replay.replay import load_recording, reference_lines
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH
 from cloning.road.track import Track
@@ -22,6 +31,7 @@ from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.run import Run
 from simulator.world import Scene
+from tools.study.networks import RENDERED, TRACKS, Variant
 
 LARGE_ERROR = 0.2  # of steering: the "thresholded relative error" of Codevilla et al. (1809.04843) has another unit
 TIME_OUT = 1.5  # times the time of a lap at the set speed; a car that leaves the road over and over gets no further
@@ -31,24 +41,48 @@ RECOVERED = 0.5, 5.0  # m and degrees: nearer than both is back in the lane
 FRAMES_PER_BATCH = 32
 
 
-def predict(network: Network, recording: Recording) -> np.ndarray:
-    """Return a network's steering on a recording's centre frames: float32 (n,). Raises RecordingError."""
-    paths = [recording.path(row) for row in range(len(recording))]
-    predicted = []
-    for start in range(0, len(paths), FRAMES_PER_BATCH):
-        frames = np.stack([read_frame(path) for path in paths[start : start + FRAMES_PER_BATCH]])
-        with torch.inference_mode():
-            predicted.append(network(torch.from_numpy(frames)).numpy())
-    return np.concatenate(predicted)
+def measure(variant: Variant, recordings: Path, file: Path, epoch_images: int, share: float, starts: int) -> None:
+    """Train a network, continuing if it was begun, and write its measures as JSON.
+
+    recordings: the folder of the real recordings; file: in the network's own folder, beside that of the rendered
+    recording; epoch_images: number of images in an epoch; share: of a lap to drive; starts: number of those from which
+    it is to recover. Call it in a process of its own, which it sets up for training. Raises UserError, OSError.
+    """
+    folder, track = file.parent, TRACKS[variant.track]
+    folder.mkdir(parents=True, exist_ok=True)
+    sources = [(folder.parent if name == RENDERED else recordings) / name for name in variant.recordings]
+    recipe = replace(variant.recipe, samples_per_epoch=epoch_images)
+    errors = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
+        status = model.train(recipe, sources, folder / "model.pt", variant.seed, device="cpu", resume=True)
+    if status:
+        raise UserError(f"{folder}: status {status}: {errors.getvalue().strip()[-500:]}")
+    torch.set_num_threads(1)
+    driver, held_out_recording = ModelDriver(str(folder / "model.pt")), load_recording(recordings / track.held_out)
+    with open(folder / "training_log.csv", encoding="utf-8", newline="") as log:
+        losses = [float(epoch["val_loss"]) for epoch in csv.DictReader(log)]
+    found = {"own_val_loss": losses[-1], "best_val_loss": min(losses)}
+    found |= offline(driver.network, held_out_recording) | replayed(held_out_recording, driver)
+    simulators = [Simulator(driver.network, variant.track, direction, track.speed) for direction in track.directions]
+    found |= laps(simulators, share)
+    if variant.recovers:
+        found["recovered"] = simulators[0].recovery(starts)
+    write_json(file, {name: round(value, 6) for name, value in found.items()})
+    print(f"{variant.name} is measured", flush=True)
 
 
 def offline(network: Network, recording: Recording) -> dict[str, float]:
     """Return a network's errors at the recorded poses, with the human driver's steering as label.
 
     whiteness: root mean square of the steering's change per second (University of Tartu's measure), here of the
-    steering on the recorded frames.
+    steering on the recorded frames. Raises RecordingError.
     """
-    guess = predict(network, recording).clip(-1, 1)
+    paths, parts = [recording.path(row) for row in range(len(recording))], []
+    for start in range(0, len(paths), FRAMES_PER_BATCH):
+        frames = np.stack([read_frame(path) for path in paths[start : start + FRAMES_PER_BATCH]])
+        with torch.inference_mode():
+            parts.append(network(torch.from_numpy(frames)).numpy())
+    guess = np.concatenate(parts).clip(-1, 1)
     error = guess - recording.steering
     seconds = np.diff(recording.time)
     change = np.diff(guess)[seconds > 0] / seconds[seconds > 0]
@@ -61,10 +95,10 @@ def offline(network: Network, recording: Recording) -> dict[str, float]:
     }
 
 
-def replayed(recording: Recording, lines: list[ReferenceLine], driver: ModelDriver) -> dict[str, float]:
+def replayed(recording: Recording, driver: ModelDriver) -> dict[str, float]:
     """Return what replays of a recording measure: NVIDIA's autonomy at both limits, distances, and drift."""
     found: dict[str, float] = {}
-    for done in drive_at_limits(recording, lines, driver, LIMITS, parallel=True):
+    for done in drive_at_limits(recording, reference_lines(recording), driver, LIMITS, parallel=True):
         limit = done.limit
         metres = float(np.sum(np.abs(recording.speed[done.row]) * MPH * done.seconds))
         found[f"autonomy_{limit:g}"] = done.autonomy()
@@ -95,24 +129,20 @@ class Simulator:
         """Return the network's steering for what the car sees now."""
         return float(steer(self.network, self.cameras.frames(run.car.node.get_transform())[0]))
 
-    def lap(self, laps: float) -> dict[str, float]:
-        """Drive; after a departure the car is set back and goes on, until the laps' end or TIME_OUT."""
+    def lap(self, laps: float) -> tuple[Run, list[float]]:
+        """Drive; after a departure the car is set back and goes on, until the laps' end or TIME_OUT.
+
+        Returns the run and the steering, one for each frame.
+        """
         run, clock = self.start(), SampleClock(1 / SAMPLE_RATE)
         metres = laps * self.track.length
-        steering, commands = self.steering(run), []
+        steering, commands = self.steering(run), list[float]()
         while run.travelled < metres and run.time < TIME_OUT * metres / (self.speed * MPH):
             run.step(steering, 1.0)
             if clock.due(run.time):
                 steering = self.steering(run)
                 commands.append(steering)
-        offset = np.abs(run.trajectory.offset)
-        return {
-            "metres": run.distance,
-            "departures": len(run.departures),
-            "offset_mean": float(offset.mean()),
-            "offset_max": float(offset.max()),
-            "lap_whiteness": float(np.sqrt(np.mean((np.diff(commands) * SAMPLE_RATE) ** 2))),
-        }
+        return run, commands
 
     def recovery(self, starts: int) -> float:
         """Return the share of starts next to the lane's centre, and turned, from which the car comes back in time.
@@ -123,9 +153,9 @@ class Simulator:
         sides = np.where(rng.random((starts, 2)) < 0.5, -1, 1)
         offsets = sides[:, 0] * rng.uniform(*RECOVERY_OFFSETS, starts)
         turns = sides[:, 1] * np.radians(rng.uniform(*RECOVERY_TURNS, starts))
-        places = (np.arange(starts) + rng.random(starts)) / starts * self.track.length
+        along = (np.arange(starts) + rng.random(starts)) / starts * self.track.length
         run = self.start()
-        return float(np.mean([self.comes_back(run, *start) for start in zip(places, offsets, turns, strict=True)]))
+        return float(np.mean([self.comes_back(run, *start) for start in zip(along, offsets, turns, strict=True)]))
 
     def comes_back(self, run: Run, s: float, offset: float, turn: float) -> bool:
         """Return whether the car is back in the lane in time, without leaving the road before.
@@ -146,15 +176,13 @@ class Simulator:
         return False
 
 
-def laps(simulators: list[Simulator], share: float) -> dict[str, float]:
-    """Return the measures of a network's laps, one in each simulator; share: of a lap, such as 1.
-
-    departures_per_km, offset_mean, offset_max: m, lap_whiteness: over all laps together.
-    """
-    driven = [simulator.lap(share) for simulator in simulators]
+def laps(simulators: Sequence[Simulator], share: float) -> dict[str, float]:
+    """Return the measures of a network's laps, one in each simulator, together; share: of a lap, such as 1."""
+    runs, commands = zip(*(simulator.lap(share) for simulator in simulators), strict=True)
+    offsets = [np.abs(run.trajectory.offset) for run in runs]
     return {
-        "departures_per_km": sum(lap["departures"] for lap in driven) / sum(lap["metres"] for lap in driven) * 1000,
-        "offset_mean": float(np.mean([lap["offset_mean"] for lap in driven])),
-        "offset_max": max(lap["offset_max"] for lap in driven),
-        "lap_whiteness": float(np.mean([lap["lap_whiteness"] for lap in driven])),
+        "departures_per_km": sum(len(run.departures) for run in runs) / sum(run.distance for run in runs) * 1000,
+        "offset_mean": float(np.mean([offset.mean() for offset in offsets])),  # m
+        "offset_max": float(max(offset.max() for offset in offsets)),
+        "lap_whiteness": float(np.mean([np.sqrt(np.mean((np.diff(lap) * SAMPLE_RATE) ** 2)) for lap in commands])),
     }

@@ -1,8 +1,7 @@
-"""The networks of the study: how they differ, and the training of one."""
+"""The networks of the study, and how they differ."""
 
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ EPOCH_IMAGES = 2528  # an eighth of the report's epoch
 RECIPE = replace(model.REPORT, batch_size=16, learning_rate=5e-4, epochs=8)
 ROBUST = replace(model.ROBUST, epochs=6)
 RENDERED = "rendered-lake"  # the recording of a lap in the stand-in simulator
-SEEDS = range(5)
 
 
 class Track(NamedTuple):
@@ -80,72 +78,38 @@ class CentreViews(CameraViews):
 
 
 UNLIT = replace(ROBUST, tinted=0.0, shaded=0.0)  # the light is changed by the report's augmentations alone
-RECOVERING = {
+RECOVERING = {  # by method; each has five seeds
     "centre camera": replace(RECIPE, views=CentreViews),
     "recipe": RECIPE,
     "shifts": replace(UNLIT, pose_yaw=0.0),
     "shifts, rotations": UNLIT,
     "robust": ROBUST,
 }
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The plan
+OTHERS = {  # by method; on each track
+    **{f"recipe, {n} epochs": replace(RECIPE, epochs=n) for n in (1, 2, 4, 20)},
+    **{f"robust, {n} epochs": replace(ROBUST, epochs=n) for n in (1, 2, 20)},
+    **{f"side correction {side:g}": replace(RECIPE, side_correction=side) for side in (0.0, 0.1, 0.3, 0.4)},
+    "no flip": replace(RECIPE, flip=0.0),
+    "no shadow": replace(RECIPE, shadow=0.0),
+    "no resampling": replace(RECIPE, keep_straight=1.0, turn=(2.0, 2.0)),  # no |steering| is above 1
+    "no throttle filter": replace(RECIPE, throttle_threshold=-1.0),
+}
 
 
 def plan() -> list[Variant]:
-    """Return all networks of the study, those first whose methods have five seeds."""
-    return [*recovering(), *others("jungle"), *others("lake")]
-
-
-def recovering() -> list[Variant]:
-    """Return the networks whose recovery is measured: five methods, from the centre camera alone to --robust."""
-    usual = (TRACKS["lake"].train,)
-    return [
-        Variant(method, recipe, "lake", usual, seed, recovers=True)
-        for seed in SEEDS
+    """Return all networks of the study, those first whose recovery is measured."""
+    both = {"recipe": RECIPE, "robust": ROBUST}
+    lake, jungle = ((TRACKS[track].train,) for track in ("lake", "jungle"))
+    found = [
+        Variant(method, recipe, "lake", lake, seed, recovers=True)
+        for seed in range(5)
         for method, recipe in RECOVERING.items()
     ]
-
-
-def others(track: str) -> list[Variant]:
-    """Return a track's other networks, one or three seeds each."""
-    usual = (TRACKS[track].train,)
-    other = (TRACKS["jungle" if track == "lake" else "lake"].train,)
-    found = []
-    if track == "jungle":  # the lake's are those of `recovering`
-        for seed in SEEDS[:3]:
-            found += [Variant("recipe", RECIPE, track, usual, seed), Variant("robust", ROBUST, track, usual, seed)]
-    recipes = {f"recipe, {n} epochs": replace(RECIPE, epochs=n) for n in (1, 2, 4, 20)}
-    recipes |= {f"robust, {n} epochs": replace(ROBUST, epochs=n) for n in (1, 2, 20)}
-    recipes |= {f"side correction {side:g}": replace(RECIPE, side_correction=side) for side in (0.0, 0.1, 0.3, 0.4)}
-    recipes |= {
-        "no flip": replace(RECIPE, flip=0.0),
-        "no shadow": replace(RECIPE, shadow=0.0),
-        "no resampling": replace(RECIPE, keep_straight=1.0, turn=(2.0, 2.0)),  # no |steering| is above 1
-        "no throttle filter": replace(RECIPE, throttle_threshold=-1.0),
-    }
-    found += [Variant(method, recipe, track, usual) for method, recipe in recipes.items()]
-    found += [
-        Variant("recipe, both tracks", RECIPE, track, usual + other),
-        Variant("robust, both tracks", ROBUST, track, usual + other),
-        Variant("recipe, other track", RECIPE, track, other),
-        Variant("robust, other track", ROBUST, track, other),
-    ]
-    if track == "lake":
-        found += [
-            Variant("recipe, rendered", RECIPE, track, (RENDERED,)),
-            Variant("recipe, real + rendered", RECIPE, track, (*usual, RENDERED)),
-        ]
+    found += [Variant(method, recipe, "jungle", jungle, seed) for seed in range(3) for method, recipe in both.items()]
+    for track, usual, other in (("jungle", jungle, lake), ("lake", lake, jungle)):
+        found += [Variant(method, recipe, track, usual) for method, recipe in OTHERS.items()]
+        for words, recordings in (("both tracks", usual + other), ("other track", other)):
+            found += [Variant(f"{method}, {words}", recipe, track, recordings) for method, recipe in both.items()]
+    for words, recordings in (("rendered", (RENDERED,)), ("real + rendered", (*lake, RENDERED))):
+        found.append(Variant(f"recipe, {words}", RECIPE, "lake", recordings))
     return found
-
-
-def train(variant: Variant, recordings: Path, folder: Path, epoch_images: int) -> int:
-    """Train a network into `folder`, continuing if it was begun there; return model.py's exit status.
-
-    recordings: the folder of the real recordings; the rendered one is beside `folder`.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    sources = [(folder.parent if name == RENDERED else recordings) / name for name in variant.recordings]
-    recipe = replace(variant.recipe, samples_per_epoch=epoch_images)
-    return model.train(recipe, sources, folder / "model.pt", variant.seed, device="cpu", resume=True)
