@@ -45,16 +45,15 @@ from cloning.recordings.frames import KEPT_FRAMES, FrameCache
 from cloning.recordings.log import CheckedRecording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import options, summary
-from cloning.training.batch import Batch, Choices
 from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, fingerprint, resumed
 from cloning.training.distributed import Ranks
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
 from cloning.training.muon import OPTIMIZERS
-from cloning.training.observations import CameraViews, Observations, centre_images
+from cloning.training.observations import CameraViews, Choices, Observations, centre_images
 from cloning.training.options import Command, Process, Run
 from cloning.training.pictures import batch_pictures, loss_picture
-from cloning.training.pieces import SquaredErrors, pieces, predict
+from cloning.training.pieces import Batch, SquaredErrors, pieces, predict
 from cloning.training.recipe import Augmentation, Recipe, Words
 from cloning.training.robust import robust
 from cloning.training.run_files import RunFiles
@@ -151,6 +150,7 @@ REPORT = Recipe(
     # Data preprocessing
     select=select_driven,
     throttle_threshold=0.25,
+    side_cameras=True,
     side_correction=0.2,
     resample=balance,
     straight=0.02,
@@ -221,7 +221,7 @@ class Generator:
         at = np.arange(number * n, (number + 1) * n)
         passes = at // len(self.observations)  # over all observations, each in another order
         parts = [self.order(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
-        chosen, camera = np.concatenate(parts), rng.integers(len(CAMERAS), size=n)
+        chosen, camera = np.concatenate(parts), rng.integers(len(CAMERAS), size=n) * recipe.side_cameras
         made = [rng.random(n) < share if share < 1 else np.ones(n, bool) for share in recipe.shares()]
         total_images = int(np.sum(made))
         slots = np.full((n, len(made)), -1)

@@ -76,7 +76,7 @@ def flipped_bit(path):
     path.write_bytes(data)
 
 
-def other_recipe(path):
+def other_preprocessing(path):
     saved = torch.load(path, weights_only=True)
     saved["recipe"]["crop"] = (50, 35)
     del saved["digest"]
@@ -89,7 +89,7 @@ def other_recipe(path):
         (lambda path: path.unlink(), "no such file"),
         (no_model, "damaged"),
         (flipped_bit, "damaged"),
-        (other_recipe, "recipe"),
+        (other_preprocessing, "its preprocessing is not that of this program's network"),
     ],
 )
 def test_an_unusable_file_is_named_before_anything_is_written(sample_recording, base, tmp_path, change, words):

@@ -18,8 +18,7 @@ from cloning.network.layer_table import layer_table
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.road.track import Track
-from cloning.training.batch import Batch
-from cloning.training.pieces import PIECE, SquaredErrors, converted, pieces, squared_errors
+from cloning.training.pieces import PIECE, Batch, SquaredErrors, converted, pieces, squared_errors
 from simulator.record import record
 
 REPORT = """

@@ -4,6 +4,7 @@ import csv
 import re
 import sys
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -15,10 +16,10 @@ from rendered import render_recording
 from test_generator import loaded, observations
 
 from cloning.replay.replay import load_recording
-from model import REPORT, ROBUST, balance
+from model import REPORT, ROBUST, Generator, balance
 from tools.study import figures
 from tools.study.measures import Simulator, offline
-from tools.study.networks import RECIPE, RECOVERING, TRACKS, CentreViews, plan
+from tools.study.networks import RECIPE, RECOVERING, TRACKS, plan
 
 
 def test_the_plan_has_many_networks_none_of_which_is_trained_on_what_is_held_out():
@@ -34,7 +35,7 @@ def test_every_recipe_differs_from_the_reports_or_the_robust_one_as_its_name_say
     common = {"report": {"batch_size", "learning_rate", "epochs"}, "robust": {"epochs"}}
     named = {"side correction": {"side_correction"}, "no flip": {"flip"}, "no shadow": {"shadow"}}
     named |= {"no resampling": {"keep_straight", "turn"}, "no throttle filter": {"throttle_threshold"}}
-    named |= {"centre camera": {"views"}, "shifts": {"tinted", "shaded", "pose_yaw"}}
+    named |= {"centre camera": {"side_cameras"}, "shifts": {"tinted", "shaded", "pose_yaw"}}
     named |= {"shifts, rotations": {"tinted", "shaded"}}
     for variant in plan():
         base = {"report": REPORT, "robust": ROBUST}[variant.recipe.name].saved()
@@ -52,9 +53,11 @@ def test_without_resampling_each_observation_counts_once():
 
 def test_the_centre_camera_alone(sample_recording):
     found = loaded(sample_recording)
-    views = CentreViews(found, np.arange(3), np.array([0, 1, 2]), RECIPE, np.random.default_rng(0))
-    assert views.labels[:, 0].tolist() == found.steering[:3].tolist()
-    assert np.array_equal(views.images(np.array([2]))[0][0], found.read_cropped(2, 0))
+    with ThreadPoolExecutor(1) as pool:
+        three, one = (Generator(found, recipe, 0, pool).sample(0) for recipe in (RECIPE, RECOVERING["centre camera"]))
+    assert np.bincount(three.camera, minlength=3).min() > 0 and not one.camera.any()
+    assert np.array_equal(three.observation, one.observation), "and nothing else is sampled in another way"
+    assert one.views.labels[:, 0].tolist() == found.steering[one.observation].tolist()
 
 
 def test_correlation_is_of_ranks_and_signed():

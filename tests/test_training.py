@@ -287,7 +287,8 @@ def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path
     lenient = run_here(copied, *SHORT, "--epochs", 1, "--output", tmp_path / "model.pt")
     assert lenient.returncode == 0, lenient.stderr
     assert f"line 4: left out: IMG/{damaged.name}: cut short" in lenient.stdout
-    assert damaged.name in (tmp_path / "rejected_rows.csv").read_text(encoding="utf-8")
+    header, row = (tmp_path / "rejected_rows.csv").read_text(encoding="utf-8").splitlines()
+    assert header == "file,line,finding,detail" and damaged.name in row
     strict = run_here(copied, *SHORT, "--strict", "--output", tmp_path / "strict.pt")
     assert strict.returncode == 2
     assert damaged.name in strict.stderr

@@ -27,23 +27,23 @@ class Adam:
         self.parameters, self.momentum, self.weight_decay = list(parameters), momentum, weight_decay
         self.state: dict[int, dict[str, torch.Tensor]] = {}
 
-    def zeros(self, number: int) -> dict[str, torch.Tensor]:
+    def zeros(self, index: int) -> dict[str, torch.Tensor]:
         """Return a parameter's state before the first step: float32, on its device, in its order in memory."""
-        parameter = self.parameters[number]
+        parameter = self.parameters[index]
         count = torch.zeros((), device=parameter.device)
         return dict(zip(AVERAGES, (count, torch.zeros_like(parameter), torch.zeros_like(parameter)), strict=True))
 
     @torch.no_grad()
     def step(self, learning_rate: float) -> None:
         """Update the parameters by their gradients."""
-        numbers = range(len(self.parameters))
-        self.state = self.state or {number: self.zeros(number) for number in numbers}
-        self.update(numbers, learning_rate)
+        indices = range(len(self.parameters))
+        self.state = self.state or {index: self.zeros(index) for index in indices}
+        self.update(indices, learning_rate)
 
-    def update(self, numbers: Sequence[int], learning_rate: float) -> None:
-        """Update some parameters, whose state is there, by their gradients; numbers: of the parameters."""
-        parameters: list[torch.Tensor] = [self.parameters[number] for number in numbers]
-        steps, averages, squares = ([self.state[number][name] for number in numbers] for name in AVERAGES)
+    def update(self, indices: Sequence[int], learning_rate: float) -> None:
+        """Update the parameters with these indices, whose state is there, by their gradients."""
+        parameters: list[torch.Tensor] = [self.parameters[index] for index in indices]
+        steps, averages, squares = ([self.state[index][name] for index in indices] for name in AVERAGES)
         adam(
             parameters,
             [parameter.grad for parameter in parameters if parameter.grad is not None],
@@ -68,7 +68,7 @@ class Adam:
 
     def restore(self, state: dict[int, dict[str, torch.Tensor]]) -> None:
         """Copy a saved `state`, whose tensors have the right shapes, to the parameters' device."""
-        self.state = {number: self.zeros(number) for number in state}
-        for number, saved in state.items():
+        self.state = {index: self.zeros(index) for index in state}
+        for index, saved in state.items():
             for name, value in saved.items():
-                self.state[number][name].copy_(value)
+                self.state[index][name].copy_(value)

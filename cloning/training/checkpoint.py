@@ -42,7 +42,7 @@ from cloning.training.options import Command, Process, Run
 from cloning.training.recipe import Recipe, option_name
 from cloning.training.run_files import RunFiles
 
-EpochMetrics = dict[str, float]  # a row of training_log.csv: epoch, images, seconds, loss, val_loss, val_drift
+EpochMetrics = dict[str, float]  # a row of training_log.csv: METRICS
 NEW_RUN = "start a new run without --resume"
 POSITION = ("number", "images", "loss", "seconds")  # of Progress
 METRICS = ("epoch", "images", "seconds", "loss", "val_loss", "val_drift")  # of EpochMetrics
@@ -99,14 +99,9 @@ class Progress:
         val_drift: m, nan if unknown; by: see `best_epoch`. The first epoch always is, so that there is a best model
         even if the losses are not numbers.
         """
-        row = {
-            "epoch": len(self.history) + 1,
-            "images": self.images,
-            "seconds": round(self.seconds, 3),
-            "loss": self.loss / self.images,
-            "val_loss": val_loss,
-            "val_drift": val_drift,
-        }
+        loss = self.loss / self.images
+        figures = (len(self.history) + 1, self.images, round(self.seconds, 3), loss, val_loss, val_drift)
+        row = dict(zip(METRICS, figures, strict=True))
         self.history.append(row)
         self.images, self.loss, self.seconds = 0, 0.0, 0.0
         return best_epoch(self.history, by) is row
@@ -176,16 +171,12 @@ def resumed(command: Command) -> tuple[Run, SavedRun | FirstWeights | None]:
     began, wanted = _values(saved.run), _values(run)
     for name in sorted(given & began.keys() - MAY_CHANGE):
         if began[name] != wanted[name]:
-            raise ModelError(
-                f"{files.resume}: the run began with {option_name(name)} {began[name]!r}, not {wanted[name]!r}; "
-                f"leave the option out, or {NEW_RUN}"
-            )
+            differs = f"the run began with {option_name(name)} {began[name]!r}, not {wanted[name]!r}"
+            raise ModelError(f"{files.resume}: {differs}; leave the option out, or {NEW_RUN}")
     for model in (files.last, files.best):
         if saved.progress.history and model.exists() and _run_of(model) != saved.progress.run:
-            raise ModelError(
-                f"{model}: damaged, or of another run than {files.resume.name}, which would replace it; move it away "
-                "first"
-            )
+            other = f"damaged, or of another run than {files.resume.name}, which would replace it"
+            raise ModelError(f"{model}: {other}; move it away first")
     epochs = run.recipe.epochs if "epochs" in given else saved.run.recipe.epochs
     recordings = run.recordings if "recordings" in given else saved.run.recordings
     return replace(saved.run, recordings=recordings, recipe=replace(saved.run.recipe, epochs=epochs)), saved
@@ -234,7 +225,7 @@ def _restore_network(network: Network, saved: dict[str, Any]) -> None:
     if read_network(saved) is not type(network):
         raise ValueError(f"its layers are {shown(saved.get('layers'))}")
     if read_preprocessing(saved) != (network.crop, network.scale, network.offset):
-        raise ValueError("its recipe is not that of this program's training")
+        raise ValueError("its preprocessing is not that of this program's network")
     restore_weights(network, saved)
 
 
@@ -243,7 +234,7 @@ def _progress(saved: dict[str, Any]) -> Progress:
     state, history, run = saved["training"], saved.get("history"), saved.get("run")
     if not isinstance(state, dict) or not isinstance(history, list) or type(run) not in (str, type(None)):
         raise ValueError("it has no state, history or identifier of its run")
-    values = [(name, state.get(name)) for name in POSITION]
+    values: list[tuple[str, Any]] = [(name, state.get(name)) for name in POSITION]
     for row in history:
         if isinstance(row, dict) and tuple(row) == METRICS[:-1]:
             row["val_drift"] = math.nan  # an earlier version did not measure it
@@ -253,8 +244,7 @@ def _progress(saved: dict[str, Any]) -> Progress:
     for name, value in values:
         if not (type(value) is int and 0 <= value <= 10**12 if name in COUNTS else type(value) is float):
             raise ValueError(f"its {name} is {shown(value)}")
-    position: dict[str, Any] = {name: state[name] for name in POSITION}
-    return Progress(**position, history=history, run=run)
+    return Progress(**dict(values[: len(POSITION)]), history=history, run=run)
 
 
 def _unusable(path: Path, error: ValueError) -> ModelError:
@@ -281,7 +271,7 @@ class Checkpoint:
     def begin(self, progress: Progress, precision: torch.dtype) -> None:
         """Write training_arguments.json and, first, unless the run is resumed, its first state."""
         if not self.resumed:
-            if _has_finished_epoch(self.files.resume):
+            if self.files.resume.exists() and _contents(self.files.resume).get("history") != []:
                 self.set_aside(self.files.resume)
             self.save(progress)
         settings = {**self.run.saved(), **asdict(self.process), "precision": str(precision), "versions": versions()}
@@ -298,22 +288,15 @@ class Checkpoint:
         Raises OSError.
         """
         more = {"arguments": self.run.saved(), "history": progress.history, "run": progress.run}
+        position = {name: getattr(progress, name) for name in POSITION}
+        training = {"optimizer": {"state": self.optimizer.state}, **position, "fingerprint": self.fingerprint}
         if models and len(progress.history) == 1:
             for path in (self.files.last, self.files.best):
                 if path.exists() and _run_of(path) != progress.run:  # its own if it was killed in `save`
                     self.set_aside(path)
         for path in models:
             save_model(path, self.network, **more)
-        save_model(
-            self.files.resume,
-            self.network,
-            **more,
-            training={
-                "optimizer": {"state": self.optimizer.state},
-                **{name: getattr(progress, name) for name in POSITION},
-                "fingerprint": self.fingerprint,
-            },
-        )
+        save_model(self.files.resume, self.network, **more, training=training)
         self._write_progress(progress)  # last, so that it never tells of more than --resume continues with
 
     def _write_progress(self, progress: Progress) -> None:
@@ -341,15 +324,15 @@ class Checkpoint:
     def _restore_optimizer(self, saved: object, has_begun: bool) -> None:
         """Load the averages of a checkpoint into the optimizer; its settings follow from the arguments."""
         averages = saved.get("state") if isinstance(saved, dict) else None
-        numbers = range(len(self.optimizer.parameters) if has_begun else 0)
-        if not isinstance(averages, dict) or averages.keys() != set(numbers):
+        indices = range(len(self.optimizer.parameters) if has_begun else 0)
+        if not isinstance(averages, dict) or averages.keys() != set(indices):
             raise ValueError("the optimizer's state is not that of this network")
         state = {}
-        for number in numbers:
+        for index in indices:
             try:
-                state[number] = matching(averages[number], self.optimizer.zeros(number))
+                state[index] = matching(averages[index], self.optimizer.zeros(index))
             except ValueError as error:
-                raise ValueError(f"in the optimizer's state {number}: {error}") from None
+                raise ValueError(f"in the optimizer's state {index}: {error}") from None
         self.optimizer.restore(state)
 
     def set_aside(self, path: Path) -> None:
@@ -358,33 +341,28 @@ class Checkpoint:
         All files of a run get the same ending. A copy, not a new name: at any time, `path` is there.
         """
         data, run = path.read_bytes(), _run_of(path)
-        for ending in itertools.chain(["previous"], (f"previous-{number}" for number in itertools.count(2))):
-            last, best, resume = (
-                file.with_stem(f"{file.stem}-{ending}")
-                for file in (self.files.last, self.files.best, self.files.resume)
-            )
+        for ending in itertools.chain(["previous"], (f"previous-{n}" for n in itertools.count(2))):
+            files = (self.files.last, self.files.best, self.files.resume)
+            copies = [file.with_stem(f"{file.stem}-{ending}") for file in files]
             copy = path.with_stem(f"{path.stem}-{ending}")
             if copy.exists():
                 if copy.read_bytes() == data:  # made before this program was killed
                     return
-            elif all(_run_of(file) == run for file in (last, best, resume) if file.exists()):
+            elif all(_run_of(other) == run for other in copies if other.exists()):
                 write(copy, data)
                 print(f"{path} of an earlier run is now {copy}")
                 return
 
 
-def _has_finished_epoch(path: Path) -> bool:
-    """Return whether a file may contain a finished epoch."""
+def _contents(path: Path) -> dict[str, Any]:
+    """Return the contents of a model file; those of a damaged one are of an unknown run."""
     try:
-        return path.exists() and load_checkpoint(path).get("history") != []
+        return load_checkpoint(path)
     except ModelError:
-        return True  # unknown, so keep it
+        return {"run": "?"}
 
 
 def _run_of(path: Path) -> str | None:
-    """Return the identifier of the run that wrote a model; None from an earlier version, "?" in no usable file."""
-    try:
-        run = load_checkpoint(path).get("run")
-    except ModelError:
-        return "?"
+    """Return the identifier of the run that wrote a model; None from an earlier version."""
+    run = _contents(path).get("run")
     return run if type(run) is str else None

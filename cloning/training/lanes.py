@@ -4,7 +4,7 @@ Poses and the lane's frame are those of `cloning/lane/recovery.py`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import cv2
@@ -16,7 +16,7 @@ from cloning.lane.recovery import LOOKAHEAD, LaneAhead
 from cloning.network.network import CROP
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
-from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, Stretch, components, forward_vector, stretches
+from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, components, forward_vector, stretches
 from cloning.road.warp import CroppedView, fill_ground
 from cloning.training import light
 from cloning.training.recipe import Recipe
@@ -57,23 +57,16 @@ class Lanes(LaneAhead):
         position = lane_position(recording, whole)
         lanes = cls.unknown(len(recording))
         for stretch in whole:
-            lanes._fill(stretch, position.lateral_offset[stretch.rows], position.trusted[stretch.rows])
+            rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
+            ahead = LaneAhead.of_stretch(stretch, position.lateral_offset[rows], position.trusted[rows])
+            for column in fields(LaneAhead):
+                getattr(lanes, column.name)[rows] = getattr(ahead, column.name)
+            earlier = np.maximum(np.searchsorted(driven, driven - EARLIER_FRAME, "right") - 1, 0)
+            lanes.earlier[rows] = rows.start + earlier
+            axle = np.stack([stretch.right, stretch.forward], axis=1)
+            back = components(axle[earlier] - axle, forward_vector(heading))
+            lanes.moved[rows] = np.column_stack([back, heading[earlier] - heading])
         return lanes
-
-    def _fill(self, stretch: Stretch, offset: np.ndarray, trusted: np.ndarray) -> None:
-        """Set the rows of a stretch, as `of` does once.
-
-        offset: of the car's middle, m; trusted: rows where it can be relied on.
-        """
-        rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
-        ahead = LaneAhead.of_stretch(stretch, offset, trusted)
-        for column in fields(LaneAhead):
-            getattr(self, column.name)[rows] = getattr(ahead, column.name)
-        earlier = np.maximum(np.searchsorted(driven, driven - EARLIER_FRAME, "right") - 1, 0)
-        self.earlier[rows] = rows.start + earlier
-        axle = np.stack([stretch.right, stretch.forward], axis=1)
-        back = components(axle[earlier] - axle, forward_vector(heading))
-        self.moved[rows] = np.column_stack([back, heading[earlier] - heading])
 
     def from_middle(self) -> np.ndarray:
         """Return how far right of the recorded car's middle the lane's centre is: float (n,), m; 0 where unknown."""
@@ -106,8 +99,8 @@ class Lanes(LaneAhead):
         distance = np.abs(eye[:, None] - list(CAMERA_OFFSETS.values()))
         near = distance <= np.maximum(recipe.camera_reach, distance.min(1, keepdims=True))
         camera = np.argmax(near * rng.uniform(1, 2, (n, 3)), axis=1)
-        colours = light.tints(recipe, rng, n)
-        return Poses.of(self, offset, yaw, camera, mirrored, colours, light.sample_shades(recipe.shaded, rng, n))
+        colours, shade = light.tints(recipe, rng, n), light.sample_shades(recipe.shaded, rng, n)
+        return replace(Poses.of(self, offset, yaw, camera, mirrored), colours=colours, shade=shade)
 
 
 @dataclass(frozen=True)
@@ -135,17 +128,8 @@ class Poses(Table):
     shade: Column
 
     @classmethod
-    def of(
-        cls,
-        lanes: Lanes,
-        offset: np.ndarray,
-        yaw: np.ndarray,
-        camera: np.ndarray,
-        mirrored: np.ndarray,
-        colours: np.ndarray | None = None,
-        shade: np.ndarray | None = None,
-    ) -> Self:
-        """Return the poses at the rows of `lanes`; arguments: the columns; without the last two, in unchanged light."""
+    def of(cls, lanes: Lanes, offset: np.ndarray, yaw: np.ndarray, camera: np.ndarray, mirrored: np.ndarray) -> Self:
+        """Return the poses at the rows of `lanes`, in unchanged light; the others are columns."""
         turn = yaw - lanes.yaw
         # The pose relative to the recorded rear axle, in the recorded car's frame: m right, m forward.
         away = offset - lanes.offset
@@ -156,10 +140,8 @@ class Poses(Table):
         warps = [VIEW.homographies(eye, turn, moved, side, mirrored) for moved in (own_frame, lanes.moved)]
         steering = lanes.steering(offset, yaw)
         labels = np.where(mirrored, -steering, steering)
-        if colours is None:
-            colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
-        if shade is None:
-            shade = np.full(len(turn), -1, np.int16)
+        colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
+        shade = np.full(len(turn), -1, np.int16)
         return cls(offset, yaw, camera, mirrored, np.stack(warps, axis=1), labels, colours, shade)
 
     def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:

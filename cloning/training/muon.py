@@ -54,22 +54,22 @@ class Muon(Adam):
         super().__init__(parameters)
         self.matrix_momentum, self.matrix_decay = momentum, weight_decay
 
-    def is_matrix(self, number: int) -> bool:
-        """Return whether a parameter, by its number, is a layer's weights with several outputs."""
-        parameter = self.parameters[number]
+    def is_matrix(self, index: int) -> bool:
+        """Return whether a parameter is a layer's weights with several outputs."""
+        parameter = self.parameters[index]
         return parameter.dim() > 1 and len(parameter) > 1
 
-    def zeros(self, number: int) -> dict[str, torch.Tensor]:
-        """Return a parameter's state before the first step: float32, on its device, in its order in memory."""
-        if not self.is_matrix(number):
-            return super().zeros(number)
-        return {"momentum": torch.zeros_like(self.parameters[number])}
+    def zeros(self, index: int) -> dict[str, torch.Tensor]:
+        """Return a parameter's state before the first step, as Adam's."""
+        if not self.is_matrix(index):
+            return super().zeros(index)
+        return {"momentum": torch.zeros_like(self.parameters[index])}
 
-    def update(self, numbers: Sequence[int], learning_rate: float) -> None:
-        """Update some parameters, whose state is there, by their gradients; numbers: of the parameters."""
-        super().update([number for number in numbers if not self.is_matrix(number)], learning_rate)
-        for number in filter(self.is_matrix, numbers):
-            parameter, average = self.parameters[number], self.state[number]["momentum"]
+    def update(self, indices: Sequence[int], learning_rate: float) -> None:
+        """Update the parameters with these indices, as Adam's."""
+        super().update([index for index in indices if not self.is_matrix(index)], learning_rate)
+        for index in filter(self.is_matrix, indices):
+            parameter, average = self.parameters[index], self.state[index]["momentum"]
             assert parameter.grad is not None
             average.lerp_(parameter.grad, 1 - self.matrix_momentum)
             ahead = parameter.grad.lerp(average, self.matrix_momentum).flatten(1)  # Nesterov's

@@ -1,7 +1,4 @@
-"""Observations: the rows that training and validation use, with their labels and images.
-
-From an observation of a batch up to four kinds of image are made, in the report: see `Augmentation`.
-"""
+"""Observations: the rows that training and validation use, their labels and images, and what a batch has of them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -65,7 +62,26 @@ class Views(Protocol):
         """
 
     def example(self, i: int) -> Example:
-        """Return the batch's observation number i for the diagnostic pictures."""
+        """Return one observation for the diagnostic pictures; i: its index in the batch."""
+
+
+class Choices(NamedTuple):
+    """The random choices for one batch: n observations, from which m images are made.
+
+    observation  int (n,): indices of the observations
+    camera       int (n,): the camera whose image is used, 0 centre, 1 left, 2 right
+    slots        int (n, augmentations): where in the batch each image is, -1 if it is not made
+    keep         bool (m, 4224): the units of the flattened layer that dropout keeps; None: all
+    augmenting   each augmentation's choices: arrays of n entries each
+    views        the images before augmentation, and the labels
+    """
+
+    observation: np.ndarray
+    camera: np.ndarray
+    slots: np.ndarray
+    keep: np.ndarray | None
+    augmenting: list[tuple[np.ndarray, ...]]
+    views: Views
 
 
 @dataclass(frozen=True)
@@ -93,15 +109,15 @@ class Observations(Table):
     def of_rows(cls, recording: CheckedRecording, rows: np.ndarray, steering: np.ndarray, lanes: Lanes) -> Self:
         """Return the observations of these rows of a recording, int (n,), with these labels."""
         frame = recording.digests[recording.images[rows, 0]]
-        number = np.zeros(len(rows), np.int16)
-        return cls([recording], number, rows.astype(np.int32), steering, frame, recording.time[rows], lanes)
+        index = np.zeros(len(rows), np.int16)
+        return cls([recording], index, rows.astype(np.int32), steering, frame, recording.time[rows], lanes)
 
     @classmethod
     def of_recordings(cls, parts: Sequence[Self]) -> Self:
         """Return the observations of several recordings; parts: those of one recording each."""
         recordings = [recording for part in parts for recording in part.recordings]
-        number = np.repeat(np.arange(len(parts), dtype=np.int16), [len(part) for part in parts])
-        return cls.joined(parts, recordings=recordings, recording=number)
+        index = np.repeat(np.arange(len(parts), dtype=np.int16), [len(part) for part in parts])
+        return cls.joined(parts, recordings=recordings, recording=index)
 
     def counts(self, repeats: int) -> np.ndarray:
         """Return how often each observation counts: int (n,), `repeats` in a recording of problem areas, else 1."""
@@ -128,6 +144,10 @@ class Observations(Table):
     def read(self, at: int, camera: int) -> np.ndarray:
         """Return an observation's whole frame: uint8 (160, 320, 3), RGB. Raises RecordingError."""
         return read_checked(self.path(at, camera))
+
+    def frames(self, at: int) -> list[np.ndarray]:
+        """Return an observation's frames of the centre, left and right camera, as `read` does."""
+        return [self.read(at, camera) for camera in range(len(CAMERAS))]
 
     def read_cropped(self, at: int, camera: int) -> np.ndarray:
         """Return what the network sees of an observation's frame: uint8 (75, 320, 3), RGB, not to be changed."""
@@ -180,7 +200,7 @@ class CameraViews:
         self.labels = np.stack([-label if mirrors else label for mirrors in self.mirrors], axis=1)
 
     def images(self, part: np.ndarray) -> list[np.ndarray]:
-        """Return the images of some observations, int (k,), for each augmentation: uint8 (k, 75, 320, 3)."""
+        """See Views."""
         chosen = zip(self.rows[part], self.cameras[part], strict=True)
         return self._mirrored(np.stack([self.observations.read_cropped(row, camera) for row, camera in chosen]))
 
@@ -190,9 +210,8 @@ class CameraViews:
         return [flipped if mirrors else images for mirrors in self.mirrors]
 
     def example(self, i: int) -> Example:
-        """Return the batch's observation number i for the diagnostic pictures."""
-        row, camera = self.rows[i], self.cameras[i]
-        frames = [self.observations.read(row, camera) for camera in range(len(CAMERAS))]
+        """See Views."""
+        row, camera, frames = self.rows[i], self.cameras[i], self.observations.frames(self.rows[i])
         labels, name = self.observations.steering[row] + self.corrections, f"{CAMERAS[camera]} camera"
         titles = [f"{name}, flipped" if mirrors else name for mirrors in self.mirrors]
         return Example(frames, labels, self._mirrored(frames[camera][None]), 0, titles)

@@ -33,12 +33,8 @@ class Run:
 
     def saved(self) -> dict[str, Any]:
         """Return the run as plain values, for a checkpoint."""
-        return {
-            "recordings": list(self.recordings),
-            "seed": self.seed,
-            "from_model": self.from_model,
-            "recipe": self.recipe.saved(),
-        }
+        run = {"recordings": list(self.recordings), "seed": self.seed, "from_model": self.from_model}
+        return {**run, "recipe": self.recipe.saved()}
 
 
 @dataclass(frozen=True)
@@ -74,6 +70,7 @@ class Command(NamedTuple):
 
 
 # The options that set fields of the recipe, and those of them that have no effect with --robust.
+COPIES = f"how often a recording counts whose name ends in {' or '.join(PROBLEM_AREAS)}"
 FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
     "epochs": (number(int, 1, MAX_COUNT), "epochs in total; may be raised with --resume"),
     "batch_size": (number(int, 1, MAX_BATCH), "observations in a batch; each gives 3.7 images on average"),
@@ -87,10 +84,7 @@ FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
         number(float),
         "steering added to the label of left images, subtracted from that of right ones",
     ),
-    "repeats": (
-        number(int, 1, MAX_REPEATS),
-        f"how often a recording counts whose name ends in {' or '.join(PROBLEM_AREAS)}",
-    ),
+    "repeats": (number(int, 1, MAX_REPEATS), COPIES),
 }
 REPORT_ONLY = ("throttle_threshold", "side_correction")
 
@@ -103,11 +97,10 @@ def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
     parser = build_parser(report, robust)
     values = vars(parser.parse_intermixed_args(argv))  # recordings may follow options
     given = frozenset(values)
-    if values.get("robust"):
-        for name in REPORT_ONLY:
-            if name in given:
-                parser.error(f"{option_name(name)} has no effect with --robust; leave it out")
     recipe = robust if values.pop("robust", False) else report
+    for name in REPORT_ONLY:
+        if recipe is robust and name in given:
+            parser.error(f"{option_name(name)} has no effect with --robust; leave it out")
     recipe = replace(recipe, **{name: values.pop(name) for name in FIGURES if name in values})
     process = Process(**{name: values.pop(name) for name in ("output", "device", "strict", "resume") if name in values})
     if "recordings" in values:
@@ -128,47 +121,30 @@ def build_parser(report: Recipe, robust: Recipe) -> argparse.ArgumentParser:
         "Stop a run with Ctrl-C at any time; --resume continues it.",
         argument_default=argparse.SUPPRESS,
     )
-    parser.add_argument(
-        "recordings",
-        nargs="*",
-        help="recordings, or folders with recordings at any depth below them; a recording is a folder with a "
-        f"{DRIVING_LOG} (default: data)",
+    text = (
+        "recordings, or folders with recordings at any depth below them; a recording is a folder with a "
+        f"{DRIVING_LOG} (default: data)"
     )
+    parser.add_argument("recordings", nargs="*", help=text)
+    add = parser.add_argument_group("recipe").add_argument
     differ = [name for name in FIGURES if getattr(report, name) != getattr(robust, name)]
-    group = parser.add_argument_group("recipe")
-    group.add_argument(
-        "--robust",
-        action="store_true",
-        help="train for robustness rather than fidelity to the report: learn recovery steering from frames warped to "
+    text = (
+        "train for robustness rather than fidelity to the report: learn recovery steering from frames warped to "
         "other lateral offsets and headings; uses "
-        + ", ".join(f"{option_name(name)} {getattr(robust, name):g}" for name in differ)
-        + " unless these are given",
+        f"{', '.join(f'{option_name(name)} {getattr(robust, name):g}' for name in differ)} unless these are given"
     )
-    for name, (parse_value, help_text) in FIGURES.items():
-        text = f"{help_text} (default: {getattr(report, name)})"
-        group.add_argument(option_name(name), type=parse_value, help=text)
-    group = parser.add_argument_group("run")
-    group.add_argument(
-        "--seed",
-        type=number(int, 0, MAX_SEED),
-        help="on the same machine, the same seed repeats the same run (default: 0)",
-    )
-    group.add_argument(
-        "--from",
-        dest="from_model",
-        metavar="MODEL",
-        help="begin with the weights of this model file (default: random weights)",
-    )
-    group.add_argument(
-        "--resume",
-        action="store_true",
-        help="continue the run of this --output with its original arguments; begin a new run if there is none",
-    )
-    group.add_argument("--strict", action="store_true", help="fail if a row is unusable, instead of leaving it out")
-    group.add_argument("--output", help="model file; all other files are written to its folder (default: model.pt)")
-    group.add_argument(
-        "--device",
-        choices=DEVICES,
-        help="cuda: an NVIDIA GPU; mps: Apple's GPU; auto: the first of cuda, mps and cpu that exists (default: auto)",
-    )
+    add("--robust", action="store_true", help=text)
+    for name, (parse_value, text) in FIGURES.items():
+        add(option_name(name), type=parse_value, help=f"{text} (default: {getattr(report, name)})")
+    add = parser.add_argument_group("run").add_argument
+    text = "on the same machine, the same seed repeats the same run (default: 0)"
+    add("--seed", type=number(int, 0, MAX_SEED), help=text)
+    text = "begin with the weights of this model file (default: random weights)"
+    add("--from", dest="from_model", metavar="MODEL", help=text)
+    text = "continue the run of this --output with its original arguments; begin a new run if there is none"
+    add("--resume", action="store_true", help=text)
+    add("--strict", action="store_true", help="fail if a row is unusable, instead of leaving it out")
+    add("--output", help="model file; all other files are written to its folder (default: model.pt)")
+    text = "cuda: an NVIDIA GPU; mps: Apple's GPU; auto: the first of cuda, mps and cpu that exists (default: auto)"
+    add("--device", choices=DEVICES, help=text)
     return parser

@@ -7,8 +7,8 @@ from PIL import Image, ImageDraw, ImageFont
 
 from cloning.recordings.format import CAMERAS
 from cloning.road.motion import FULL_LOCK
-from cloning.training.batch import Choices
 from cloning.training.checkpoint import EpochMetrics
+from cloning.training.observations import Choices
 from cloning.training.recipe import Recipe
 
 SCALE = 3  # of a frame's pixels: three frames in a row are 25 cm wide at 300 dpi

@@ -1,10 +1,11 @@
-"""Compute loss, gradients and predictions, on a CPU in pieces of a batch that fit its cache."""
+"""Batches; loss, gradients and predictions, on a CPU in pieces of a batch that fit its cache."""
 
 import copy
 import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,10 +13,30 @@ import torch
 from torch import nn
 
 from cloning.network.compute import in_precision
-from cloning.training.batch import Batch
 
 PIECE = 28  # images at most: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
 Module = TypeVar("Module", bound=nn.Module)
+
+
+@dataclass
+class Batch:
+    """One process's share of a batch.
+
+    images  uint8 (n, 75, 320, 3), RGB, cropped
+    labels  float32 (n,): steering, -1..1
+    keep    bool (n, units): the units of the flattened layer that dropout keeps; None: all
+    total   images in the whole batch, of all processes
+    """
+
+    images: np.ndarray
+    labels: np.ndarray
+    keep: np.ndarray | None
+    total: int
+
+    def part(self, piece: slice) -> "Batch":
+        """Return some of the images."""
+        keep = None if self.keep is None else self.keep[piece]
+        return Batch(self.images[piece], self.labels[piece], keep, self.total)
 
 
 def pieces(images: int) -> list[slice]:

@@ -83,6 +83,7 @@ class Recipe:
     # Data preprocessing
     select: Callable[..., Any]
     throttle_threshold: float  # rows with less throttle are dropped
+    side_cameras: bool  # whether images are taken from all three cameras, not from the centre one alone
     side_correction: float  # steering added to the label of left images, subtracted from that of right ones
     resample: Callable[..., Any]
     straight: float  # |steering| below which an observation is straight driving

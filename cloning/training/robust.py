@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from cloning.network.network import CROP, SEEN_SHAPE
-from cloning.recordings.format import CAMERAS, LANE_FILE
+from cloning.recordings.format import LANE_FILE
 from cloning.recordings.log import CheckedRecording
 from cloning.road.warp import with_alpha
 from cloning.training.lanes import Lanes, Poses
@@ -115,14 +115,13 @@ class PoseViews:
         self.labels = np.stack([each.steering for each in self.poses], axis=1)
 
     def images(self, part: np.ndarray) -> list[np.ndarray]:
-        """Return the images of some observations, int (k,), for each augmentation: uint8 (k, 75, 320, 3)."""
+        """See `observations.Views`."""
         return warped(self.observations, self.rows[part], [each.take(part) for each in self.poses])
 
     def example(self, i: int) -> Example:
-        """Return the batch's observation number i for the diagnostic pictures."""
-        row = self.rows[i]
-        frames = [self.observations.read(row, camera) for camera in range(len(CAMERAS))]
-        labels = self.observations.lanes.camera_labels(row)
+        """See `observations.Views`."""
+        frames = self.observations.frames(self.rows[i])
+        labels = self.observations.lanes.camera_labels(self.rows[i])
         return Example(frames, labels, self.images(np.array([i])), CROP[0], [each.title(i) for each in self.poses])
 
 

@@ -49,10 +49,8 @@ class RunFiles:
                 try:
                     fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
-                    raise OutputError(
-                        f"{self.last}: another run is writing to this folder; wait for its end, or give an --output in "
-                        "another folder"
-                    ) from None
+                    remedy = "wait for its end, or give an --output in another folder"
+                    raise OutputError(f"{self.last}: another run is writing to this folder; {remedy}") from None
                 except OSError as error:  # a network's file system, for example
                     print(f"{self.last.parent}: cannot be locked ({error.strerror}); start no other run in it")
 
@@ -83,15 +81,12 @@ class RunFiles:
     def next_step(self, before: tuple[int, int] | None, resumed: bool) -> str:
         """Return what the user can do after an error.
 
-        before: what `state` was when the run began: until it has saved a state, --resume would continue an earlier
-        run; resumed: whether --resume was given.
+        before: `state` when the run began: until the run has saved one, --resume would continue an earlier run;
+        resumed: whether --resume was given.
         """
-        begun = resumed or self.state() != before
-        return "continue with --resume" if begun else "start the run again"
+        return "continue with --resume" if resumed or self.state() != before else "start the run again"
 
     def state(self) -> tuple[int, int] | None:
-        """Return what tells whether model-resume.pt was replaced; None if there is none."""
-        if not os.path.exists(self.resume):
-            return None
-        now = self.resume.stat()
-        return now.st_ino, now.st_mtime_ns
+        """Return what shows whether model-resume.pt was replaced; None if there is none."""
+        now = self.resume.stat() if os.path.exists(self.resume) else None
+        return now and (now.st_ino, now.st_mtime_ns)

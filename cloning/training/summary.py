@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from cloning.base.errors import RecordingError
 from cloning.base.files import write
+from cloning.base.outputs import plural
 from cloning.network.compute import threads
 from cloning.network.layer_table import layer_table
 from cloning.network.network import Network
@@ -32,7 +33,7 @@ VERDICTS = (
     (1.6, "Networks like this one leave the road now and then."),
     (math.inf, "Networks like this one leave the road often: {remedy}."),
 )
-TIMED_BATCHES, TIMED_SECONDS = 10, 5.0  # at least, before the time of the whole run is told
+TIMED_BATCHES, TIMED_SECONDS = 10, 5.0  # at least, before it prints how long the whole run takes
 
 
 class Counts(NamedTuple):
@@ -45,18 +46,17 @@ class Counts(NamedTuple):
     dropped: int
     kept: int
 
-    @staticmethod
-    def of(recording: Recording, kept: int) -> "Counts":
+    @classmethod
+    def of(cls, recording: Recording, kept: int) -> Self:
         """Return the counts of a checked recording; kept: number of its rows that are kept."""
         usable, cut = len(recording), sum(rows for _, rows in recording.cuts)
         unusable = recording.rows_read - cut - usable
-        return Counts(str(recording.folder), recording.rows_read, cut, unusable, usable - kept, kept)
+        return cls(str(recording.folder), recording.rows_read, cut, unusable, usable - kept, kept)
 
 
 def total(counts: list[Counts]) -> Counts:
     """Return the sums over all recordings."""
-    rows_read, cut, unusable, dropped, kept = (int(sum(column)) for column in list(zip(*counts, strict=True))[1:])
-    return Counts("total", rows_read, cut, unusable, dropped, kept)
+    return Counts("total", *(sum(column) for column in list(zip(*counts, strict=True))[1:]))
 
 
 def recordings_table(counts: list[Counts], dropped: str) -> str:
@@ -86,7 +86,7 @@ def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> 
         path, line, _, detail = rejected[0]
         raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {len(rejected)} unusable rows)")
     if rejected:
-        write(file, csv_bytes(("file", "line", "kind", "detail"), rejected))
+        write(file, csv_bytes(("file", "line", "finding", "detail"), rejected))
         print(f"{len(rejected)} unusable rows are left out; {file} lists them")
 
 
@@ -111,28 +111,23 @@ def run_header(network: Network, device: torch.device, precision: torch.dtype, r
 
 def epoch_line(row: EpochMetrics) -> str:
     """Return the line for a finished epoch, in the format of the report's log."""
+    losses = f"loss: {row['loss']:.4f} - val_loss: {row['val_loss']:.4f}"
     drift = "" if math.isnan(row["val_drift"]) else f" - val_drift: {row['val_drift']:.2f} m"
-    return (
-        f"{row['images']} images [{'=' * 30}] - {row['seconds']:.0f}s - "
-        f"loss: {row['loss']:.4f} - val_loss: {row['val_loss']:.4f}{drift}"
-    )
+    return f"{row['images']} images [{'=' * 30}] - {row['seconds']:.0f}s - {losses}{drift}"
 
 
 class Pace:
-    """Measures how fast this process trains, and tells how long the rest of the run will take on this machine."""
+    """Measures how fast this process trains, and estimates how long the rest of the run will take on this machine."""
 
     def __init__(self, recipe: Recipe, prints: bool = True):
-        """prints: whether this process tells how long the run will take."""
+        """prints: whether the estimate is printed once, too."""
         self.epochs, self.samples = recipe.epochs, recipe.samples_per_epoch
         self.batches = self.images = 0  # timed so far
         self.started: float | None = None  # time.monotonic() at the end of the first batch, which is slower
         self.to_print, self.rest = prints, ""
 
     def after_batch(self, images: int, progress: Progress) -> str:
-        """Return the mean loss of the epoch and the time left for the whole run, for a progress bar.
-
-        Call it after each batch; images: number in it. Once, it prints how long the run will take.
-        """
+        """Return the epoch's mean loss and the time left for the run, for a progress bar; images: in this batch."""
         loss = f"loss: {progress.loss / progress.images:.4f}"
         if self.started is None:
             self.started = time.monotonic()
@@ -144,7 +139,7 @@ class Pace:
         left = max(0, self.epochs * self.samples - done) * seconds / self.images
         if self.to_print and self.batches >= TIMED_BATCHES and seconds >= TIMED_SECONDS:
             self.to_print = False
-            epochs = "1 epoch" if self.epochs == 1 else f"{self.epochs} epochs"
+            epochs = plural(self.epochs, "epoch")
             tqdm.write(f"about {duration(seconds + left)} for {self.rest}{epochs} on this machine")
         return f"{loss}, {duration(left)} left in all"
 

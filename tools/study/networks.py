@@ -4,10 +4,7 @@ import re
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 import model
-from cloning.training.observations import CameraViews, Observations
 from cloning.training.recipe import Recipe
 
 # A network is to take a minute on one core. The report's 43 steps an epoch would teach it little in so few images, so
@@ -63,23 +60,9 @@ class Variant(NamedTuple):
         return re.sub(r"[^a-z0-9.]+", "-", f"{self.track} {self.method} seed {self.seed}")
 
 
-class CentreViews(CameraViews):
-    """The centre camera's image of each observation, whichever camera was chosen."""
-
-    def __init__(
-        self,
-        observations: Observations,
-        rows: np.ndarray,
-        cameras: np.ndarray,
-        recipe: Recipe,
-        rng: np.random.Generator,
-    ):
-        super().__init__(observations, rows, np.zeros_like(cameras), recipe, rng)
-
-
 UNLIT = replace(ROBUST, tinted=0.0, shaded=0.0)  # the light is changed by the report's augmentations alone
 RECOVERING = {  # by method; each has five seeds
-    "centre camera": replace(RECIPE, views=CentreViews),
+    "centre camera": replace(RECIPE, side_cameras=False),
     "recipe": RECIPE,
     "shifts": replace(UNLIT, pose_yaw=0.0),
     "shifts, rotations": UNLIT,
