@@ -21,6 +21,7 @@ SHADOWS, UNKNOWN_ROADS = "shadows", "unknown roads"
 SUMMARY_LINES = (*ROADS, SHADOWS, UNKNOWN_ROADS)
 ORACLE = "oracle (no network)"  # the title of its column
 LIMIT, STAND_IN = "real recordings, limit {:g} m", "stand-in simulator"  # titles in the summary
+MARKS = {True: "in sample", False: "held out"}
 Cells = dict[str, dict[str, str]]  # by row and column
 Result = TypeVar("Result")
 
@@ -34,15 +35,11 @@ class Replayed(TypedDict):
 
 
 class RealRecording(TypedDict):
-    """What a real recording's replays have in common, whatever the network.
+    """What a real recording's replays have in common, whatever the network."""
 
-    seconds: driven; lane_centre_percent: share of the rows measured from the lane's centre, the others from the human
-    driver's path; oracle: the recovery steering itself, driven, by the limit in metres.
-    """
-
-    seconds: float
-    lane_centre_percent: float
-    oracle: dict[str, Replayed]
+    seconds: float  # driven
+    lane_centre_percent: float  # share of the rows measured from the lane's centre, the others from the driver's path
+    oracle: dict[str, Replayed]  # the recovery steering itself, driven, by the limit in metres
 
 
 class Driven(TypedDict):
@@ -62,24 +59,20 @@ class Driven(TypedDict):
 
 
 class NetworkResults(TypedDict):
-    """A network's results.
+    """A network's results."""
 
-    what: how it was trained; sha256: of its model file; trained_on: the recordings' names; replays: by the recording's
-    name and the limit in metres.
-    """
-
-    what: str
-    sha256: str
-    trained_on: list[str]
-    replays: dict[str, dict[str, Replayed]]
+    what: str  # how it was trained
+    sha256: str  # of its model file
+    trained_on: list[str]  # the recordings' names
+    replays: dict[str, dict[str, Replayed]]  # by the recording's name and the limit in metres
     drives: list[Driven]
 
 
 class Board(TypedDict):
-    """All results: the real recordings by name, and the networks by the titles of their columns."""
+    """All results."""
 
-    recordings: dict[str, RealRecording]
-    networks: dict[str, NetworkResults]
+    recordings: dict[str, RealRecording]  # by name
+    networks: dict[str, NetworkResults]  # by the titles of their columns
 
 
 def driven(report: LapReport, speed_mph: int, look: int, laps: float, finished: bool) -> Driven:
@@ -137,11 +130,6 @@ def drive_in_sample(track: str, look: int, trained_on: Sequence[str]) -> bool:
     return False
 
 
-def mark(in_sample: bool) -> str:
-    """Return the words that mark a result."""
-    return "in sample" if in_sample else "held out"
-
-
 def replays(board: Board) -> Iterator[tuple[str, str, float, Replayed, bool]]:
     """Yield each replay: its network's title, recording and limit in metres, the result, whether it is in sample."""
     for title, network in board["networks"].items():
@@ -161,31 +149,22 @@ def drives(board: Board) -> Iterator[tuple[str, Driven, bool]]:
 # The summary: four lines for each network
 
 
-def replay_line(recording: str) -> str | None:
-    """Return the line of the summary to which a real recording belongs by its name, or None."""
-    return SHADOWS if "shadow" in recording else next((track for track in ROADS if recording.startswith(track)), None)
-
-
-def drive_line(drive: Driven) -> str:
-    """Return the line of the summary to which a drive belongs."""
-    if road_number(drive["track"]) is not None:
-        return UNKNOWN_ROADS
-    return SHADOWS if drive["look"] >= SHADOWED else drive["track"]
-
-
 def summary(board: Board) -> Cells:
     """Return the summary's cells: of each network's results on a line those held out, or all if there are none."""
     pools: dict[str, dict[str, list[tuple[Any, bool]]]] = defaultdict(lambda: defaultdict(list))
     for title, name, limit, result, in_sample in replays(board):
+        line = SHADOWS if "shadow" in name else next(filter(name.startswith, ROADS), None)
         counted = board["recordings"][name]["seconds"], result["interventions"]
-        pools[f"{title}: {replay_line(name)}"][LIMIT.format(limit)].append((counted, in_sample))
+        pools[f"{title}: {line}"][LIMIT.format(limit)].append((counted, in_sample))
     for title, drive, in_sample in drives(board):
-        pools[f"{title}: {drive_line(drive)}"][STAND_IN].append((drive, in_sample))
+        line = SHADOWS if drive["look"] >= SHADOWED else drive["track"]
+        line = line if road_number(drive["track"]) is None else UNKNOWN_ROADS
+        pools[f"{title}: {line}"][STAND_IN].append((drive, in_sample))
 
     def pooled(column: str, results: list[tuple[Any, bool]]) -> str:
         held_out = [result for result, in_sample in results if not in_sample]
         chosen = held_out or [result for result, _ in results]
-        return f"{laps_text(chosen) if column == STAND_IN else autonomy_text(chosen)}, {mark(not held_out)}"
+        return f"{laps_text(chosen) if column == STAND_IN else autonomy_text(chosen)}, {MARKS[not held_out]}"
 
     rows = [f"{title}: {line}" for title in board["networks"] for line in SUMMARY_LINES]
     return {row: {column: pooled(column, results) for column, results in pools[row].items()} for row in rows}
@@ -218,12 +197,12 @@ def replay_rows(board: Board) -> Cells:
         for limit, result in recording["oracle"].items():
             rows[name, float(limit)][ORACLE] = replay_text(result)
     for title, name, metres, result, in_sample in replays(board):
-        rows[name, metres][title] = f"{replay_text(result)}, {mark(in_sample)}"
+        rows[name, metres][title] = f"{replay_text(result)}, {MARKS[in_sample]}"
 
-    def reference(share: float) -> str:
-        return "" if share == 100 else f", {share:.0f} % of it from the lane's centre"
-
-    references = {name: reference(recording["lane_centre_percent"]) for name, recording in board["recordings"].items()}
+    shares = {name: recording["lane_centre_percent"] for name, recording in board["recordings"].items()}
+    references = {
+        name: "" if share == 100 else f", {share:.0f} % of it from the lane's centre" for name, share in shares.items()
+    }
     return {f"{name}, limit {limit:g} m{references[name]}": rows[name, limit] for name, limit in sorted(rows)}
 
 
@@ -241,7 +220,7 @@ def known_track_rows(board: Board) -> Cells:
             rows[course(drive)][title] = (
                 f"{plural(drive['departures'], 'departure')} in {drive['distance_km']:.1f} km, "
                 f"{drive['offset_mean_m']:.2f} m, at most {drive['offset_max_m']:.2f} m, "
-                f"roughness {drive['roughness_per_s']:.2f}/s, {mark(in_sample)}"
+                f"roughness {drive['roughness_per_s']:.2f}/s, {MARKS[in_sample]}"
             )
     return {
         f"{track} {direction}, {mph} mph, look {look}": rows[track, direction, mph, look]
@@ -256,7 +235,7 @@ def generated_road_rows(board: Board) -> Cells:
         if road_number(drive["track"]) is not None:
             pools[drive["speed_mph"], drive["look"] >= SHADOWED, in_sample][title].append(drive)
     return {
-        f"{mph} mph, looks {'with' if shadowed else 'without'} shadows, {mark(in_sample)}": {
+        f"{mph} mph, looks {'with' if shadowed else 'without'} shadows, {MARKS[in_sample]}": {
             title: roads_text(pool) for title, pool in pools[mph, shadowed, in_sample].items()
         }
         for mph, shadowed, in_sample in sorted(pools)

@@ -51,11 +51,7 @@ from tools.server_process import ServerProcess
 
 DIRECTIONS = ("ccw", "cw")
 UNSEEN_LOOKS = (101, 102)  # no model was trained on looks 101 to 1000
-
-
-def one_thread() -> dict[str, str]:
-    """Return an environment in which a process computes with one thread, because as many run as there are cores."""
-    return {**os.environ, "OMP_NUM_THREADS": "1"}
+ONE_THREAD = {"OMP_NUM_THREADS": "1"}  # a process computes with one, because as many run as there are cores
 
 
 def simulate(*command: object) -> tuple[Any, int, str]:
@@ -63,7 +59,7 @@ def simulate(*command: object) -> tuple[Any, int, str]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "report.json")
         words = ("-m", "simulator", *command, "--report", file)
-        done = python(*words, cwd=ROOT, env=one_thread(), capture_output=True)
+        done = python(*words, cwd=ROOT, env=os.environ | ONE_THREAD, capture_output=True)
         report = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
     return report, done.returncode, done.stderr
 
@@ -76,11 +72,8 @@ def replay(model: Path, folder: Path) -> tuple[RealRecording, dict[str, Replayed
     report: ReplayReport = reports[0]
 
     def shown(metrics: DrivingMetrics) -> Replayed:
-        return {
-            "autonomy_percent": metrics["autonomy_percent"],
-            "interventions": metrics["interventions"],
-            "distance_mean_m": metrics["distance_mean_m"],
-        }
+        percent, metres = metrics["autonomy_percent"], metrics["distance_mean_m"]
+        return {"autonomy_percent": percent, "interventions": metrics["interventions"], "distance_mean_m": metres}
 
     recording: RealRecording = {
         "seconds": report["seconds"],
@@ -97,7 +90,7 @@ def serving(model: Path, mph: int, drives: int) -> Iterator[SimpleQueue[int]]:
     with ExitStack() as stack:
         for first in range(0, drives, MAX_CLIENTS):
             words = (ROOT / "drive.py", model, "--speed", str(mph), "--port", "0")
-            server = stack.enter_context(ServerProcess(*words, environment=one_thread()))
+            server = stack.enter_context(ServerProcess(*words, environment=os.environ | ONE_THREAD))
             for _ in range(min(MAX_CLIENTS, drives - first)):
                 ports.put(server.port)
         yield ports

@@ -20,7 +20,7 @@ import json
 import multiprocessing
 import shutil
 import signal
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from pathlib import Path
 
 from cloning.base import program
@@ -89,6 +89,8 @@ def measure_all(variants: list[Variant], options: argparse.Namespace) -> list[di
         try:
             for network in begun:
                 network.result()
+        except BrokenExecutor:
+            raise UserError("a network's process was killed; start the study again, with fewer --jobs") from None
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise

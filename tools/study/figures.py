@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,41 +19,30 @@ INTERVAL = 2.5, 97.5  # percentiles: 95 %
 DPI = 150
 
 
-class Measure(NamedTuple):
-    """A measure that might tell how a network drives.
-
-    name   column of study.csv
-    title  in words
-    sign   1 if more is worse, -1 if more is better
-    group  "loss" of errors on recorded frames, "replay"
-    """
-
-    name: str
-    title: str
-    sign: int
-    group: str
-
-
-MEASURES = (
-    Measure("own_val_loss", "its own validation loss", 1, "loss"),
-    Measure("mse", "mean squared error", 1, "loss"),
-    Measure("mae", "mean absolute error", 1, "loss"),
-    Measure("correlation", "correlation with the driver", -1, "loss"),
-    Measure("large_errors", "share of errors above 0.2", 1, "loss"),
-    Measure("whiteness", "whiteness of the steering", 1, "loss"),
-    Measure("drift", "replay of 2 s: drift from the driver", 1, "replay"),
-    Measure("autonomy_1", "replay: autonomy at 1 m", -1, "replay"),
-    Measure("autonomy_2.5", "replay: autonomy at 2.5 m", -1, "replay"),
-    Measure("metres_per_intervention_1", "replay: m per intervention at 1 m", -1, "replay"),
-    Measure("replay_distance_2.5", "replay: mean distance", 1, "replay"),
-)
+# What might tell how a network drives: columns of study.csv, each with its title, and 1 if more is worse, -1 if better.
+LOSSES = {  # errors on recorded frames, of which a loss is made
+    "own_val_loss": ("its own validation loss", 1),
+    "mse": ("mean squared error", 1),
+    "mae": ("mean absolute error", 1),
+    "correlation": ("correlation with the driver", -1),
+    "large_errors": ("share of errors above 0.2", 1),
+    "whiteness": ("whiteness of the steering", 1),
+}
+REPLAYS = {
+    "drift": ("replay of 2 s: drift from the driver", 1),
+    "autonomy_1": ("replay: autonomy at 1 m", -1),
+    "autonomy_2.5": ("replay: autonomy at 2.5 m", -1),
+    "metres_per_intervention_1": ("replay: m per intervention at 1 m", -1),
+    "replay_distance_2.5": ("replay: mean distance", 1),
+}
+MEASURES = LOSSES | REPLAYS
 DRIVING = {
     "driving": "departures per km and, among equals, mean distance",
     "departures_per_km": "departures per km",
     "offset_mean": "mean distance from the lane's centre",
 }
 EQUALS = 0.01  # departures per km that a metre of mean distance counts: less than one departure in a lap
-COLOURS = {"loss": "tab:orange", "replay": "tab:blue"}
+COLOURS = dict.fromkeys(LOSSES, "tab:orange") | dict.fromkeys(REPLAYS, "tab:blue")
 
 
 def row(variant: Variant, found: dict[str, float]) -> Row:
@@ -74,7 +62,7 @@ def column(rows: Sequence[Row], name: str) -> np.ndarray:
 def correlated(measure: np.ndarray, driving: np.ndarray, sign: int) -> tuple[float, float, float]:
     """Return Spearman's rank correlation of a measure with driving, and the ends of its 95 % interval.
 
-    measure, driving: float64 (n,); sign: see Measure; more driving is worse. The interval is that of a bootstrap over
+    measure, driving: float64 (n,); sign: see LOSSES; more driving is worse. The interval is that of a bootstrap over
     the networks. nan if either has the same value everywhere.
     """
     rng, n = np.random.default_rng(0), len(measure)
@@ -103,10 +91,8 @@ def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 def correlations(rows: Sequence[Row], driving: str) -> dict[str, tuple[float, float, float]]:
     """Return, by measure, the correlation of some networks with driving and its interval; driving: key of DRIVING."""
-    return {
-        measure.name: correlated(column(rows, measure.name), column(rows, driving), measure.sign)
-        for measure in MEASURES
-    }
+    true = column(rows, driving)
+    return {name: correlated(column(rows, name), true, sign) for name, (_, sign) in MEASURES.items()}
 
 
 def report(rows: Sequence[Row]) -> str:
@@ -117,9 +103,9 @@ def report(rows: Sequence[Row]) -> str:
         found = [correlations(part, name) for part in compared.values()]
         lines += ["", f"## Rank correlation with laps in the stand-in simulator: {words}", ""]
         lines.append(command.head("measure", *(f"{title}, {len(part)} networks" for title, part in compared.items())))
-        for measure in MEASURES:
-            cells = ["{:.2f} ({:.2f} to {:.2f})".format(*each[measure.name]) for each in found]
-            lines.append(command.row(measure.title, *cells))
+        for measure, (title, _) in MEASURES.items():
+            cells = ["{:.2f} ({:.2f} to {:.2f})".format(*each[measure]) for each in found]
+            lines.append(command.row(title, *cells))
         lines += ["", "Spearman's, signed so that 1 is perfect foresight; in brackets, 95 % of a bootstrap's draws."]
     seconds, metres = RECOVERY_SECONDS, RECOVERY_SPEED * MPH
     lines += ["", f"## Back in the lane within {seconds:g} s, at {metres:.0f} m/s", ""]
@@ -158,13 +144,13 @@ def correlation_picture(rows: Sequence[Row]) -> bytes:
     for axes, (title, part) in zip(every_axes, compared.items(), strict=True):
         found = correlations(part, "driving") if len(part) > 2 else {}
         for at, measure in enumerate(MEASURES):
-            value, low, high = found.get(measure.name, (np.nan,) * 3)
-            axes.barh(at, value, color=COLOURS[measure.group], alpha=0.8, height=0.7)
+            value, low, high = found.get(measure, (np.nan,) * 3)
+            axes.barh(at, value, color=COLOURS[measure], alpha=0.8, height=0.7)
             axes.plot([low, high], [at, at], color="black", linewidth=1.2)
         axes.axvline(0, color="black", linewidth=0.8)
         axes.set(xlim=(-1, 1), title=f"{title}\n{len(part)} networks")
         axes.grid(axis="x", alpha=0.3)
-    every_axes[0].set_yticks(range(len(MEASURES)), [measure.title for measure in MEASURES])
+    every_axes[0].set_yticks(range(len(MEASURES)), [title for title, _ in MEASURES.values()])
     every_axes[0].invert_yaxis()
     figure.supxlabel("rank correlation with driving: 1 is perfect foresight")
     return png(figure)
