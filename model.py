@@ -235,22 +235,21 @@ class Generator:
 
     def start_batch(self, number: int) -> Callable[[], Batch]:
         """Start making this process's share of batch `number`; return a function that waits for it and returns it."""
-        choices = self.sample(number)
+        choices, augmentations = self.sample(number), self.recipe.augmentations
         mine = np.arange(self.recipe.batch_size)[self.ranks.share]
         slots = choices.slots[mine]
         order = np.sort(slots[slots >= 0])  # the slots of this process's images among those of the whole batch
         images, labels = np.empty((len(order), *SEEN_SHAPE), np.uint8), np.empty(len(order), np.float32)
 
         def make(part: np.ndarray) -> None:
-            for kind, seen in enumerate(choices.views.images(part)):
-                has = choices.slots[part, kind] >= 0
+            for i, (augmentation, seen) in enumerate(zip(augmentations, choices.views.images(part), strict=True)):
+                has = choices.slots[part, i] >= 0
                 if not has.any():
                     continue
                 which, seen = (part, seen) if has.all() else (part[has], seen[has])
-                at = np.searchsorted(order, choices.slots[which, kind])
-                chosen = [column[which] for column in choices.augmenting[kind]]
-                images[at] = self.recipe.augmentations[kind].change(seen, CROP[0], *chosen)
-                labels[at] = choices.views.labels[which, kind]
+                at = np.searchsorted(order, choices.slots[which, i])
+                images[at] = augmentation.change(seen, CROP[0], *(column[which] for column in choices.augmenting[i]))
+                labels[at] = choices.views.labels[which, i]
 
         parts = [self.pool.submit(make, mine[piece]) for piece in pieces(len(mine))]
 

@@ -63,14 +63,11 @@ def measure_frames(network: LaneNetwork) -> None:
     for name, courses in unseen_courses().items():
         strips, true = render_all([RenderedScene(track, look, 150) for track, look in courses], seed=1)
         estimated = estimate_centres(strips, network)
-        slopes = []
-        for x, y in zip(true.T, estimated.T, strict=True):
-            known = ~np.isnan(x)
-            slopes.append(np.polyfit(x[known], y[known], 1)[0])
+        columns = zip(true.T, estimated.T, ~np.isnan(true.T), strict=True)
         rows = {
             "mean absolute error, m": np.nanmean(abs(estimated - true), 0),
             "bias, m": np.nanmean(estimated - true, 0),
-            "slope": np.array(slopes),
+            "slope": [np.polyfit(x[known], y[known], 1)[0] for x, y, known in columns],
         }
         for label, values in rows.items():
             print(f"{f'{name}, {label}':34}" + "".join(f"{value:8.2f}" for value in values))
@@ -88,11 +85,16 @@ def measure_drives(network: LaneNetwork, laps: float) -> None:
         true = np.array(run.trajectory.offset)[step]
         error = position.lateral_offset - true
         print(
-            f"{f'rendered drive, {name}, look {look}':34}{len(error):6} rows, error {np.abs(error).mean():.2f} m, "
-            f"95th percentile {np.quantile(np.abs(error), 0.95):.2f}, bias {error.mean():+.2f}, "
+            f"{f'rendered drive, {name}, look {look}':34}{len(error):6} rows, error {spread(error)}, "
+            f"bias {error.mean():+.2f}, "
             f"slope {np.polyfit(true, position.lateral_offset, 1)[0]:.2f}; trusted {position.trusted.mean():.1%}; "
             f"localised, if possible: error {np.abs(located.lateral_offset - true).mean():.2f} m"
         )
+
+
+def spread(values: np.ndarray) -> str:
+    """Return the mean and a percentile of distances to either side, in m."""
+    return f"{np.abs(values).mean():.2f} m, 95th percentile {np.quantile(np.abs(values), 0.95):.2f}"
 
 
 def measure_recording(folder: str, network: LaneNetwork) -> None:
@@ -107,17 +109,14 @@ def measure_recording(folder: str, network: LaneNetwork) -> None:
     finished = time.perf_counter()
     apart = centres[:, :1] - centres[:, 1:]
     print(f"{folder}, {len(recording)} rows")
-    near = DISTANCES_AHEAD[:3]
+    near = ", ".join(f"{distance:g}" for distance in DISTANCES_AHEAD[:3])
     for side, name in enumerate(("left", "right")):
-        cells = [f"{np.mean(apart[:, side, k]):+.2f} ± {np.std(apart[:, side, k]):.2f}" for k in range(len(near))]
-        print(
-            f"  {name + ' camera appears to be at':32}{', '.join(cells)} m, from {near[0]:g}, {near[1]:g}, {near[2]:g} "
-            f"m ahead (mounted at {MOUNT_OFFSETS[side + 1]:+.2f})"
-        )
+        cells = ", ".join(f"{np.mean(at):+.2f} ± {np.std(at):.2f}" for at in apart[:, side, :3].T)
+        mounted = f"mounted at {MOUNT_OFFSETS[side + 1]:+.2f}"
+        print(f"  {name + ' camera appears to be at':32}{cells} m, from {near} m ahead ({mounted})")
     offset = position.lateral_offset
     print(
-        f"  {'lateral offset':32}{np.abs(offset).mean():.2f} m, 95th percentile "
-        f"{np.quantile(np.abs(offset), 0.95):.2f}, mean {offset.mean():+.2f}; "
+        f"  {'lateral offset':32}{spread(offset)}, mean {offset.mean():+.2f}; "
         f"heading error {np.degrees(position.heading_error).std():.1f} degrees; trusted {position.trusted.mean():.1%}"
     )
     ms = np.diff([started, decoded, estimated, finished]) / len(recording) * 1e3

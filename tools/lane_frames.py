@@ -4,6 +4,7 @@ The tracks are rendered in many looks, with and without shadows, and so are gene
 nor the road is one that the network knows. Roads below FIRST_ROAD and looks from 101 on are left to measure with.
 """
 
+import itertools
 import multiprocessing
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -96,7 +97,6 @@ def render_strips(scene: RenderedScene, seed: int) -> tuple[np.ndarray, np.ndarr
 
 def render_all(chosen: Iterable[RenderedScene], seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Run `render_strips` for several scenes, in several processes, and return all frames."""
-    jobs = [(scene, seed) for scene in chosen]
     with ProcessPoolExecutor(threads(), mp_context=multiprocessing.get_context("spawn")) as pool:
-        strips, centres = zip(*pool.map(render_strips, *zip(*jobs, strict=True)), strict=True)
+        strips, centres = zip(*pool.map(render_strips, chosen, itertools.repeat(seed)), strict=True)
     return np.concatenate(strips), np.concatenate(centres)

@@ -87,9 +87,9 @@ def render(folder: Path, chosen: list[Lap]) -> list[Path]:
 
 
 def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
-    """Make a folder of each real recording that training repeats as it does problem areas, and return these folders.
+    """Make a folder of each real recording, with a name for which training repeats it, and return these folders.
 
-    Their names say so. Raises RecordingError for two recordings of one name, OSError.
+    Raises RecordingError for two recordings of one name, OSError.
     """
     twins: dict[Path, Path] = {}
     for recording in recordings:

@@ -181,28 +181,26 @@ class BatchSampler:
         rng = np.random.default_rng([self.seed, 2, index])
         chosen = rng.integers(0, len(self.strips), RENDERED)
         strips, masks = list(self.strips[chosen]), [self.augmentation.mask(rng, 0.3) for _ in range(RENDERED)]
-        sampled = [
-            self.pair(self.recordings[rng.integers(len(self.recordings))], rng)
-            for _ in range(PAIRS if self.recordings else 0)
-        ]
-        strips += [pair.first for pair in sampled] + [pair.second for pair in sampled]
-        masks += 2 * [pair.mask for pair in sampled]
-        poses = [pair.pose for pair in sampled]
-        pairs = zip(strips, masks, strict=True)
-        inputs = np.stack([normalize(self.augmentation.apply(strip, rng)) * mask for strip, mask in pairs])
+        pairs = [self.pair(rng) for _ in range(PAIRS if self.recordings else 0)]
+        strips += [pair.first for pair in pairs] + [pair.second for pair in pairs]
+        masks += 2 * [pair.mask for pair in pairs]
+        poses = [pair.pose for pair in pairs]
+        masked = zip(strips, masks, strict=True)
+        inputs = np.stack([normalize(self.augmentation.apply(strip, rng)) * mask for strip, mask in masked])
         mirrored = rng.random(len(inputs)) < 0.5
         inputs[mirrored] = inputs[mirrored, :, ::-1]
         signs = np.where(mirrored, -1, 1)[:, None].astype(np.float32)
         return inputs, signs, self.centres[chosen], np.array(poses, np.float32).reshape(-1, 4)
 
-    def pair(self, recording: RealRecording, rng: np.random.Generator) -> Pair:
+    def pair(self, rng: np.random.Generator) -> Pair:
         """Sample a pair: from two cameras at once, from two rows of a drive, or from one row, warped twice."""
+        recording = self.recordings[rng.integers(len(self.recordings))]
         row, choice = int(rng.integers(len(recording.strips))), rng.random()
         if choice < 0.4:
             first, second = rng.permutation(3)[:2]
-            views = recording.strips[row, first], recording.strips[row, second]
-            apart = MOUNT_OFFSETS[second] - MOUNT_OFFSETS[first]
-            return Pair(*views, self.augmentation.mask(rng, 0.3), (apart, 0, 0, np.inf))
+            pose = (MOUNT_OFFSETS[second] - MOUNT_OFFSETS[first], 0, 0, np.inf)
+            strips = recording.strips[row]
+            return Pair(strips[first], strips[second], self.augmentation.mask(rng, 0.3), pose)
         if choice < 0.7:
             later, (right, forward, yaw) = recording.later(row, rng.uniform(*TRAVEL))
             first, second = rng.integers(0, 3, 2)
@@ -277,8 +275,7 @@ def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
             with in_precision(precision, device):
                 predicted = network(torch.from_numpy(inputs))
             predicted = predicted * torch.from_numpy(signs)
-            rendered = masked_loss(predicted[:RENDERED], torch.from_numpy(centres))
-            real = torch.zeros(())
+            rendered, real = masked_loss(predicted[:RENDERED], torch.from_numpy(centres)), torch.zeros(())
             if len(poses):
                 first, second = predicted[RENDERED:].split(len(poses))
                 real = consistency_loss(first, second, torch.from_numpy(poses))
@@ -288,13 +285,9 @@ def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
             schedule.step()
             sums += float(rendered.detach()), float(real.detach())
             if step % 250 == 249 or step + 1 == steps:
-                count = step % 250 + 1
-                print(
-                    f"step {step + 1}/{steps} - {time.monotonic() - started:.0f}s"
-                    f" - rendered: {sums[0] / count:.3f} - real: {sums[1] / count:.3f}",
-                    flush=True,
-                )
-                sums[:] = 0
+                means, sums = sums / (step % 250 + 1), np.zeros(2)
+                begin = f"step {step + 1}/{steps} - {time.monotonic() - started:.0f}s"
+                print(f"{begin} - rendered: {means[0]:.3f} - real: {means[1]:.3f}", flush=True)
     return network.eval()
 
 

@@ -57,16 +57,13 @@ def batch_pictures(choices: Choices, recipe: Recipe) -> dict[str, bytes]:
     One shows the left, centre and right image, the other an image of each augmentation, each with its label.
     """
     example = choices.views.example(0)
-    center, left, right = (
-        panel(frame, camera, label)
-        for frame, camera, label in zip(example.frames, CAMERAS, example.camera_labels, strict=True)
-    )
+    center, left, right = map(panel, example.frames, CAMERAS, example.camera_labels)
     panels = []
-    for kind, augmentation in enumerate(recipe.augmentations):
-        chosen = [column[:1] for column in choices.augmenting[kind]]
-        image = augmentation.change(example.images[kind], example.first_row, *chosen)[0]
+    for i, augmentation in enumerate(recipe.augmentations):
+        chosen = [column[:1] for column in choices.augmenting[i]]
+        image = augmentation.change(example.images[i], example.first_row, *chosen)[0]
         caption = f", {augmentation.caption.format(*(column[0] for column in chosen))}" if augmentation.caption else ""
-        panels.append(panel(image, example.titles[kind] + caption, choices.views.labels[0, kind]))
+        panels.append(panel(image, example.titles[i] + caption, choices.views.labels[0, i]))
     return {
         "training_generator_LRC_{}.png": grid([left, center, right], columns=3),
         "training_generator_augmented-{}.png": grid(panels, columns=2),
@@ -96,11 +93,10 @@ def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:
     drift = [row["val_drift"] for row in history]
     if not np.isnan(drift).all():
         right = axes.twinx()
-        (line,) = right.plot(
-            epochs, drift, "s--", color="tab:green", label="drift in two seconds of driving, validation"
-        )
+        right.plot(epochs, drift, "s--", color="tab:green")
         right.set(ylabel="drift, m", ylim=(0, None))
-        axes.plot([], [], "s--", color=line.get_color(), label=line.get_label())  # for the one legend
+        label = "drift in two seconds of driving, validation"
+        axes.plot([], [], "s--", color="tab:green", label=label)  # for the one legend
     axes.legend()
     axes.grid(alpha=0.3)
     file = io.BytesIO()

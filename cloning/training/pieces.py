@@ -1,6 +1,7 @@
 """Batches; loss, gradients and predictions, on a CPU in pieces of a batch that fit its cache."""
 
 import copy
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -70,47 +71,21 @@ def squared_errors(network: nn.Module, batch: Batch, huber: float | None = None)
     return (known**2 + slope * (error - known)).sum()  # the second term is 0, and has the gradient
 
 
-class PieceByPiece(torch.autograd.Function):
-    """Loss and gradients of a batch on a CPU, in pieces that fit its cache, each computed by one thread of the pool.
-
-    Sums are taken in the order of the pieces, so that the result does not depend on which thread was faster.
-    """
+class WithGradients(torch.autograd.Function):
+    """A sum whose gradients are computed together with it, before `backward` asks for them."""
 
     @staticmethod
     def forward(
-        context: Any,
-        network: nn.Module,
-        pool: ThreadPoolExecutor,
-        batch: Batch,
-        huber: float | None,
-        meanwhile: Callable[[], None],
-        *parameters: nn.Parameter,
+        context: Any, compute: Callable[[], tuple[torch.Tensor, list[torch.Tensor]]], *parameters: nn.Parameter
     ) -> torch.Tensor:
-        """Return the sum of squared errors; the gradients are computed, too, and kept for `backward`.
-
-        network: computes, with the values of the parameters, which are float32; it may have them in bfloat16;
-        huber: see `squared_errors`; meanwhile: called when all pieces are in the pool's queue.
-        """
-        weights = list(network.parameters())
-
-        def piece(part: slice) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-            with torch.enable_grad():
-                errors = squared_errors(network, batch.part(part), huber)
-            return errors.detach(), torch.autograd.grad(errors, weights)
-
-        done = pool.map(piece, pieces(len(batch.labels)))
-        meanwhile()
-        total, gradients = torch.zeros(()), [torch.zeros_like(parameter) for parameter in parameters]
-        for piece_errors, piece_gradients in done:
-            total += piece_errors
-            torch._foreach_add_(gradients, list(piece_gradients))
-        context.gradients = gradients
+        """Return the sum, a scalar; compute: returns it and the gradient of each parameter."""
+        total, context.gradients = compute()
         return total
 
     @staticmethod
     def backward(context: Any, scale: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Return the gradients of the parameters, times `scale`; the first five inputs have none."""
-        return None, None, None, None, None, *torch._foreach_mul(context.gradients, scale)
+        """Return the gradients of the parameters, times `scale`."""
+        return None, *torch._foreach_mul(context.gradients, scale)
 
 
 class SquaredErrors(nn.Module):
@@ -134,13 +109,34 @@ class SquaredErrors(nn.Module):
         pool is done later.
         """
         if self.device.type == "cpu":
-            (network,) = self.converted  # once for a batch: converting the weights for each piece would take longer
-            with torch.no_grad():
-                torch._foreach_copy_(list(network.parameters()), list(self.network.parameters()))
-            return PieceByPiece.apply(network, self.pool, batch, self.huber, meanwhile, *self.network.parameters())
+            in_pieces = functools.partial(self.in_pieces, batch, meanwhile)
+            return WithGradients.apply(in_pieces, *self.network.parameters())
         meanwhile()
         with in_precision(self.precision, self.device):
             return squared_errors(self.network, batch, self.huber)
+
+    def in_pieces(self, batch: Batch, meanwhile: Callable[[], None]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Return the sum and its gradients, computed in pieces, each by one thread of the pool.
+
+        They are added in the order of the pieces, so that the result does not depend on which thread was faster.
+        """
+        (network,) = self.converted  # once for a batch: converting the weights for each piece would take longer
+        weights, parameters = list(network.parameters()), list(self.network.parameters())
+        with torch.no_grad():
+            torch._foreach_copy_([*weights], [*parameters])
+
+        def compute(part: slice) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+            with torch.enable_grad():
+                errors = squared_errors(network, batch.part(part), self.huber)
+            return errors.detach(), torch.autograd.grad(errors, weights)
+
+        done = self.pool.map(compute, pieces(len(batch.labels)))
+        meanwhile()
+        total, gradients = torch.zeros(()), [torch.zeros_like(parameter) for parameter in parameters]
+        for piece_errors, piece_gradients in done:
+            total += piece_errors
+            torch._foreach_add_(gradients, list(piece_gradients))
+        return total, gradients
 
 
 def predict(
