@@ -20,7 +20,8 @@ import json
 import multiprocessing
 import shutil
 import signal
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from cloning.base import program
@@ -75,26 +76,23 @@ def write_study(rows: list[Row], folder: Path) -> None:
         write_output(folder / f"study_{picture.__name__.removesuffix('_picture')}.png", picture(rows))
 
 
-def measure_all(variants: list[Variant], options: argparse.Namespace) -> list[dict[str, float]]:
-    """Train and measure the networks that are not measured yet, and return all measures. Raises UserError, OSError."""
-    files = {variant: options.folder / variant.name / "result.json" for variant in variants}
-    context = multiprocessing.get_context("spawn")
-    default = signal.signal, (signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a process at once, or saves its training
-    with ProcessPoolExecutor(options.jobs, context, *default, max_tasks_per_child=1) as pool:
-        begun = [
-            pool.submit(measure, variant, options.recordings, file, options.images, options.laps, options.starts)
-            for variant, file in files.items()
-            if not file.exists()
-        ]
-        try:
-            for network in begun:
-                network.result()
-        except BrokenExecutor:
-            raise UserError("a network's process was killed; start the study again, with fewer --jobs") from None
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return [json.loads(file.read_text(encoding="utf-8")) for file in files.values()]
+def result(variant: Variant, options: argparse.Namespace) -> dict[str, float]:
+    """Return a network's measures; if there are none yet, train and measure it in a process of its own.
+
+    Raises UserError, OSError.
+    """
+    file = options.folder / variant.name / "result.json"
+    if not file.exists():
+        context = multiprocessing.get_context("spawn")
+        default = signal.signal, (signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it at once, or saves its training
+        with ProcessPoolExecutor(1, context, *default) as process:
+            figures = options.images, options.laps, options.starts
+            try:
+                process.submit(measure, variant, options.recordings, file, *figures).result()
+            except BrokenExecutor:
+                remedy = "start the study again, with fewer --jobs"
+                raise UserError(f"{file.parent}: its process was killed; {remedy}") from None
+    return json.loads(file.read_text(encoding="utf-8"))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -111,7 +109,12 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     variants = plan()[: options.networks]
     prepare(options)
-    found = measure_all(variants, options)
+    with ThreadPoolExecutor(options.jobs) as pool:
+        try:
+            found = list(pool.map(partial(result, options=options), variants))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     write_study([row(*pair) for pair in zip(variants, found, strict=True)], options.folder)
     print(f"{options.folder / 'study.md'}, study.csv and pictures")
     return program.DONE
