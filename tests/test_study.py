@@ -1,6 +1,8 @@
 """tools.study: its plan, what alters the training, its measures against oracles, and the command on tiny recordings."""
 
+import argparse
 import csv
+import os
 import re
 import sys
 from collections import Counter
@@ -15,8 +17,10 @@ from commands import ROOT
 from rendered import render_recording
 from test_generator import loaded, observations
 
+from cloning.base.errors import UserError
 from cloning.replay.replay import load_recording
 from model import REPORT, ROBUST, Generator, balance
+from tools.study import __main__ as study
 from tools.study import figures
 from tools.study.measures import Simulator, offline
 from tools.study.networks import RECIPE, RECOVERING, TRACKS, plan
@@ -154,6 +158,18 @@ def test_the_command_measures_and_goes_on(tmp_path):
         "lake-cw: the study needs recordings by the names jungle, jungle-shadows, lake-ccw, lake-cw" in missing.stderr
     )
     assert "Traceback" not in missing.stderr
+
+
+def end_process(*_):
+    os._exit(9)
+
+
+def test_a_killed_process_is_named(tmp_path, monkeypatch):
+    """As when memory is short."""
+    monkeypatch.setattr(study, "measure", end_process)
+    options = argparse.Namespace(folder=tmp_path, recordings=tmp_path, images=1, laps=1, starts=1)
+    with pytest.raises(UserError, match="lake-centre-camera-seed-0: its process was killed"):
+        study.result(plan()[0], options)
 
 
 def test_the_report_and_the_pictures_show_all_networks():
