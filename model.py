@@ -363,7 +363,8 @@ class TrainingRun:
         n, share = len(self.validation), self.ranks.share
         chosen = default_rng([self.seed, 4]).permutation(n)[: max(self.recipe.samples_per_epoch // 5, 1)]
         mine, sets = chosen[share], self.validation_sets
-        error = sum(float(((self.predict(self.network, x, mine) - y[mine]) ** 2).sum()) for x, y in sets)
+        guesses = [(self.predict(self.network, images, mine), labels[mine]) for images, labels in sets]
+        error = sum(float(((guess - labels) ** 2).sum()) for guess, labels in guesses)
         far = drifts(self.held_out[share], self.network, self.pool)
         error, metres, driven = self.ranks.summed([error, float(far.sum()), float(len(far))], self.device)
         return error / len(sets) / len(chosen), metres / driven if driven else math.nan
