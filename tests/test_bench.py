@@ -2,7 +2,6 @@
 
 import json
 import re
-from types import SimpleNamespace
 
 from cloning.base.program import DONE, INCOMPLETE
 from cloning.network.network import Network
@@ -13,27 +12,6 @@ def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording
     assert bench_training.main([str(sample_recording), "--part", "ab", "--samples", "2370"]) == DONE
     measured = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert set(measured["rates"]) == {"a", "b"} and min(measured["rates"].values()) > 0
-
-
-def test_the_training_benchmark_compares_its_parts(monkeypatch, capsys):
-    """Part (c) takes the same time in both rounds, the others half of it in the second."""
-    rounds = {"limit": [400.0, 800.0], "a": [100.0, 200.0], "b": [200.0, 400.0], "c": [50.0, 50.0]}
-    parts: list[str] = []
-
-    def python(*words, **_):
-        part = words[words.index("--part") + 1]
-        rates = {name: rounds[name][parts.count(part)] for name in ({"a", "b"} if part == "ab" else {part})}
-        parts.append(part)
-        about = {"gb": 1.5, "device": "cpu", "precision": "float32", "flops": 5e7}
-        return SimpleNamespace(returncode=0, stdout="training: 6 rows\n" + json.dumps(about | {"rates": rates}))
-
-    monkeypatch.setattr(bench_training, "python", python)
-    assert bench_training.main(["recording", "--rounds", "2"]) == DONE
-    assert parts == ["limit", "ab", "c"] * 2
-    printed = capsys.readouterr().out
-    assert "cpu, float32, 2 rounds, 50 MFLOP per image" in printed
-    assert "| (a) an epoch of model.py | 150 | 100 | 200 | 1.50 |" in printed
-    assert "| a / c | 3.00 | 2.00 | 4.00 |" in printed and "| b / limit | 0.50 | 0.50 | 0.50 |" in printed
 
 
 def test_the_operations_are_those_of_the_network():

@@ -46,13 +46,6 @@ def test_the_ground_is_projected_where_it_is_warped_from():
     assert moved[:2] / moved[2] == pytest.approx(far, abs=1e-9)
 
 
-def test_homographies_of_many_poses_are_those_of_each():
-    poses = np.random.default_rng(0).normal(0, 0.3, (3, 20))
-    many = camera.homographies(*poses)
-    assert many.shape == (20, 2, 3, 3)
-    assert many == pytest.approx(np.array([camera.homographies(*pose) for pose in poses.T]), rel=1e-12)
-
-
 def test_a_camera_is_where_the_cars_pose_and_its_mounting_put_it():
     """In a trajectory's frame (right, forward) and on a track (x east, y north), against complex numbers."""
     yaw, axle, offset = 0.3, np.array([2.0, -1.0]), 0.825

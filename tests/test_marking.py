@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cloning.lane import marking
-from cloning.lane.ahead import centre_ahead, line_ahead
+from cloning.lane.ahead import line_ahead
 from cloning.lane.localise import localise_recording, shipped_networks
 from cloning.lane.reader import DIRECTION_TO_STRIP, MOUNT_OFFSETS, STRIP_SHAPE, estimate_centres, read_strips
 from cloning.recordings.log import read_recording
@@ -75,15 +75,6 @@ def test_the_cameras_agree_on_a_line_where_the_road_falls_or_rises(factor):
     assert find_line(strips, STRAIGHT) != pytest.approx(0.3, abs=0.04)
 
 
-def test_where_a_line_is_seen_on_flat_ground():
-    track, distances = Track("lake"), np.arange(2.0, 9)
-    at = track.at(40)
-    pose = 40, np.array([at.x, at.y]), at.heading + 0.05
-    right, factor = line_ahead(track, *pose, distances)
-    assert right == pytest.approx(centre_ahead(track, *pose, distances), abs=1e-9)
-    assert (factor == 1).all()
-
-
 @pytest.mark.parametrize("bend", [-1, 1])
 def test_where_a_line_is_seen_where_the_road_falls_or_rises(bend):
     """At the jungle's sharpest crest and dip, against its points, one by one, from a car as steep as the road below."""
@@ -111,30 +102,6 @@ def test_where_a_line_is_seen_where_the_road_falls_or_rises(bend):
     assert found[visible] == pytest.approx(expected[visible], abs=0.02)
     assert factor[visible] == pytest.approx(np.interp(distances, seen[:end], factors[:end])[visible], abs=0.02)
     assert ((factor[visible] - 1) * bend > 0.1).any()
-
-
-def test_each_row_is_searched_on_its_own():
-    strips = np.stack([paint([right]) for right in (-0.6, 0.4, 2.5)])
-    expected = np.stack([STRAIGHT, STRAIGHT + 0.1 * ASIDE, STRAIGHT])
-    np.testing.assert_array_equal(
-        marking.find_lines(strips, expected), [find_line(*row) for row in zip(strips, expected, strict=True)]
-    )
-
-
-def test_detections_need_support():
-    """Against a loop over all pairs."""
-    rng = np.random.default_rng(0)
-    found = np.where(rng.random((80, 3)) < 0.5, rng.normal(0, 0.2, (80, 3)), np.nan)
-    found[40:] += rng.uniform(-2, 2, (40, 3))
-    expected = np.full_like(found, np.nan)
-    for row, part in np.argwhere(~np.isnan(found)):
-        rows = np.arange(max(0, row - marking.NEAR_ROWS), min(80, row + marking.NEAR_ROWS + 1))
-        allowed = marking.AGREEMENT + marking.DRIFT * np.abs(rows - row)[:, None]
-        if (np.abs(found[rows] - found[row, part]) < allowed).sum() - 1 >= marking.SUPPORT:
-            expected[row, part] = found[row, part]
-    kept = marking.supported(found)
-    np.testing.assert_array_equal(kept, expected)
-    assert 40 < (~np.isnan(kept)).sum() < (~np.isnan(found)).sum() - 15
 
 
 def test_the_line_corrects_what_the_network_detects(tmp_path, monkeypatch):

@@ -122,16 +122,6 @@ def test_a_line_of_the_summary_pools_held_out_results_else_those_in_sample(board
     assert "limit 2.5 m" not in text and "one: lake" not in text and "two: shadows" not in text, "nothing to show"
 
 
-def test_a_row_names_the_reference_and_shows_the_oracle(board):
-    text = table(board)
-    assert cells(text, "jungle, limit 1 m") == [
-        "100.0 %, 0 interventions, 0.12 m",
-        "94.0 %, 1 intervention, 0.20 m, in sample",
-        "88.0 %, 2 interventions, 0.50 m, held out",
-    ]
-    assert cells(text, "jungle-shadows, limit 1 m, 75 % of it from the lane's centre")[2] == "-"
-
-
 def test_generated_roads_share_a_row_and_columns_without_results_are_left_out(board):
     drives = table(board).split("## Laps in the stand-in simulator")[1]
     assert "two" not in drives.split("## The networks")[0]

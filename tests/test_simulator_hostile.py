@@ -23,7 +23,8 @@ from simulator.__main__ import main
 from simulator.client import Client, RemoteDriver
 from simulator.run import Run
 
-WAIT = 0.3  # s of patience
+WAIT = 0.2  # s of patience
+TICK = 0.02  # s between a server's looks at the clock
 SLACK = 8.0  # s: more than the client takes beyond its patience on a busy machine; then the server gives up
 TEXT, BINARY, CLOSE, PING = 1, 2, 8, 9
 OPENED = '0{"sid":"x","upgrades":[],"pingTimeout":60000,"pingInterval":25000}'
@@ -90,7 +91,7 @@ class Hostile:
         return time.monotonic() < self.until
 
     def run(self):
-        self.listener.settimeout(0.1)
+        self.listener.settimeout(TICK)
         with self.listener:
             while self.open:
                 with contextlib.suppress(TimeoutError):
@@ -99,7 +100,7 @@ class Hostile:
                     self.threads[-1].start()
 
     def serve(self, client):
-        client.settimeout(0.1)
+        client.settimeout(TICK)
         case = self.case
         with client, contextlib.suppress(OSError):
             if case.accepts:
@@ -163,6 +164,12 @@ CASES = {
 # The error names the last loss of the connection: an attempt that the end of the patience cut short, at times.
 LATE = "|accepts connections but does not answer"
 hostile = pytest.mark.parametrize("name", CASES)
+
+
+@pytest.fixture(autouse=True)
+def short_goodbye(monkeypatch):
+    """A server that does not notice the end of a session is waited for 0.1 s, not 1 s."""
+    monkeypatch.setattr("cloning.wire.client.CLOSE_TIMEOUT", 0.1)
 
 
 @functools.cache
@@ -231,7 +238,7 @@ def test_the_command_ends_with_status_2(capsys):
     with Hostile(CASES["closes at once"]) as server:
         assert main(["drive", "--wait", str(WAIT), "--port", str(server.port)]) == 2
     printed = capsys.readouterr().err
-    assert re.search(r"^simulator: .*no usable answer in 0\.3 s", printed, re.MULTILINE) and "Traceback" not in printed
+    assert re.search(r"^simulator: .*no usable answer in 0\.2 s", printed, re.MULTILINE) and "Traceback" not in printed
 
 
 @hostile
