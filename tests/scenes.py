@@ -1,14 +1,18 @@
 """Rendered views of the tracks; a process builds each scene once for all its tests."""
 
 import functools
+from concurrent.futures import Executor, Future
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
+from cloning.recordings.log import Recording, read_recording
 from cloning.road.track import Track
-from simulator import scenery
+from simulator import record, scenery
 from simulator.cameras import Cameras
+from simulator.car import STEP
 from simulator.run import Run
 from simulator.world import Scene
 
@@ -24,6 +28,37 @@ def view(track: str, look: int, s: float = 300.0, offset: float = 0.0) -> np.nda
     run.s = s
     run.set_back(offset)
     return cameras(track, look).frames(run.car.node.get_transform()).astype(int)
+
+
+class Here(Executor):
+    """Does in this process at once what is submitted."""
+
+    def __init__(self, *_):
+        pass
+
+    def submit(self, function, /, *arguments, **more):
+        done: Future = Future()
+        done.set_result(function(*arguments, **more))
+        return done
+
+
+def recorded(
+    folder: Path, track: Track, laps: float, speed: float, seed: int = 3, look: int = 0
+) -> tuple[Recording, np.ndarray]:
+    """What the expert drives, and the true lateral offset of each row, m; rendered with this process's own scenes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record, "ProcessPoolExecutor", Here)
+        patch.setattr(record, "_cameras", cameras)
+        run, _ = record.record(folder, track, laps, speed, seed, look)
+    recording = read_recording(folder)
+    steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
+    return recording, np.array(run.trajectory.offset)[steps]
+
+
+@functools.cache
+def lake_drive(session: Path) -> tuple[Recording, np.ndarray]:
+    """A drive on the lake, recorded once in pytest's folder, not to be changed; see `recorded`."""
+    return recorded(session / "recorded" / "lake", Track("lake"), 0.12, 30)
 
 
 def load(path: str | Path) -> np.ndarray:

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from commands import run_here
+from scenes import lake_drive
 
 from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses
@@ -14,22 +15,15 @@ from cloning.lane.localise import estimate_lane_position
 from cloning.recordings.log import read_recording
 from cloning.replay.replay import load_recording, reference_lines
 from cloning.road.motion import stretches
-from cloning.road.track import Track
-from simulator.car import STEP
-from simulator.record import record
 
 HEADER = "center image,lateral offset (m),heading error (radians)\n"
 
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """A recorded piece of a lap, and the offsets that the car really had at its rows."""
-    folder = tmp_path_factory.mktemp("known") / "lake"
-    run, rows = record(folder, Track("lake"), 0.1, 20, seed=3)
-    assert rows > 60
-    recording = read_recording(folder)
-    steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-    return folder, np.array(run.trajectory.offset)[steps]
+    """A recording's folder, and the offsets that the car really had at its rows."""
+    recording, true = lake_drive(tmp_path_factory.getbasetemp())
+    return recording.folder, true
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ import real_recordings
 import torch
 import warm
 from commands import HERE
+from scenes import lake_drive, recorded
 
 from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
@@ -43,8 +44,6 @@ from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, camera_position
 from cloning.road.motion import MIN_TRUSTED, REAR_AXLE, Stretch, stretches
 from cloning.road.track import ROADS, Track
 from simulator import __main__ as simulator
-from simulator.car import STEP
-from simulator.record import record
 from tools import lane_accuracy, likeness, train_lane
 from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
@@ -55,12 +54,7 @@ UNSEEN = 1003  # a look that the network was not trained on
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """A rendered drive on the lake in look 0: the recording, and the true lateral offset of each row, m."""
-    folder = tmp_path_factory.mktemp("lane") / "lake"
-    run, _ = record(folder, Track("lake"), 0.12, 30, seed=3)
-    recording = read_recording(folder)
-    steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-    return recording, np.array(run.trajectory.offset)[steps]
+    return lake_drive(tmp_path_factory.getbasetemp())
 
 
 def test_a_strip_is_the_frames_road_at_half_the_resolution():
@@ -192,11 +186,9 @@ def test_a_rendered_drive(drive):
 
 def test_a_road_that_no_network_was_trained_on(tmp_path):
     """In a look that none was trained on, with shadows; other such roads have 0.05 to 0.36 m."""
-    run, _ = record(tmp_path / "road", Track("road-5"), 0.15, 20, seed=3, look=10105)
-    recording = read_recording(tmp_path / "road")
+    recording, true = recorded(tmp_path / "road", Track("road-5"), 0.15, 20, look=10105)
     found = estimate_lane_position(recording, stretches(recording))
-    steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-    error = np.abs(found.lateral_offset - np.array(run.trajectory.offset)[steps])
+    error = np.abs(found.lateral_offset - true)
     assert error[SAMPLE_RATE:].mean() < 0.25  # measured: 0.191
     assert found.trusted.mean() > 0.95  # measured: 1
 

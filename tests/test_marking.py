@@ -5,17 +5,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scenes import recorded
 
 from cloning.lane import marking
 from cloning.lane.ahead import line_ahead
 from cloning.lane.localise import localise_recording, shipped_networks
 from cloning.lane.reader import DIRECTION_TO_STRIP, MOUNT_OFFSETS, STRIP_SHAPE, estimate_centres, read_strips
-from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT
 from cloning.road.motion import AXLE_TO_CAMERA, WHEELBASE, stretches
 from cloning.road.track import ROADS, Track
-from simulator.car import STEP
-from simulator.record import record
 
 WIDTH = 0.2  # m, of a painted line
 CORNERS = [(-WIDTH / 2, 2.5), (WIDTH / 2, 2.5), (WIDTH / 2, 20), (-WIDTH / 2, 20)]  # m right and ahead
@@ -106,10 +104,8 @@ def test_where_a_line_is_seen_where_the_road_falls_or_rises(bend):
 
 def test_the_line_corrects_what_the_network_detects(tmp_path, monkeypatch):
     """Detections 0.3 m to the right of where they should be, as they were in a real recording."""
-    run, _ = record(tmp_path / "jungle", Track("jungle"), 0.15, 15, seed=1000, look=1000)
-    recording = read_recording(tmp_path / "jungle")
-    steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-    true, driven, strips = np.array(run.trajectory.offset)[steps], stretches(recording), read_strips(recording)
+    recording, true = recorded(tmp_path / "jungle", Track("jungle"), 0.15, 15, seed=1000, look=1000)
+    driven, strips = stretches(recording), read_strips(recording)
 
     def biased(network):
         return estimate_centres(strips, network) + 0.3
