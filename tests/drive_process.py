@@ -52,7 +52,8 @@ class Process:
     """A drive.py process; first: Python code to run before it."""
 
     def __init__(self, *arguments, port=0, cwd=None, first=""):
-        self.process = warm.Popen(
+        start = subprocess.Popen if first else warm.Popen  # the warm process has loaded the libraries already
+        self.process: warm.Process = start(
             [*script("drive.py", first), *map(str, arguments), "--port", str(port)],
             cwd=cwd,
             env={**os.environ, **HERE},
@@ -96,6 +97,11 @@ def script(name: str, first: str = "") -> list[str]:
         return [sys.executable, str(ROOT / name)]
     run = f"import runpy, sys; sys.argv = sys.argv[1:]\nrunpy.run_path({str(ROOT / name)!r}, run_name='__main__')"
     return [sys.executable, "-c", f"{first}\n{run}", name]
+
+
+def warm_python(*words: object, **options) -> subprocess.CompletedProcess:
+    """As `tools.command.python`."""
+    return warm.run([sys.executable, *map(str, words)], text=True, **options)
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 import json
 import re
 
+from drive_process import warm_python
+
 from cloning.base.program import DONE, INCOMPLETE
 from cloning.network.network import Network
 from tools import bench_simulator, bench_training, speedrun
@@ -30,7 +32,8 @@ def test_the_simulator_benchmark_measures_both_tracks(capsys):
         assert len(speeds) == 7 and min(speeds) > 0
 
 
-def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording, capsys):
+def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording, capsys, monkeypatch):
+    monkeypatch.setattr(speedrun, "python", warm_python)
     few = ["--in-sample", "--seeds", "1", "--images", "60", "--limit", "20", "--autonomy", "101"]
     assert speedrun.main([str(sample_recording), *few]) == INCOMPLETE
     printed, name = capsys.readouterr().out, sample_recording.name

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from commands import ROOT
+from drive_process import warm_python
 from rendered import render_recording
 
 from cloning.base.errors import UserError
@@ -183,8 +184,9 @@ def measure(tmp_path):
     return run
 
 
-def test_a_model_drives_a_recording_and_a_road(tmp_path, measure, model_file):
+def test_a_model_drives_a_recording_and_a_road(tmp_path, measure, model_file, monkeypatch):
     """Without stand-ins: a replay, and two drives at the same time by one drive.py, in the road's own look."""
+    monkeypatch.setattr(scoreboard, "python", warm_python)
     recording = render_recording(tmp_path / "lake", rows=32)
     courses = ("--tracks", "road-3", "--looks", "own", "--speeds", "20", "--laps", "0.01")
     assert measure(model_file, "one", "--trained-on", "lake", "--recordings", recording, *courses) == DONE

@@ -96,37 +96,36 @@ def test_a_repeated_recording_shows_the_images_of_this_run(linked, tmp_path):
         repeat(tmp_path / "repeated", [tmp_path / "before" / "lake", source])
 
 
-def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path, expert, monkeypatch):
-    """The folder may hold laps and recordings of an earlier run with other options."""
-    commands: list[list[str]] = []
+@pytest.fixture
+def commands(monkeypatch) -> SimpleNamespace:
+    """The commands that were run, in `run`; each ends with the exit status `status`."""
+    commands = SimpleNamespace(run=[], status=DONE)
 
     def python(*words):
-        commands.append([str(word) for word in words])
-        return SimpleNamespace(returncode=INCOMPLETE)
+        commands.run.append([str(word) for word in words])
+        return SimpleNamespace(returncode=commands.status)
 
     monkeypatch.setattr(shipped, "python", python)
-    out = tmp_path / "out"
+    return commands
+
+
+def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path, expert, commands):
+    """The folder may hold laps and recordings of an earlier run with other options."""
+    out, commands.status = tmp_path / "out", INCOMPLETE
     for name, roads in (("first", "2"), ("second", "1")):
         shutil.copytree(sample_recording, tmp_path / name)
         options = [str(tmp_path / name), "--looks", "1", "--roads", roads, "--folder", str(out)]
         assert shipped.main(options) == INCOMPLETE
-    first, second = commands
+    first, second = commands.run
     assert sum("road-" in part for part in first) == 2 and sum("road-" in part for part in second) == 1
     assert [part for part in second if "/real/" in part] == [str(out / "real" / f"second{PROBLEM_AREAS[0]}")]
     with pytest.raises(RecordingError, match="none: no such folder"):
         shipped.main([str(tmp_path / "none"), "--folder", str(out)])
 
 
-def test_a_trained_network_is_measured(sample_recording, tmp_path, expert, monkeypatch):
-    commands: list[tuple[object, ...]] = []
-
-    def python(*words):
-        commands.append(words)
-        return SimpleNamespace(returncode=DONE)
-
-    monkeypatch.setattr(shipped, "python", python)
+def test_a_trained_network_is_measured(sample_recording, tmp_path, expert, commands):
     out = tmp_path / "out"
     assert shipped.main([str(sample_recording), "--looks", "1", "--roads", "0", "--folder", str(out)]) == DONE
-    training, measuring = commands
-    assert training[training.index("--output") + 1] == measuring[2] == out / "model.pt"
-    assert measuring[:2] == ("-m", "tools.scoreboard") and str(sample_recording) in measuring
+    training, measuring = commands.run
+    assert training[training.index("--output") + 1] == measuring[2] == str(out / "model.pt")
+    assert measuring[:2] == ["-m", "tools.scoreboard"] and str(sample_recording) in measuring
