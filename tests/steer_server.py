@@ -134,7 +134,10 @@ class Blank(Cameras):
         return self.noise[None]
 
 
-def drive(server, laps=0.01, wait=5.0, realtime=False):
+LAPS = 0.004  # a drive of 1.4 s
+
+
+def drive(server, laps=LAPS, wait=5.0, realtime=False):
     run, cameras = Run(Track("lake"), "autonomous"), cast(Any, Blank())
     client = Client(run, cameras, "127.0.0.1", server.port, wait, realtime)
     client.drive(laps)

@@ -29,27 +29,6 @@ def test_seconds_driven_leave_out_breaks():
     np.testing.assert_allclose(summary.driven_seconds(time), [0, 0.1, 0.2, 0.2 + 1 / 15, 0.3 + 1 / 15], atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_rows_with_the_largest_values_by_brute_force(seed):
-    """The largest value that is left, and then no other within the distance, again and again."""
-    rng = np.random.default_rng(seed)
-    values = np.round(rng.normal(size=200), 1)
-    values[rng.random(200) < 0.3] = np.nan
-    left = {row for row in range(200) if not np.isnan(values[row]) and values[row]}
-    wanted: list[int] = []
-    while left and len(wanted) < 5:
-        best = max(left, key=lambda row: (abs(values[row]), -row))
-        wanted.append(best)
-        left = {row for row in left if abs(row - best) >= 12}
-    assert summary.largest(values, 5, 12) == sorted(wanted)
-
-
-def test_rows_with_the_steering_at_its_stop():
-    steering = np.array([1, 1, 0.5, -1, 1, 0, -0.9, -1, -1, 0], np.float32)
-    assert summary.at_stop(steering) == [0, 3, 4, 7]
-    assert summary.at_stop(np.zeros(3)) == [] and summary.largest(np.full(3, np.nan)) == []
-
-
 def test_jumps_are_to_rows_that_are_not_cut():
     steering = np.zeros(90, np.float32)
     steering[[5, 70]] = 1, -1
@@ -59,6 +38,7 @@ def test_jumps_are_to_rows_that_are_not_cut():
     cut = summary.jumps(steering, offset, models, np.arange(90) >= 60)
     assert cut == {"stop": [5], "offset": [29, 59], "difference": [5, 35]}
     assert summary.jumps(steering, None, [], np.zeros(90, bool)) == {"stop": [5, 70]}
+    assert summary.at_stop(np.array([1, 1, 0.5, -1, 1, 0, -0.9, -1, -1, 0], np.float32)) == [0, 3, 4, 7]
 
 
 def test_figures_are_those_of_the_rows_that_are_not_cut(sample_recording):

@@ -23,7 +23,7 @@ from drive_process import serving
 from rendered import render_recording
 
 from cloning.base.errors import SimulatorError
-from cloning.lane.recovery import LaneAhead, LanePosition
+from cloning.lane.recovery import LanePosition
 from cloning.network.network import CROP, Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
@@ -137,15 +137,6 @@ def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, lane):
         assert not done.interventions and done.offset[0] == pytest.approx(begin)
         after_2_s = np.abs(done.offset[30:])
         assert after_2_s.max() < 0.3 and after_2_s.mean() < 0.15, "it cuts the slalom's bends a little"
-
-
-@pytest.mark.parametrize("known", [[], [0], [3, 8]])
-def test_where_the_lane_ahead_is_unknown_the_nearest_known_rows_tell(known):
-    n = 10
-    goal = np.stack([np.arange(n), np.full(n, 6.0)], axis=1).astype(np.float32)
-    ahead = LaneAhead(np.zeros(n), np.zeros(n), goal, np.isin(np.arange(n), known))
-    right = ahead.extended().goal[:, 0].tolist()
-    assert right == {0: list(range(n)), 1: [0] * n, 2: [3, 3, 3, 3, 4, 5, 6, 7, 8, 8]}[len(known)]
 
 
 def test_the_oracle_drives_the_real_jungle():

@@ -8,7 +8,7 @@ import socket
 import time
 
 import pytest
-from steer_server import STEER, Blank, Server, ahead, drive
+from steer_server import LAPS, STEER, Blank, Server, ahead, drive
 
 from cloning.base.errors import SimulatorError
 from cloning.recordings.images import decode
@@ -119,17 +119,17 @@ def test_reconnects_and_continues(realtime, death):
     deaths = iter([True])
 
     def dies_once(packet, n):
-        return death if n == 20 and next(deaths, False) else ahead(packet, n)
+        return death if n == 12 and next(deaths, False) else ahead(packet, n)
 
     with Server(dies_once, sessions=2) as server:
         client = drive(server, realtime=realtime)
     assert client.reconnections == 1
-    assert client.run.travelled >= 0.01 * client.run.track.length
+    assert client.run.travelled >= LAPS * client.run.track.length
     assert len(server.requests) == 2
 
 
 def test_the_window_sends_null_while_a_person_steers_and_is_never_held_up():
-    """A server that answers at once must not keep the window from being sample_recording."""
+    """A server that answers at once must not keep the window from being rendered."""
 
     def reply(packet, n):
         return ['42["manual",{}]'] if packet.endswith("null]") else [STEER % ("0.5", "0.25")]
