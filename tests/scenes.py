@@ -33,7 +33,7 @@ def view(track: str, look: int, s: float = 300.0, offset: float = 0.0) -> np.nda
 class Here(Executor):
     """Does in this process at once what is submitted."""
 
-    def __init__(self, *_):
+    def __init__(self, *_, **__):
         pass
 
     def submit(self, function, /, *arguments, **more):

@@ -19,6 +19,11 @@ from simulator.run import Run
 STEER = '42["steer",{"steering_angle":"%s","throttle":"%s"}]'
 
 
+def unused_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        return closed.getsockname()[1]
+
+
 def lost():
     raise ConnectionError
 

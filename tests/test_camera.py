@@ -57,10 +57,7 @@ def test_a_camera_is_where_the_cars_pose_and_its_mounting_put_it():
     assert found == pytest.approx(np.add(axle, [turned.real, turned.imag]))
 
 
-def test_components_undo_a_turn_and_steering_a_curvature():
-    forward = motion.forward_vector(np.array([0.4, -2.0]))
-    vector = 3 * motion.right_of(forward) + 5 * forward
-    assert motion.components(vector, forward) == pytest.approx(np.array([[3, 5], [3, 5]]))
+def test_the_curvature_of_a_steering():
     steering = np.linspace(-1, 1, 21)
     assert motion.steering_for(motion.curvature(steering)) == pytest.approx(steering)
     assert motion.curvature(1.0) == pytest.approx(np.tan(np.radians(25)) / 2.87)

@@ -1,13 +1,12 @@
 """Corrections: where the expert takes over from a server, what is recorded of it, and the same by hand."""
 
 import re
-import socket
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from steer_server import STEER, Blank, Server, ahead
+from steer_server import STEER, Blank, Server, ahead, unused_port
 from test_simulator_window import pad_of
 
 from cloning.base.errors import RecordingError
@@ -20,7 +19,7 @@ from simulator import window
 from simulator.__main__ import main
 from simulator.client import RemoteDriver
 from simulator.controls import Controls
-from simulator.correct import TOO_FAR
+from simulator.correct import TOO_FAR, CorrectedClient
 from simulator.expert import Expert
 from simulator.run import Run
 from simulator.window import Window
@@ -42,9 +41,7 @@ def drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data") / "lake-corrections"
     sent = SimpleNamespace(offsets=[], printed="")
     with Server(to_the_right) as server, pytest.MonkeyPatch.context() as patch:
-        from simulator import correct
-
-        update, expert_time = correct.CorrectedClient.next_frame, {}
+        update, expert_time = CorrectedClient.next_frame, {}
 
         def noted(client):
             packet = update(client)
@@ -52,7 +49,7 @@ def drive(tmp_path_factory):
             expert_time["share"] = client.expert_time / max(client.run.time, 0.02)
             return packet
 
-        patch.setattr(correct.CorrectedClient, "next_frame", noted)
+        patch.setattr(CorrectedClient, "next_frame", noted)
         patch.setattr("builtins.print", lambda text: setattr(sent, "printed", text))
         sent.status = corrected(folder, server, 0.08)
         sent.messages = [text for text in server.messages if text.startswith("42")]
@@ -110,9 +107,7 @@ def test_without_a_correction_or_a_server_there_is_no_recording(tmp_path, capsys
         assert corrected(folder, server, 0.005) == 0
     assert "corrections: 0, the expert drove 0.0 % of the time; 0 rows" in capsys.readouterr().out
     assert not folder.exists()
-    with socket.create_server(("127.0.0.1", 0)) as closed:
-        port = closed.getsockname()[1]
-    assert main(["correct", str(folder), "--wait", "0.1", "--port", str(port)]) == 2
+    assert main(["correct", str(folder), "--wait", "0.1", "--port", str(unused_port())]) == 2
     assert not folder.exists()
 
 

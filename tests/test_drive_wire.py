@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drive_process import awaited, serving
+from steer_server import unused_port
 
 from tools.simulator_client import Simulator, fragments, telemetry
 
@@ -151,8 +152,7 @@ def test_frames_in_flight_are_answered_in_order(server, jpegs, steering):
 
 
 def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering):
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = unused_port()
     for _ in range(2):
         with serving(model_file, port=port) as process:
             gone = Simulator(port)

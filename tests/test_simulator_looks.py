@@ -5,7 +5,7 @@ import csv
 import cv2
 import numpy as np
 import pytest
-from scenes import cameras, view
+from scenes import Here, cameras, view
 from scipy.spatial import cKDTree
 
 from cloning.base.errors import OutputError
@@ -107,12 +107,9 @@ def test_recovery_records_only_the_returns():
     assert not run.departures
 
 
-def unrendered(track, look, transform):
-    return [b"a JPEG"] * 3
-
-
 def test_a_recovery_recording_has_a_pause_between_the_returns(tmp_path, monkeypatch):
-    monkeypatch.setattr(record, "_render", unrendered)
+    monkeypatch.setattr(record, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(record, "_render", lambda *_: [b"a JPEG"] * 3)
     run, rows = record.record(tmp_path / "recovery", Track("lake"), laps=0.2, recovery=True)
     assert rows < 0.7 * run.time * SAMPLE_RATE
     names = [row[0] for row in csv.reader((tmp_path / "recovery" / "driving_log.csv").read_text().splitlines())]

@@ -4,11 +4,10 @@ import base64
 import json
 import re
 import select
-import socket
 import time
 
 import pytest
-from steer_server import LAPS, STEER, Blank, Server, ahead, drive
+from steer_server import LAPS, STEER, Blank, Server, ahead, drive, unused_port
 
 from cloning.base.errors import SimulatorError
 from cloning.recordings.images import decode
@@ -101,11 +100,6 @@ def test_answers_are_read():
     assert parse_answer(STEER % ("-0.05", "0.2")) == Answer(-0.05, 0.2)
     assert parse_answer(STEER % ("-7", "2")) == Answer(-1.0, 1.0)
     assert parse_answer('42["manual",{}]') == Answer()
-
-
-def unused_port():
-    with socket.create_server(("127.0.0.1", 0)) as closed:
-        return closed.getsockname()[1]
 
 
 def test_a_missing_server_is_waited_for_then_reported(capsys):
