@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 import warm
@@ -37,10 +38,18 @@ def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
         try:
-            status = model.main(command)
+            status: Any = model.main(command)
         except SystemExit as error:  # argparse's
             status = error.code
     return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
+
+
+def started_run(*arguments, until: str) -> warm.Process:
+    """model.py in a process of its own, which has printed a line that begins like this."""
+    command = [sys.executable, str(ROOT / "model.py"), *map(str, arguments)]
+    run = warm.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert run.stdout and any(line.startswith(until) for line in run.stdout)
+    return run
 
 
 def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.CompletedProcess, Path]:

@@ -44,9 +44,9 @@ def sample_recording(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def copied(tmp_path) -> Path:
+def copied(sample_recording, tmp_path) -> Path:
     """A recording of 60 rows that a test may change."""
-    return render_recording(tmp_path / "data" / "lake")
+    return shutil.copytree(sample_recording, tmp_path / "data" / "lake")
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def model_file(tmp_path_factory) -> Path:
     """A model file with random weights."""
     torch.manual_seed(3)
     network = Network()
-    torch.nn.init.normal_(network.dense[-1].weight, std=3)  # so that the frames' steering differs
+    torch.nn.init.normal_(network.get_parameter("dense.3.weight"), std=3)  # so that the frames' steering differs
     path = tmp_path_factory.mktemp("model") / "model.pt"
     save_model(path, network)
     return path

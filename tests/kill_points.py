@@ -5,6 +5,7 @@ that are watched: before each file or folder is opened for writing, made, rename
 through each write. A kill is the system's own: SIGKILL.
 """
 
+import builtins
 import errno
 import io
 import json
@@ -14,6 +15,7 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import warm
 from commands import HERE, ROOT
@@ -43,7 +45,7 @@ class Points:
         whole = os.path.abspath(os.fsdecode(path))
         return any(whole == folder or whole.startswith(folder + os.sep) for folder in self.folders)
 
-    def reached(self, event: str, path: object) -> bool:
+    def reached(self, event: str, path: Any) -> bool:
         """Count a point; return whether it is the one at which to end."""
         with self.lock:
             self.count += 1
@@ -109,7 +111,7 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (request["bytes"], request["bytes"]))
     points = Points(request["watch"], request["trace"], request["kill"], request["full"])
     sys.addaudithook(points.audit)
-    io.open = sys.modules["builtins"].open = points.open
+    vars(io)["open"] = vars(builtins)["open"] = points.open
     warm.run_command(sys.argv[2:])
 
 

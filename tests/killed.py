@@ -4,7 +4,6 @@ import hashlib
 import io
 import json
 import os
-import re
 import shutil
 import signal
 import time
@@ -31,6 +30,10 @@ KILLED = -signal.SIGKILL
 
 def is_temporary(path: Path) -> bool:
     return bool(TEMPORARY_NAME.fullmatch(path.name))
+
+
+def temporaries(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if is_temporary(path)]
 
 
 def check_whole(folder: Path) -> None:
@@ -110,7 +113,6 @@ class Place:
     again     the next run
     begin     a folder: what is there before the command
     checked   called after each kill
-    failures  what was found, for one message at the end
     """
 
     folder: Path
@@ -119,7 +121,8 @@ class Place:
     begin: Path | None = None
     checked: Callable[[], None] = lambda: None
     companion: Callable[[Watched], None] = lambda running: None  # does its part while the command runs
-    failures: list[str] = field(default_factory=list)
+    whole: tuple[dict[str, object], list[str]] | None = None  # what `whole_run` has found
+    sizes: dict[str, int] = field(default_factory=dict)  # of the files that it left
 
     def restore(self) -> None:
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -139,13 +142,17 @@ class Place:
             os.utime(path, (time.time() - 2 * 86_400,) * 2)
 
     def whole_run(self) -> tuple[dict[str, object], list[str]]:
-        """The command without a kill: what it leaves, and its points."""
+        """The command without a kill, when first called: what it leaves, and its points."""
+        if self.whole:
+            return self.whole
         self.restore()
         ended = self.run(self.command)
         assert ended.status == 0, ended.printed
         check_whole(self.folder)
-        assert not [path for path in self.folder.rglob("*") if is_temporary(path)]
-        return contents(self.folder), ended.points
+        assert not temporaries(self.folder)
+        self.sizes = {path.name: path.stat().st_size for path in self.folder.rglob("*")}
+        self.whole = contents(self.folder), ended.points
+        return self.whole
 
     def killed_everywhere(self, count: int, next_run: Callable[[dict[str, object]], None] | None = None) -> None:
         """Kill the command at the chosen points, each time from the beginning, and let the next run go on.
@@ -153,18 +160,16 @@ class Place:
         count: see `chosen`; next_run: instead of `goes_on`.
         """
         wanted, points = self.whole_run()
-        for number in chosen(points, count):
-            self.restore()
+
+        def kill(number: int) -> None:
             ended = self.run(self.command, kill=number)
-            try:
-                assert ended.status == KILLED, ended.printed
-                self.checked()
-                check_whole(self.folder)
-                self.age_temporaries()
-                (next_run or self.goes_on)(wanted)
-            except Exception as error:
-                self.failures.append(f"killed at {number} of {len(points)}, {points[number - 1]}: {str(error)[:300]}")
-        self.report(f"{len(chosen(points, count))} of {len(points)} points")
+            assert ended.status == KILLED, ended.printed
+            self.checked()
+            check_whole(self.folder)
+            self.age_temporaries()
+            (next_run or self.goes_on)(wanted)
+
+        self.at_each(chosen(points, count), points, kill)
 
     def goes_on(self, wanted: dict[str, object]) -> None:
         """The next run ends as if the one before had not been killed, and leaves no temporary file."""
@@ -176,27 +181,36 @@ class Place:
     def disk_full_everywhere(self, others: int, status: int) -> None:
         """Fill the disk in the chosen writes; status: the command's."""
         wanted, points = self.whole_run()
-        writes = [number for number, point in enumerate(points, 1) if point.startswith("write")]
-        writes = writes if ALL else spread(writes, others)
-        for number in writes:
-            self.restore()
+
+        def fill(number: int) -> None:
             ended = self.run(self.command, full=number)
+            assert "Traceback" not in ended.printed, ended.printed
+            assert ended.status == status, ended.printed
+            assert "No space left on device" in ended.printed, ended.printed
+            self.checked()
+            check_whole(self.folder)
+            assert not temporaries(self.folder)
+            self.goes_on(wanted)
+
+        self.at_each(writes(points, others), points, fill)
+
+    def at_each(self, numbers: list[int], points: list[str], trial: Callable[[int], None]) -> None:
+        """Try at each of these points, each time from the beginning, and report all failures at the end."""
+        failures = []
+        for number in numbers:
+            self.restore()
             try:
-                assert "Traceback" not in ended.printed, ended.printed
-                assert ended.status == status, ended.printed
-                assert re.search("No space left on device", ended.printed), ended.printed
-                self.checked()
-                check_whole(self.folder)
-                assert not [path for path in self.folder.rglob("*") if is_temporary(path)]
-                self.goes_on(wanted)
+                trial(number)
             except Exception as error:
-                self.failures.append(f"full at {number} of {len(points)}, {points[number - 1]}: {str(error)[:300]}")
-        self.report(f"{len(writes)} writes")
+                failures.append(f"{number} of {len(points)}, {points[number - 1]}: {str(error)[:300]}")
+        print(f"{len(numbers)} of {len(points)} points")
+        if failures:
+            pytest.fail("\n".join([f"{len(failures)} failures", *failures]), pytrace=False)
 
     def killed_at_every_length(self, name: str, lengths: int) -> None:
         """Have the system kill the command in the write that makes its film longer, at so many different lengths."""
         wanted, _ = self.whole_run()
-        whole = (self.folder / name).stat().st_size
+        whole = self.sizes[name]
         # Not up to the whole length, because x264's threads do not always take the same decisions.
         for length in np.linspace(0.9 * whole, 0, lengths).astype(int).tolist():
             self.restore()
@@ -205,11 +219,6 @@ class Place:
             assert not (self.folder / name).exists()
             self.age_temporaries()
             self.goes_on(wanted)
-
-    def report(self, points: str) -> None:
-        print(points)
-        if self.failures:
-            pytest.fail("\n".join([f"{len(self.failures)} failures", *self.failures]), pytrace=False)
 
 
 def differences(found: dict[str, object], wanted: dict[str, object]) -> list[str]:
@@ -221,6 +230,12 @@ def spread(numbers: list[int], count: int) -> list[int]:
     if count >= len(numbers):
         return numbers
     return [numbers[i] for i in np.linspace(0, len(numbers) - 1, count).round().astype(int)] if count else []
+
+
+def writes(points: list[str], count: int) -> list[int]:
+    """The numbers of the points that are writes: all of them, or so many."""
+    numbers = [number for number, point in enumerate(points, 1) if point.startswith("write")]
+    return numbers if ALL else spread(numbers, count)
 
 
 def chosen(points: list[str], count: int) -> list[int]:

@@ -2,9 +2,13 @@
 
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+
+from cloning.recordings.format import NUMBERS
+from cloning.recordings.log import Recording
 
 
 def render_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarray:
@@ -42,3 +46,11 @@ def render_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = 
         lines.append(",".join([prefix + name for name in names] + [f"{0.4 * bend:.6g}", str(throttle), "0", "30.19"]))
     (folder / "driving_log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder
+
+
+def without_files(n: int, name: str = "lake", seconds: float = 0.0714, first: float = 0, **columns: float) -> Recording:
+    """n rows of a recording that has no files; columns: steering and others' values, else 0."""
+    numbers: dict[str, Any] = {column: np.full(n, columns.get(column, 0), np.float32) for column in NUMBERS}
+    time, lines = first + np.arange(n) * seconds, np.arange(1, n + 1, dtype=np.int32)
+    images = np.zeros((n, 3), np.int32)
+    return Recording(Path(name), np.array([], "S9"), images, **numbers, time=time, lines=lines, rows_read=n)

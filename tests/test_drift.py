@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rendered import render_recording
-from test_generator import recording as without_images
+from rendered import render_recording, without_files
 
 from cloning.base.errors import SimulatorError
 from cloning.network.network import Network
@@ -28,10 +27,8 @@ def recording(tmp_path_factory):
     return load_recording(render_recording(tmp_path_factory.mktemp("drift") / "lake", rows=100))
 
 
-def moving(n, name="lake"):
-    found = without_images(n, name, seconds=1 / 15)
-    found.speed[:] = 20
-    return found
+def moving(n, name="lake", steering=0.0):
+    return without_files(n, name, seconds=1 / 15, speed=20, steering=steering)
 
 
 def rows_of(found):
@@ -54,7 +51,7 @@ def test_pieces_are_those_of_the_held_out_stretches_with_the_rows_in_between():
     assert len(every) == MOST_PIECES
     assert rows_of(every)[0] == (0, ROWS)
     assert rows_of(every)[-1][1] > 9_900, "from the first to the last"
-    assert driven([without_images(400)], np.zeros(400, int), np.arange(400)) == [], "the car stands still"
+    assert driven([without_files(400)], np.zeros(400, int), np.arange(400)) == [], "the car stands still"
     assert driven([moving(400)], np.array([], int), np.array([], int)) == []
 
 
@@ -87,9 +84,7 @@ def test_the_aim_is_that_of_the_pieces_last_row():
 
 
 def test_straight_ahead_the_car_drifts_by_the_bends_that_the_driver_takes():
-    recording = moving(30)
-    recording.steering[:] = 0.1
-    [far] = still_drifts(driven([recording], np.zeros(30, int), np.arange(30)))
+    [far] = still_drifts(driven([moving(30, steering=0.1)], np.zeros(30, int), np.arange(30)))
     metres = 20 * 0.44704 * 29 / 15
     assert far == pytest.approx(float(curvature(0.1)) * metres**2 / 2, rel=0.25)  # a parabola; the lag takes some
 
@@ -105,11 +100,13 @@ def test_a_network_that_diverged_drives_nowhere(recording):
 
 
 @pytest.mark.parametrize(
-    ("by", "best"), [("val_drift", [True, True, False, True, False]), ("val_loss", [True, False, True, False, False])]
+    ("by", "best"),
+    [("val_drift", [True, True, True, False, True, False]), ("val_loss", [True, True, False, True, False, False])],
 )
 def test_the_best_epoch_is_chosen_by_one_metric(by, best):
+    """The first is the best so far, also if it diverged."""
     progress, found = Progress(), []
-    for loss, far in ((0.3, 2.0), (0.4, 1.5), (0.2, 1.7), (0.5, 1.0), (0.4, math.nan)):
+    for loss, far in ((math.nan, math.nan), (0.3, 2.0), (0.4, 1.5), (0.2, 1.7), (0.5, 1.0), (0.4, math.nan)):
         progress.images = 1
         found.append(progress.finish_epoch(loss, far, by))
     assert found == best

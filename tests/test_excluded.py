@@ -1,13 +1,13 @@
 """excluded.csv: which rows a cut leaves out, what every reader says of it, and that cuts are never lost."""
 
 import os
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+import warm
 from commands import ROOT, SHORT, run_here
 
 from cloning.base.errors import RecordingError
@@ -170,7 +170,7 @@ for n in range(20):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no lock here")
 def test_programs_that_cut_at_the_same_time_lose_nothing(linked):
     def add(name: str) -> None:
-        subprocess.run([sys.executable, "-c", ADD, str(linked), name], check=True, cwd=ROOT, timeout=120)
+        warm.run([sys.executable, "-c", ADD, str(linked), name], check=True, cwd=ROOT, timeout=120)
 
     with ThreadPoolExecutor(3) as pool:
         list(pool.map(add, "xyz"))

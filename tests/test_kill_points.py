@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from commands import ROOT
 from kill_points import Watched
-from killed import ALL, KILLED, Place, check_whole, chosen, is_temporary, spread
+from killed import ALL, KILLED, Place, check_whole, chosen, is_temporary, spread, writes
 from rendered import render_recording
 from steer_server import STEER, Server
 
@@ -57,9 +57,11 @@ def training(lake: Path, *arguments) -> list:
     return [ROOT / "model.py", lake, *TINY, *arguments, "--output", "model.pt"]
 
 
-def test_training_killed_anywhere(lake, tmp_path):
+def test_training_killed_anywhere_and_on_a_full_disk(lake, tmp_path):
     begin = training(lake, "--epochs", 1)
-    Place(tmp_path / "place", begin, [*begin, "--resume"]).killed_everywhere(3)
+    place = Place(tmp_path / "place", begin, [*begin, "--resume"])
+    place.killed_everywhere(2)
+    place.disk_full_everywhere(2, status=2)
 
 
 def test_resumed_training_killed_anywhere(lake, trained, tmp_path):
@@ -86,13 +88,7 @@ def test_training_over_an_earlier_runs_files_killed_anywhere(lake, trained, tmp_
         place.goes_on(wanted)
 
     place.checked = checked
-    place.killed_everywhere(3, next_run)
-
-
-def test_training_on_a_full_disk(lake, tmp_path):
-    begin = training(lake, "--epochs", 1)
-    place = Place(tmp_path / "place", begin, [*begin, "--resume"])
-    place.disk_full_everywhere(3, status=2)
+    place.killed_everywhere(2, next_run)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -152,8 +148,7 @@ def test_recording_on_a_full_disk(tmp_path):
     place = Place(tmp_path / "place", RECORD, RECORD)
     _, points = place.whole_run()
     complete = rows_of(place.folder / RECORDED)
-    writes = [number for number, point in enumerate(points, 1) if point.startswith("write")]
-    for full in writes if ALL else spread(writes, 2):
+    for full in writes(points, 2):
         place.restore()
         ended = place.run(RECORD, full=full)
         assert ended.status == 2 and "No space left on device; the" in ended.printed, ended.printed
@@ -166,7 +161,8 @@ def test_recording_on_a_full_disk(tmp_path):
         assert f"the {rows} rows before it" in ended.printed
         assert log == b"" or log.endswith(b"\n")
         assert len(images) == 3 * rows, "what was written of the last row is taken back"
-        for kill in range(full + 1, len(ended.points) + 1):
+        later = list(range(full + 1, len(ended.points) + 1))
+        for kill in later if ALL else spread(later, 2):
             place.restore()
             assert place.run(RECORD, full=full, kill=kill).status == KILLED
             check_whole(place.folder)
@@ -257,11 +253,10 @@ def test_driving_on_a_full_disk(driving, jpegs):
     place, car = driving
     place.restore()
     points = place.run(place.command).points
-    writes = [number for number, point in enumerate(points, 1) if point.startswith("write")]
-    for number in writes if ALL else spread(writes, 2):
+    for number in writes(points, 2):
         place.restore()
         ended = place.run(place.command, full=number)
-        lost = len(writes) - writes.index(number)
+        lost = sum(point.startswith("write") for point in points[number - 1 :])
         assert car.answers == 6
         assert ended.status == 1 and "Traceback" not in ended.printed
         assert (
@@ -282,7 +277,8 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
     recorded = tmp_path / "begin" / "lake"
     (recorded / "IMG").mkdir(parents=True)
     shutil.copy(lake / "driving_log.csv", recorded)
-    earlier, new = (Cut(*(names[row][0][0].decode() for row in rows), "off") for rows in ((1, 2), (5, 9)))
+    center = [images[0].decode() for images, _ in names]
+    earlier, new = Cut(center[1], center[2], "off"), Cut(center[5], center[9], "off")
     add_cut(recorded, earlier)
     command, answers = ["-m", "cloning.browse", "lake", "--port", 0], []
     place = Place(tmp_path / "place", command, command, tmp_path / "begin")
@@ -310,7 +306,7 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
     place.companion, place.checked = cut, checked
     place.killed_everywhere(4)
     _, points = place.whole_run()
-    for number in (number for number, point in enumerate(points, 1) if point.startswith("write")):
+    for number in writes(points, 10):
         place.restore()
         assert place.run(command, full=number).status == 0
         assert "excluded.csv: No space left on device" in json.loads(answers[-1])["message"]
@@ -364,26 +360,16 @@ class ServerForAll(Server):
         self.thread.join(20)
 
 
-def test_a_simulated_drive_killed_anywhere(simulator_drive):
+def test_a_simulated_drive_killed_anywhere_and_on_a_full_disk(simulator_drive):
     simulator_drive.killed_everywhere(1)
     simulator_drive.killed_at_every_length("film.mp4", 20 if ALL else 1)
-
-
-def test_a_simulated_drive_on_a_full_disk(simulator_drive):
     simulator_drive.disk_full_everywhere(1, status=2)
 
 
-@pytest.fixture
-def replaying(lake, model_file, tmp_path):
+def test_a_replay_killed_anywhere_and_on_a_full_disk(lake, model_file, tmp_path):
     files = ("--report", "replay.json", "--picture", "replay.png", "--film", "replay.mp4")
     command = ["-m", "simulator", "replay", lake, "--model", model_file, "--limit", 1, "--reference", "human", *files]
-    return Place(tmp_path / "place", command, command)
-
-
-def test_a_replay_killed_anywhere(replaying):
-    replaying.killed_everywhere(1)
-    replaying.killed_at_every_length("replay.mp4", 20 if ALL else 1)
-
-
-def test_a_replay_on_a_full_disk(replaying):
-    replaying.disk_full_everywhere(1, status=2)
+    place = Place(tmp_path / "place", command, command)
+    place.killed_everywhere(1)
+    place.killed_at_every_length("replay.mp4", 20 if ALL else 1)
+    place.disk_full_everywhere(1, status=2)

@@ -18,7 +18,7 @@ from cloning.network.layer_table import layer_table
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.road.track import Track
-from cloning.training.pieces import PIECE, Batch, SquaredErrors, converted, pieces, squared_errors
+from cloning.training.pieces import PIECE, Batch, SquaredErrors, pieces
 from simulator.record import record
 
 REPORT = """
@@ -95,32 +95,6 @@ def test_a_fast_convolution_and_its_gradients_are_torchs(fast, shape):
     assert fast is in_blocks or gradients[0].is_contiguous(memory_format=torch.channels_last)
 
 
-def test_only_training_in_bfloat16_computes_in_blocks_or_over_pairs(network, frames, monkeypatch):
-    calls: list[object] = []
-
-    def counted(function, called_with):
-        def call(*inputs):
-            calls.append(called_with(*inputs))
-            return function(*inputs)
-
-        return call
-
-    monkeypatch.setattr(fast_conv, "in_blocks", counted(fast_conv.in_blocks, lambda x: x.shape[1:]))
-    monkeypatch.setattr(OverPairs, "apply", counted(OverPairs.apply, lambda *_: "pairs"))
-    half = converted(network, torch.bfloat16)
-    for amx, expected in ((False, ["pairs"]), (True, [(24, 36, 158), (24, 5, 5)])):
-        monkeypatch.setattr(fast_conv, "has_amx", lambda amx=amx: amx)
-        with torch.inference_mode():
-            half(frames)
-        network(frames).sum().backward()  # float32
-        assert not calls
-        steering = half(frames)
-        steering.sum().backward()
-        assert calls == expected
-        calls.clear()
-        torch.testing.assert_close(steering, network(frames), rtol=0, atol=0.01)
-
-
 def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):
     keep = torch.zeros(5, 4224, dtype=torch.bool)
     flat = []
@@ -151,53 +125,41 @@ def test_later_batches_are_computed_with_the_weights_of_then(network):
         assert errors(batch).item() == pytest.approx(2e6, rel=0.02)
 
 
-def test_pieces_give_the_gradient_of_the_whole_batch(network):
-    rng = np.random.default_rng(1)
-    batch = Batch(
-        rng.integers(0, 256, (45, 75, 320, 3), np.uint8),
-        rng.normal(0, 0.2, 45).astype(np.float32),
-        rng.random((45, 4224)) < 0.5,
-        45,
-    )
-    squared_errors(network, batch).backward()
-    whole = [parameter.grad.clone() for parameter in network.parameters()]
-    network.zero_grad()
-    with ThreadPoolExecutor(2) as pool:
-        loss = SquaredErrors(network, torch.float32, pool)(batch)
-        (loss * 3).backward()
-        for parameter, expected in zip(network.parameters(), whole, strict=True):
-            torch.testing.assert_close(parameter.grad, expected * 3, rtol=1e-4, atol=1e-4)
-        again = SquaredErrors(network, torch.float32, pool)(batch)
-    assert torch.equal(loss, again)  # whichever thread was faster
+def random_batch(n: int, keep: np.ndarray | None = None) -> Batch:
+    rng = np.random.default_rng(3)
+    images = rng.integers(0, 256, (n, 75, 320, 3), np.uint8)
+    return Batch(images, rng.normal(0, 0.2, n).astype(np.float32), keep, n)
 
 
 @pytest.mark.parametrize("limit", [None, 0.1])
-def test_the_gradient_is_that_of_the_loss_and_the_value_the_squared_errors(network, limit):
-    rng = np.random.default_rng(3)
-    images, labels = rng.integers(0, 256, (20, 75, 320, 3), np.uint8), rng.normal(0, 0.2, 20).astype(np.float32)
-    batch, parameters = Batch(images, labels, None, 20), list(network.parameters())
-    predicted, wanted = network(torch.from_numpy(images)), torch.from_numpy(labels)
-    assert 2 < int(((predicted - wanted).abs() < 0.1).sum()) < 18  # both sides of the limit
+@pytest.mark.parametrize("dropout", [False, True])
+def test_the_gradient_is_that_of_the_loss_and_the_value_the_squared_errors(network, limit, dropout):
+    batch = random_batch(45, np.random.default_rng(1).random((45, 4224)) < 0.5 if dropout else None)
+    keep = None if batch.keep is None else torch.from_numpy(batch.keep)
+    predicted, wanted = network(torch.from_numpy(batch.images), keep), torch.from_numpy(batch.labels)
+    assert 4 < int(((predicted - wanted).abs() < 0.1).sum()) < 41  # both sides of the limit
     squared = torch.nn.functional.mse_loss(predicted, wanted, reduction="sum")
     huber = 2 * torch.nn.functional.huber_loss(predicted, wanted, reduction="sum", delta=0.1)
-    expected = torch.autograd.grad(huber if limit else squared, parameters)
+    expected = torch.autograd.grad(huber if limit else squared, list(network.parameters()))
     with ThreadPoolExecutor(2) as pool:
         errors = SquaredErrors(network, torch.float32, pool, limit)(batch)
-        errors.backward()
+        (errors * 3).backward()
+        again = SquaredErrors(network, torch.float32, pool, limit)(batch)
+    assert torch.equal(errors, again)  # whichever thread was faster
     assert errors.item() == pytest.approx(squared.item(), rel=1e-4)
-    for parameter, gradient in zip(parameters, expected, strict=True):
-        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-4)
+    for parameter, gradient in zip(network.parameters(), expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient * 3, rtol=1e-4, atol=1e-4)
 
 
-def test_bfloat16_steps_where_float32_does(network):
+@pytest.mark.parametrize("amx", [False, True])
+def test_bfloat16_steps_where_float32_does(network, monkeypatch, amx):
     """Some processors only emulate it; the gradient's direction shows that it is the same function."""
-    rng = np.random.default_rng(2)
-    images, angles = rng.integers(0, 256, (4, 75, 320, 3), np.uint8), rng.normal(0, 0.2, 4).astype(np.float32)
+    monkeypatch.setattr(fast_conv, "has_amx", lambda: amx)
     gradients = []
     with ThreadPoolExecutor(1) as pool:
         for precision in (torch.float32, torch.bfloat16):
             network.zero_grad()
-            SquaredErrors(network, precision, pool)(Batch(images, angles, None, 4)).backward()
+            SquaredErrors(network, precision, pool)(random_batch(4)).backward()
             gradients.append(torch.cat([parameter.grad.flatten() for parameter in network.parameters()]))
             assert gradients[-1].dtype == torch.float32
     assert torch.cosine_similarity(gradients[0], gradients[1], dim=0) > 0.99
@@ -293,34 +255,24 @@ NAME = "dense.3.weight"  # (1, 10)
 @pytest.mark.parametrize(
     "part, value, words",
     [
-        ("recipe", None, "no preprocessing"),
         ("recipe", [1], "no preprocessing"),
         ("frame", (120, 320, 3), "frame"),
-        ("frame", torch.zeros(3), "frame"),
         ("colour", "BGR", "colour 'BGR'"),
         ("crop", (60, 26), "crop"),
         ("crop", (-1, 86), "crop"),
-        ("crop", [60, 25], "crop"),
-        ("crop", (60,), "crop"),
         ("crop", ("60", "25"), "crop"),
-        ("crop", 60, "crop"),
         ("scale", 0, "scale"),
-        ("scale", -127.5, "scale"),
         ("scale", float("nan"), "scale"),
-        ("scale", "127.5", "scale"),
-        ("scale", None, "scale"),
         ("scale", True, "scale"),
         ("scale", torch.tensor(127.5), "scale"),
         ("scale", 10**400, "scale"),
         ("offset", float("inf"), "offset"),
         ("network", None, "missing or unknown"),
         ("network", [torch.zeros(3)], "missing or unknown"),
-        ("network", {0: torch.zeros(3)}, "missing or unknown"),
         ("more", torch.zeros(3), "missing or unknown: 'more'"),
         (NAME, "weights", f"{NAME} is 'weights'"),
         (NAME, torch.zeros(10, 1), f"{NAME} is a tensor \\(10, 1\\)"),
         (NAME, torch.zeros(1, 10, dtype=torch.int32), "int32"),
-        (NAME, torch.full((1, 10), float("nan")), f"{NAME} contains numbers that are not finite"),
         (NAME, torch.full((1, 10), -float("inf")), f"{NAME} contains numbers that are not finite"),
         (NAME, torch.full((1, 10), 1e200, dtype=torch.float64), f"{NAME} contains numbers that are not finite"),
         (NAME, torch.zeros(1).expand(10**5, 10**5), "more than 30,000,000 bytes"),

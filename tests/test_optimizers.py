@@ -2,7 +2,10 @@
 
 import subprocess
 import sys
+from functools import partial
+from typing import Any
 
+import pytest
 import torch
 from commands import ROOT
 
@@ -24,7 +27,9 @@ print([name for name in ("torch._dynamo", "sympy") if name in sys.modules])
 
 def networks():
     """Two equal networks, in memory as in training."""
-    made = [Network().to(memory_format=torch.channels_last) for _ in "ab"]
+    made: list[Any] = [Network() for _ in "ab"]
+    for network in made:
+        network.to(memory_format=torch.channels_last)
     made[1].load_state_dict(made[0].state_dict())
     return made
 
@@ -59,20 +64,25 @@ def test_every_bit_is_as_with_torchs():
     assert all(parameter.grad is None for parameter in network.parameters())
 
 
-def test_it_continues_from_torchs_state():
-    """Checkpoints of earlier versions hold one."""
-    network, torchs_network = networks()
-    torchs = torch.optim.Adam(torchs_network.parameters(), 1e-4, fused=True)
-    for number in range(3):
-        give_gradients((torchs_network,), number)
-        torchs.step()
-    network.load_state_dict(torchs_network.state_dict())
-    optimizer = Adam(network.parameters())
-    optimizer.restore(torchs.state_dict()["state"])
-    give_gradients((network, torchs_network), 3)
-    optimizer.step(1e-4)
-    torchs.step()
-    assert_same(network, optimizer, torchs_network, torchs)
+@pytest.mark.parametrize("optimizer", [Adam, Muon])
+def test_it_continues_from_its_state(optimizer):
+    """Adam from torch's, which checkpoints of earlier versions hold."""
+    network, earlier = networks()
+    first: Any = Muon(earlier.parameters())
+    step = partial(first.step, 1e-4)
+    if optimizer is Adam:
+        first = torch.optim.Adam(earlier.parameters(), 1e-4, fused=True)
+        step = first.step
+    for seed in range(3):
+        give_gradients((earlier,), seed)
+        step()
+    network.load_state_dict(earlier.state_dict())
+    restored = optimizer(network.parameters())
+    restored.restore(first.state_dict()["state"] if optimizer is Adam else first.state)
+    give_gradients((network, earlier), 3)
+    restored.step(1e-4)
+    step()
+    assert all(map(torch.equal, network.parameters(), earlier.parameters()))
 
 
 def test_it_does_not_import_torchs_compiler():
@@ -96,7 +106,8 @@ def test_orthogonal_keeps_the_singular_vectors_and_makes_the_values_about_one():
 
 def test_weights_move_as_with_torchs_muon_and_biases_as_with_adam():
     torch.manual_seed(0)
-    ours, torchs = (torch.nn.Sequential(torch.nn.Linear(40, 30), torch.nn.Linear(30, 1)) for _ in "ab")
+    layers: list[Any] = [torch.nn.Sequential(torch.nn.Linear(40, 30), torch.nn.Linear(30, 1)) for _ in "ab"]
+    ours, torchs = layers
     torchs.load_state_dict(ours.state_dict())
     begin = ours[0].weight.detach().clone()
     optimizer = Muon(ours.parameters(), weight_decay=1.0)
@@ -111,16 +122,3 @@ def test_weights_move_as_with_torchs_muon_and_biases_as_with_adam():
     assert (moved - expected).norm() < 0.05 * expected.norm()  # torch's computes in bfloat16
     assert torch.equal(ours[0].bias, torchs[0].bias)
     assert all(map(torch.equal, ours[1].parameters(), torchs[1].parameters()))
-
-
-def test_muon_continues_from_its_state():
-    network, other = networks()
-    optimizer, restored = Muon(network.parameters()), Muon(other.parameters())
-    give_gradients((network,), 5)
-    optimizer.step(1e-3)
-    other.load_state_dict(network.state_dict())
-    restored.restore(optimizer.state)
-    give_gradients((network, other), 6)
-    optimizer.step(1e-3)
-    restored.step(1e-3)
-    assert all(map(torch.equal, network.parameters(), other.parameters()))

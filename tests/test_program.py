@@ -26,19 +26,6 @@ TOOLS = [
     path.stem for path in sorted((ROOT / "tools").glob("*.py")) if "= command_line(" in path.read_text(encoding="utf-8")
 ]
 
-INTERRUPTED_MAIN = """
-import os, signal
-from cloning.base import program
-program.end_on_interrupt("test", "stopped")
-def main():
-    try:
-        os.kill(os.getpid(), signal.SIGINT)
-    except KeyboardInterrupt:
-        print("cleaned up")
-        raise
-program.run(main)
-"""
-
 
 @pytest.mark.parametrize(
     ("program", "command"),
@@ -76,30 +63,39 @@ def test_an_error_of_the_user_is_a_line_and_status_2(tmp_path, command):
     assert "nowhere" in done.stderr.splitlines()[-1] and "Traceback" not in done.stderr
 
 
-def test_ctrl_c_in_a_command_lets_it_clean_up():
-    done = subprocess.run([sys.executable, "-c", INTERRUPTED_MAIN], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "cleaned up\n", "test: stopped\n")
-
-
 ENDING_MAIN = """
-import atexit, sys, threading, time
+import atexit, os, signal, sys, threading, time
 from cloning.base import program
+program.end_on_interrupt("test", "stopped")
 def main():
-    atexit.register(print, "at exit", end="")
+    atexit.register(print, "at exit")
     if "thread" in sys.argv:
         threading.Thread(target=lambda: [time.sleep(0.3), print("thread done")]).start()
     print("main done")
+    if "interrupted" in sys.argv:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            print("cleaned up")
+            raise
     return 1
 program.run(main)
 """
 
 
-@pytest.mark.parametrize("arguments", [[], ["thread"]], ids=["alone", "beside a thread"])
-def test_a_command_ends_when_all_is_done_and_printed(arguments):
+@pytest.mark.parametrize(
+    ("arguments", "later", "status", "errors"),
+    [
+        ([], ["at exit"], 1, ""),
+        (["thread"], ["thread done", "at exit"], 1, ""),
+        (["interrupted"], ["cleaned up"], 130, "test: stopped\n"),
+    ],
+    ids=["alone", "beside a thread", "by Ctrl-C"],
+)
+def test_a_command_ends_when_all_is_done_and_printed(arguments, later, status, errors):
     command = [sys.executable, "-c", ENDING_MAIN, *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    said = ["main done", *["thread done"] * len(arguments), "at exit"]
-    assert (done.returncode, done.stdout, done.stderr) == (1, "\n".join(said), "")
+    assert (done.returncode, done.stdout.splitlines(), done.stderr) == (status, ["main done", *later], errors)
 
 
 def test_a_command_whose_last_lines_cannot_be_printed_says_so():

@@ -11,10 +11,12 @@ import sys
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 import warm
-from commands import HERE, ROOT, SHORT, finished_run, log, run_here, run_model, same, weights
+from commands import HERE, SHORT, finished_run, log, run_here, run_model, same, started_run, weights
+from killed import ALL
 from rendered import render_recording
 
 import model
@@ -82,7 +84,7 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, sample
         run.kill()
         run.wait()
         kills += 1
-    assert run.wait() == 0, run.stderr.read()
+    assert run.wait() == 0, run.stderr and run.stderr.read()
     assert same(weights(output), weights(finished[1] / "model.pt"))
     assert same(weights(tmp_path / "model-best.pt"), weights(finished[1] / "model-best.pt"))
     ours, theirs = (
@@ -97,11 +99,7 @@ def test_killed_anywhere_and_resumed_ends_with_the_same_weights(finished, sample
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_cleanly_with_everything_saved(finished, sample_recording, tmp_path, number):
     output = tmp_path / "model.pt"
-    command = [sys.executable, str(ROOT / "model.py"), str(sample_recording), *map(str, SHORT), "--output", str(output)]
-    run = warm.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    for line in run.stdout:
-        if line.startswith("Epoch"):
-            break
+    run = started_run(sample_recording, *SHORT, "--output", output, until="Epoch")
     run.send_signal(number)
     _, errors = run.communicate(timeout=120)
     assert run.returncode == 128 + number
@@ -125,14 +123,6 @@ def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
     changed = run_here(render_recording(tmp_path / "other", rows=20, seed=1), "--output", output, "--resume")
     assert changed.returncode == 2
     assert "the run began with other recordings" in changed.stderr
-
-
-def test_resume_refuses_a_state_that_does_not_fit(begun):
-    with edited(begun / "model-resume.pt") as saved:
-        del saved["training"]["optimizer"]
-    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
-    assert done.returncode == 2
-    assert str(begun / "model-resume.pt") in done.stderr
 
 
 def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path):
@@ -181,7 +171,7 @@ def test_a_run_is_resumed_only_by_its_own_recipe(begun, sample_recording, capsys
     short = replace(REPORT, epochs=1, samples_per_epoch=150, batch_size=8)
     for changed, words in (
         (replace(short, flip=0.5), "--flip 0.9, not 0.5"),
-        (replace(short, order=lambda *_: None), "order is 'shuffle'"),
+        (replace(short, order=lambda *_: np.arange(3)), "order is 'shuffle'"),
     ):
         assert model.train(changed, [sample_recording], begun / "model.pt", device="cpu", resume=True) == 2
         assert words in capsys.readouterr().err
@@ -189,42 +179,23 @@ def test_a_run_is_resumed_only_by_its_own_recipe(begun, sample_recording, capsys
     assert model.train(more, [sample_recording], begun / "model.pt", device="cpu", resume=True) == 0
 
 
-def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording):
+@pytest.mark.parametrize("missing", [False, True])
+def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording, missing):
+    """All files of a run get the same ending, also if one of them was missing."""
+    if missing:
+        (begun / "model-best.pt").unlink()
     for seed in (1, 2):
         done = run_here(sample_recording, *SHORT, "--epochs", 1, "--seed", seed, "--output", begun / "model.pt")
         assert done.returncode == 0, done.stderr
         assert f"{begun / 'model.pt'} of an earlier run is now" in done.stdout
-    for kind in ("model", "model-best", "model-resume"):
-        names = [begun / f"{kind}{ending}.pt" for ending in ("-previous", "-previous-2", "")]
-        assert [seed_of(name) for name in names] == [0, 1, 2]
+    endings = ("-previous", "-previous-2", "")
+    expected = {f"{kind}{ending}.pt": seed for kind in KINDS for seed, ending in enumerate(endings)}
+    if missing:
+        del expected["model-best-previous.pt"]
+    assert seeds(begun) == expected
 
 
-@pytest.mark.parametrize("before_the_end", ["in the first epoch", "while it is saved"])
-def test_a_new_run_leaves_the_model_in_place_until_its_first_epoch_has_ended(
-    begun, sample_recording, monkeypatch, before_the_end
-):
-    old = (begun / "model.pt").read_bytes(), (begun / "model-best.pt").read_bytes()
-
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        if before_the_end == "in the first epoch":
-            patch.setattr(model.TrainingRun, "validate", interrupted)
-        else:
-            patch.setattr(model, "loss_picture", interrupted)
-        stopped = run_here(sample_recording, *SHORT, "--seed", 1, "--output", begun / "model.pt")
-    assert stopped.returncode == 128 + signal.SIGINT
-    assert ((begun / "model.pt").read_bytes(), (begun / "model-best.pt").read_bytes()) == old
-    assert seed_of(begun / "model-resume-previous.pt") == 0
-    assert seed_of(begun / "model-resume.pt") == 1
-    again = run_here(sample_recording, *SHORT, "--seed", 2, "--epochs", 1, "--output", begun / "model.pt")
-    assert again.returncode == 0, again.stderr
-    assert ((begun / "model-previous.pt").read_bytes(), (begun / "model-best-previous.pt").read_bytes()) == old
-    assert not (begun / "model-resume-previous-2.pt").exists()  # the stopped run had no finished epoch
-
-
-def tables(folder):
+def seeds(folder):
     """The seed in each model file of a folder: of the run that wrote it."""
     return {path.name: seed_of(path) for path in folder.glob("*.pt")}
 
@@ -233,7 +204,7 @@ KINDS = ("model", "model-best", "model-resume")
 CHANGES = 12  # of files by a new run of one epoch until it is saved
 
 
-@pytest.mark.parametrize("kill_at", range(1, CHANGES + 1))
+@pytest.mark.parametrize("kill_at", range(1, CHANGES + 1) if ALL else (1, 2, 3, 8, 9, 10, 11, 12))
 @pytest.mark.parametrize("then", ["resume", "new run"])
 def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, kill_at, then):
     """At each point --resume continues the run that model-resume.pt is of, and each earlier run's model is kept once.
@@ -258,7 +229,8 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
         patch.setattr(os, "rename", dying)
         with pytest.raises(Killed):
             run_here(*command, "--seed", 1)
-    assert all((begun / f"{kind}.pt").exists() for kind in KINDS)  # complete, and never missing for a moment
+    for kind, point in zip(KINDS[:2], (9, 10), strict=True):  # the earlier run's until the new one has an epoch
+        assert seed_of(begun / f"{kind}.pt") == (kill_at > point)
     new_run_begun = kill_at > 2
     assert seed_of(begun / "model-resume.pt") == new_run_begun
     if then == "resume":
@@ -268,7 +240,7 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
         done = run_here(*command, "--seed", 2)
         last, earlier = 2, [0]
     assert done.returncode == 0, done.stderr
-    found = tables(begun)
+    found = seeds(begun)
     for kind in KINDS:
         assert found.pop(f"{kind}.pt") == last
         for seed in earlier:
@@ -278,18 +250,6 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
     kept = {f"{kind}-previous-2.pt": 1 for kind, point in zip(KINDS, (9, 10, 11), strict=True) if kill_at > point}
     copied = {"model-resume-previous.pt": 0} if kill_at == 2 else {}
     assert found == (copied if then == "resume" else kept)
-
-
-def test_files_of_a_run_get_the_same_ending(begun, sample_recording):
-    """Also if some of them were missing."""
-    command = (sample_recording, *SHORT, "--epochs", 1, "--output", begun / "model.pt")
-    (begun / "model-best.pt").unlink()
-    for seed in (1, 2):
-        assert run_here(*command, "--seed", seed).returncode == 0
-    assert tables(begun) == {f"{kind}.pt": 2 for kind in KINDS} | {f"{kind}-previous-2.pt": 1 for kind in KINDS} | {
-        "model-previous.pt": 0,
-        "model-resume-previous.pt": 0,
-    }
 
 
 def test_resume_does_not_replace_the_models_of_another_run(begun, sample_recording):
@@ -354,17 +314,12 @@ def set_position(name, value):
         (set_average("exp_avg", torch.full((36,), torch.nan)), "exp_avg contains numbers that are not finite"),
         (set_average("exp_avg_sq", torch.zeros(35)), "exp_avg_sq is a tensor (35,)"),
         (set_average("step", 3.0), "step is 3.0"),
-        (set_average("more", 3.0), "unknown: 'more'"),
-        (set_position("optimizer", [1]), "optimizer's state"),
+        (lambda saved: saved["training"].pop("optimizer"), "optimizer's state"),
         (set_position("optimizer", {"state": {}}), "optimizer's state"),
-        (set_position("number", 1.5), "number is 1.5"),
         (set_position("number", -1), "number is -1"),
         (set_position("images", "4"), "images is '4'"),
-        (set_position("loss", None), "loss is None"),
-        (set_position("seconds", torch.zeros(2)), "seconds is a tensor"),
         (set_position("fingerprint", torch.zeros(2)), "other recordings"),
         (lambda saved: saved.update(training=3), "no state"),
-        (lambda saved: saved.update(history={"epoch": 1}), "history"),
         (lambda saved: saved.update(history=[1]), "history"),
         (lambda saved: saved["history"][0].update(val_loss="low"), "val_loss is 'low'"),
         (lambda saved: saved["history"][0].pop("images"), "history"),
@@ -373,7 +328,6 @@ def set_position(name, value):
         (lambda saved: saved["arguments"]["recipe"].update(batch_size="8"), "--batch-size is of type str"),
         (lambda saved: saved["arguments"].update(recordings=[1]), "--recordings is of type list"),
         (lambda saved: saved["arguments"]["recipe"].update(optimizer="sgd"), "optimizer is 'sgd', not adam or muon"),
-        (lambda saved: saved["arguments"]["recipe"].update(huber="0.1"), "huber is of type str"),
         (lambda saved: saved["arguments"]["recipe"].update(turn=(0.2,)), "turn is (0.2,), not 2 numbers"),
         (lambda saved: saved["arguments"]["recipe"].update(views="Others"), "views is 'Others', not CameraViews"),
         (lambda saved: saved["arguments"]["recipe"].update(name="mine"), "recipe is 'mine', not report or robust"),

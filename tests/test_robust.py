@@ -1,25 +1,22 @@
 """Recovery steering against geometry, warped frames against a rendered plane, and `model.py --robust`."""
 
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
-import warm
-from commands import ROOT, SHORT, finished_run, run_here, run_model, weights
-from rendered import render_recording
+from commands import ROOT, SHORT, finished_run, run_here, run_model, same, started_run, weights
+from rendered import render_recording, without_files
 
 import model
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
 from cloning.network.network import CROP, SEEN_SHAPE, Network
-from cloning.recordings.log import CheckedRecording, Recording
+from cloning.recordings.log import CheckedRecording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
 from cloning.road.warp import ground_mask, with_alpha
@@ -39,23 +36,15 @@ N, SPEED = 300, 20.0  # rows; mph
 
 def recording(steering, pause_after=None):
     """One drive of N rows, 15 a second, with no files."""
-    columns = [np.full(N, value, np.float32) for value in (steering, 1, 0, SPEED)]
-    time = np.arange(N) / 15
+    found = without_files(N, "drive", 1 / 15, steering=steering, throttle=1, speed=SPEED)
     if pause_after is not None:
-        time[pause_after + 1 :] += 2
-    return Recording(
-        Path("drive"),
-        np.array([], "S9"),
-        np.zeros((N, 3), np.int32),
-        *columns,
-        time,
-        np.arange(1, N + 1, dtype=np.int32),
-        N,
-    )
+        found.time[pause_after + 1 :] += 2
+    return found
 
 
-def lanes(monkeypatch, steering=0.0, offset=0.0, **more) -> Lanes:
-    reading = LanePosition(np.full(N, offset), np.zeros(N), np.ones(N, bool))
+def lanes(monkeypatch, steering=0.0, offset=0.0, trusted=True, **more) -> Lanes:
+    """The lanes of a recording that is `offset` metres right of the centre; trusted: which rows' readings."""
+    reading = LanePosition(np.full(N, offset), np.zeros(N), np.full(N, trusted))
     monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
     return Lanes.of(recording(steering, **more))
 
@@ -91,16 +80,6 @@ def test_a_shifted_car_comes_back_and_stays(monkeypatch, steering, right, yaw):
     assert np.abs(drive_back(found, float(curvature(steering)), right, yaw, 30)) == pytest.approx([0, 0], abs=0.04)
 
 
-def test_the_label_grows_with_offset_and_yaw(monkeypatch):
-    one = lanes(monkeypatch).take(np.array([50]))
-    limit = recovery.MAX_LABEL_OFFSET
-    by_offset = [float(one.steering(right, 0.0)[0]) for right in np.linspace(-limit, limit, 9)]
-    by_yaw = [float(one.steering(0.0, yaw)[0]) for yaw in np.linspace(-0.2, 0.2, 9)]
-    for found in (by_offset, by_yaw):
-        assert (np.diff(found) < 0).all()
-        assert found[4] == pytest.approx(0, abs=1e-6)
-
-
 @pytest.mark.parametrize("bend", [0.0, 1 / 20, -1 / 20])
 @pytest.mark.parametrize("offset", [1.0, -1.5])
 def test_the_lane_is_as_far_from_the_human_as_was_estimated(monkeypatch, bend, offset):
@@ -112,9 +91,7 @@ def test_the_lane_is_as_far_from_the_human_as_was_estimated(monkeypatch, bend, o
 
 
 def test_where_most_is_not_trusted_the_humans_path_is_the_lane(monkeypatch):
-    reading = LanePosition(np.ones(N), np.ones(N), np.arange(N) % 2 == 0)
-    monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
-    found = Lanes.of(recording(0.2))
+    found = lanes(monkeypatch, 0.2, offset=1.0, trusted=np.arange(N) % 2 == 0)
     assert not found.offset.any()
     assert found.steering(found.offset, found.yaw)[found.known] == pytest.approx(0.2, abs=1e-3)
 
@@ -191,15 +168,11 @@ def test_sampled_poses_are_on_both_sides_and_of_every_camera(monkeypatch):
 @pytest.mark.parametrize("human", [0.0, 1.5, -1.5])
 def test_sampled_poses_are_near_the_lane_and_near_the_recorded_car(monkeypatch, human):
     """Far from the recorded car, little of the warped frame would be seen."""
-    found, sampled, of = lanes(monkeypatch, offset=human).take(np.full(2000, 100)), [], Poses.of
-
-    def note(lanes, offset, yaw, *more):
-        sampled[:] = offset, yaw
-        return of(lanes, offset, yaw, *more)
-
-    monkeypatch.setattr(Poses, "of", note)
+    found = lanes(monkeypatch, offset=human).take(np.full(2000, 100))
+    sampled = Mock(wraps=Poses.of)
+    monkeypatch.setattr(Poses, "of", sampled)
     found.sample_poses(ROBUST, np.random.default_rng(0), np.zeros(2000, bool))
-    offset, yaw = sampled
+    _, offset, yaw, *_ = sampled.call_args.args
     least, most = max(-2.0, human - 2.4), min(2.0, human + 2.4)  # m from the lane's centre and from the recorded car
     assert abs(offset.min() - least) < 0.1 and abs(offset.max() - most) < 0.1
     if human == 0:  # nothing is cut off: a triangle's deviation
@@ -235,22 +208,12 @@ def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording)
 
 
 def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_recording, tmp_path):
-    command = [
-        sys.executable,
-        str(ROOT / "model.py"),
-        str(sample_recording),
-        *map(str, OPTIONS),
-        "--output",
-        tmp_path / "model.pt",
-    ]
-    run = warm.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert any(line.startswith("Epoch 2") for line in run.stdout)
+    run = started_run(sample_recording, *OPTIONS, "--output", tmp_path / "model.pt", until="Epoch 2")
     run.kill()
     run.wait()
     assert run_here("--output", tmp_path / "model.pt", "--resume").returncode == 0
     for name in ("model.pt", "model-best.pt"):
-        a, b = weights(finished[1] / name), weights(tmp_path / name)
-        assert all(torch.equal(a[key], b[key]) for key in a)
+        assert same(weights(finished[1] / name), weights(tmp_path / name))
 
 
 def test_a_robust_run_of_an_earlier_version_goes_on_as_it_began(finished, tmp_path):
@@ -275,15 +238,20 @@ def test_a_robust_run_of_an_earlier_version_goes_on_as_it_began(finished, tmp_pa
 def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
     sample_recording, tmp_path, monkeypatch, recipe, begins
 ):
-    rates, done = [], []  # of the steps; the share of the run that is finished before each
+    rates: list[float] = []  # of the steps
+    done: list[float] = []  # the share of the run that is finished before each
     step, share = Adam.step, Progress.done
 
-    def note(progress, recipe):
+    def noted_step(optimizer, rate):
+        rates.append(rate)
+        step(optimizer, rate)
+
+    def noted_share(progress, recipe):
         done.append(share(progress, recipe))
         return done[-1]
 
-    monkeypatch.setattr(Adam, "step", lambda optimizer, rate: rates.append(rate) or step(optimizer, rate))
-    monkeypatch.setattr(Progress, "done", note)
+    monkeypatch.setattr(Adam, "step", noted_step)
+    monkeypatch.setattr(Progress, "done", noted_share)
     short = replace(recipe, epochs=2, samples_per_epoch=150, batch_size=8)
     assert model.train(short, [sample_recording], tmp_path / "model.pt", device="cpu") == 0
     expected = begins * (1 + np.cos(np.pi * np.array(done))) / 2 if recipe is ROBUST else np.full(len(done), begins)
@@ -318,21 +286,19 @@ def test_a_missing_lane_network_is_named(sample_recording, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_the_reports_options_do_not_go_with_robust(sample_recording, tmp_path):
-    for option in ("--throttle-threshold", "--side-correction"):
-        done = run_here(sample_recording, "--robust", option, 0.1, "--output", tmp_path / "model.pt")
-        assert done.returncode == 2
-        assert f"{option} has no effect with --robust" in done.stderr
-
-
-def test_drives_too_short_are_named(tmp_path):
-    done = run_here(render_recording(tmp_path / "short", rows=20), *OPTIONS, "--output", tmp_path / "model.pt")
-    assert done.returncode == 2
-    assert "too short" in done.stderr
+def test_wrong_options_and_drives_too_short_are_named(sample_recording, tmp_path):
+    short = render_recording(tmp_path / "short", rows=20)
+    for recording, options, words in (
+        (sample_recording, ("--throttle-threshold", 0.1), "--throttle-threshold has no effect with --robust"),
+        (sample_recording, ("--side-correction", 0.1), "--side-correction has no effect with --robust"),
+        (short, SHORT, "too short"),
+    ):
+        done = run_here(recording, "--robust", *options, "--output", tmp_path / "model.pt")
+        assert done.returncode == 2 and words in done.stderr
 
 
 def test_tints_keep_grey_nearly_grey():
-    grey, red = (np.float32([100, 100, 100]), np.float32([200, 50, 50]))
+    grey, red = (np.array([100, 100, 100], np.float32), np.array([200, 50, 50], np.float32))
     colours = light.tints(ROBUST, np.random.default_rng(0), 2000)
     assert colours.shape == (2000, 3, 3) and colours.dtype == np.float32
     plain = (colours == np.eye(3)).all((1, 2))
@@ -376,25 +342,12 @@ def test_problem_areas_are_sampled_so_many_times_as_often(monkeypatch, repeats):
     def part(folder):
         rows = np.arange(50)
         known = lanes(monkeypatch, 0.05).take(rows + 50)
-        recording = SimpleNamespace(folder=Path(folder))
-        return Observations([recording], np.zeros(50, np.int16), rows, rows * 0.0, rows, rows * 1.0, known)
+        return Observations([without_files(50, folder)], np.zeros(50, int), rows, rows * 0.0, rows, rows * 1.0, known)
 
-    both, recipe = (
-        Observations.of_recordings([part("plain"), part("bend-repetitive")]),
-        replace(ROBUST, repeats=repeats),
-    )
+    both = Observations.of_recordings([part("plain"), part("bend-repetitive")])
+    recipe = replace(ROBUST, repeats=repeats)
     chosen = np.concatenate([sample_bends_more(both, recipe, np.random.default_rng(seed)) for seed in range(100)])
     assert (chosen >= 50).mean() == pytest.approx(repeats / (repeats + 1), abs=0.02)
-
-
-def test_rows_in_bends_are_sampled_more_often(monkeypatch):
-    many = lanes(monkeypatch, 0.4)
-    straight, bent = Lanes.unknown(3), many.take(np.array([100]))
-    weights = Lanes.joined([straight, bent]).weights(0.2)
-    steering = abs(float(bent.steering(np.zeros(1), np.zeros(1))[0]))
-    assert steering > 0.2
-    assert weights.sum() == pytest.approx(1)
-    assert weights[3] / weights[0] == pytest.approx((0.2 + steering) / 0.2)
 
 
 def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monkeypatch):
@@ -407,7 +360,10 @@ def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monk
     turn = sample_bends_more(everything, ROBUST, np.random.default_rng(0))
     assert len(turn) == n
     expected = both.weights(ROBUST.straight_weight)[2000:].sum()  # of the rows in a bend
-    assert expected > 0.6
+    bend = abs(
+        both.steering(np.zeros(n), np.zeros(n))[-1]
+    )  # its |steering| is its weight, and 0.2 more as of a straight
+    assert bend > 0.2 and expected == pytest.approx((0.2 + bend) / (0.4 + bend), rel=1e-5)
     assert (turn >= 2000).mean() == pytest.approx(expected, abs=0.03)
     views = PoseViews(everything, turn, np.zeros(n, int), ROBUST, np.random.default_rng(1))
     for poses in views.poses:
@@ -416,8 +372,7 @@ def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monk
 
 def test_the_label_is_the_recovery_steering_and_not_the_drivers(monkeypatch):
     """Rows whose lane is 1 m to the left of a car that a human drives straight on."""
-    reading = LanePosition(np.full(N, 1.0), np.zeros(N), np.ones(N, bool))
-    monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
+    lanes(monkeypatch, offset=1.0)
     checked = CheckedRecording(**vars(recording(0.0)), digests=np.zeros(1, np.uint64))
     selected = select_known_lane(checked, ROBUST)
     assert (selected.steering < -0.1).all()

@@ -4,7 +4,6 @@ import argparse
 import csv
 import os
 import re
-import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -12,12 +11,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import warm
-from commands import ROOT
+import torch
 from rendered import render_recording
 from test_generator import loaded, observations
 
 from cloning.base.errors import UserError
+from cloning.network.network import Network
 from cloning.replay.replay import load_recording
 from model import REPORT, ROBUST, Generator, balance
 from tools.study import __main__ as study
@@ -49,7 +48,7 @@ def test_every_recipe_differs_from_the_reports_or_the_robust_one_as_its_name_say
 
 
 def test_without_resampling_each_observation_counts_once():
-    steering = np.float32([0, 0.01, 0.3, -0.4, 1] * 20)
+    steering = np.array([0, 0.01, 0.3, -0.4, 1] * 20, np.float32)
     recipe = {variant.method: variant.recipe for variant in plan()}["no resampling"]
     assert len(balance(observations(steering), replace(REPORT, repeats=1), seed=0)) != len(steering)
     assert sorted(balance(observations(steering), replace(recipe, repeats=1), seed=0).steering) == sorted(steering)
@@ -77,7 +76,9 @@ def test_correlation_is_of_ranks_and_signed():
 
 
 def test_driving_is_told_by_departures_and_among_equals_by_distance():
-    rows = [{"departures_per_km": far, "offset_mean": off} for far, off in ((0, 3.5), (0, 0.2), (0.4, 0.1), (2, 1))]
+    rows: list[dict[str, float | str]] = [
+        {"departures_per_km": far, "offset_mean": off} for far, off in ((0, 3.5), (0, 0.2), (0.4, 0.1), (2, 1))
+    ]
     assert np.argsort(figures.column(rows, "driving")).tolist() == [1, 0, 2, 3]
 
 
@@ -86,15 +87,14 @@ def recording(tmp_path_factory):
     return load_recording(render_recording(tmp_path_factory.mktemp("study") / "lake-cw", rows=100))
 
 
-class Constant:
+class Constant(Network):
     """A network that always steers alike, or one that repeats the recorded steering plus something."""
 
     def __init__(self, values):
-        self.values = np.float32(values)
+        super().__init__()
+        self.values = values.astype(np.float32)
 
-    def __call__(self, frames):
-        import torch
-
+    def forward(self, frames, keep=None):
         now, self.values = self.values[: len(frames)], self.values[len(frames) :]
         return torch.from_numpy(now)
 
@@ -112,7 +112,7 @@ def test_errors_on_recorded_frames(recording):
 @pytest.mark.parametrize(("steering", "departures"), [(None, False), (0.3, True)])
 def test_laps_and_recovery_in_the_simulator(monkeypatch, steering, departures):
     """Steered by the known position, the car stays and comes back; steered to one side, it leaves the road."""
-    simulator = Simulator(None, "lake", "ccw", 15)
+    simulator = Simulator(Network(), "lake", "ccw", 15)
     monkeypatch.setattr(
         simulator, "steering", lambda run: follow(run) if steering is None else steering
     )  # without rendering
@@ -131,33 +131,25 @@ def follow(run):
     return float(np.clip(-3 * ((bearing + np.pi) % (2 * np.pi) - np.pi), -1, 1))
 
 
-def test_the_command_measures_and_goes_on(tmp_path):
+def test_the_command_measures_and_goes_on(tmp_path, capsys):
     data, folder = tmp_path / "data", tmp_path / "study"
     for seed, name in enumerate(["jungle", "jungle-shadows", "lake-ccw", "lake-cw"]):
         render_recording(data / name, seed=seed)
-
-    def study(*more):
-        command = [sys.executable, "-m", "tools.study", str(data), "--folder", str(folder), "--jobs", "1", *more]
-        trial = ["--images", "30", "--laps", "0.01", "--starts", "1"]
-        return warm.run([*command, *trial], cwd=ROOT, capture_output=True, text=True, timeout=300)
-
-    done = study("--networks", "1")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "lake-centre-camera-seed-0 is measured" in done.stdout
+    command = [str(data), "--folder", str(folder), "--jobs", "1", "--networks", "1"]
+    command += ["--images", "30", "--laps", "0.01", "--starts", "1"]
+    assert study.main(command) == 0
+    assert "lake-centre-camera-seed-0 is measured" in capsys.readouterr().out
     with open(folder / "study.csv", encoding="utf-8", newline="") as file:
         [row] = csv.DictReader(file)
     assert (row["method"], row["recordings"]) == ("centre camera", "lake-ccw")
     assert set(figures.MEASURES) | (set(figures.DRIVING) - {"driving"}) <= set(row)
     assert float(row["recovered"]) in (0, 1)
-    again = study("--networks", "1")
-    assert (again.returncode, "is measured" in again.stdout) == (0, False), "it was measured before"
+    assert study.main(command) == 0
+    assert "is measured" not in capsys.readouterr().out, "it was measured before"
     (data / "lake-cw" / "driving_log.csv").rename(data / "lake-cw" / "log.csv")
-    missing = study("--networks", "1")
-    assert missing.returncode == 2
-    assert (
-        "lake-cw: the study needs recordings by the names jungle, jungle-shadows, lake-ccw, lake-cw" in missing.stderr
-    )
-    assert "Traceback" not in missing.stderr
+    assert study.main(command) == 2
+    names = "jungle, jungle-shadows, lake-ccw, lake-cw"
+    assert f"lake-cw: the study needs recordings by the names {names}" in capsys.readouterr().err
 
 
 def end_process(*_):
@@ -187,4 +179,4 @@ def test_the_report_and_the_pictures_show_all_networks():
     assert "| robust | 25 %, 25 %, 25 %, 25 %, 25 % | 25 % |" in text
     for draw in (figures.correlation_picture, figures.recovery_picture):
         pixels = cv2.imdecode(np.frombuffer(draw(rows), np.uint8), cv2.IMREAD_COLOR)
-        assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20
+        assert pixels is not None and len(np.unique(pixels.reshape(-1, 3), axis=0)) > 20

@@ -9,13 +9,13 @@ import subprocess
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
-from commands import HERE, ROOT, SHORT, finished_run, log, run_here, run_model, same, weights
-from matplotlib.figure import Figure
+from commands import HERE, ROOT, SHORT, log, run_here, run_model, same, weights
 from PIL import Image
 from rendered import render_recording
 
@@ -108,19 +108,6 @@ def test_a_diagnostic_picture_names_the_pose_that_its_image_shows():
     assert [turned.title(at).split(", ")[1] for at in range(2)] == ["turned 5° right", "turned 5° left"]
 
 
-@pytest.mark.parametrize("options, dropout", [((), "with dropout"), (("--robust",), "without dropout")])
-def test_the_legend_of_the_losses_says_whether_training_uses_dropout(
-    sample_recording, tmp_path, monkeypatch, options, dropout
-):
-    legends = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: legends.append(figure.axes[0].get_legend()))
-    finished_run(sample_recording, tmp_path, *SHORT, "--epochs", 1, *options)
-    training, validation = (text.get_text() for text in legends[0].get_texts())
-    assert training == f"training (augmented, {dropout})" and re.fullmatch(
-        r"validation \(lowest: .* in epoch 1\)", validation
-    )
-
-
 def test_what_a_run_leaves(finished):
     folder = finished[1]
     assert {path.name for path in folder.iterdir()} == {
@@ -173,14 +160,7 @@ def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_rec
     assert run.generator.observations is training and run.validation is validation
 
 
-def test_same_seed_same_weights_other_seed_others(finished, sample_recording, tmp_path):
-    for seed in (0, 1):
-        assert run_here(sample_recording, *SHORT, "--seed", seed, "--output", tmp_path / f"{seed}.pt").returncode == 0
-    assert same(weights(tmp_path / "0.pt"), weights(finished[1] / "model.pt"))
-    assert not same(weights(tmp_path / "1.pt"), weights(finished[1] / "model.pt"))
-
-
-def test_no_run_changes_a_tracked_file(sample_recording, tmp_path):
+def test_every_recording_under_data_is_the_default_and_no_run_changes_a_tracked_file(sample_recording, tmp_path):
     git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "core.autocrlf=false"]
     if not shutil.which("git"):
         pytest.skip("git is not installed")
@@ -192,10 +172,13 @@ def test_no_run_changes_a_tracked_file(sample_recording, tmp_path):
     for command in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "all"]):
         subprocess.run([*git, *command], cwd=tmp_path, check=True)
     shutil.copytree(sample_recording, tmp_path / "data" / "lake")
+    render_recording(tmp_path / "data" / "turn-repetitive", rows=20, seed=1)
     damaged = next((tmp_path / "data" / "lake" / "IMG").glob("left*"))
     damaged.write_bytes(b"")  # so that rejected_rows.csv is written, too
     for _ in range(2):
-        assert run_here(*SHORT, "--epochs", 1, cwd=tmp_path).returncode == 0
+        done = run_here(*SHORT, "--epochs", 1, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert next(line.split()[1] for line in done.stdout.splitlines() if line.startswith("total")) == "80"
     assert (tmp_path / "model-previous.pt").exists() and (tmp_path / "rejected_rows.csv").exists()
     status = subprocess.run([*git, "status", "--porcelain"], cwd=tmp_path, check=True, capture_output=True, text=True)
     assert status.stdout == ""
@@ -259,18 +242,6 @@ def test_a_folder_is_not_taken_for_the_model_file(sample_recording, tmp_path, ou
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
-def test_recordings_may_follow_options():
-    assert parse(["a", "--epochs", "3", "b"]).run.recordings == ("a", "b")
-
-
-def test_the_first_epoch_is_the_best_so_far_even_if_it_diverged():
-    progress, is_best = Progress(), []
-    for val_loss in (math.nan, 0.5, math.nan, 0.6, 0.4):
-        progress.images = 1
-        is_best.append(progress.finish_epoch(val_loss, math.nan))
-    assert is_best == [True, True, False, False, True]
-
-
 @pytest.mark.parametrize("device", ["cuda", "mps"])
 def test_a_device_that_is_not_there(sample_recording, tmp_path, monkeypatch, device):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -295,22 +266,13 @@ def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path
     assert not (tmp_path / "strict.pt").exists()
 
 
-def test_default_is_every_recording_under_data(tmp_path):
-    for i, name in enumerate(("lake", "turn-repetitive")):
-        render_recording(tmp_path / "data" / name, rows=20, seed=i)
-    done = run_here(*SHORT, "--epochs", 1, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    totals = [line.split()[-4:] for line in done.stdout.splitlines() if line.startswith("total")]
-    assert totals == [["40", "0", "4", "36"]]
-    assert (tmp_path / "model.pt").exists()
-
-
 def test_a_given_value_counts_as_given_also_when_it_is_the_default():
     resumed = parse(["--resume", "--epochs", "10"])
     assert (resumed.run, resumed.process) == (Run(REPORT), Process(resume=True))
     assert resumed.given == {"resume", "epochs"}
     assert parse([]).run == Run(REPORT) and not parse([]).given
     assert parse(["data"]).given == {"recordings"}
+    assert parse(["a", "--epochs", "3", "b"]).run.recordings == ("a", "b"), "they may follow options"
 
 
 def test_options_are_fields_of_the_recipe_the_run_and_the_process():
@@ -319,19 +281,14 @@ def test_options_are_fields_of_the_recipe_the_run_and_the_process():
     names = {field.name for each in (Recipe, Run, Process) for field in fields(each)}
     assert {action.dest for action in actions} - {"help", "robust"} <= names
     for name in FIGURES:
-        value = {"epochs": 3, "batch_size": 5, "samples_per_epoch": 7, "repeats": 2}.get(name, 0.5)
+        value: Any = {"epochs": 3, "batch_size": 5, "samples_per_epoch": 7, "repeats": 2}.get(name, 0.5)
         assert parse([option_name(name), str(value)]).run.recipe == replace(REPORT, **{name: value})
     assert parse(["--robust", "--epochs", "1"]).run.recipe == replace(ROBUST, epochs=1)
 
 
 def test_importing_does_nothing(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", "import model, cloning.recordings.log, cloning.network.network"],
-        cwd=tmp_path,
-        env={**os.environ, **HERE},
-        capture_output=True,
-        text=True,
-    )
+    code = "import model, cloning.recordings.log, cloning.network.network"
+    done = run_model(command=[sys.executable, "-c", code], env=HERE, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert not os.listdir(tmp_path)
 
@@ -339,15 +296,8 @@ def test_importing_does_nothing(tmp_path):
 # ----------------------------------------------------------------------------------------------------------------------
 # Several processes
 
-TORCHRUN = [
-    sys.executable,
-    "-m",
-    "torch.distributed.run",
-    "--nproc_per_node=2",
-    "--master_port=0",
-    "--standalone",
-    str(ROOT / "model.py"),
-]
+TORCHRUN = [sys.executable, *["-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0", "--standalone"]]
+TORCHRUN.append(str(ROOT / "model.py"))
 without_libuv = pytest.mark.skipif(sys.platform == "win32", reason="PyTorch for Windows has no libuv for torchrun")
 
 
@@ -369,8 +319,13 @@ def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
 
 @without_libuv
 def test_two_processes_train_as_one(finished, two_processes):
-    """Two ranks with half of every batch each end where one process ends."""
+    """Two ranks with half of every batch each end where one process ends; they print once, and the losses of both."""
     assert_equal_up_to_rounding(finished[1] / "model.pt", two_processes[1] / "model.pt")
+    one, two = (
+        [float(loss) for line in run.stdout.splitlines() for loss in re.findall(r"loss: ([\d.]+)", line)]
+        for run in (finished[0], two_processes[0])
+    )
+    assert len(one) == 4 and two == pytest.approx(one, abs=2e-4)  # the global losses; bfloat16 rounds
 
 
 @without_libuv
@@ -384,20 +339,6 @@ def test_two_processes_continue_with_the_runs_own_arguments(finished, two_proces
     assert done.returncode == 0, done.stderr
     assert [row["epoch"] for row in log(two)] == ["1", "2", "3"]
     assert_equal_up_to_rounding(one / "model.pt", two / "model.pt")
-
-
-@without_libuv
-def test_two_processes_print_once_and_the_losses_of_both(finished, two_processes):
-    logs = [
-        [
-            float(number)
-            for line in output.splitlines()
-            if "val_loss" in line
-            for number in re.findall(r"loss: ([\d.]+)", line)
-        ]
-        for output in (finished[0].stdout, two_processes[0].stdout)
-    ]
-    assert len(logs[0]) == 4 and logs[1] == pytest.approx(logs[0], abs=2e-4)  # the global losses; bfloat16 rounds
 
 
 def test_a_rank_prints_the_error_that_it_alone_meets(tmp_path, capsys):
