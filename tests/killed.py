@@ -22,6 +22,11 @@ from cloning.base.files import TEMPORARY_NAME
 
 ALL = bool(os.environ.get("ALL_KILL_POINTS"))  # see `chosen`
 KILLED = -signal.SIGKILL
+VARYING = {  # what differs between two runs of one command
+    "training_arguments.json": {"resume"},
+    "training_progress.json": {"run", "seconds"},
+    "drive.json": {"round_trip_ms", "own_ms_a_frame"},
+}
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -72,16 +77,8 @@ def value(path: Path) -> object:
         return plain(saved)
     if path.name == "training_log.csv":
         return [line.split(",")[:2] + line.split(",")[3:] for line in path.read_text(encoding="utf-8").splitlines()]
-    if path.name == "training_arguments.json":
-        return json.loads(path.read_bytes()) | {"resume": None}
-    if path.name == "training_progress.json":
-        return json.loads(path.read_bytes()) | {"run": None, "seconds": None}
-    if path.name == "drive.json":
-        return {
-            name: value
-            for name, value in json.loads(path.read_bytes()).items()
-            if name not in ("round_trip_ms", "own_ms_a_frame")
-        }
+    if path.name in VARYING:
+        return {name: found for name, found in json.loads(path.read_bytes()).items() if name not in VARYING[path.name]}
     if path.suffix == ".mp4":  # its bytes differ from one run to the next
         with av.open(str(path)) as film:
             return film.streams.video[0].average_rate, [frame.to_ndarray().shape for frame in film.decode(video=0)]

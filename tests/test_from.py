@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+import torch
 from commands import SHORT, run_here, same, weights
 
 import model

@@ -124,42 +124,28 @@ def test_the_orientation_in_exif_data_is_ignored(orientation):
     np.testing.assert_array_equal(decode(turned), decode(PLAIN))
 
 
-def mutations(count: int):
-    """JPEGs with bytes of the header changed, and markers, huge frame headers and other segments put in between."""
-    rng = random.Random(0)
-    pieces = [*MARKERS, *HIDDEN, HUGE, HUGE.replace(b"\xff\xc0", b"\xff\xc2")]
-    pieces += [PLAIN[HEADER:SCAN], PLAIN[SCAN : SCAN + 14]]
+def decode_mutations() -> None:
+    """Run in a process whose OpenCV takes no more than 160 x 320 pixels: it must never be asked to take more.
+
+    JPEGs have bytes of the header changed, and markers, huge frame headers and other segments put in between.
+    """
+    rng, whole = random.Random(0), 0
+    pieces = [*MARKERS, *HIDDEN, HUGE, HUGE.replace(b"\xff\xc0", b"\xff\xc2"), PLAIN[HEADER:SCAN]]
     originals = [PLAIN, jpeg_of(progressive=True)]
-    for _ in range(count):
-        jpeg = bytearray(rng.choice(originals))
-        borders = [at for at in range(2, SCAN + 14) if jpeg[at] == 0xFF]
+    for _ in range(1500):
+        mutation = bytearray(rng.choice(originals))
+        borders = [at for at in range(2, SCAN + 14) if mutation[at] == 0xFF]
         for _ in range(rng.randint(0, 3)):
-            jpeg[rng.randrange(SCAN + 40)] = rng.choice([0, 1, 0xFF, rng.randrange(256)])
+            mutation[rng.randrange(SCAN + 40)] = rng.choice([0, 1, 0xFF, rng.randrange(256)])
         for _ in range(rng.randint(0, 3)):
             at = rng.choice(borders)
-            jpeg[at:at] = rng.choice(pieces)
-        yield bytes(jpeg)
-
-
-def decode_mutations() -> None:
-    """Run in a process whose OpenCV takes no more than 160 x 320 pixels: it must never be asked to take more."""
-    whole = 0
-    for jpeg in mutations(1500):
-        try:
-            if jpeg_size(jpeg) != (160, 320):
-                continue
-        except ValueError:
-            continue
-        try:
-            frame = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error as error:
-            assert "IMAGE_PIXELS" not in str(error), jpeg[: SCAN + 100].hex()
-        else:
-            whole += frame is not None
+            mutation[at:at] = rng.choice(pieces)
+        jpeg = bytes(mutation)
         try:
             assert decode(jpeg).shape == (160, 320, 3)
+            whole += 1
         except ValueError as error:
-            assert str(error) == "damaged"
+            assert "IMAGE_PIXELS" not in str(error.__cause__), jpeg[: SCAN + 100].hex()
     print(whole)
 
 
@@ -304,10 +290,14 @@ def shrink(image: Path) -> None:
     cv2.imwrite(str(image), FRAME[::2, ::2])
 
 
-CHANGES = [(Path.unlink, "No such file or directory"), (cut, "cut short"), (shrink, "160x80 pixels where 320x160")]
-
-
-@pytest.mark.parametrize(("change", "reason"), CHANGES)
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (Path.unlink, "No such file or directory"),
+        (cut, "cut short"),
+        (shrink, "160x80 pixels where 320x160 are expected"),
+    ],
+)
 def test_an_image_that_changes_while_it_is_replayed_is_named(copied, monkeypatch, capsys, change, reason):
     def lines_then_change(recording, by_lane):
         lines = replay.reference_lines(recording, by_lane)
@@ -318,27 +308,23 @@ def test_an_image_that_changes_while_it_is_replayed_is_named(copied, monkeypatch
     assert simulator.main(["replay", str(copied), "--model", str(SHIPPED_MODEL), "--reference", "human"]) == 2
     name = sorted((copied / "IMG").glob("left*"))[30].name.replace("left", "center")
     assert capsys.readouterr().err == (
-        f"simulator: {copied / 'IMG' / name}: {reason}"
-        f"{' are expected' if 'pixels' in reason else ''}; copy it again, or delete its row from the log\n"
+        f"simulator: {copied / 'IMG' / name}: {reason}; copy it again, or delete its row from the log\n"
     )
 
 
-@pytest.mark.parametrize(("change", "reason"), CHANGES)
-def test_an_image_that_changes_during_training_is_named_and_can_be_restored(
-    copied, finished, tmp_path, monkeypatch, change, reason
-):
+def test_an_image_that_changes_during_training_is_named_and_can_be_restored(copied, finished, tmp_path, monkeypatch):
     images, split = {path: path.read_bytes() for path in (copied / "IMG").iterdir()}, model.split
 
-    def change_then_split(*arguments):
+    def cut_then_split(*arguments):
         for image in images:
-            change(image)
+            cut(image)
         return split(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(model, "split", change_then_split)
+        patch.setattr(model, "split", cut_then_split)
         done = run_here(copied, *SHORT, "--output", tmp_path / "model.pt")
     assert done.returncode == 2
-    assert f".jpg: {reason}" in done.stderr and str(copied / "IMG") in done.stderr
+    assert ".jpg: cut short" in done.stderr and str(copied / "IMG") in done.stderr
     assert "Restore it and continue with --resume" in done.stderr
     for image, jpeg in images.items():
         image.write_bytes(jpeg)

@@ -3,7 +3,6 @@
 Without ALL_KILL_POINTS=1 in the environment, some of the points are left out: see `killed.chosen`.
 """
 
-import hashlib
 import http.client
 import json
 import os
@@ -67,28 +66,6 @@ def test_training_killed_anywhere_and_on_a_full_disk(lake, tmp_path):
 def test_resumed_training_killed_anywhere(lake, trained, tmp_path):
     command = training(lake, "--epochs", 2, "--resume")
     Place(tmp_path / "place", command, command, trained).killed_everywhere(2)
-
-
-def test_training_over_an_earlier_runs_files_killed_anywhere(lake, trained, tmp_path):
-    """The next run finds its way: with --resume or, if the killed one had no state yet, as it tells, without."""
-    begin = training(lake, "--epochs", 1, "--seed", 1)
-    earlier = {hashlib.sha256(path.read_bytes()).hexdigest() for path in trained.glob("*.pt")}
-    place = Place(tmp_path / "place", begin, [], trained)
-
-    def checked() -> None:
-        found = {hashlib.sha256(path.read_bytes()).hexdigest() for path in place.folder.glob("*.pt")}
-        assert earlier <= found, "an earlier run's model is gone"
-
-    def next_run(wanted: dict[str, object]) -> None:
-        resumed = place.run([*begin, "--resume"])
-        place.again = [*begin, "--resume"]
-        if resumed.status == 2:
-            assert "start a new run without --resume" in resumed.printed
-            place.again = begin
-        place.goes_on(wanted)
-
-    place.checked = checked
-    place.killed_everywhere(2, next_run)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from cloning.network.layer_table import layer_table
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.road.track import Track
-from cloning.training.pieces import PIECE, Batch, SquaredErrors, pieces
+from cloning.training.pieces import Batch, SquaredErrors
 from simulator.record import record
 
 REPORT = """
@@ -104,15 +104,6 @@ def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):
     network(frames, keep)
     torch.testing.assert_close(flat[1][:, ::2], flat[0][:, ::2] * 2)
     assert not flat[1][:, 1::2].any()
-
-
-@pytest.mark.parametrize("images", [0, 1, 2, 48, 56, 57, 474])
-def test_pieces_are_an_even_number_of_about_the_same_size(images):
-    parts = pieces(images)
-    assert [index for part in parts for index in range(images)[part]] == list(range(images))
-    sizes = [part.stop - part.start for part in parts]
-    assert len(parts) % 2 == 0 and all(size <= PIECE for size in sizes)
-    assert not images or max(sizes) - min(sizes) <= 1
 
 
 def test_later_batches_are_computed_with_the_weights_of_then(network):

@@ -286,15 +286,9 @@ def test_a_missing_lane_network_is_named(sample_recording, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_wrong_options_and_drives_too_short_are_named(sample_recording, tmp_path):
-    short = render_recording(tmp_path / "short", rows=20)
-    for recording, options, words in (
-        (sample_recording, ("--throttle-threshold", 0.1), "--throttle-threshold has no effect with --robust"),
-        (sample_recording, ("--side-correction", 0.1), "--side-correction has no effect with --robust"),
-        (short, SHORT, "too short"),
-    ):
-        done = run_here(recording, "--robust", *options, "--output", tmp_path / "model.pt")
-        assert done.returncode == 2 and words in done.stderr
+def test_drives_too_short_are_named(tmp_path):
+    done = run_here(render_recording(tmp_path / "short", rows=20), *OPTIONS, "--output", tmp_path / "model.pt")
+    assert done.returncode == 2 and "too short" in done.stderr
 
 
 def test_tints_keep_grey_nearly_grey():
