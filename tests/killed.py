@@ -103,7 +103,7 @@ def contents(folder: Path) -> dict[str, object]:
 
 
 @dataclass
-class Place:
+class Trial:
     """A folder in which a command runs again and again from the same beginning.
 
     command   to kill
@@ -191,13 +191,13 @@ class Place:
 
         self.at_each(writes(points, others), points, fill)
 
-    def at_each(self, numbers: list[int], points: list[str], trial: Callable[[int], None]) -> None:
+    def at_each(self, numbers: list[int], points: list[str], attempt: Callable[[int], None]) -> None:
         """Try at each of these points, each time from the beginning, and report all failures at the end."""
         failures = []
         for number in numbers:
             self.restore()
             try:
-                trial(number)
+                attempt(number)
             except Exception as error:
                 failures.append(f"{number} of {len(points)}, {points[number - 1]}: {str(error)[:300]}")
         print(f"{len(numbers)} of {len(points)} points")

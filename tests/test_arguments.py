@@ -12,9 +12,9 @@ IMPOSSIBLE = ["nan", "inf", "-inf", "1e400", "", "x", "1,5", "9" * 5000]
 
 @pytest.mark.parametrize("text", [*IMPOSSIBLE, "-1", "0", "1001", "0.5"])
 def test_a_number_out_of_its_range_is_refused(text):
-    for kind in (int, float, ratio):
+    for form in (int, float, ratio):
         with pytest.raises(argparse.ArgumentTypeError, match="at least 1 and at most 1000"):
-            number(kind, 1, 1000)(text)
+            number(form, 1, 1000)(text)
 
 
 def test_numbers_in_their_range_are_read():

@@ -124,12 +124,12 @@ def test_shadow_is_opencvs_hls_lightness_on_one_side_of_the_line(left):
 def test_probabilities_and_ranges_over_many_batches(generator):
     draws = [generator.sample(number) for number in range(200)]
     n = 200 * 128
-    kinds = sum((d.slots >= 0).sum(0) for d in draws) / n
-    np.testing.assert_allclose(kinds, [1, 0.9, 1, 0.8], atol=0.01)
+    shares = sum((d.slots >= 0).sum(0) for d in draws) / n
+    np.testing.assert_allclose(shares, [1, 0.9, 1, 0.8], atol=0.01)
     np.testing.assert_allclose(np.bincount(np.concatenate([d.camera for d in draws])) / n, [1 / 3] * 3, atol=0.01)
     [brightness], [darkness, line, left] = (
         [np.concatenate(v) for v in zip(*chosen, strict=True)]
-        for chosen in ([d.augmenting[kind] for d in draws] for kind in (2, 3))
+        for chosen in ([d.augmenting[augmentation] for d in draws] for augmentation in (2, 3))
     )
     for values, low, high in ((brightness, 0.4, 1.2), (darkness, 0.2, 0.5), (line, 0, 320)):
         assert low <= values.min() and values.max() <= high

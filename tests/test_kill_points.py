@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from commands import ROOT
 from kill_points import Watched
-from killed import ALL, KILLED, Place, check_whole, chosen, is_temporary, spread, writes
+from killed import ALL, KILLED, Trial, check_whole, chosen, is_temporary, spread, writes
 from rendered import render_recording
 from steer_server import STEER, Server
 
@@ -46,9 +46,9 @@ def lake(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def trained(lake, tmp_path_factory) -> Path:
     """The folder of a finished run of one epoch with seed 0, and the cache of checked images; not to be changed."""
-    folder = tmp_path_factory.mktemp("earlier") / "place"
-    place = Place(folder, training(lake, "--epochs", 1), [])
-    place.whole_run()
+    folder = tmp_path_factory.mktemp("earlier") / "trial"
+    trial = Trial(folder, training(lake, "--epochs", 1), [])
+    trial.whole_run()
     return folder
 
 
@@ -58,14 +58,14 @@ def training(lake: Path, *arguments) -> list:
 
 def test_training_killed_anywhere_and_on_a_full_disk(lake, tmp_path):
     begin = training(lake, "--epochs", 1)
-    place = Place(tmp_path / "place", begin, [*begin, "--resume"])
-    place.killed_everywhere(2)
-    place.disk_full_everywhere(2, status=2)
+    trial = Trial(tmp_path / "trial", begin, [*begin, "--resume"])
+    trial.killed_everywhere(2)
+    trial.disk_full_everywhere(2, status=2)
 
 
 def test_resumed_training_killed_anywhere(lake, trained, tmp_path):
     command = training(lake, "--epochs", 2, "--resume")
-    Place(tmp_path / "place", command, command, trained).killed_everywhere(2)
+    Trial(tmp_path / "trial", command, command, trained).killed_everywhere(2)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -94,57 +94,57 @@ def rows_of(folder: Path) -> list[tuple]:
 @pytest.fixture(params=["record", "correct"])
 def recording(tmp_path, request):
     if request.param == "record":
-        yield Place(tmp_path / "place", RECORD, RECORD)
+        yield Trial(tmp_path / "trial", RECORD, RECORD)
         return
     with ServerForAll("1") as server:  # so the expert takes over after 4 m
         command = ["-m", "simulator", "correct", RECORDED, "--laps", "0.004", "--port", server.port]
-        yield Place(tmp_path / "place", command, command)
+        yield Trial(tmp_path / "trial", command, command)
 
 
 def test_recording_killed_anywhere(recording):
     """A killed recording can be trained on; one that has no row yet is begun again by the same command."""
-    place = recording
-    place.whole_run()
-    complete = rows_of(place.folder / RECORDED)
+    trial = recording
+    trial.whole_run()
+    complete = rows_of(trial.folder / RECORDED)
     assert complete
 
     def next_run(wanted: dict[str, object]) -> None:
-        log = place.folder / RECORDED / "driving_log.csv"
+        log = trial.folder / RECORDED / "driving_log.csv"
         if not log.exists() or not log.stat().st_size:
-            place.goes_on(wanted)
+            trial.goes_on(wanted)
             return
         assert rows_of(log.parent) in [complete[:count] for count in range(len(complete) + 1)]
-        ended = place.run(place.command)
+        ended = trial.run(trial.command)
         assert ended.status == 2 and "exists already; name another folder, or delete this one" in ended.printed
 
-    place.killed_everywhere(2, next_run)
+    trial.killed_everywhere(2, next_run)
 
 
 def test_recording_on_a_full_disk(tmp_path):
     """The rows before it are complete, also if the process is killed while it takes back the last one."""
-    place = Place(tmp_path / "place", RECORD, RECORD)
-    _, points = place.whole_run()
-    complete = rows_of(place.folder / RECORDED)
+    trial = Trial(tmp_path / "trial", RECORD, RECORD)
+    _, points = trial.whole_run()
+    complete = rows_of(trial.folder / RECORDED)
     for full in writes(points, 2):
-        place.restore()
-        ended = place.run(RECORD, full=full)
+        trial.restore()
+        ended = trial.run(RECORD, full=full)
         assert ended.status == 2 and "No space left on device; the" in ended.printed, ended.printed
         assert "Traceback" not in ended.printed
-        check_whole(place.folder)
-        log_file = place.folder / RECORDED / "driving_log.csv"
+        check_whole(trial.folder)
+        log_file = trial.folder / RECORDED / "driving_log.csv"
         log = log_file.read_bytes() if log_file.exists() else b""  # without a row, the recording is removed
-        images = set((place.folder / RECORDED).glob("IMG/*"))
+        images = set((trial.folder / RECORDED).glob("IMG/*"))
         rows = log.count(b"\n")
         assert f"the {rows} rows before it" in ended.printed
         assert log == b"" or log.endswith(b"\n")
         assert len(images) == 3 * rows, "what was written of the last row is taken back"
         later = list(range(full + 1, len(ended.points) + 1))
         for kill in later if ALL else spread(later, 2):
-            place.restore()
-            assert place.run(RECORD, full=full, kill=kill).status == KILLED
-            check_whole(place.folder)
+            trial.restore()
+            assert trial.run(RECORD, full=full, kill=kill).status == KILLED
+            check_whole(trial.folder)
             if log_file.exists() and log_file.stat().st_size:
-                assert rows_of(place.folder / RECORDED) == complete[:rows]
+                assert rows_of(trial.folder / RECORDED) == complete[:rows]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -191,10 +191,10 @@ def driving(model_file, jpegs, tmp_path):
     (begin / "run1" / "2018_07_16_17_11_43_382.jpg").write_bytes(jpegs[7])
     (begin / "run1" / ".2018_07_16_17_11_43_383.jpg.0123abcd.part").write_bytes(jpegs[7][:100])
     command = [ROOT / "drive.py", model_file, "run1", "--port", 0]
-    place = Place(tmp_path / "place", command, command, begin)
+    trial = Trial(tmp_path / "trial", command, command, begin)
     car = Car(jpegs)
-    place.companion = car.drive
-    return place, car
+    trial.companion = car.drive
+    return trial, car
 
 
 def saved(folder: Path) -> list[bytes]:
@@ -203,36 +203,36 @@ def saved(folder: Path) -> list[bytes]:
 
 def test_driving_killed_anywhere(driving, jpegs):
     """The frames that are there are whole, video.py films them, and the next drive deletes them all."""
-    place, car = driving
-    place.restore()
-    points = place.run(place.command).points
-    assert saved(place.folder / "run1") == jpegs[:6]
+    trial, car = driving
+    trial.restore()
+    points = trial.run(trial.command).points
+    assert saved(trial.folder / "run1") == jpegs[:6]
     for number in chosen(points, 4):
-        place.restore()
-        assert place.run(place.command, kill=number).status == KILLED
-        check_whole(place.folder)
-        frames = [jpeg for jpeg in saved(place.folder / "run1") if jpeg != jpegs[7]]
+        trial.restore()
+        assert trial.run(trial.command, kill=number).status == KILLED
+        check_whole(trial.folder)
+        frames = [jpeg for jpeg in saved(trial.folder / "run1") if jpeg != jpegs[7]]
         assert frames == jpegs[: len(frames)]
         if frames:
-            place.companion = lambda running: None
-            film = place.run([ROOT / "video.py", "run1"])
-            place.companion = car.drive
+            trial.companion = lambda running: None
+            film = trial.run([ROOT / "video.py", "run1"])
+            trial.companion = car.drive
             assert film.status == 0 and f"run1.mp4: {len(frames)} frames" in film.printed
             assert "unreadable" not in film.printed
-        assert place.run(place.command).status == 0
-        assert saved(place.folder / "run1") == jpegs[:6]
-        assert not list((place.folder / "run1").glob(".*"))
+        assert trial.run(trial.command).status == 0
+        assert saved(trial.folder / "run1") == jpegs[:6]
+        assert not list((trial.folder / "run1").glob(".*"))
     print(f"{len(chosen(points, 4))} of {len(points)} points")
 
 
 def test_driving_on_a_full_disk(driving, jpegs):
     """All frames are answered; those that are lost are counted, in the session's summary and at the end."""
-    place, car = driving
-    place.restore()
-    points = place.run(place.command).points
+    trial, car = driving
+    trial.restore()
+    points = trial.run(trial.command).points
     for number in writes(points, 2):
-        place.restore()
-        ended = place.run(place.command, full=number)
+        trial.restore()
+        ended = trial.run(trial.command, full=number)
         lost = sum(point.startswith("write") for point in points[number - 1 :])
         assert car.answers == 6
         assert ended.status == 1 and "Traceback" not in ended.printed
@@ -240,8 +240,8 @@ def test_driving_on_a_full_disk(driving, jpegs):
             f"session ended: 6 frames driven, 0 unusable; {6 - lost} frames saved in run1, {lost} LOST" in ended.printed
         )
         assert f"drive.py: run1: {lost} of 6 frames were not saved" in ended.printed.splitlines()[-1]
-        assert saved(place.folder / "run1") == jpegs[: 6 - lost]
-        assert not list((place.folder / "run1").glob(".*"))
+        assert saved(trial.folder / "run1") == jpegs[: 6 - lost]
+        assert not list((trial.folder / "run1").glob(".*"))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -258,7 +258,7 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
     earlier, new = Cut(center[1], center[2], "off"), Cut(center[5], center[9], "off")
     add_cut(recorded, earlier)
     command, answers = ["-m", "cloning.browse", "lake", "--port", 0], []
-    place = Place(tmp_path / "place", command, command, tmp_path / "begin")
+    trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin")
 
     def cut(running: Watched) -> None:
         if not (port := printed_port(running, r"http://[\d.]+:(\d+)/")):
@@ -276,24 +276,24 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
         running.process.send_signal(signal.SIGINT)
 
     def checked() -> None:
-        cuts = [each.row() for each in read_cuts(place.folder / "lake")]
+        cuts = [each.row() for each in read_cuts(trial.folder / "lake")]
         assert cuts in ([earlier.row()], [earlier.row(), new.row()])
-        assert len(read_recording(place.folder / "lake")) in (38, 33)
+        assert len(read_recording(trial.folder / "lake")) in (38, 33)
 
-    place.companion, place.checked = cut, checked
-    place.killed_everywhere(4)
-    _, points = place.whole_run()
+    trial.companion, trial.checked = cut, checked
+    trial.killed_everywhere(4)
+    _, points = trial.whole_run()
     for number in writes(points, 10):
-        place.restore()
-        assert place.run(command, full=number).status == 0
+        trial.restore()
+        assert trial.run(command, full=number).status == 0
         assert "excluded.csv: No space left on device" in json.loads(answers[-1])["message"]
-        assert [each.row() for each in read_cuts(place.folder / "lake")] == [earlier.row()]
-        assert sorted(path.name for path in (place.folder / "lake").iterdir()) == sorted(os.listdir(recorded))
+        assert [each.row() for each in read_cuts(trial.folder / "lake")] == [earlier.row()]
+        assert sorted(path.name for path in (trial.folder / "lake").iterdir()) == sorted(os.listdir(recorded))
 
 
 def test_an_analysis_of_the_lane_killed_anywhere(lake, tmp_path):
     command = ["-m", "cloning.browse.analyse", lake, "lane"]
-    Place(tmp_path / "place", command, command).killed_everywhere(1)
+    Trial(tmp_path / "trial", command, command).killed_everywhere(1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -306,7 +306,7 @@ def filming(jpegs, tmp_path):
     folder.mkdir(parents=True)
     for n, jpeg in enumerate(jpegs):
         (folder / f"2018_07_16_17_11_43_{n:03d}.jpg").write_bytes(jpeg)
-    return Place(tmp_path / "place", [ROOT / "video.py", "run1"], [ROOT / "video.py", "run1"], tmp_path / "begin")
+    return Trial(tmp_path / "trial", [ROOT / "video.py", "run1"], [ROOT / "video.py", "run1"], tmp_path / "begin")
 
 
 def test_filming_saved_frames_killed_anywhere(filming):
@@ -321,7 +321,7 @@ OUTPUTS = ("--report", "drive.json", "--picture", "above.png", "--film", "film.m
 def simulator_drive(tmp_path):
     with ServerForAll() as server:
         command = ["-m", "simulator", "drive", "--laps", "0.002", "--port", server.port, *OUTPUTS]
-        yield Place(tmp_path / "place", command, command)
+        yield Trial(tmp_path / "trial", command, command)
 
 
 class ServerForAll(Server):
@@ -346,7 +346,7 @@ def test_a_simulated_drive_killed_anywhere_and_on_a_full_disk(simulator_drive):
 def test_a_replay_killed_anywhere_and_on_a_full_disk(lake, model_file, tmp_path):
     files = ("--report", "replay.json", "--picture", "replay.png", "--film", "replay.mp4")
     command = ["-m", "simulator", "replay", lake, "--model", model_file, "--limit", 1, "--reference", "human", *files]
-    place = Place(tmp_path / "place", command, command)
-    place.killed_everywhere(1)
-    place.killed_at_every_length("replay.mp4", 20 if ALL else 1)
-    place.disk_full_everywhere(1, status=2)
+    trial = Trial(tmp_path / "trial", command, command)
+    trial.killed_everywhere(1)
+    trial.killed_at_every_length("replay.mp4", 20 if ALL else 1)
+    trial.disk_full_everywhere(1, status=2)

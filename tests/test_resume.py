@@ -59,8 +59,8 @@ def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_inte
     assert run.returncode == 128 + number
     assert errors.startswith("model.py: ") and "--resume" in errors
     assert "Traceback" not in errors
-    place = torch.load(tmp_path / "model-resume.pt", weights_only=True)["training"]
-    assert 0 < place["images"] < 150  # in the middle of an epoch
+    state = torch.load(tmp_path / "model-resume.pt", weights_only=True)["training"]
+    assert 0 < state["images"] < 150  # in the middle of an epoch
     assert run_here(sample_recording, "--output", output, "--resume").returncode == 0
     for name in ("model.pt", "model-best.pt"):
         assert same(weights(tmp_path / name), weights(finished[1] / name))
@@ -143,7 +143,7 @@ def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording, 
         assert done.returncode == 0, done.stderr
         assert f"{begun / 'model.pt'} of an earlier run is now" in done.stdout
     endings = ("-previous", "-previous-2", "")
-    expected = {f"{kind}{ending}.pt": seed for kind in KINDS for seed, ending in enumerate(endings)}
+    expected = {f"{name}{ending}.pt": seed for name in MODELS for seed, ending in enumerate(endings)}
     if missing:
         del expected["model-best-previous.pt"]
     assert seeds(begun) == expected
@@ -154,7 +154,7 @@ def seeds(folder):
     return {path.name: seed_of(path) for path in folder.glob("*.pt")}
 
 
-KINDS = ("model", "model-best", "model-resume")
+MODELS = ("model", "model-best", "model-resume")
 
 
 @pytest.mark.parametrize("kill_at", range(1, 13) if ALL else (1, 2, 3, 8, 9, 10, 11, 12))
@@ -182,8 +182,8 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
         patch.setattr(os, "rename", dying)
         with pytest.raises(Killed):
             run_here(*command, "--seed", 1)
-    for kind, point in zip(KINDS[:2], (9, 10), strict=True):  # the earlier run's until the new one has an epoch
-        assert seed_of(begun / f"{kind}.pt") == (kill_at > point)
+    for name, point in zip(MODELS[:2], (9, 10), strict=True):  # the earlier run's until the new one has an epoch
+        assert seed_of(begun / f"{name}.pt") == (kill_at > point)
     new_run_begun = kill_at > 2
     assert seed_of(begun / "model-resume.pt") == new_run_begun
     if then == "resume":
@@ -194,13 +194,13 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
         last, earlier = 2, [0]
     assert done.returncode == 0, done.stderr
     found = seeds(begun)
-    for kind in KINDS:
-        assert found.pop(f"{kind}.pt") == last
+    for name in MODELS:
+        assert found.pop(f"{name}.pt") == last
         for seed in earlier:
-            assert found.pop(f"{kind}-previous.pt") == seed
+            assert found.pop(f"{name}-previous.pt") == seed
     # What else is kept: the models of seed 1 that a kill after they were written left; a copy of the resumed run's
     # state that was made for the new run.
-    kept = {f"{kind}-previous-2.pt": 1 for kind, point in zip(KINDS, (9, 10, 11), strict=True) if kill_at > point}
+    kept = {f"{name}-previous-2.pt": 1 for name, point in zip(MODELS, (9, 10, 11), strict=True) if kill_at > point}
     copied = {"model-resume-previous.pt": 0} if kill_at == 2 else {}
     assert found == (copied if then == "resume" else kept)
 
@@ -212,8 +212,8 @@ def test_resume_does_not_replace_the_models_of_another_run(begun, sample_recordi
     done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
     assert done.returncode == 2
     assert f"{begun / 'model.pt'}: damaged, or of another run than model-resume.pt" in done.stderr
-    for kind in ("model", "model-best"):
-        os.replace(begun / f"{kind}-previous.pt", begun / f"{kind}.pt")
+    for name in ("model", "model-best"):
+        os.replace(begun / f"{name}-previous.pt", begun / f"{name}.pt")
     assert run_here("--output", begun / "model.pt", "--resume", "--epochs", 2).returncode == 0
 
 
@@ -237,16 +237,16 @@ def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkey
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device", "disk")])
-@pytest.mark.parametrize("place, advice", [("fingerprint", "start the run again"), ("loss_picture", "--resume")])
+@pytest.mark.parametrize("function, advice", [("fingerprint", "start the run again"), ("loss_picture", "--resume")])
 def test_resume_is_recommended_only_once_the_new_run_has_a_state(
-    begun, sample_recording, monkeypatch, error, place, advice
+    begun, sample_recording, monkeypatch, error, function, advice
 ):
     """Before, --resume would continue the earlier run."""
 
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(model, place, fail)
+    monkeypatch.setattr(model, function, fail)
     done = run_here(sample_recording, *SHORT, "--seed", 1, "--output", begun / "model.pt")
     assert done.returncode in (2, 130)
     assert ("--resume" in done.stderr) == (advice == "--resume") and advice in done.stderr
