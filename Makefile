@@ -16,7 +16,7 @@ APT = ./.ci/apt
 test: lint
 	@(for command in chromium Xvfb xdotool; do command -v $$command || exit; done) > /dev/null \
 		|| $(APT) --optional chromium xvfb xdotool
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 3 --dist worksteal
 
 lint: .venv/installed
 	$(BIN)/ruff check .

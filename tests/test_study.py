@@ -131,25 +131,25 @@ def follow(run):
     return float(np.clip(-3 * ((bearing + np.pi) % (2 * np.pi) - np.pi), -1, 1))
 
 
-def test_the_command_measures_and_goes_on(tmp_path, capsys):
+def test_the_command_measures_and_goes_on(tmp_path, capfd):
     data, folder = tmp_path / "data", tmp_path / "study"
     for seed, name in enumerate(["jungle", "jungle-shadows", "lake-ccw", "lake-cw"]):
         render_recording(data / name, seed=seed)
     command = [str(data), "--folder", str(folder), "--jobs", "1", "--networks", "1"]
     command += ["--images", "30", "--laps", "0.01", "--starts", "1"]
     assert study.main(command) == 0
-    assert "lake-centre-camera-seed-0 is measured" in capsys.readouterr().out
+    assert "lake-centre-camera-seed-0 is measured" in capfd.readouterr().out
     with open(folder / "study.csv", encoding="utf-8", newline="") as file:
         [row] = csv.DictReader(file)
     assert (row["method"], row["recordings"]) == ("centre camera", "lake-ccw")
     assert set(figures.MEASURES) | (set(figures.DRIVING) - {"driving"}) <= set(row)
     assert float(row["recovered"]) in (0, 1)
     assert study.main(command) == 0
-    assert "is measured" not in capsys.readouterr().out, "it was measured before"
+    assert "is measured" not in capfd.readouterr().out, "it was measured before"
     (data / "lake-cw" / "driving_log.csv").rename(data / "lake-cw" / "log.csv")
     assert study.main(command) == 2
     names = "jungle, jungle-shadows, lake-ccw, lake-cw"
-    assert f"lake-cw: the study needs recordings by the names {names}" in capsys.readouterr().err
+    assert f"lake-cw: the study needs recordings by the names {names}" in capfd.readouterr().err
 
 
 def end_process(*_):
