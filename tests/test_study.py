@@ -15,7 +15,7 @@ import torch
 from rendered import render_recording
 from test_generator import loaded, observations
 
-from cloning.base.errors import UserError
+from cloning.base.errors import RecordingError, UserError
 from cloning.network.network import Network
 from cloning.replay.replay import load_recording
 from model import REPORT, ROBUST, Generator, balance
@@ -147,9 +147,8 @@ def test_the_command_measures_and_goes_on(tmp_path, capfd):
     assert study.main(command) == 0
     assert "is measured" not in capfd.readouterr().out, "it was measured before"
     (data / "lake-cw" / "driving_log.csv").rename(data / "lake-cw" / "log.csv")
-    assert study.main(command) == 2
-    names = "jungle, jungle-shadows, lake-ccw, lake-cw"
-    assert f"lake-cw: the study needs recordings by the names {names}" in capfd.readouterr().err
+    with pytest.raises(RecordingError, match="recordings by the names jungle, jungle-shadows, lake-ccw, lake-cw"):
+        study.main(command)
 
 
 def end_process(*_):
