@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import IO, Any
 
 LIBRARIES = (
-    *("torch", "torch._dynamo", "numpy", "pandas", "cv2", "av", "tqdm", "PIL.Image", "PIL.PngImagePlugin"),
+    *("torch", "torch._dynamo", "numpy", "cv2", "av", "tqdm", "PIL.Image", "PIL.PngImagePlugin"),
     *("scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.sparse.linalg", "scipy.spatial"),
     *("matplotlib.backends.backend_agg", "matplotlib.figure", "matplotlib.pyplot", "panda3d.core", "multiprocessing"),
     *("engineio.async_drivers.eventlet", "socketio", "eventlet.websocket", "eventlet.wsgi", "flask", "wsproto"),
