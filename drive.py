@@ -9,12 +9,11 @@ import argparse
 import gc
 import itertools
 import logging
-import re
 import statistics
 import sys
 import time
+from collections import Counter
 from pathlib import Path
-from wsgiref.types import WSGIEnvironment
 
 from cloning.base import program
 
@@ -30,12 +29,13 @@ from cloning.base.frame import FRAME
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
-from cloning.server import page
+from cloning.server import page, terminal
 from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
-from cloning.server.versions import check_versions
 from cloning.wire.protocol import PORT
 
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
+FRAMES_IN_FLIGHT = 3  # that a simulator sends at its start, before it has used an answer
+PATIENCE = 5.0  # s until a simulator that sends nothing more is told of
 log = logging.getLogger("drive")
 
 
@@ -67,18 +67,21 @@ class SpeedController:
 class Session(page.Session):
     """A connected simulator, with its speed controller."""
 
-    def __init__(self, server: "DriveServer", environ: WSGIEnvironment):
-        """environ: the WSGI environment of the connection."""
+    def __init__(self, server: "DriveServer"):
         super().__init__()
-        self.server, self.environ = server, environ
+        self.server = server
         self.controller = SpeedController(server.set_speed)
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
-        self.warned: set[str] = set()  # kinds of warnings logged: see OncePerKind
+        self.puzzled = False  # whether `tell_of_silence` has told of it
+        self.warned: Counter[str] = Counter()  # kinds of warnings logged: see terminal.Few
 
-    def answer(self, message: object) -> dict[str, str]:
-        """Return the answer to a telemetry message: steering and throttle, -1..1, as strings. Never raises."""
-        arrived = self.arrival_time()
+    def answer(self, message: object, arrived: float | None = None) -> dict[str, str]:
+        """Return the answer to a telemetry message: steering and throttle, -1..1, as strings. Never raises.
+
+        arrived: time.perf_counter() when its first fragment was read; None: now.
+        """
+        arrived = time.perf_counter() if arrived is None else arrived
         self.heard, self.manual, throttle = time.time(), False, 0.0
         try:
             self.separator = decimal_separator(message, self.separator)
@@ -106,11 +109,6 @@ class Session(page.Session):
             "throttle": format_number(throttle, self.separator),
         }
 
-    def arrival_time(self) -> float:
-        """Return the time.perf_counter() at which the first fragment of the current message was read."""
-        websocket = self.environ.get("drive.websocket")  # None if the client uses HTTP polling
-        return websocket.arrived if websocket else time.perf_counter()
-
     def summary(self) -> str:
         """Return a line about the whole session: how many frames, and where they are saved."""
         saved = f"; {self.folder.summary()}" if self.folder else ""
@@ -126,7 +124,7 @@ class DriveServer:
 
     def __init__(self, network: Network, set_speed: float = SET_SPEED_MPH, model: str = ""):
         """set_speed: mph; model: the network's name on the page."""
-        from cloning.server import server, turns  # here, because they need the socket libraries: see `main`
+        from cloning.server import server  # here, because it needs the socket libraries
 
         self.network, self.set_speed, self.model = network, set_speed, model
         self.saver: saved_frames.FrameSaver | None = None  # saves the frames
@@ -136,13 +134,13 @@ class DriveServer:
         self.socket.on("connect", self.connect)
         self.socket.on("telemetry", self.telemetry)
         self.socket.on("disconnect", self.disconnect)
-        self.app = self.socket.application(page.create_app(self, turns.pause))
+        self.app = server.socketio.WSGIApp(self.socket, page.create_app(self, server.eventlet.sleep))
         steer(network, np.zeros(FRAME, np.uint8))  # the first pass is slow: do it before the first frame
 
     def session(self, sid: str) -> Session:
         """Return the session of a connection; make one for a new connection."""
         if sid not in self.sessions:
-            self.sessions[sid] = Session(self, self.socket.environ[sid])
+            self.sessions[sid] = Session(self)
         return self.sessions[sid]
 
     def connect(self, sid: str, *_: object) -> None:
@@ -158,13 +156,13 @@ class DriveServer:
             session.heard, session.manual = time.time(), True
             self.socket.emit("manual", {}, room=sid)
         else:
-            self.socket.emit("steer", session.answer(message), room=sid)
+            self.socket.emit("steer", session.answer(message, self.socket.arrived(sid)), room=sid)
 
     def disconnect(self, sid: str, *_: object) -> None:
         """Forget a session and log its summary."""
         session = self.sessions.pop(sid, None)
         if session and session.heard:
-            session.ended, session.environ, self.last_ended = True, {}, session
+            session.ended, self.last_ended = True, session
         if session and session.driven + session.unusable:
             if session.folder:
                 session.folder.when_written(lambda: log.info(session.summary()))
@@ -190,14 +188,26 @@ class DriveServer:
         for session in self.sessions.values():
             session.controller.set_speed = set_speed  # its sum stays: it is what holds the speed on this slope
 
+    def tell_of_silence(self) -> None:
+        """Log that a simulator may expect other answers, if it looks like that."""
+        for session in self.sessions.values():
+            frames = list(session.history) if session.driven <= FRAMES_IN_FLIGHT else []
+            if frames and frames[0].cte is not None and time.time() > session.heard + PATIENCE and not session.puzzled:
+                session.puzzled = True
+                log.warning(
+                    f"a simulator that sends cte has been silent for {PATIENCE:g} s after its first frames; if it is "
+                    "Udacity's term-2 simulator: that expects JSON numbers, and drive.py drives the term-1 simulator, "
+                    "which expects strings"
+                )
+
 
 class StatusLine:
     """Prints a line about the watched session: every half second on a terminal, every minute to a file."""
 
-    def __init__(self, server: DriveServer, terminal: bool):
-        """terminal: whether to print to a terminal, where each line replaces the last one."""
-        self.server, self.terminal = server, terminal
-        self.period = 0.5 if terminal else 60.0  # s
+    def __init__(self, server: DriveServer, stderr: terminal.Unblocked):
+        """stderr: where each line replaces the last one if it is a terminal."""
+        self.server, self.stderr = server, stderr
+        self.period = 0.5 if stderr.is_terminal else 60.0  # s
         self.session: Session | None = None
         self.frames, self.time = 0, time.perf_counter()  # at the last line
 
@@ -208,8 +218,8 @@ class StatusLine:
             return
         session = self.server.watched_session()
         if session and session.driven and not session.ended:
-            start, end = ("\r", "\033[K") if self.terminal else ("", "\n")
-            print(start + self.text(session, now), end=end, file=sys.stderr, flush=True)
+            line = self.text(session, now)
+            self.stderr.write(f"\r{line}\033[K" if self.stderr.is_terminal else f"{line}\n")
             self.frames = session.driven
         self.session, self.time = session, now
 
@@ -223,7 +233,7 @@ class StatusLine:
         recent = list(itertools.islice(reversed(session.history), max(session.driven - frames, 1)))
         latency, last = statistics.fmean(frame.latency for frame in recent), recent[0]
         line = (
-            f"{rate:5.1f} frames/s, latency {latency:5.1f} ms, steering {last.steering:+.2f}, "
+            f"{rate:5.1f} frames/s, {latency:5.1f} ms in drive.py, steering {last.steering:+.2f}, "
             f"{last.speed:4.1f} mph, {session.driven} frames"
         )
         return f"{line}, {session.unusable} unusable" if session.unusable else line
@@ -231,29 +241,6 @@ class StatusLine:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Command line
-
-
-class OncePerKind(logging.Filter):
-    """Passes each kind of warning once, so that a broken client does not fill the log.
-
-    Warnings that differ only in digits are of one kind. A record may have an attribute `warned`, a set of the kinds
-    already logged; a session's records have its own, so that each session logs each kind once.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.warned: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to log a record."""
-        if record.levelno < logging.WARNING:
-            return True
-        warned = getattr(record, "warned", self.warned)
-        kind = f"{record.name}: {re.sub(r'[0-9]+', '', str(record.msg))}"
-        if kind in warned:
-            return False
-        warned.add(kind)
-        return True
 
 
 def choose_model(argument: Path | None, folder: Path | None) -> Path:
@@ -295,24 +282,15 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     return parsed
 
 
-def log_to_stderr() -> None:
-    """Print the log to stderr, each kind of warning once."""
-    handler = logging.StreamHandler()
-    handler.addFilter(OncePerKind())
-    status_line_end = "\r\033[K" if sys.stderr.isatty() else ""
-    logging.basicConfig(format=f"{status_line_end}drive.py: %(message)s", handlers=[handler])
-    log.setLevel(logging.INFO)
-
-
 def main() -> int:
     """Load the model, listen, and drive until Ctrl-C; return the exit status."""
     arguments = parse_arguments()
-    log_to_stderr()
+    stderr = terminal.log_to_stderr("drive.py")
+    log.setLevel(logging.INFO)
     torch.set_num_threads(1)  # a second thread would make single frames slower and their latency less regular
     saver = None
     try:
-        check_versions()
-        from cloning.server import connections  # with some other versions of the libraries, it cannot be imported
+        from cloning.server import connections  # here, because it needs the socket libraries
 
         model = choose_model(arguments.model, arguments.folder)
         network = load_model(model, arguments.device)
@@ -325,7 +303,7 @@ def main() -> int:
             server.saver = saver = saved_frames.FrameSaver(arguments.folder)  # last, because it empties the folder
     except (UserError, OSError) as error:
         return program.failed("drive.py", error)
-    port = listener.getsockname()[1]
+    stopped, port = connections.noted_signals(), listener.getsockname()[1]
     watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(arguments.host, arguments.host)
     print(
         f"Driving with {model}{origin and f' ({origin})'}.\n"
@@ -338,7 +316,7 @@ def main() -> int:
     gc.freeze()  # else a client can make the collector look through all the libraries' objects: 0.2 s each time
     status = program.DONE
     try:
-        connections.serve_until_stopped(listener, server.app, StatusLine(server, sys.stderr.isatty()).update)
+        connections.serve(listener, server.app, stopped, server.tell_of_silence, StatusLine(server, stderr).update)
     finally:
         server.close()
         if saver:
@@ -347,6 +325,7 @@ def main() -> int:
             except UserError as error:
                 print(f"drive.py: {error}", file=sys.stderr)
                 status = program.INCOMPLETE
+        stderr.finish()
     return status
 
 

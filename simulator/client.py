@@ -150,7 +150,7 @@ class Client(Driven, ClientSession):
             packet = self.connection.receive(pause)
             self._show(bar)
             answer = self.parse(packet) if packet else None
-            greeted = greeted or packet == CONNECT
+            greeted = greeted or bool(packet and packet.startswith(CONNECT))
             if answer is None:
                 if time.monotonic() > until:
                     raise self.no_answer()

@@ -1,9 +1,12 @@
 """drive.py without a network socket: speed controller, answers, status line, saved frames, attention."""
 
 import base64
+import io
 import logging
+import os
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -20,6 +23,7 @@ from cloning.network.network import Network
 from cloning.recordings import saved_frames as frames
 from cloning.recordings.images import decode
 from cloning.road.overlay import overlay
+from cloning.server.terminal import MAX_PER_MINUTE, Few, Unblocked
 from tools.simulator_client import telemetry
 
 
@@ -40,7 +44,7 @@ def network() -> Network:
 
 @pytest.fixture
 def session(network) -> drive.Session:
-    return drive.Session(drive.DriveServer(network), {})
+    return drive.Session(drive.DriveServer(network))
 
 
 def steering_always(output: float) -> Network:
@@ -91,14 +95,14 @@ def test_controller_settles_at_each_set_speed_and_is_not_wound_up_by_a_wait_or_a
 
 def test_a_change_of_the_set_speed_leaves_the_integral_as_it_is(network, jpeg):
     server = drive.DriveServer(network, 9)
-    session = server.sessions["sid"] = drive.Session(server, {})
+    session = server.sessions["sid"] = drive.Session(server)
     for _ in range(50):
         session.answer(telemetry(jpeg, speed="8.0000"))
     assert session.controller.error_sum == pytest.approx(50)
     server.change_set_speed(12.0)
     answer = session.answer(telemetry(jpeg, speed="8.0000"))
     assert float(answer["throttle"]) == pytest.approx(0.1 * 4 + 0.002 * (50 + 4))
-    assert drive.Session(server, {}).controller.set_speed == 12, "the next simulator is driven at it, too"
+    assert drive.Session(server).controller.set_speed == 12, "the next simulator is driven at it, too"
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -159,7 +163,7 @@ def test_a_failing_network_is_answered(session, jpeg, failure):
 
 
 def test_only_the_image_and_the_speed_are_needed(session, jpeg):
-    expected, good = drive.Session(session.server, {}).answer(telemetry(jpeg)), telemetry(jpeg)
+    expected, good = drive.Session(session.server).answer(telemetry(jpeg)), telemetry(jpeg)
     others: tuple[dict, ...] = ({"steering_angle": [0]}, {"steering_angle": "left"}, {"throttle": None}, {"lap": 1})
     messages = [{**good, **other} for other in others]
     messages += [{key: good[key] for key in good if key != lost} for lost in ("steering_angle", "throttle")]
@@ -177,7 +181,7 @@ def test_only_the_image_and_the_speed_are_needed(session, jpeg):
     ],
 )
 def test_the_distance_from_the_centre_is_shown_or_ignored(session, jpeg, sent, cte):
-    plain = drive.Session(session.server, {}).answer(telemetry(jpeg))
+    plain = drive.Session(session.server).answer(telemetry(jpeg))
     assert session.answer({**telemetry(jpeg), "cte": sent}) == plain
     assert session.history[-1].cte == cte and session.unusable == 0
 
@@ -193,7 +197,7 @@ def test_the_distance_from_the_centre_is_shown_or_ignored(session, jpeg, sent, c
     ],
 )
 def test_every_culture_is_answered_in_kind(session, jpeg, angle, throttle, speed, separator):
-    expected = drive.Session(session.server, {}).answer(telemetry(jpeg, speed="6.5000"))
+    expected = drive.Session(session.server).answer(telemetry(jpeg, speed="6.5000"))
     answer = session.answer({**telemetry(jpeg, speed=speed), "steering_angle": angle, "throttle": throttle})
     assert answer == {key: value.replace(".", separator) for key, value in expected.items()}
     assert separator in answer["throttle"] and session.unusable == 0
@@ -204,63 +208,97 @@ def test_every_culture_is_answered_in_kind(session, jpeg, angle, throttle, speed
 # Status line and log
 
 
+def printed() -> Unblocked:
+    return Unblocked(io.StringIO())
+
+
+def shown(stderr: Unblocked) -> str:
+    """What was printed since the last call."""
+    stderr.finish()
+    assert isinstance(stderr.stream, io.StringIO)
+    text = stderr.stream.getvalue()
+    stderr.stream.seek(0)
+    stderr.stream.truncate()
+    return text
+
+
+def logged(few: Few, messages: list[str], level: int = logging.WARNING) -> list[str]:
+    """The messages that pass, as they are logged."""
+    records = [logging.LogRecord("drive", level, "", 0, message, None, None) for message in messages]
+    return [record.getMessage() for record in records if few.filter(record)]
+
+
 def test_each_session_logs_each_kind_of_warning_once(session, caplog):
-    once, other = drive.OncePerKind(), drive.Session(session.server, {})
+    once, other = Few(), drive.Session(session.server)
     with caplog.at_level(logging.WARNING, "drive"):
         for each in (session, other, session, other):
             each.answer({})
             each.answer([])
     assert [once.filter(record) for record in caplog.records] == [True] * 4 + [False] * 4
-    messages = ("30000x30000 pixels", "20000x100 pixels", "not base64")
-    records = [logging.LogRecord("drive", logging.WARNING, "", 0, message, None, None) for message in messages]
-    assert [once.filter(record) for record in records] == [True, False, True]
+    assert logged(once, ["30000x30000 pixels", "20000x100 pixels", "5 x"]) == ["30000x30000 pixels", "5 x"]
+    assert logged(once, ["5 x"] * 99) == ["5 x (10 times so far)", "5 x (100 times so far)"]
 
 
-class Arrived:
-    """A websocket whose message arrived `ms` milliseconds ago."""
+def test_the_log_is_short_whatever_clients_do(monkeypatch):
+    few, now = Few(), [0.0]
+    monkeypatch.setattr("cloning.server.terminal.time", SimpleNamespace(monotonic=lambda: now[0]))
+    letters = ["".join(chr(97 + n // 26**at % 26) for at in range(3)) for n in range(10_000)]
+    assert len(logged(few, letters)) == 50, "kinds"
+    assert len(logged(few, ["session ended"] * 10_000, logging.INFO)) == MAX_PER_MINUTE - 50
+    now[0] = 60
+    assert logged(few, ["session ended"] * 2, logging.INFO) == ["session ended"] * 2
 
-    def __init__(self, ms: float):
-        self.ms = ms
 
-    @property
-    def arrived(self) -> float:
-        return time.perf_counter() - self.ms / 1000
+def test_a_terminal_that_nobody_reads_costs_lines_and_no_time():
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "w") as stream:
+        unread = Unblocked(stream)
+        started = time.monotonic()
+        for n in range(5000):
+            unread.write(f"{n:1000}")
+        unread.finish()
+        assert time.monotonic() - started < 5
+        first = os.read(reading, 100_000)
+        assert first.startswith(b" " * 999 + b"0") and len(first) < 100_000
+        os.close(reading)
 
 
 def test_the_latency_is_the_time_in_the_server_however_many_frames_are_in_flight(session, jpeg):
     """Three telemetries circulate, and the simulator takes half a second to send the next one."""
-    session.environ["drive.websocket"] = Arrived(ms=40)
     for _ in range(3):
-        session.answer(telemetry(jpeg))
-    status = drive.StatusLine(session.server, terminal=False)
-    shown = [float(part.split()[1]) for part in status.text(session, time.perf_counter()).split(", ") if "ms" in part]
+        session.answer(telemetry(jpeg), time.perf_counter() - 0.04)
+    status = drive.StatusLine(session.server, printed())
+    shown = [float(part.split()[0]) for part in status.text(session, time.perf_counter()).split(", ") if "ms" in part]
     on_the_page = [frame.latency for frame in session.history]
     assert shown == [pytest.approx(np.mean(on_the_page), abs=0.06)]
     assert all(40 <= latency < 540 for latency in on_the_page)
 
 
-def test_the_rate_counts_from_the_sessions_start_or_the_last_line(session, jpeg, capsys):
-    status = drive.StatusLine(session.server, terminal=False)
+def test_the_rate_counts_from_the_sessions_start_or_the_last_line(session, jpeg):
+    stderr = printed()
+    status = drive.StatusLine(session.server, stderr)
     status.time -= 3600  # an hour of waiting for a simulator
     session.server.sessions["sid"] = session
     session.answer(telemetry(jpeg))
     session.driven, session.started = 2000, time.perf_counter() - 200.0
     status.update()
-    assert float(capsys.readouterr().err.split()[0]) == pytest.approx(10, rel=0.05)
+    assert float(shown(stderr).split()[0]) == pytest.approx(10, rel=0.05)
     status.time, status.session = time.perf_counter() - 600, session
     session.driven += 6000
     status.update()
-    assert float(capsys.readouterr().err.split()[0]) == pytest.approx(10, rel=0.05)
+    assert float(shown(stderr).split()[0]) == pytest.approx(10, rel=0.05)
 
 
-def test_escape_sequences_are_for_terminals_only(session, jpeg, capsys):
+def test_escape_sequences_are_for_terminals_only(session, jpeg):
     session.server.sessions["sid"] = session
     session.answer(telemetry(jpeg))
-    for terminal in (True, False):
-        status = drive.StatusLine(session.server, terminal)
+    for is_terminal in (True, False):
+        stderr = printed()
+        stderr.is_terminal = is_terminal
+        status = drive.StatusLine(session.server, stderr)
         status.time -= 3600
         status.update()
-        assert ("\033" in capsys.readouterr().err) is terminal
+        assert ("\033" in shown(stderr)) is is_terminal
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -347,7 +385,7 @@ def test_the_line_bends_to_the_side_of_the_steering():
 @pytest.mark.parametrize("output", [-4.9, 4.9])
 def test_the_steering_stays_within_its_range_and_the_overlay_shows_what_is_sent(output, jpeg):
     network, frame = steering_always(output), np.zeros((160, 320, 3), np.uint8)
-    answer = drive.Session(drive.DriveServer(network), {}).answer(telemetry(jpeg))
+    answer = drive.Session(drive.DriveServer(network)).answer(telemetry(jpeg))
     assert answer["steering_angle"] == ("-1" if output < 0 else "1")
     steering, _ = attention.visual_backprop(network, frame)
     assert steering == np.sign(output) == np.sign(middle(overlay(frame, steering)) - 320)

@@ -121,7 +121,7 @@ def test_what_is_no_set_speed_is_refused(server):
 def test_the_state_is_what_happens(network, jpegs, monkeypatch):
     server = drive.DriveServer(network)
     monkeypatch.setattr(server.socket, "emit", lambda *_, **__: None)
-    monkeypatch.setitem(server.socket.environ, "sid", {})
+    monkeypatch.setattr(server.socket, "arrived", lambda _: time.perf_counter())
 
     def state(later: float = 0.0) -> str:
         return drive_page.state_of(server.watched_session(), time.time() + later)
@@ -157,7 +157,7 @@ def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monk
     assert json.loads(next(events)[6:]) == {"state": "waiting", "set_speed": 9.0, "saving": "", "saver": False}
     next(events)
     assert len(naps) == 1 + drive_page.QUIET_INTERVALS
-    session = server.sessions["sid"] = drive.Session(server, {})
+    session = server.sessions["sid"] = drive.Session(server)
     session.heard, session.manual = time.time(), True
     assert json.loads(next(events)[6:])["state"] == "manual"
     assert len(naps) <= drive_page.QUIET_INTERVALS + 3
@@ -165,7 +165,7 @@ def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monk
 
 def test_frames_per_second_are_those_of_the_last_two(network):
     server, now = drive.DriveServer(network), time.time()
-    session = drive.Session(server, {})
+    session = drive.Session(server)
     session.history.extend(drive_page.DrivenFrame(now - 10 + at / 20, 0, 9, 0.5, 3) for at in range(200))
     assert drive_page.figures(server, session, now)["rate"] == pytest.approx(20, rel=0.05)
     assert drive_page.figures(server, session, now + 1)["rate"] == pytest.approx(10, rel=0.1)

@@ -1,6 +1,7 @@
 """drive.py as a process, over real sockets: the simulator's session, requests of other sites, other clients."""
 
 import json
+import queue
 import re
 import shutil
 import signal
@@ -11,9 +12,11 @@ import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import socketio
 from drive_process import awaited, serving
 from steer_server import unused_port
 
@@ -53,9 +56,10 @@ def test_the_recorded_session_byte_by_byte(server, jpegs, steering):
     assert head.startswith(b"HTTP/1.1 101 ")
     assert b"Sec-WebSocket-Accept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo=\r\n" in head  # RFC 6455's own example
     assert b"Extensions" not in head
-    assert re.fullmatch(rb'0\{"sid":"\w+","upgrades":\[\],"pingTimeout":60000,"pingInterval":25000\}', frame())
+    opening = rb'0\{"sid":"[\w-]+","upgrades":\[\],"pingTimeout":60000,"pingInterval":25000,"maxPayload":1000000\}'
+    assert re.fullmatch(opening, frame())
     assert frame() == b'42["steer",{"steering_angle":"0","throttle":"0"}]'
-    assert frame() == b"40"
+    assert re.fullmatch(rb'40\{"sid":"[\w-]+"\}', frame()), "which its decoder ignores"
     send("2")
     assert frame() == b"3"
     for jpeg, expected in zip(jpegs, steering, strict=True):
@@ -124,7 +128,7 @@ def test_each_kind_of_unusable_frame_is_logged_once(server, jpegs):
             simulator.drive(telemetry(jpegs[0][:3000]))
     awaited(lambda: any("1 frames driven, 150 unusable" in line for line in server.lines[begin:]))
     text = "".join(server.lines[begin:])
-    assert text.count("can't be used") == 3
+    assert text.count("can't be used") == 6, "the first and the tenth of each"
     assert all(reason in text for reason in ("speed is missing", "speed is not a number", "cut short"))
 
 
@@ -233,15 +237,19 @@ def test_it_listens_on_loopback_alone(server):
 
 
 CLIENT = """
-const socket = require('socket.io-client')(`http://127.0.0.1:${process.argv[2]}`, JSON.parse(process.argv[3]));
-const telemetry = JSON.parse(require('fs').readFileSync(process.argv[4]));
+const [, , library, port, options, file] = process.argv;
+const socket = require(library)(`http://127.0.0.1:${port}`, {reconnection: false, ...JSON.parse(options)});
+const telemetry = JSON.parse(require('fs').readFileSync(file));
 const answers = [];
+socket.on('connect_error', error => { console.log(JSON.stringify({refused: error.message})); process.exit(); });
 socket.on('steer', data => {
   answers.push(data);
   if (answers.length < 6) socket.emit('telemetry', telemetry); else socket.emit('telemetry', null);
 });
 socket.on('manual', data => { console.log(JSON.stringify({answers, data})); socket.close(); });
 """
+VERSIONS = {2: "2.5.0", 3: "3.1.3", 4: "4.8.1"}  # of JavaScript's client; 2 speaks Engine.IO 3, the others 4
+ONLY_WEBSOCKET = "Only the websocket transport is served: connect with transports=['websocket']."
 
 
 @pytest.fixture(scope="module")
@@ -250,21 +258,41 @@ def node_client(tmp_path_factory) -> Path:
     if not npm:
         pytest.skip("no node here")
     folder = tmp_path_factory.mktemp("node")
-    command = [npm, "install", "--no-audit", "--no-fund", "--silent", "socket.io-client@2.5.0"]
+    libraries = [f"client{n}@npm:socket.io-client@{version}" for n, version in VERSIONS.items()]
+    command = [npm, "install", "--no-audit", "--no-fund", "--silent", *libraries]
     try:
-        subprocess.run(command, cwd=folder, check=True, timeout=40, capture_output=True)
+        subprocess.run(command, cwd=folder, check=True, timeout=60, capture_output=True)
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
         pytest.skip("npm can't install socket.io-client here")
     (folder / "client.js").write_text(CLIENT, encoding="utf-8")
     return folder
 
 
-@pytest.mark.parametrize("transports", [["websocket"], ["polling", "websocket"], ["polling"]])
-def test_the_independent_client(server, node_client, jpegs, steering, transports):
+@pytest.mark.parametrize("version", VERSIONS)
+def test_javascripts_client(server, node_client, jpegs, steering, version):
+    def session(options):
+        command = ["node", "client.js", f"client{version}", str(server.port), json.dumps(options), "telemetry.json"]
+        return json.loads(subprocess.run(command, cwd=node_client, capture_output=True, timeout=60).stdout)
+
     message = json.dumps(telemetry(jpegs[3], speed="9.0000"))
     (node_client / "telemetry.json").write_text(message, encoding="utf-8")
-    command = ["node", "client.js", str(server.port), json.dumps({"transports": transports}), "telemetry.json"]
-    session = json.loads(subprocess.run(command, cwd=node_client, capture_output=True, timeout=60).stdout)
-    assert session["answers"][0] == {"steering_angle": "0", "throttle": "0"} and session["data"] == {}
-    for answer in session["answers"][1:]:
+    driven = session({"transports": ["websocket"]})
+    assert driven["answers"][0] == {"steering_angle": "0", "throttle": "0"} and driven["data"] == {}
+    for answer in driven["answers"][1:]:
         assert np.float32(answer["steering_angle"]) == steering[3] and answer["throttle"] == "0"
+    assert session({})["refused"] == (ONLY_WEBSOCKET if version > 2 else "xhr poll error")
+    assert any(ONLY_WEBSOCKET in line for line in server.lines), "the terminal tells in any case"
+
+
+def test_pythons_client(server, jpegs, steering):
+    client, received = socketio.Client(reconnection=False), queue.Queue[Any]()
+    client.on("steer", received.put)
+    client.on("connect_error", received.put)
+    with pytest.raises(socketio.exceptions.ConnectionError):
+        client.connect(f"http://127.0.0.1:{server.port}")
+    assert received.get(timeout=20) == {"message": ONLY_WEBSOCKET}
+    client.connect(f"http://127.0.0.1:{server.port}", transports=["websocket"])
+    assert received.get(timeout=20) == {"steering_angle": "0", "throttle": "0"}
+    client.emit("telemetry", telemetry(jpegs[3], speed="9.0000"))
+    assert np.float32(received.get(timeout=20)["steering_angle"]) == steering[3]
+    client.disconnect()

@@ -2,9 +2,13 @@
 
 import base64
 import json
+import os
 import re
 import select
+import subprocess
+import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 from steer_server import LAPS, STEER, Blank, Server, ahead, drive, unused_port
@@ -181,3 +185,76 @@ def test_a_car_that_is_never_driven_is_reported(monkeypatch):
         with pytest.raises(SimulatorError, match="stood still"):
             client.drive(0.1)
     assert lap_report(run, client)["ended"] == "stood_still"
+
+
+# A drive.py as other people have it, for python-socketio 4 and 5 alike; and with Flask-SocketIO.
+CLASSIC = """
+import importlib.metadata, warnings
+warnings.simplefilter("ignore")
+import eventlet, eventlet.wsgi, flask, socketio
+server = socketio.Server()
+@server.on("connect")
+def connect(sid, environ, auth=None):
+    server.emit("steer", {"steering_angle": "0", "throttle": "1"}, room=sid)
+@server.on("telemetry")
+def telemetry(sid, data):
+    assert set(data) == {"steering_angle", "throttle", "speed", "image"}
+    server.emit("steer", {"steering_angle": "0", "throttle": "1"}, room=sid)
+listener = eventlet.listen(("127.0.0.1", 0))
+print(importlib.metadata.version("python-socketio"), listener.getsockname()[1], flush=True)
+eventlet.wsgi.server(listener, socketio.WSGIApp(server, flask.Flask("classic")), log_output=False)
+"""
+FLASK_SOCKETIO = """
+import socket
+import flask, flask_socketio
+app = flask.Flask("other")
+server = flask_socketio.SocketIO(app, async_mode="threading", allow_upgrades=False)
+@server.on("connect")
+def connect():
+    flask_socketio.emit("steer", {"steering_angle": "0", "throttle": "1"})
+@server.on("telemetry")
+def telemetry(data):
+    flask_socketio.emit("steer", {"steering_angle": "0", "throttle": "1"})
+with socket.create_server(("127.0.0.1", 0)) as taken:
+    port = taken.getsockname()[1]
+print("flask", port, flush=True)
+server.run(app, "127.0.0.1", port, allow_unsafe_werkzeug=True)
+"""
+OTHER_SERVERS = {
+    "python-socketio 4": (CLASSIC, ["python-socketio==4.6.1", "python-engineio==3.13.2"], False),
+    "python-socketio 5": (CLASSIC, [], True),
+    "Flask-SocketIO": (FLASK_SOCKETIO, ["flask-socketio==5.6.1"], True),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_SERVERS)
+def test_drives_with_other_peoples_servers(name, tmp_path, capsys, monkeypatch):
+    program, packages, asks = OTHER_SERVERS[name]
+    if packages:
+        command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path), *packages]
+        if subprocess.run(command, timeout=60).returncode:
+            pytest.skip(f"pip can't install {packages} here")
+    monkeypatch.setattr("cloning.wire.client.PING_INTERVAL", 0.5)
+    monkeypatch.setattr("cloning.wire.client.PONG_TIMEOUT", 0.5)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True
+    ) as server:
+        try:
+            assert server.stdout
+            version, port = server.stdout.readline().split()
+            assert version[0] in (name[-1], "f")
+            for realtime in (False, True):
+                client = drive(SimpleNamespace(port=int(port)), laps=0.02, realtime=realtime)
+                assert client.reconnections == client.unusable == 0 and client.frames > 20
+                assert ("the real simulator would get no answer" in capsys.readouterr().err) is asks
+        finally:
+            server.kill()
+
+
+def test_a_server_that_is_silent_is_told_from_a_missing_one():
+    with (
+        Server(lambda packet, n: []) as server,
+        pytest.raises(SimulatorError, match="a server is there, but is silent"),
+    ):
+        drive(server, wait=1.5)

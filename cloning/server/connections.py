@@ -3,22 +3,23 @@
 import errno
 import io
 import ipaddress
+import logging
 import signal
 import socket
 from collections.abc import Callable, Iterable
 from typing import Any
+from urllib.parse import urlsplit
 from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
 from cloning.base.errors import UserError
 from cloning.server.libraries import eventlet
-from cloning.server.turns import STRANGERS, TURNS
 
 MAX_CONNECTIONS = 192  # at once: macOS lets a process open 256 files
-MAX_BODY = 1 << 17  # bytes of a request: over HTTP polling, about 8 telemetries
-REQUEST_TIMEOUT = 5.0  # s from one answer to the end of the next request, or from the beginning
-WRITE_TIMEOUT = 10.0  # s in which a client must read something of an answer
-NO_HANDLES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-BROKEN = (errno.ECONNABORTED, errno.ECONNRESET, errno.EPROTO)  # by the client, before it was accepted
+MAX_BODY = 1 << 17  # bytes of a request
+TIMEOUT = 10.0  # s in which a client must send something of a request, or read something of an answer
+# Errors of accept that pass: no more file handles, or the client has broken the connection already.
+PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM, errno.ECONNABORTED, errno.ECONNRESET, errno.EPROTO)
+log = logging.getLogger(__name__)
 
 
 class Listener:
@@ -27,26 +28,25 @@ class Listener:
     When there are MAX_CONNECTIONS, a new one takes the place of the oldest that has not sent a request.
     """
 
-    def __init__(self, sock: Any):
-        self.sock = sock
+    def __init__(self, sock: Any, pool: Any):
+        """pool: an eventlet.GreenPool, in which each connection has a thread."""
+        self.sock, self.pool = sock, pool
         self.family, self.getsockname, self.close = sock.family, sock.getsockname, sock.close
         self.idle: dict[Any, None] = {}  # connections without a whole request, the oldest first
-        self.busy = 0  # number of the others
 
     def accept(self) -> tuple[Any, Any]:
         """Return the next connection and the client's address."""
         while True:
-            TURNS.take(STRANGERS)
+            eventlet.sleep(0)  # so that others work, however many come
             try:
                 client, address = self.sock.accept()
             except OSError as error:
-                if error.errno in NO_HANDLES:
-                    self._hang_up_oldest()
-                    eventlet.sleep(0.05)
-                elif error.errno not in BROKEN:
+                if error.errno not in PASSING:
                     raise
+                self._hang_up_oldest()
+                eventlet.sleep(0.05)
                 continue
-            if len(self.idle) + self.busy < MAX_CONNECTIONS or self._hang_up_oldest():
+            if self.pool.running() < MAX_CONNECTIONS or self._hang_up_oldest():
                 self.idle[client] = None
                 return client, address
             client.close()
@@ -62,40 +62,28 @@ class Listener:
 
 
 class Protocol(eventlet.wsgi.HttpProtocol):
-    """eventlet's HTTP, where a request must arrive in time, and takes a turn."""
+    """eventlet's HTTP, where requests take turns."""
 
-    is_busy = False
+    one_at_a_time = eventlet.semaphore.Semaphore()
 
-    def handle_one_request(self) -> None:
-        """Read a request and answer it."""
-        self.deadline = eventlet.Timeout(REQUEST_TIMEOUT)
-        try:
-            super().handle_one_request()
-        except eventlet.Timeout:
-            self.close_connection = True
-        finally:
-            self.deadline.cancel()
-            listener = self.server.socket
-            if self.is_busy:
-                self.is_busy, listener.busy = False, listener.busy - 1
-                listener.idle[self.connection] = None
+    @classmethod
+    def take_turn(cls) -> None:
+        """Wait until the connections with clients had their turn, and no other request has this one.
+
+        eventlet goes round all connections that have something to do: beside a hundred busy ones, a car would wait for
+        each of them, several times for each telemetry.
+        """
+        with cls.one_at_a_time:
+            eventlet.sleep(0)
+
+    def log_message(self, *_: Any) -> None:
+        """Log that a request is no HTTP, without what the client sent."""
+        log.warning("a request can't be read")
 
     def parse_request(self) -> bool:
         """Read the headers."""
-        TURNS.take(STRANGERS)
+        self.take_turn()
         return super().parse_request()
-
-    def get_environ(self) -> WSGIEnvironment:
-        """Return the request's WSGI environment, with this object as "drive.protocol"."""
-        return {**super().get_environ(), "drive.protocol": self}
-
-    def received(self) -> None:
-        """Note that the request is there: the connection is no longer an idle one."""
-        self.deadline.cancel()
-        listener = self.server.socket
-        if self.connection in listener.idle:  # else it was hung up on
-            del listener.idle[self.connection]
-            self.is_busy, listener.busy = True, listener.busy + 1
 
     def finish(self) -> None:
         """Close the connection."""
@@ -106,46 +94,51 @@ class Protocol(eventlet.wsgi.HttpProtocol):
             self.rfile.close()  # which keeps the socket open if the client did not read its last answer
 
 
-def whole_requests(app: WSGIApplication) -> WSGIApplication:
+def whole_requests(app: WSGIApplication, listener: Listener) -> WSGIApplication:
     """Return a WSGI application that gives `app` a request when all of it has been read, unless it is too long."""
 
     def read(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
-        protocol, length = environ["drive.protocol"], int(environ.get("CONTENT_LENGTH", 0))
+        length = int(environ.get("CONTENT_LENGTH", 0))
         if "HTTP_TRANSFER_ENCODING" in environ or length > MAX_BODY:
-            protocol.close_connection = True  # rather than read the rest
             text = f"A request's body has a Content-Length, of {MAX_BODY} bytes at most."
             return refuse(start_response, "413 Content Too Large", text)
         environ["wsgi.input"] = io.BytesIO(environ["wsgi.input"].read(length))
-        protocol.received()
-        TURNS.take(STRANGERS)
+        listener.idle.pop(environ["eventlet.input"].get_socket(), None)
+        Protocol.take_turn()
         return app(environ, start_response)
 
     return read
 
 
-def refuse(start_response: StartResponse, status: str, reason: str) -> list[bytes]:
-    """Answer a request with an error status and one sentence, and end the connection."""
+def refuse(start_response: StartResponse, status: str, reason: str, body: str = "") -> list[bytes]:
+    """Answer a request with a status and one sentence, or a body that has it, and log it.
+
+    That the connection ends keeps an unread rest of the request from being taken for the next one.
+    """
+    log.warning(f"a request is refused: {reason}")
     start_response(status, [("Content-Type", "text/plain"), ("Connection", "close")])
-    return [f"{reason}\n".encode()]
+    return [(body or f"{reason}\n").encode()]
 
 
 def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:
     """Return a WSGI application that serves `app` to programs and to its own page, but to no page of another site.
 
-    A browser names another site's page in Origin (websocket, fetch) or Sec-Fetch-Site (image, script); if that page's
-    host name resolves to this machine (DNS rebinding), in Host.
+    A browser names another site's page in Origin (each websocket, fetch) or Sec-Fetch-Site (image, script); if that
+    page's host name resolves to this machine (DNS rebinding), in Host. So a websocket without Origin is a program's.
     """
 
     def guard(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         host, origin = environ.get("HTTP_HOST", ""), environ.get("HTTP_ORIGIN")
         site = environ.get("HTTP_SEC_FETCH_SITE", "none")
-        if (
-            _is_address(host)
-            and origin in (None, f"http://{host}")
-            and (site in ("none", "same-origin") or environ["PATH_INFO"] == "/")
+        is_program = origin is None and environ.get("HTTP_UPGRADE", "").lower() == "websocket"
+        if not (is_program or _is_address(host)):
+            reason = "A browser must use this server's IP address, since any site can give it a name."
+        elif origin not in (None, f"http://{host}") or (
+            site not in ("none", "same-origin") and environ["PATH_INFO"] != "/"
         ):
+            reason = "This server answers programs and its own page, but no page of another site."
+        else:
             return app(environ, start_response)
-        reason = "This server answers programs and its own page, but no page of another site."
         return refuse(start_response, "403 Forbidden", reason)
 
     return guard
@@ -153,11 +146,9 @@ def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:
 
 def _is_address(host: str) -> bool:
     """Return whether a Host header names an IP address, localhost, or nothing."""
-    name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
-    if name in ("localhost", ""):
-        return True
     try:
-        return bool(ipaddress.ip_address(name.strip("[]")))
+        name = urlsplit(f"//{host}").hostname or ""
+        return name in ("localhost", "") or bool(ipaddress.ip_address(name))
     except ValueError:
         return False
 
@@ -174,27 +165,37 @@ def claim_port(host: str, port: int) -> socket.socket:
         ) from None
 
 
-def serve_until_stopped(
-    listener: socket.socket, app: WSGIApplication, update: Callable[[], None] = lambda: None
-) -> None:
-    """Serve the application until Ctrl-C or a signal that asks to terminate; update: called ten times a second."""
-    stopped: list[int] = []
-    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # the last one exists on Windows only
+def noted_signals() -> list[int]:
+    """Return a list to which Ctrl-C and the signals that ask to terminate are added from now on.
+
+    python-engineio would catch an exception raised in their handler.
+    """
+    noted: list[int] = []
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):  # the third is missing on Windows, the last elsewhere
         if hasattr(signal, name):
-            # The handler only notes the signal: python-engineio would catch an exception raised here.
-            signal.signal(getattr(signal, name), lambda number, _: stopped.append(number))
+            signal.signal(getattr(signal, name), lambda number, _: noted.append(number))
+    return noted
+
+
+def serve(listener: socket.socket, app: WSGIApplication, stopped: list[int], *updates: Callable[[], None]) -> None:
+    """Serve the application until `stopped` has a signal; updates: called ten times a second."""
+    pool = eventlet.GreenPool(MAX_CONNECTIONS + 1)  # one more, which takes the place of one that has been hung up
+    patient = Listener(listener, pool)
     serving = eventlet.spawn(
         eventlet.wsgi.server,
-        Listener(listener),
-        whole_requests(refuse_other_sites(app)),
+        patient,
+        whole_requests(refuse_other_sites(app), patient),
         protocol=Protocol,
+        custom_pool=pool,
+        keepalive=False,  # so that an answered connection is not kept from others
         minimum_chunk_size=1,  # so that each event of the page is sent at once
-        socket_timeout=WRITE_TIMEOUT,
+        socket_timeout=TIMEOUT,
         log_output=False,
         debug=False,
     )
     while not stopped and not serving.dead:
         eventlet.sleep(0.1)
-        update()
+        for update in updates:
+            update()
     if serving.dead:
         serving.wait()  # raises the exception that ended it

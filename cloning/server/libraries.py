@@ -1,20 +1,28 @@
-"""The socket libraries, for the modules of the server's end; commands call `check_versions` before they import those.
+"""The socket libraries, for the modules of the server's end; commands import those in `main`, to tell of errors."""
 
-With some other versions, the imports below fail.
-"""
-
+import importlib.metadata
 import warnings
 
-with warnings.catch_warnings():
-    # eventlet advises against using it in new projects, but no server has been used longer with this simulator.
-    warnings.simplefilter("ignore")
-    import engineio
-    import engineio.async_drivers.eventlet
-    import engineio.socket
-    import eventlet
-    import eventlet.tpool
-    import eventlet.websocket
-    import eventlet.wsgi
-    import socketio
+from cloning.base.errors import UserError
+
+try:
+    installed = importlib.metadata.version("python-socketio")
+    if installed.split(".")[0] != "5":
+        raise ImportError(f"python-socketio is {installed} and must be 5")
+    with warnings.catch_warnings():
+        # eventlet advises against using it in new projects, but no server has been used longer with this simulator.
+        warnings.simplefilter("ignore")
+        import engineio
+        import engineio.async_drivers.eventlet
+        import engineio.packet
+        import engineio.socket
+        import eventlet
+        import eventlet.tpool
+        import eventlet.websocket
+        import eventlet.wsgi
+        import socketio
+        import socketio.packet
+except ImportError as error:  # PackageNotFoundError is one, too
+    raise UserError(f"{error}: run `pip install -r requirements.txt`") from error
 
 __all__ = ["engineio", "eventlet", "socketio"]

@@ -1,22 +1,23 @@
-"""The server's end of the wire: python-socketio with bounds for each client."""
+"""The server's end of the wire: python-socketio, made to understand the simulator, with bounds for each client."""
 
 import json
 import logging
 import time
 from typing import Any
 from urllib.parse import parse_qs
-from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
+from wsgiref.types import StartResponse, WSGIEnvironment
 
 from cloning.server.connections import refuse
-from cloning.server.libraries import engineio, socketio
-from cloning.server.telemetry import MAX_MESSAGE, UNREADABLE
-from cloning.server.turns import TURNS, Account
-from cloning.server.websocket import SOCKET_IO_PACKET, WebSocket, WebSocketWSGI
+from cloning.server.libraries import engineio, eventlet, socketio
+from cloning.server.telemetry import UNREADABLE
+from cloning.server.websocket import WebSocket, WebSocketWSGI
 from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 MAX_UNREAD = 64  # packets that wait for a client; the simulator has 3 telemetries in flight
+# The packets that open a session and refuse its connection to Socket.IO, but for the message.
+NO_SESSION = '0{"sid":"none","upgrades":[],"pingInterval":25000,"pingTimeout":60000}\x1e44'
 log = logging.getLogger(__name__)
 
 
@@ -36,25 +37,33 @@ class Json:
             raise ValueError(f"not JSON: {type(error).__name__}") from None
 
 
+class Packet(socketio.packet.Packet):
+    """A packet without attachments, of which python-socketio would keep any number for a client that sends them."""
+
+    def decode(self, encoded_packet: str) -> int:
+        """Read a packet; an event that announces attachments is an unreadable telemetry."""
+        if encoded_packet[:1] in ("5", "6"):
+            encoded_packet = '2["telemetry"'
+        return super().decode(encoded_packet)
+
+
 class Client(engineio.socket.Socket):
-    """A client's session, which ends when the client does not read what it is sent, or sends nothing for too long."""
+    """A client's session: it may send pings, as in Engine.IO 3, and must read what it is sent."""
 
     def __init__(self, server: "Engine", sid: str):
         super().__init__(server, sid)
-        self.account, self.polled = Account(), False
         self.websocket: WebSocket | None = None
-        server.clients.add(self)
+        self.heard = time.monotonic()  # when it last sent something
+        self.last_ping = None  # so that python-engineio neither pings nor takes a changed clock for silence
+        self.expects_pings = False
 
     def receive(self, packet: Any) -> None:
-        """Handle a packet; whatever it is, the client is alive."""
-        if self.closed:
-            raise engineio.exceptions.SocketIsClosedError
-        self.last_ping = time.time()
-        if not self.upgraded:  # the websocket has taken a turn for its packet
-            TURNS.take(self.account)
-        if packet.packet_type == engineio.packet.PING and packet.data != "probe":
-            packet.data = None  # else the pong would be as long as the ping
-        super().receive(packet)
+        """Handle a packet."""
+        self.heard = time.monotonic()
+        if packet.packet_type == engineio.packet.PING:
+            self.send(engineio.packet.Packet(engineio.packet.PONG))
+        else:
+            super().receive(packet)
 
     def send(self, packet: Any) -> None:
         """Send a packet, unless too many of them wait already: then end the session."""
@@ -63,91 +72,11 @@ class Client(engineio.socket.Socket):
         else:
             self.hang_up()
 
-    def poll(self) -> list[Any]:
-        """Return the packets to send, at least one; none when the session has ended."""
-        while True:
-            try:
-                return super().poll()
-            except engineio.exceptions.QueueEmpty:  # for a minute
-                if not self.upgraded:
-                    raise
-
-    def close(self, wait: bool = True, abort: bool = False) -> None:
-        """End the session, and forget it; never wait until the client has read everything."""
-        super().close(wait=False, abort=abort)
-        self.server.sockets.pop(self.sid, None)
-        if not self.websocket:  # else it counts as a client until its connection ends
-            self.server.clients.discard(self)
-
     def hang_up(self) -> None:
         """End the session and its connection at once."""
-        self.close(abort=True)
+        self.close(wait=False, abort=True)
         if self.websocket:
             self.websocket.hang_up()
-
-    def handle_get_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
-        """Answer a GET: open a websocket, or wait for packets; only one may do so at a time."""
-        if "HTTP_UPGRADE" in environ:
-            return super().handle_get_request(environ, start_response)
-        if self.polled:
-            raise engineio.exceptions.EngineIOError("two requests poll at once")
-        self.polled = True
-        try:
-            return super().handle_get_request(environ, start_response)
-        finally:
-            self.polled = False
-
-    def handle_post_request(self, environ: WSGIEnvironment) -> None:
-        """Handle the packets of a POST."""
-        body = environ["wsgi.input"].getvalue()
-        if not _is_payload(body):
-            raise engineio.exceptions.EngineIOError("not a payload")
-        super().handle_post_request(environ)
-
-    def _websocket_handler(self, ws: WebSocket) -> Any:
-        if self.websocket or self.closed:
-            return []
-        self.websocket = ws
-        try:
-            return super()._websocket_handler(ws)
-        finally:
-            self.websocket = None
-            if self.closed:
-                self.server.clients.discard(self)
-
-
-def _is_payload(body: bytes) -> bool:
-    """Return whether a POST's body has the lengths of its packets where python-engineio looks for them.
-
-    It takes quadratic time to read a long number in the binary format, and to take apart a long form.
-    """
-    if body[:1].isdigit():
-        return True
-    at = 0
-    while at < len(body):
-        digits = body[at + 1 : at + 9].partition(b"\xff")
-        if body[at] > 1 or not digits[1]:
-            return False
-        at += 2 + len(digits[0])
-        length = 0
-        for digit in digits[0]:
-            length = 10 * length + digit
-        at += length
-    return True
-
-
-def _opens_websocket(environ: WSGIEnvironment) -> bool:
-    """Return whether a request with the header Upgrade has all that python-engineio and eventlet look for.
-
-    With a part of it, they would take it for a poll, or fail on it.
-    """
-    options = [option.strip() for option in environ.get("HTTP_CONNECTION", "").lower().split(",")]
-    return (
-        environ["HTTP_UPGRADE"].lower() == "websocket"
-        and "upgrade" in options
-        and environ.get("HTTP_SEC_WEBSOCKET_VERSION") == "13"
-        and "HTTP_SEC_WEBSOCKET_KEY" in environ
-    )
 
 
 class Engine(engineio.Server):
@@ -157,72 +86,89 @@ class Engine(engineio.Server):
         super().__init__(*args, **options)
         self._async: dict[str, Any] = {**engineio.async_drivers.eventlet._async, "websocket": WebSocketWSGI}
         engineio.socket.Socket = Client  # of which python-engineio makes one for each session
-        # Those with a session or a websocket. python-engineio's own table forgets a session that has ended, but the
-        # websocket of such a session may still be open, and take time.
         self.clients: set[Client] = set()
 
     def handle_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
-        """Answer a request."""
+        """Serve a client until its websocket ends, or tell it why not."""
         query = parse_qs(environ.get("QUERY_STRING", ""))
-        upgrade = "HTTP_UPGRADE" in environ
         if query.get("EIO") not in (["3"], ["4"]):
-            reason = "EIO must be 3 or 4, the version of Engine.IO."
-        elif query.get("transport") != ["websocket" if upgrade else "polling"]:
-            reason = "transport must be websocket, with the header Upgrade: websocket, or polling, without it."
-        elif upgrade and not _opens_websocket(environ):
-            reason = (
-                "A websocket needs the headers Upgrade: websocket, Connection: Upgrade, Sec-WebSocket-Version: 13 "
-                "and Sec-WebSocket-Key."
-            )
-        elif "j" in query:
-            reason = "JSONP is not supported."
-        elif environ["REQUEST_METHOD"] == "GET" and "sid" not in query and not self._make_room():
-            reason = f"{MAX_CLIENTS} clients are connected already."
-            log.warning(f"a further client is refused: {reason}")
-            return refuse(start_response, "503 Service Unavailable", reason)
-        else:
+            return refuse(start_response, "400 Bad Request", "EIO must be 3 or 4, the version of Engine.IO.")
+        if (
+            query.get("transport") != ["websocket"]
+            or environ.get("HTTP_UPGRADE", "").lower() != "websocket"
+            or environ.get("HTTP_SEC_WEBSOCKET_VERSION") != "13"
+        ):
+            reason = "Only the websocket transport is served: connect with transports=['websocket']."
+            is_first_poll = query.get("transport") == ["polling"] and "sid" not in query and query["EIO"] == ["4"]
+            if not is_first_poll:
+                return refuse(start_response, "400 Bad Request", reason)
+            # Socket.IO's clients show a message that comes in a session, and not one that comes with an error status.
+            return refuse(start_response, "200 OK", reason, NO_SESSION + json.dumps({"message": reason}))
+        if not self._make_room():
+            return refuse(start_response, "503 Service Unavailable", f"{MAX_CLIENTS} clients are connected already.")
+        environ["QUERY_STRING"] = "EIO=4&transport=websocket"
+        try:
             return super().handle_request(environ, start_response)
-        return refuse(start_response, "400 Bad Request", reason)
+        finally:
+            if client := environ.get("drive.client"):
+                client.close(wait=False, abort=True)
+                self.sockets.pop(client.sid, None)
+                self.clients.discard(client)
 
     def _make_room(self) -> bool:
         """Return whether there is room for another client; end the quietest one's session for that."""
         if len(self.clients) < MAX_CLIENTS:
             return True
-        quietest = min(self.clients, key=lambda client: client.last_ping)
-        if time.time() < quietest.last_ping + QUIET:
+        quietest = min(self.clients, key=lambda client: client.heard)
+        if time.monotonic() < quietest.heard + QUIET:
             return False
         quietest.hang_up()
         return True
 
 
 class Server(socketio.Server):
-    """python-socketio's server with the settings and filters that the simulator needs."""
+    """python-socketio's server with the settings and overrides that the simulator needs."""
 
     def __init__(self) -> None:
         super().__init__(
             async_mode="eventlet",
             async_handlers=False,
+            transports=["websocket"],
             json=Json,
-            max_http_buffer_size=MAX_MESSAGE,
-            # The second interval is how much later than due a ping may come: a suspended laptop stays connected.
+            serializer=Packet,
+            logger=log,
+            engineio_logger=log,
             ping_timeout=PONG_TIMEOUT,
-            ping_interval=(PING_INTERVAL, 60),
-            cookie=None,
+            ping_interval=PING_INTERVAL,
+            monitor_clients=False,
             cors_allowed_origins=[],
         )
+        eventlet.spawn(self._ping)
 
-    def application(self, page: WSGIApplication) -> WSGIApplication:
-        """Return the application that answers simulators itself, and all else with `page`."""
-        return socketio.WSGIApp(self, page)
+    def arrived(self, sid: str) -> float:
+        """Return the time.perf_counter() at which the first fragment of a client's last message was read."""
+        return self.get_environ(sid)["drive.client"].websocket.arrived
 
     def _engineio_server_class(self) -> type[Engine]:
         return Engine
 
-    def _handle_eio_message(self, sid: str, data: str | bytes) -> None:
-        """Handle a Socket.IO packet, if it is one that the simulator may send.
+    def _ping(self) -> None:
+        """Ping the clients that expect it."""
+        while True:
+            eventlet.sleep(PING_INTERVAL)
+            for client in list(self.eio.clients):
+                if client.expects_pings:
+                    client.send(engineio.packet.Packet(engineio.packet.PING))
 
-        python-socketio takes quadratic time to read the digits of a long header, keeps every namespace that a client
-        names, and waits for the attachments that are announced: these are not, and the event is unreadable.
-        """
-        if isinstance(data, str) and SOCKET_IO_PACKET.match(data):
-            super()._handle_eio_message(sid, data if data[0] != "5" else f"2{data[data.index('[') :]}!")
+    def _handle_eio_connect(self, eio_sid: str, environ: WSGIEnvironment) -> None:
+        """Connect a new client at once, as the simulator expects: it never asks for it."""
+        super()._handle_eio_connect(eio_sid, environ)
+        environ["drive.client"] = self.eio.sockets[eio_sid]
+        self.eio.clients.add(environ["drive.client"])
+        super()._handle_connect(eio_sid, "/", None)
+
+    def _handle_connect(self, eio_sid: str, namespace: str | None, data: Any) -> None:
+        """Connect a client that asks for it: one of Engine.IO 4, which is connected already, and expects pings."""
+        self.eio.sockets[eio_sid].expects_pings = True
+        if not self.manager.sid_from_eio_sid(eio_sid, namespace or "/"):
+            super()._handle_connect(eio_sid, namespace, data)

@@ -1,7 +1,5 @@
 """The websocket of the server's end: eventlet's, made faster, and without a way to use much time or memory."""
 
-import errno
-import re
 import socket
 import time
 from typing import Any
@@ -9,16 +7,11 @@ from wsgiref.types import WSGIEnvironment
 
 from cloning.server.libraries import engineio, eventlet
 from cloning.server.telemetry import MAX_MESSAGE
-from cloning.server.turns import TURNS, Account
 
-UNREADABLE_LENGTH = 23  # bytes that are kept of a longer one: enough to see that it is a telemetry
+UNREADABLE_LENGTH = 23  # bytes that are kept of a longer message: enough to see that it is a telemetry
 SEND_BUFFER = 1 << 15  # bytes of answers that the system keeps for a client that does not read; an answer has about 70
-SLICE = 0.0003  # s that a connection may read and unmask in one turn, or without one when it has waited for input
-PATIENT_PRICE = 0.25  # of a turn for a message that had to be waited for, as in lock-step: others send before they read
-# The beginnings of the Socket.IO packets that are understood: an event, one with attachments, a greeting, a farewell.
-SOCKET_IO_PACKET = re.compile(r'2\d{0,9}\["|5\d{1,9}-\d{0,9}\["|[01]$')
-# What python-engineio is given: these, or a packet of its own, such as a ping or an upgrade.
-PACKET = re.compile(rf"4({SOCKET_IO_PACKET.pattern})|[0-356].{{0,125}}$")
+SLICE = 0.0003  # s that a connection may work before others do
+PACKET_TYPES = tuple("0123456")  # of Engine.IO, with which each text begins
 QUICKACK: int | None = getattr(socket, "TCP_QUICKACK", None)  # Linux only
 
 
@@ -35,14 +28,13 @@ class QuickSocket:
         self.sock, self.buffer, self.at = sock, b"", 0
         self.sendall, self.settimeout = sock.sendall, sock.settimeout
         self.shutdown, self.close = sock.shutdown, sock.close
-        self.account = Account()
-        self.since = time.perf_counter()  # when this connection last had a turn, or nothing to read
-        self.waited = False  # whether it had nothing to read since the last message
+        self.since = time.perf_counter()  # when others had their turn
 
     def recv(self, size: int) -> bytes:
         """Return up to `size` bytes; none at the end of the connection."""
         if time.perf_counter() > self.since + SLICE:
-            self.take_turn()
+            eventlet.sleep(0)  # eventlet does not let others work while there is something to read
+            self.since = time.perf_counter()
         if self.at == len(self.buffer):
             self.buffer, self.at = self._read(), 0
             if QUICKACK is not None:
@@ -55,13 +47,8 @@ class QuickSocket:
             return self.sock.fd.recv(65536)
         except BlockingIOError:
             data = self.sock.recv(65536)  # waits, while others work
-            self.since, self.waited = time.perf_counter(), True
+            self.since = time.perf_counter()
             return data
-
-    def take_turn(self, price: float = 1.0) -> None:
-        """Wait until this connection may work; price: see Turns."""
-        TURNS.take(self.account, price)
-        self.since = time.perf_counter()
 
 
 class WebSocket(eventlet.websocket.RFC6455WebSocket):
@@ -76,36 +63,26 @@ class WebSocket(eventlet.websocket.RFC6455WebSocket):
         length = 0
 
         def push(self, data: bytes, final: bool = False) -> None:
-            """Append a fragment, unless it is empty or the message is too long.
+            """Append a fragment, unless it is empty; of a message that is too long, only the beginning is kept.
 
             Such a message is answered like any other unreadable one: without an answer the car would stand still.
             """
-            self.finished = final
-            if data and self.length <= MAX_MESSAGE:
+            self.finished, self.length = final, self.length + len(data)
+            if self.length > MAX_MESSAGE:
+                self.data = [b"".join([*self.data, data])[:UNREADABLE_LENGTH]]
+            elif data:
                 self.data.append(data)
-                self.length += len(data)
-                if self.length > MAX_MESSAGE:
-                    kept = b"".join(self.data)[:UNREADABLE_LENGTH]
-                    self.data = [kept.decode("ascii", "ignore").encode()]
 
-    def __init__(self, sock: Any, *args: Any, **kwargs: Any):
-        super().__init__(QuickSocket(sock), *args, **kwargs)
+    def __init__(self, sock: Any, *args: Any, **options: Any):
+        super().__init__(QuickSocket(sock), *args, **options)
         self.max_frame_length = float("inf")  # Message limits the length
 
     def wait(self) -> str | None:
-        """Return the next text that python-engineio understands, when it is this client's turn.
-
-        None at the end of the connection. What the simulator never sends is passed over: attachments and other binary
-        messages, on which python-engineio may fail, and long pings, which it would answer as long.
-        """
-        while True:
-            message = super().wait()
-            if message is None:
-                return None
-            if isinstance(message, str) and PACKET.match(message):
-                self.socket.take_turn(PATIENT_PRICE if self.socket.waited else 1.0)
-                self.socket.waited = False
-                return message
+        """Return the next packet that python-engineio can read, or None at the end of the connection."""
+        while (message := super().wait()) is not None:
+            if isinstance(message, str) and message[:1] in PACKET_TYPES:
+                break
+        return message
 
     def _recv_frame(self, message: Any = None) -> Any:
         frame = super()._recv_frame(message)
@@ -122,20 +99,16 @@ class WebSocket(eventlet.websocket.RFC6455WebSocket):
 
     def hang_up(self) -> None:
         """End the connection at once, also for a green thread that waits to read or write."""
-        try:
-            self.socket.shutdown(socket.SHUT_RDWR)
-        except OSError as error:
-            if error.errno not in (errno.ENOTCONN, errno.EBADF):  # it has ended already
-                raise
+        eventlet.greenio.shutdown_safe(self.socket)
 
 
 class WebSocketWSGI(engineio.async_drivers.eventlet.WebSocketWSGI):
-    """Opens a WebSocket and leaves it in the request's environment, as "drive.websocket"."""
+    """Opens a WebSocket, and tells the client's session of it."""
 
     def _handle_hybi_request(self, environ: WSGIEnvironment) -> WebSocket:
         plain = super()._handle_hybi_request(environ)
-        environ["drive.websocket"] = WebSocket(plain.socket, environ, plain.version, protocol=plain.protocol)
-        return environ["drive.websocket"]
+        environ["drive.client"].websocket = WebSocket(plain.socket, environ, plain.version, protocol=plain.protocol)
+        return environ["drive.client"].websocket
 
     def _negotiate_permessage_deflate(self, extensions: Any) -> None:
         """Decline compression: it would cost time, and a small message could unpack to a huge one."""

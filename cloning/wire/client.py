@@ -1,7 +1,7 @@
 """The simulator's end of the wire: Engine.IO over a WebSocket, with the real client's peculiarities.
 
 The real client announces Engine.IO 4 but speaks version 3: it sends the pings, and no CONNECT packet. It sends
-long messages in fragments.
+long messages in fragments. A server that says nothing after its open packet is spoken to in version 4.
 """
 
 import base64
@@ -26,11 +26,13 @@ from cloning.wire.protocol import FRAGMENT, PING_INTERVAL, PONG_TIMEOUT
 PATH = "/socket.io/?EIO=4&transport=websocket"
 # Engine.IO's packet types, with which each packet begins; a message (4) goes on with Socket.IO's type.
 OPEN, CLOSE, PING, PONG, MESSAGE = "0", "1", "2", "3", "4"
-CONNECT, DISCONNECT, EVENT = "40", "41", "42"
+CONNECT, DISCONNECT, EVENT, REFUSAL = "40", "41", "42", "44"
+GREETING_TIMEOUT = 1.0  # s for a server to send its first command, or its first answer
 CONNECT_TIMEOUT = 10.0  # s to reach a server and for it to open a session
 SEND_TIMEOUT = 5.0  # s for a server to take a packet; one that reads takes it at once
 CLOSE_TIMEOUT = 1.0  # s for a server to notice that the session is over
 READ_BYTES = 4096  # at a time: enough for 40 answers, and few enough to decode before the next picture is due
+MAX_WAITING = 100  # packets that are kept while a first message is waited for
 MAX_PACKET = 1 << 16  # characters; an answer has about 80
 
 
@@ -130,6 +132,7 @@ class Connection:
         self.partial = ""  # message of which not all fragments have arrived
         self.last_ping = time.monotonic()
         self.pong_due_since: float | None = None
+        self.greeted = self.asked = False  # whether the server spoke first; whether it was asked to connect
         agent = [(b"user-agent", b"websocket-sharp/1.0")]
         with self._closed_if_lost():
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0 if real_timing else 1)
@@ -163,6 +166,18 @@ class Connection:
             raise ConnectionLost(f"{address} does not speak Engine.IO (it sent {packet[:60]!r})")
         self._send(PING)
         self.last_ping = self.pong_due_since = time.monotonic()
+        until = min(until, time.monotonic() + GREETING_TIMEOUT)
+        while not (self.greeted or self.asked):
+            if (left := until - time.monotonic()) > 0 and len(self.packets) < MAX_WAITING:
+                self._read_socket(left)
+                self.greeted = any(packet.startswith(MESSAGE) for packet in self.packets)
+            else:
+                self._ask_for_connection()
+
+    def _ask_for_connection(self) -> None:
+        """Send CONNECT: a server with python-socketio 5 waits for that, and sends the pings."""
+        self._send(CONNECT)
+        self.asked, self.last_ping, self.pong_due_since = True, math.inf, None
 
     def _read_socket(self, timeout: float) -> None:
         """Wait up to `timeout` seconds for bytes, and decode them."""
@@ -234,6 +249,8 @@ class Connection:
                 self._send(PONG + packet[1:])
             elif packet in (CLOSE, DISCONNECT):
                 raise ConnectionLost("the server ended the session")
+            elif packet.startswith(REFUSAL):
+                raise ConnectionLost(f"the server refuses to connect ({packet[len(REFUSAL) :]!s:.100})")
             return packet
 
     def _keep_alive(self) -> None:

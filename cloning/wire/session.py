@@ -9,6 +9,7 @@ from cloning.base.errors import SimulatorError
 from cloning.wire.client import (
     CONNECT,
     CONNECT_TIMEOUT,
+    GREETING_TIMEOUT,
     MESSAGE,
     SEND_TIMEOUT,
     Answer,
@@ -18,7 +19,6 @@ from cloning.wire.client import (
 )
 
 OPENS = 2  # telemetries sent at the start: the real client's "open" event fires twice
-GREETING_TIMEOUT = 1.0  # s for a server to send its first command, or its first answer
 RETRY_INTERVAL = 0.1  # s between two attempts to connect; the real client makes thousands a second
 MAX_UNASKED = 100  # commands that came unasked and are read before a frame; a server could send them without end
 
@@ -39,6 +39,7 @@ class ClientSession:
         self._in_flight = 1  # telemetries sent before the next answer is due
         self._waiting_until: float | None = None  # time.monotonic() at which patience ends; None: not waiting
         self._lost: ConnectionLost | None = None  # why the last connection broke, while waiting
+        self._told = False  # whether the user knows that the server is not one for the real simulator
 
     @property
     def connected(self) -> bool:
@@ -62,6 +63,10 @@ class ClientSession:
                 )
             except ConnectionLost as error:
                 self._wait_after(error)
+            else:
+                if self._connection.asked and not self._told:
+                    self._told = True
+                    _print("this server waited to be asked for a connection: the real simulator would get no answer")
 
     def _patience_ends(self) -> float:
         """Return the time.monotonic() at which patience ends; it begins when the first thing is waited for."""
@@ -89,7 +94,7 @@ class ClientSession:
     def parse(self, packet: str) -> Answer | None:
         """Return the answer in a packet, or None; count messages that hold none."""
         answer = parse_answer(packet)
-        if answer is None and packet.startswith(MESSAGE) and packet != CONNECT:
+        if answer is None and packet.startswith(MESSAGE) and not packet.startswith(CONNECT):
             self.unusable += 1
         return answer
 
@@ -147,6 +152,8 @@ class ClientSession:
         """Return the error for a server that is missing, breaks each connection, or sends nothing usable."""
         reason = f"{self._lost}; " if self._lost else ""
         remedy = "start `python drive.py model.pt` first"
+        if self._connection:
+            remedy = "a server is there, but is silent: it may be busy, or have no handler for the event `telemetry`"
         if self.unusable:
             remedy = f"{self.unusable} unusable answers so far: `steer` must contain strings, as drive.py sends them"
         return SimulatorError(f"{reason}no usable answer in {self.wait:g} s; {remedy}")

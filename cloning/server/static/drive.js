@@ -22,7 +22,7 @@ const GRAPHS = [
   {title: "Steering, right positive", unit: "", digits: 2, least: 0.1, both: true},
   {title: "Speed", unit: " mph", digits: 1, least: 1, isSpeed: true},
   {title: "Throttle", unit: "", digits: 2, least: 0.1},
-  {title: "Latency", unit: " ms", digits: 1, least: 10},
+  {title: "Time in drive.py", unit: " ms", digits: 1, least: 10},
   {title: "Distance from the centre, sign as sent", unit: " m", digits: 2, least: 0.5, both: true},
 ];
 let live = {}, rows = [], events, again;
