@@ -17,7 +17,7 @@ from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.server import MAX_CLIENTS, QUIET
 from tools import attack
-from tools.attacks import GET, all_attacks, frame
+from tools.attacks import GET, WEBSOCKET, all_attacks, frame
 from tools.simulator_client import Simulator, telemetry
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory and open files are read from /proc")
@@ -57,11 +57,13 @@ def test_the_attacks_find_a_fault(server, jpegs, expected):
 
 
 def test_a_client_that_reads_nothing_is_disconnected(server):
-    with Simulator(server.port) as stranger:
-        stranger.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    with socket.socket() as stranger:
+        stranger.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        stranger.connect(("127.0.0.1", server.port))
+        stranger.sendall(WEBSOCKET % b"")
         with pytest.raises(ConnectionError):
             for _ in range(10_000):
-                stranger.socket.sendall(frame(b'42["telemetry",0]') * 100)
+                stranger.sendall(frame(b'42["telemetry",0]') * 100)
 
 
 def test_a_long_ping_is_not_answered(server):

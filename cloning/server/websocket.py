@@ -9,7 +9,6 @@ from cloning.server.libraries import engineio, eventlet
 from cloning.server.telemetry import MAX_MESSAGE
 
 UNREADABLE_LENGTH = 23  # bytes that are kept of a longer message: enough to see that it is a telemetry
-SEND_BUFFER = 1 << 15  # bytes of answers that the system keeps for a client that does not read; an answer has about 70
 SLICE = 0.0003  # s that a connection may work before others do
 PACKET_TYPES = tuple("0123456")  # of Engine.IO, with which each text begins
 QUICKACK: int | None = getattr(socket, "TCP_QUICKACK", None)  # Linux only
@@ -24,7 +23,6 @@ class QuickSocket:
 
     def __init__(self, sock: Any):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self.sock, self.buffer, self.at = sock, b"", 0
         self.sendall, self.settimeout = sock.sendall, sock.settimeout
         self.shutdown, self.close = sock.shutdown, sock.close
