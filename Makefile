@@ -1,5 +1,6 @@
 # make test   install what is needed into .venv, then make lint, then run the tests
 # make lint   check the style, the types and the direction of the imports
+# make lock   write requirements.txt anew, with the newest versions that pyproject.toml allows
 # make demo   record, train and drive in the stand-in simulator, and show it on a page: see tools/demo.py
 
 # make shipped RECORDINGS="FOLDER …"
@@ -25,13 +26,21 @@ lint: .venv/installed
 	$(BIN)/lint-imports --no-logo
 
 # The stamp is written last, so that an interrupted installation is repeated.
-.venv/installed: requirements.txt requirements-export.txt requirements-dev.txt
+.venv/installed: requirements.txt
 	@$(PYTHON) -c "import ensurepip" 2>/dev/null || $(APT) python3-venv
 	@[ "$$(uname)" != Linux ] || PATH="$$PATH:/sbin" ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
 	@echo "install into .venv, where it takes 1.7 GB: one to three minutes"
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
 	touch $@
+
+lock:
+	$(PYTHON) -m venv .venv-lock
+	.venv-lock/bin/python -m pip install --quiet '.[simulator,gymnasium,export,dev]'
+	(head -n 2 requirements.txt; .venv-lock/bin/python -m pip list --format=freeze --exclude behavioral-cloning \
+		--exclude pip --exclude setuptools | sed 's/+cpu$$//') > .venv-lock/requirements.txt
+	mv .venv-lock/requirements.txt requirements.txt
+	rm -r .venv-lock
 
 demo: .venv/installed
 	@$(BIN)/python -m tools.demo
@@ -39,4 +48,4 @@ demo: .venv/installed
 shipped: .venv/installed
 	$(BIN)/python -m tools.shipped $(RECORDINGS)
 
-.PHONY: test lint demo shipped
+.PHONY: test lint lock demo shipped

@@ -1,9 +1,9 @@
 """The stand-in simulator as a Gymnasium environment; importing this module registers it.
 
-    import gymnasium, numpy, simulator.environment, torch
+    import gymnasium, numpy, torch
     from cloning.network.network import SHIPPED_MODEL, load_model, steer
 
-    env = gymnasium.make("behavioral-cloning/Drive-v0", track="lake", speed=15)
+    env = gymnasium.make("simulator.environment:behavioral-cloning/Drive-v0", track="lake", speed=15)
     network = load_model(SHIPPED_MODEL)
     torch.set_num_threads(1)  # for a single frame, several threads mostly wait for one another
     frame, info = env.reset()

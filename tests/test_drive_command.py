@@ -54,7 +54,7 @@ def test_other_socket_libraries_are_refused_by_the_command_and_no_harm_to_an_imp
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert done.stdout == f"{module == 'drive'}\n" and done.returncode == 2, done.stderr
     assert words in done.stderr and "Traceback" not in done.stderr
-    assert "pip install -r requirements.txt" in done.stderr
+    assert "`pip install .`" in done.stderr
 
 
 def test_which_model_drives(jpegs, tmp_path, monkeypatch):

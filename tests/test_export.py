@@ -51,7 +51,7 @@ def test_what_is_missing_is_told_and_nothing_is_written(tmp_path):
     for arguments, environment, message in (
         ((tmp_path / "none.pt", output), {}, "none.pt: no such file"),
         ((SHIPPED_MODEL, tmp_path / "none" / "a.onnx"), {}, "no such folder"),
-        ((SHIPPED_MODEL, output), without, "there is none; pip install -r requirements-export.txt"),
+        ((SHIPPED_MODEL, output), without, "there is none; pip install onnx onnxscript onnxruntime"),
     ):
         done = run(*arguments, **environment)
         assert done.returncode == 2

@@ -90,29 +90,21 @@ def test_requirements_are_what_the_code_imports():
     foreign = imported - own - set(sys.stdlib_module_names)
     distributions = packages_distributions()
     used = {distributions[name][0].lower() for name in foreign}
-    lines = [
-        line for name in ("", "-export") for line in (ROOT / f"requirements{name}.txt").read_text("utf-8").split("\n")
-    ]
-    required = {line.split("==")[0] for line in lines if "==" in line}
-    assert used == required
+    extras = PROJECT["project"]["optional-dependencies"]
+    wanted = [each for name in extras if name != "dev" for each in extras[name]] + PROJECT["project"]["dependencies"]
+    assert used == names_of(wanted)
 
 
-def test_every_requirement_is_listed_with_its_purpose():
+def names_of(requirements: list[str]) -> set[str]:
+    return {re.split("[<>=]", each)[0].lower() for each in requirements}
+
+
+def test_every_requirement_is_listed_with_its_purpose_and_pinned():
     section = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Dependencies")[1].split("## ")[0]
-    for file in ("requirements.txt", "requirements-export.txt", "requirements-dev.txt"):
-        for line in (ROOT / file).read_text(encoding="utf-8").splitlines():
-            name = line.split("==")[0]
-            if "==" in line and not name.startswith("types-"):
-                assert re.search(rf"\b{name}\b", section), name
-
-
-def test_the_package_carries_every_data_file():
-    patterns = PROJECT["tool"]["setuptools"]["package-data"]["*"]
-    carried = {path for name in PACKAGES for pattern in patterns for path in (ROOT / name).rglob(pattern)}
-    needed = {path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()}
-    needed = {path for path in needed if path.suffix not in (".py", ".pyc")}
-    assert {path.name for path in needed} >= {"lake.csv", "jungle.csv", "lane.pt", "shipped.pt"}
-    assert needed == carried
+    pinned = names_of((ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines())
+    for requirements in (PROJECT["project"]["dependencies"], *PROJECT["project"]["optional-dependencies"].values()):
+        for name in names_of(requirements):
+            assert re.search(rf"\b{name}\b", section) and name in pinned, name
 
 
 def anchors(document: Path) -> set[str]:

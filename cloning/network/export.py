@@ -1,6 +1,6 @@
 """Export a model to ONNX, which other programs and languages can run, and check the result with ONNX Runtime.
 
-    pip install -r requirements-export.txt
+    pip install onnx onnxscript onnxruntime
     python -m cloning.network.export model.pt model.onnx
 
 The file takes `frames`, uint8 (n, 160, 320, 3), RGB, as the simulator sends them, and returns `steering`, float32 (n,),
@@ -41,7 +41,7 @@ def export(network: Network, path: Path) -> None:
         import onnxruntime
         import onnxscript  # noqa: F401  # torch's exporter needs it, and says so less clearly
     except ImportError as error:
-        raise UserError(f"{error}; pip install -r requirements-export.txt") from None
+        raise UserError(f"{error}; pip install onnx onnxscript onnxruntime") from None
     frames = check_frames()
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports its steps as warnings
     with warnings.catch_warnings():

@@ -23,6 +23,6 @@ try:
         import socketio
         import socketio.packet
 except ImportError as error:  # PackageNotFoundError is one, too
-    raise UserError(f"{error}: run `pip install -r requirements.txt`") from error
+    raise UserError(f"{error}: run `pip install .` in the folder of the project") from error
 
 __all__ = ["engineio", "eventlet", "socketio"]

@@ -1,0 +1,85 @@
+"""The package: its wheel, installed in a fresh environment."""
+
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+from commands import ROOT
+from drive_process import ask, found
+
+KEPT = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+
+
+@pytest.fixture
+def wheel(tmp_path) -> Path:
+    """The wheel of a copy of the files that git keeps, so that nothing else gets into it, or into the folder."""
+    for name in KEPT:
+        copy = tmp_path / "source" / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, copy)
+    command = ["pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(tmp_path), str(tmp_path / "source")]
+    done = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, timeout=120)
+    if "No matching distribution found for setuptools" in done.stderr:
+        pytest.skip("pip can't install setuptools here")
+    assert done.returncode == 0, done.stderr
+    return next(tmp_path.glob("*.whl"))
+
+
+def install(wheel: Path, folder: Path) -> Path:
+    """Make an environment with the wheel, and with the libraries of this one; return the folder of its commands."""
+    venv.create(folder)
+    [packages] = folder.glob("Lib/site-packages" if os.name == "nt" else "lib/python*/site-packages")
+    libraries = importlib.metadata.distribution("numpy").locate_file("")
+    (packages / "libraries.pth").write_text(f"{libraries}\n", encoding="utf-8")
+    command = ["pip", "--python", str(folder), "install", "--quiet", "--no-deps", str(wheel)]
+    subprocess.run([sys.executable, "-m", *command], check=True, timeout=120)
+    return folder / ("Scripts" if os.name == "nt" else "bin")
+
+
+def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
+    """It has the project's files and no others; its commands run anywhere, and drive ten seconds of the lake."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+    wanted = {name for name in KEPT if name.startswith(("cloning/", "simulator/"))}
+    assert names == wanted | {f"cloning/scripts/{name}.py" for name in ("model", "drive", "video")}
+    assert {"cloning/py.typed", "simulator/py.typed", "cloning/network/shipped.pt"} <= names
+
+    folder, elsewhere = install(wheel, tmp_path / "environment"), tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    command = str(folder / "behavioral-cloning")
+
+    def run(*words: str | Path) -> subprocess.CompletedProcess:
+        return subprocess.run(words, cwd=elsewhere, capture_output=True, text=True, encoding="utf-8", timeout=120)
+
+    assert run(command).returncode == 2
+    commands = re.findall(r"^  (\w+)", run(command, "--help").stdout, re.MULTILINE)
+    assert commands == ["train", "drive", "video", "simulator", "replay", "browse", "export"]
+    for name in commands:
+        done = run(command, name, "--help")
+        assert done.returncode == 0 and "usage:" in done.stdout, done.stderr
+    missing = run(command, "train", "nowhere")
+    assert missing.returncode == 2 and "nowhere" in missing.stderr and "Traceback" not in missing.stderr
+
+    make = "import gymnasium; env = gymnasium.make('simulator.environment:behavioral-cloning/Drive-v0')"
+    shape = run(folder / "python", "-c", f"{make}; print(env.reset()[0].shape)")
+    assert shape.stdout == "(160, 320, 3)\n", shape.stderr
+
+    server = subprocess.Popen([command, "drive", "--port", "0"], cwd=elsewhere, stderr=subprocess.PIPE, text=True)
+    try:
+        assert server.stderr
+        port = found(r"Listening on [\d.]+:(\d+)", server.stderr.readline() + server.stderr.readline())
+        assert ask(int(port), "/")[0] == ask(int(port), "/site/style.css")[0] == 200, "it finds its page"
+        drive = run(command, "simulator", "drive", "--laps", "0.036", "--port", port, "--report", "lap.json")
+        assert drive.returncode == 0, drive.stderr
+        assert json.loads((elsewhere / "lap.json").read_text(encoding="utf-8"))["simulated_seconds"] > 10
+    finally:
+        server.kill()
+        server.wait()
