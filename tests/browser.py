@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 AXE = Path(__file__).with_name("axe.min.js")  # axe-core 4.14.1 by Deque Systems, MPL-2.0: see axe.LICENSE
-CHROMIUM = shutil.which("chromium") or ""
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome") or ""
 needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="no Chromium here")
 LOOKS = [(390, True), (1280, False), (2200, True)]  # widths in px, and whether the system's colours are dark
 OPTIONS = (

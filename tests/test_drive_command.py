@@ -2,6 +2,7 @@
 
 import os
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from commands import HERE, ROOT
-from drive_process import script, serving
+from drive_process import STOP, found, script, serving
 
 import drive
 from cloning.base.errors import UserError
@@ -112,3 +113,28 @@ def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path):
     saved = sorted((tmp_path / "run1").iterdir())
     assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(200)]
     assert all(re.fullmatch(r"\d{4}(_\d\d){5}_\d{3}\.jpg", path.name) for path in saved)
+
+
+def test_a_terminal_that_nobody_reads_and_requests_that_fill_it_stop_no_car(model_file, jpegs):
+    """A pipe takes 64 KiB; http.server writes two lines about each of these requests."""
+    command = [*script("drive.py"), str(model_file), "--port", "0"]
+    with subprocess.Popen(command, env={**os.environ, **HERE}, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr
+            port = int(found(r"Listening on [\d.]+:(\d+)", "".join(process.stderr.readline() for _ in range(3))))
+            for _ in range(3000):
+                with socket.create_connection(("127.0.0.1", port), 10) as client:
+                    client.sendall(b"G\r\n\r\n")
+                    client.recv(10)
+            with Simulator(port) as simulator:
+                simulator.open()
+                for _ in range(1000):
+                    with Simulator(port) as other:
+                        other.open()
+                        other.drive({})  # a warning of its own session, and a line about its end
+                    simulator.drive(telemetry(jpegs[0]))
+            process.send_signal(STOP)
+            assert process.wait(10) == 0
+            assert len(process.stderr.read()) < 50_000
+        finally:
+            process.kill()

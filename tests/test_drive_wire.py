@@ -20,6 +20,7 @@ import socketio
 from drive_process import awaited, serving
 from steer_server import unused_port
 
+from tools.attacks import WEBSOCKET
 from tools.simulator_client import Simulator, fragments, telemetry
 
 LINGER = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)  # close without waiting: struct linger
@@ -213,6 +214,28 @@ def test_ten_thousand_malformed_messages_do_not_disturb_another_session(server, 
 def test_another_origin_cannot_connect(server, header, status):
     with Simulator(server.port, headers=header.format(port=server.port)) as stranger:
         assert stranger.status == status
+
+
+@pytest.mark.parametrize(
+    "origin, answer", [(b"", b"HTTP/1.1 101 "), (b"Origin: http://evil.example:4567\r\n", b"HTTP/1.1 403 ")]
+)
+def test_a_program_may_use_a_host_name_and_a_browser_may_not(server, origin, answer):
+    """A browser names its origin with each websocket, and any site can give this machine a name."""
+    with socket.create_connection(("127.0.0.1", server.port), 10) as client:
+        client.sendall(WEBSOCKET.replace(b"Host: localhost\r\n", b"Host: evil.example:4567\r\n" + origin) % b"")
+        assert client.recv(13) == answer
+    told = "A browser must use this server's IP address"
+    awaited(lambda: not origin or any(told in line for line in server.lines))
+
+
+def test_a_simulator_that_may_expect_numbers_is_told_of(model_file, jpegs):
+    """Udacity's term-2 simulator sends cte, and nothing more when its first answers are strings."""
+    soon = "import time; real = time.time; time.time = lambda: 40 * real()"
+    with serving(model_file, first=soon) as process, Simulator(process.port) as simulator:
+        simulator.open()
+        for jpeg in jpegs[:3]:
+            simulator.drive({**telemetry(jpeg), "cte": "0.7598"})
+        awaited(lambda: any("if it is Udacity's term-2 simulator" in line for line in process.lines))
 
 
 def test_it_listens_on_loopback_alone(server):

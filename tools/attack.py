@@ -30,7 +30,7 @@ from tools.server_process import ServerProcess
 from tools.simulator_client import Simulator, telemetry_message
 
 OPEN_FILES = 1024  # that the server may have: Linux's usual limit
-MAX_MEMORY, MAX_P99, MIN_RATE = 450, 40, 15  # MB, ms, frames/s: beside an attack
+MAX_MEMORY, MAX_P99, MIN_RATE = 350, 40, 15  # MB, ms, frames/s: beside an attack
 NEW_CAR, LEFT_OPEN = 5.0, 10.0  # s after an attack until a new car is answered, and until its connections are closed
 FRAME_INTERVAL = 1 / 60  # s: the simulator sends at most one telemetry in a frame of its own
 PATIENCE = 20.0  # s for an answer
