@@ -82,7 +82,7 @@ class Session(page.Session):
         arrived: time.perf_counter() when its first fragment was read; None: now.
         """
         arrived = time.perf_counter() if arrived is None else arrived
-        self.heard, self.manual, throttle = time.time(), False, 0.0
+        self.heard, self.manual, throttle = time.monotonic(), False, 0.0
         try:
             self.separator = decimal_separator(message, self.separator)
             telemetry = parse_telemetry(message)
@@ -102,7 +102,7 @@ class Session(page.Session):
                 self.folder = self.folder or self.server.saver.start_session()
                 self.folder.save(telemetry.jpeg)
             latency = (time.perf_counter() - arrived) * 1000
-            figures = (time.time(), float(self.steering), telemetry.speed, throttle, latency, telemetry.cte)
+            figures = (time.monotonic(), float(self.steering), telemetry.speed, throttle, latency, telemetry.cte)
             self.history.append(page.DrivenFrame(*figures))
         return {
             "steering_angle": format_number(self.steering, self.separator),
@@ -153,7 +153,7 @@ class DriveServer:
         """Answer each telemetry exactly once: with `steer`, or with `manual` if the human driver steers."""
         session = self.session(sid)
         if message is None:
-            session.heard, session.manual = time.time(), True
+            session.heard, session.manual = time.monotonic(), True
             self.socket.emit("manual", {}, room=sid)
         else:
             self.socket.emit("steer", session.answer(message, self.socket.arrived(sid)), room=sid)
@@ -191,8 +191,8 @@ class DriveServer:
     def tell_of_silence(self) -> None:
         """Log that a simulator may expect other answers, if it looks like that."""
         for session in self.sessions.values():
-            frames = list(session.history) if session.driven <= FRAMES_IN_FLIGHT else []
-            if frames and frames[0].cte is not None and time.time() > session.heard + PATIENCE and not session.puzzled:
+            sends_cte = 0 < session.driven <= FRAMES_IN_FLIGHT and session.history[-1].cte is not None
+            if sends_cte and time.monotonic() > session.heard + PATIENCE and not session.puzzled:
                 session.puzzled = True
                 log.warning(
                     f"a simulator that sends cte has been silent for {PATIENCE:g} s after its first frames; if it is "

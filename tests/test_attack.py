@@ -48,7 +48,7 @@ def test_the_attacks_find_a_fault(server, jpegs, expected):
     """What a car is told must be right: an answer that is not the expected one, and none at all, are found."""
     other = [expected[0]] * len(expected)
     assert "wrong" in attack.run(None, server, jpegs, other, SECONDS).faults()
-    assert attack.Report(attack.Drive(asked=2, round_trips=[0.01]), 500.0, 9.0, 1).faults(timely=False) == [
+    assert attack.Report(attack.Drive(asked=2, round_trips=[0.01]), 500.0, 100.0, 9.0, 1).faults(timely=False) == [
         "lost",
         "memory",
         "new car",
@@ -167,7 +167,7 @@ def test_all_pages_share_a_picture(jpegs, monkeypatch):
         return "picture"
 
     monkeypatch.setattr(page, "image", image)
-    monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[0], time=time.time))
+    monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[0]))
     monkeypatch.setattr(page, "UPDATE_INTERVAL", 2**-10)
     pages = page.Pages(server, with_attention=True, pause=time.sleep)
     readers: list[Any] = [pages.events() for _ in range(50)]
@@ -185,7 +185,7 @@ def test_all_pages_share_a_picture(jpegs, monkeypatch):
 
 
 def test_a_new_page_gets_the_last_minute_in_as_many_rows_as_it_can_show(jpegs, monkeypatch):
-    server, now = drive.DriveServer(Network().eval()), time.time()
+    server, now = drive.DriveServer(Network().eval()), time.monotonic()
     session = server.sessions["sid"] = drive.Session(server)
     session.answer(telemetry(jpegs[0]))
     session.history.extend(page.DrivenFrame(now - 50 + at / 120, 0, 9, 0.5, 3) for at in range(5 * page.SHOWN_FRAMES))

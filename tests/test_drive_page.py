@@ -61,7 +61,7 @@ def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_i
         for query in ("", "?attention"):
             live = shown(server, query)
             time_stamp, _, speed, throttle, latency, _ = live["rows"][-1]
-            assert abs(time_stamp - time.time()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
+            assert abs(time_stamp - time.monotonic()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
             assert live["image"].startswith("data:image/jpeg;base64,/9j/")
         measured: Any = SimpleNamespace(port=server.port, latencies=[])
         bench_driving.Server.read_latencies(measured, 2)
@@ -124,7 +124,7 @@ def test_the_state_is_what_happens(network, jpegs, monkeypatch):
     monkeypatch.setattr(server.socket, "arrived", lambda _: time.perf_counter())
 
     def state(later: float = 0.0) -> str:
-        return drive_page.state_of(server.watched_session(), time.time() + later)
+        return drive_page.state_of(server.watched_session(), time.monotonic() + later)
 
     assert state() == "waiting"
     server.connect("sid")
@@ -141,7 +141,7 @@ def test_the_state_is_what_happens(network, jpegs, monkeypatch):
     assert state(3 * drive_page.SILENCE) == "silent"
     server.disconnect("sid")
     assert state() == state(1000) == "gone"
-    figures = drive_page.figures(server, server.watched_session(), time.time())
+    figures = drive_page.figures(server, server.watched_session(), time.monotonic())
     assert (figures["frames"], figures["unusable"], figures["reason"]) == (2, 2, "speed is missing")
 
 
@@ -158,13 +158,13 @@ def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monk
     next(events)
     assert len(naps) == 1 + drive_page.QUIET_INTERVALS
     session = server.sessions["sid"] = drive.Session(server)
-    session.heard, session.manual = time.time(), True
+    session.heard, session.manual = time.monotonic(), True
     assert json.loads(next(events)[6:])["state"] == "manual"
     assert len(naps) <= drive_page.QUIET_INTERVALS + 3
 
 
 def test_frames_per_second_are_those_of_the_last_two(network):
-    server, now = drive.DriveServer(network), time.time()
+    server, now = drive.DriveServer(network), time.monotonic()
     session = drive.Session(server)
     session.history.extend(drive_page.DrivenFrame(now - 10 + at / 20, 0, 9, 0.5, 3) for at in range(200))
     assert drive_page.figures(server, session, now)["rate"] == pytest.approx(20, rel=0.05)

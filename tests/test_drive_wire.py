@@ -228,14 +228,13 @@ def test_a_program_may_use_a_host_name_and_a_browser_may_not(server, origin, ans
     awaited(lambda: not origin or any(told in line for line in server.lines))
 
 
-def test_a_simulator_that_may_expect_numbers_is_told_of(model_file, jpegs):
+def test_a_simulator_that_may_expect_numbers_is_told_of(server, jpegs):
     """Udacity's term-2 simulator sends cte, and nothing more when its first answers are strings."""
-    soon = "import time; real = time.time; time.time = lambda: 40 * real()"
-    with serving(model_file, first=soon) as process, Simulator(process.port) as simulator:
+    with Simulator(server.port) as simulator:
         simulator.open()
         for jpeg in jpegs[:3]:
             simulator.drive({**telemetry(jpeg), "cte": "0.7598"})
-        awaited(lambda: any("if it is Udacity's term-2 simulator" in line for line in process.lines))
+        awaited(lambda: any("if it is Udacity's term-2 simulator" in line for line in server.lines))
 
 
 def test_it_listens_on_loopback_alone(server):

@@ -39,7 +39,7 @@ def install(wheel: Path, folder: Path) -> Path:
     [packages] = folder.glob("Lib/site-packages" if os.name == "nt" else "lib/python*/site-packages")
     libraries = importlib.metadata.distribution("numpy").locate_file("")
     (packages / "libraries.pth").write_text(f"{libraries}\n", encoding="utf-8")
-    command = ["pip", "--python", str(folder), "install", "--quiet", "--no-deps", str(wheel)]
+    command = ["pip", "--python", str(folder), "install", "--quiet", "--no-deps", "--ignore-installed", str(wheel)]
     subprocess.run([sys.executable, "-m", *command], check=True, timeout=120)
     return folder / ("Scripts" if os.name == "nt" else "bin")
 

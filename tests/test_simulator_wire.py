@@ -221,7 +221,7 @@ print("flask", port, flush=True)
 server.run(app, "127.0.0.1", port, allow_unsafe_werkzeug=True)
 """
 OTHER_SERVERS = {
-    "python-socketio 4": (CLASSIC, ["python-socketio==4.6.1", "python-engineio==3.13.2"], False),
+    "python-socketio 4": (CLASSIC, ["python-socketio==4.6.1", "python-engineio==3.13.2", "six==1.17.0"], False),
     "python-socketio 5": (CLASSIC, [], True),
     "Flask-SocketIO": (FLASK_SOCKETIO, ["flask-socketio==5.6.1"], True),
 }

@@ -30,7 +30,7 @@ from tools.server_process import ServerProcess
 from tools.simulator_client import Simulator, telemetry_message
 
 OPEN_FILES = 1024  # that the server may have: Linux's usual limit
-MAX_MEMORY, MAX_P99, MIN_RATE = 350, 40, 15  # MB, ms, frames/s: beside an attack
+MAX_GROWTH, MAX_P99, MIN_RATE = 60, 40, 15  # MB, ms, frames/s: beside an attack
 NEW_CAR, LEFT_OPEN = 5.0, 10.0  # s after an attack until a new car is answered, and until its connections are closed
 FRAME_INTERVAL = 1 / 60  # s: the simulator sends at most one telemetry in a frame of its own
 PATIENCE = 20.0  # s for an answer
@@ -122,10 +122,11 @@ class Target(ServerProcess):
 
 @dataclass
 class Report:
-    """What an attack did: to the car, to the server's memory in MB, and afterwards."""
+    """What an attack did: to the car, to the server's memory in MB (its peak, and above its start), and afterwards."""
 
     drive: Drive
     memory: float
+    growth: float
     new_car: float  # s until a new car was answered
     left_open: int  # connections of the attack that the server has not closed
 
@@ -135,7 +136,7 @@ class Report:
             "the server ended": self.memory == 0,
             "lost": self.drive.answered != self.drive.asked or not self.drive.asked,
             "wrong": self.drive.wrong > 0,
-            "memory": self.memory > MAX_MEMORY,
+            "memory": self.growth > MAX_GROWTH,
             "new car": self.new_car > NEW_CAR,
             "left open": self.left_open > 0,
             "slow": timely and (self.drive.milliseconds()[1] > MAX_P99 or self.drive.rate < MIN_RATE),
@@ -147,6 +148,7 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     """Attack a server beside a car for some seconds; None: only drive."""
     car = Car(server.port, jpegs, expected)
     server.forget_peak()
+    memory = server.memory()
     before, until = server.open_files(), time.monotonic() + seconds
     attacker = multiprocessing.get_context("fork").Process(target=_attack, args=(attack, server.port, until))
     attacker.start()
@@ -154,7 +156,7 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     attacker.kill()
     attacker.join()
     if server.process.poll() is not None:
-        return Report(drive, 0.0, PATIENCE, 0)
+        return Report(drive, 0.0, 0.0, PATIENCE, 0)
     ended = time.monotonic()
     try:
         new = Car(server.port, jpegs[:1], expected[:1])
@@ -166,7 +168,8 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     while (left := server.open_files() - before) > 0 and time.monotonic() < ended + LEFT_OPEN:
         time.sleep(0.05)
     car.simulator.socket.close()
-    return Report(drive, server.memory("VmHWM"), answered_after, max(left, 0))
+    peak = server.memory("VmHWM")
+    return Report(drive, peak, peak - memory, answered_after, max(left, 0))
 
 
 def _attack(attack: Attack | None, port: int, until: float) -> None:

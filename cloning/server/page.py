@@ -40,7 +40,7 @@ Pause = Callable[[float], None]  # waits for so many seconds, while others work
 class DrivenFrame(NamedTuple):
     """The figures of one driven frame."""
 
-    time: float  # seconds since 1970
+    time: float  # time.monotonic(), which no change of the clock changes
     steering: float  # -1..1
     speed: float  # mph
     throttle: float  # -1..1
@@ -53,7 +53,7 @@ class Session:
 
     def __init__(self) -> None:
         self.started = time.perf_counter()  # tells sessions apart
-        self.heard = 0.0  # time of the last telemetry, in seconds since 1970
+        self.heard = 0.0  # time.monotonic() of the last telemetry
         self.manual = self.ended = False  # whether a person drove then; whether the connection has ended
         self.history: deque[DrivenFrame] = deque(maxlen=HISTORY_FRAMES)
         self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
@@ -128,9 +128,9 @@ class Pages:
         self.open = 0  # number of pages
         self.interval = -1
         self.session: Session | None = None  # shown in this interval
-        self.now = 0.0  # the time at which the graphs end, in seconds since 1970
+        self.now = 0.0  # the time.monotonic() at which the graphs end
         self.state = ""
-        self.until = 0.0  # time of its last frame shown, in seconds since 1970
+        self.until = 0.0  # time.monotonic() of its last frame shown
         self.picture = ""  # data URL, or "" if it is not drawn yet
         self.texts: dict[float, str] = {}  # of this interval's events, by the time of the first frame shown
 
@@ -161,13 +161,13 @@ class Pages:
         interval = int(time.monotonic() / UPDATE_INTERVAL)
         if interval > self.interval:
             self.interval, self.session = interval, self.server.watched_session()
-            self.now = self.session.heard if self.session and self.session.ended else time.time()
+            self.now = self.session.heard if self.session and self.session.ended else time.monotonic()
             self.state = state_of(self.session, self.now)
             self.until = self.session.history[-1].time if self.session and self.session.history else 0.0
             self.picture, self.texts = "", {}
 
     def _event(self, last: float) -> str:
-        """Return an event with the frames later than `last`, in seconds since 1970."""
+        """Return an event with the frames later than `last`, a time.monotonic()."""
         if last not in self.texts:
             event = {"state": self.state, **figures(self.server, self.session, self.now)}
             if self.session and self.until > last:
@@ -181,7 +181,7 @@ class Pages:
 
 
 def state_of(session: Session | None, now: float) -> str:
-    """Return what a session does, by a name for which drive.js has the words; now: seconds since 1970."""
+    """Return what a session does, by a name for which drive.js has the words; now: time.monotonic()."""
     if session is None:
         return "waiting"
     if session.ended:
@@ -196,7 +196,7 @@ def state_of(session: Session | None, now: float) -> str:
 
 
 def figures(server: Server, session: Session | None, now: float) -> dict[str, Any]:
-    """Return what the page tells besides the state and the graphs, for JSON; now: seconds since 1970."""
+    """Return what the page tells besides the state and the graphs, for JSON; now: time.monotonic()."""
     folder = session.folder if session else None
     shown = {"set_speed": server.set_speed, "saving": folder.progress() if folder else "", "saver": bool(server.saver)}
     if session:
@@ -208,7 +208,7 @@ def figures(server: Server, session: Session | None, now: float) -> dict[str, An
 
 
 def frames_since(history: deque[DrivenFrame], first: float) -> list[DrivenFrame]:
-    """Return the frames that are later than `first`, in seconds since 1970."""
+    """Return the frames that are later than `first`, a time.monotonic()."""
     return list(itertools.takewhile(lambda frame: frame.time > first, reversed(history)))[::-1]
 
 
