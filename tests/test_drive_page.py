@@ -62,7 +62,7 @@ def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_i
             live = shown(server, query)
             time_stamp, _, speed, throttle, latency, _ = live["rows"][-1]
             assert abs(time_stamp - time.monotonic()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
-            assert live["image"].startswith("data:image/jpeg;base64,/9j/")
+            assert live["image"].startswith("/9j/")
         measured: Any = SimpleNamespace(port=server.port, latencies=[])
         bench_driving.Server.read_latencies(measured, 2)
     assert len(measured.latencies) == 2 and all(0 < seconds < 60 for seconds in measured.latencies)
@@ -220,7 +220,7 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
         page.open(own)
         page.shows("#state", "Waiting for a simulator")
         assert page.run("document.title") == "Waiting for a simulator"
-        assert page.run("document.querySelector('#image').hidden && document.images.length == 1")
+        assert page.run("document.querySelector('#image').hidden")
         assert str(model_file) in page.text() and "begins with the first frame" in page.text()
         usual = telemetry(jpegs[0], speed="9.0000")
         with feeding(server.port, usual) as feeder:

@@ -131,14 +131,14 @@ class Pages:
         self.now = 0.0  # the time.monotonic() at which the graphs end
         self.state = ""
         self.until = 0.0  # time.monotonic() of its last frame shown
-        self.picture = ""  # data URL, or "" if it is not drawn yet
+        self.picture = ""  # JPEG in base64, or "" if it is not drawn yet
         self.texts: dict[float, str] = {}  # of this interval's events, by the time of the first frame shown
 
     def events(self) -> Iterator[str]:
         """Yield server-sent events: when frames have been driven, when the state changes, and else once a second.
 
         Writing one fails once the page is closed, which ends this loop. Their JSON is that of `figures`, and with new
-        frames also {"rows": [[time, steering, speed, throttle, latency, cte], …], "image": data URL}.
+        frames also {"rows": [[time, steering, speed, throttle, latency, cte], …], "image": JPEG in base64}.
         """
         self.open += 1
         try:
@@ -213,8 +213,8 @@ def frames_since(history: deque[DrivenFrame], first: float) -> list[DrivenFrame]
 
 
 def image(server: Server, session: Session, with_attention: bool) -> str:
-    """Return the session's last frame with its overlay, as a data URL."""
+    """Return the session's last frame with its overlay, as a JPEG in base64."""
     assert session.frame is not None, "a session with driven frames has a last one"
     mask = visual_backprop(server.network, session.frame)[1] if with_attention else None
     picture = overlay(session.frame, session.history[-1].steering, mask)
-    return "data:image/jpeg;base64," + base64.b64encode(encode(picture, JPEG_QUALITY)).decode()
+    return base64.b64encode(encode(picture, JPEG_QUALITY)).decode()

@@ -46,6 +46,15 @@ function showFigures({rate, frames, unusable, reason, saving, saver, state}) {
   element("saving").textContent = saving || (saver ? "begins with the first frame" : "no; name a folder after the model to save the frames");
 }
 
+// Draws a picture; as the source of an image element, the browser would keep every one.
+async function show(base64) {
+  const jpeg = new Blob([Uint8Array.from(atob(base64), character => character.charCodeAt(0))]);
+  const picture = await createImageBitmap(jpeg), canvas = element("image");
+  canvas.getContext("2d").drawImage(picture, 0, 0, canvas.width, canvas.height);
+  picture.close();
+  canvas.hidden = false;
+}
+
 function hear(event) {
   const before = live;
   live = JSON.parse(event.data);
@@ -53,8 +62,7 @@ function hear(event) {
   if (live.set_speed != before.set_speed && document.activeElement != element("speed")) element("speed").value = live.set_speed;
   const last = rows.at(-1)?.[0] ?? 0; // after a reconnection the server sends the last minute again
   rows = rows.concat((live.rows ?? []).filter(row => row[0] > last)).filter(row => row[0] > live.now - SECONDS);
-  if (live.image) element("image").src = live.image;
-  element("image").hidden = !element("image").src;
+  if (live.image) show(live.image);
   say(live.state);
   showFigures(live);
   draw();
