@@ -96,15 +96,19 @@ def test_one_client_too_many_waits_until_another_is_quiet(model_file, jpegs):
             other.socket.close()
 
 
-def test_a_car_that_never_pings_is_answered(model_file, jpegs):
-    """Two minutes pass in 1.2 seconds there, and a ping is due every 25 seconds."""
-    fast = "import time; now = time.time; time.time = lambda: 100 * now()"
-    with serving(model_file, first=fast) as process, Simulator(process.port) as simulator:
+@pytest.mark.parametrize("clock", ["100 * now()", "now() + 3600 * next(hours)"])
+def test_no_change_of_the_clock_costs_an_answer(model_file, jpegs, clock):
+    """Two minutes pass in 1.2 seconds there, or an hour forwards or back, beside a car that never pings."""
+    first = f"import itertools, time; now, hours = time.time, itertools.cycle([0, 1, -1]); time.time = lambda: {clock}"
+    with serving(model_file, first=first) as process, Simulator(process.port) as simulator:
         simulator.open()
         until = time.monotonic() + 1.2
         while time.monotonic() < until:
             simulator.drive(telemetry(jpegs[0]))
             time.sleep(0.05)
+        with urllib.request.urlopen(f"http://127.0.0.1:{process.port}/live", timeout=10) as live:
+            shown = json.loads(live.readline()[6:])
+        assert shown["state"] == "driving" and 5 < shown["rate"] < 20
 
 
 def test_only_a_client_that_asks_for_a_connection_is_pinged(model_file, jpegs):
