@@ -6,6 +6,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ from drive_process import serving
 import drive
 from cloning.network.network import Network
 from cloning.server import page
+from cloning.server.connections import MAX_CONNECTIONS
 from cloning.server.server import MAX_CLIENTS, QUIET
 from tools import attack
 from tools.attacks import GET, WEBSOCKET, all_attacks, frame
@@ -94,6 +96,17 @@ def test_one_client_too_many_waits_until_another_is_quiet(model_file, jpegs):
             others[0].receive()
         for other in others:
             other.socket.close()
+
+
+def test_a_new_car_takes_the_place_of_a_connection_without_a_request(server, jpegs):
+    with ExitStack() as stack:
+        for n in range(MAX_CONNECTIONS + 20):
+            idle = stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
+            if n % 2:
+                idle.sendall(b"POST /set-speed HTTP/1.1\r\nContent-Length: 99\r\n\r\n{")
+        simulator = stack.enter_context(Simulator(server.port))
+        simulator.open()
+        simulator.drive(telemetry(jpegs[0]))
 
 
 @pytest.mark.parametrize("clock", ["100 * now()", "now() + 3600 * next(hours)"])
