@@ -22,8 +22,9 @@ from cloning.recordings.columns import (
     header_columns,
     is_header,
     is_image,
+    number_ranges,
 )
-from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, NUMBERS, RANGES
+from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, NUMBERS
 
 FOLDER = r'(?:(?:[^,"/\\]*+[/\\])++| *)'  # of an image, or blanks
 # A row as the simulator writes it: nearly all are, so these are read at once.
@@ -121,17 +122,18 @@ class RowReader:
         lines = np.array([line for line, *_ in self._rows], np.int32)
         numbers = np.array([float(token) for *_, tokens in self._rows for token in tokens]).reshape(-1, len(NUMBERS))
         below = np.searchsorted(self._headers, lines)
+        outside = np.zeros(numbers.shape, bool)
         for header in np.unique(below):
             rows = below == header
-            check_numbers(lines[rows], numbers[rows], is_named=bool(header > 1))
-        least, greatest = np.array([*RANGES.values()], float).T
-        outside = (numbers < least) | (numbers > greatest)
+            outside[rows] = check_numbers(lines[rows], numbers[rows], is_named=bool(header > 1))
         usable = ~outside.any(1)
         for row in np.flatnonzero(~usable):
             column = outside[row].argmax()
-            what = f"{NUMBERS[column]} {numbers[row, column]:g} is not in {least[column]:g}..{greatest[column]:g}"
-            lost = " (has its decimal point been lost?)" if NUMBERS[column] == "speed" else ""
-            self._reject(int(lines[row]), Finding.OUT_OF_RANGE, f"{what}{lost}; correct or delete the row")
+            name = NUMBERS[column]
+            least, greatest = number_ranges(is_named=bool(below[row] > 1))[name]
+            lost = " (has its decimal point been lost?)" if name == "speed" else ""
+            detail = f"{name} {numbers[row, column]:g} is not in {least}..{greatest}{lost}; correct or delete the row"
+            self._reject(int(lines[row]), Finding.OUT_OF_RANGE, detail)
         if open_line in lines[usable]:
             self._repair("the file ends within this line: its last number may be cut short", open_line)
         names = np.array([name.encode(errors="surrogateescape") for _, row, _ in self._rows for name in row], bytes)
