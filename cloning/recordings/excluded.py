@@ -16,6 +16,7 @@ import numpy as np
 from cloning.base.errors import RecordingError
 from cloning.base.files import write
 from cloning.recordings.format import DRIVING_LOG
+from cloning.recordings.images import NONBLOCKING
 
 if os.name != "nt":
     import fcntl
@@ -137,7 +138,7 @@ def _change(folder: Path, change: Callable[[list[str], list[Cut]], list[str]]) -
 def _locked(log: Path) -> Iterator[None]:
     """Wait for the lock of a recording's log and hold it until the block ends; on Windows there is none."""
     try:
-        file = os.open(log, os.O_RDONLY)
+        file = os.open(log, os.O_RDONLY | NONBLOCKING)
     except OSError as error:
         raise RecordingError(f"{log}: {error.strerror}; put the recording back, or forget its cuts") from None
     try:
