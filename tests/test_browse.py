@@ -1,5 +1,7 @@
 """What the browser of recordings shows: figures, rows to jump to, and the slow analyses of lane and models."""
 
+import errno
+import os
 import shutil
 import sys
 import time
@@ -10,7 +12,7 @@ import pytest
 from browse_process import opened
 from drive_process import awaited
 
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, message_of
 from cloning.browse import analyse, analyses, summary
 from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
 from cloning.browse.library import UnknownError
@@ -166,3 +168,9 @@ def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", "import sys; sys.exit('started')"))
     recording.retry("offset")
     assert ended(recording.analyses, linked)[-1] == {"state": "failed", "message": "started"}
+
+
+def test_without_file_handles_no_file_is_blamed():
+    """Python may have wanted to open a module of its own."""
+    message = message_of(OSError(errno.EMFILE, os.strerror(errno.EMFILE), "encodings/latin_1.py"))
+    assert message == "Too many open files; end other programs, or raise the limit with `ulimit -n`"

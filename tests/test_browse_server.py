@@ -150,6 +150,9 @@ def test_cuts_over_the_socket(linked):
         wrongs: tuple[object, ...] = ([], {"first": 1, "last": "b", "reason": ""}, one | {"more": ""})
         for wrong in wrongs:
             assert server.ask(f"{here}/cuts", "POST", wrong)[0] == 400
+        for wrong in (b"[" * 100_000, json.dumps(one | {"reason": "\ud800"}).encode()):
+            status, data, _ = server.ask(f"{here}/cuts", "POST", wrong)
+            assert status == 400 and b"A cut is a JSON object with the texts" in data
         refused("is not the centre image", "cuts", "POST", one | {"first": "../x"})
         refused("comes before", "cuts", "POST", one | {"last": names[2]})
         text = f'first image,last image,reason\n{names[10]},{names[10]},"crash, hard"\n'

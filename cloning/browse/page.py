@@ -9,6 +9,7 @@ from cloning.base.errors import UserError, message_of
 from cloning.browse.library import Library, UnknownError
 from cloning.browse.replays import NotReplayedError
 from cloning.browse.runs import Runs
+from cloning.recordings.excluded import BYTES
 from cloning.road.autonomy import LIMITS
 from cloning.server import site
 
@@ -129,8 +130,11 @@ def limit() -> str | None:
 
 def stretch() -> dict[str, str]:
     """Return the request's cut: {"first", "last", "reason"}. Ends the request with 400 if it has none."""
-    body = flask.request.get_json()
-    names = {"first", "last", "reason"}
-    if not isinstance(body, dict) or set(body) != names or any(type(text) is not str for text in body.values()):
+    try:
+        body = flask.request.get_json()
+        if not isinstance(body, dict) or set(body) != {"first", "last", "reason"}:
+            raise TypeError
+        "".join(body.values()).encode(**BYTES)
+    except (RecursionError, TypeError, UnicodeEncodeError):  # nested too deeply; no texts; half of a character
         flask.abort(400, "A cut is a JSON object with the texts first, last and reason.")
     return body
