@@ -7,6 +7,7 @@ import contextlib
 import csv
 import io
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,7 @@ EXCLUDED = "excluded.csv"
 HEADER = ("first image", "last image", "reason")
 MAX_REASON = 200  # characters
 BYTES = {"encoding": "utf-8", "errors": "surrogateescape"}  # names of files may hold any bytes
+_changing = threading.Lock()  # for Windows, where no other lock is taken
 
 
 @dataclass(frozen=True)
@@ -125,9 +127,9 @@ def one_line(reason: str) -> str:
 
 
 def _change(folder: Path, change: Callable[[list[str], list[Cut]], list[str]]) -> None:
-    """Replace the file's lines by those that `change` returns, while no other process does the same."""
+    """Replace the file's lines by those that `change` returns, while no other thread or process does the same."""
     path = folder / EXCLUDED
-    with _locked(folder / DRIVING_LOG):
+    with _changing, _locked(folder / DRIVING_LOG):
         lines = _lines(path)
         changed = change(lines, _parse(path, lines))
         if changed != lines:
