@@ -175,7 +175,7 @@ def test_plain_rows_are_read_as_all_others(log, monkeypatch):
 @pytest.mark.parametrize(
     "bad, finding, words",
     [
-        (f"{images(9)},0,0.38,0,19647", Finding.OUT_OF_RANGE, "(has its decimal point been lost?)"),  # 14
+        (f"{images(9)},0,0.38,0,19647", Finding.OUT_OF_RANGE, "(has its decimal point been lost, or"),  # 14
         ("=======", Finding.MERGE_CONFLICT, "merge"),  # 16
         ("<<<<<<< HEAD", Finding.MERGE_CONFLICT, "merge"),
         ("IMG/center_x.jpg, 0.0", Finding.NOT_A_ROW, "1 image name where center, left, right belong"),  # 18
@@ -341,6 +341,8 @@ def test_numbers_that_show_other_columns_or_units(log, rows, why):
         log(*usual(numbers=rows))
     if "brake" in why or "speed is 48.58" in why:  # which a header settles
         assert len(log(HEADER, *usual(numbers=rows))) == len(rows)
+        with pytest.raises(RecordingError, match=r"line \d: (the brake is pressed|speed is 48.58)"):
+            log(HEADER.replace("throttle,brake", "0,0"), *usual(numbers=rows))
 
 
 def test_a_speed_that_the_simulator_never_writes_is_left_out(log):

@@ -4,10 +4,11 @@ Below a header, a column is taken if its whole name is understood. Without one, 
 writes: the images of the centre, left and right camera, then steering, throttle, brake and speed. An image is taken if
 its file's whole name tells its camera. What is not understood is refused, and the message has the remedy.
 
-Some things leave no evidence: without a header, or below one that was not meant for them, numbers in another order or
-unit that stay within the ranges, such as the km/h of a car that never exceeds 20 mph; below a header, values that are
-not what their column's name says, such as steering in radians. That its car drives at most 30 mph is certain of the
-simulator's own log, which has no header: below one, a faster car of another simulator is believed.
+Some things leave no evidence. Without a header that names all columns, or below one that was not meant for them:
+numbers in another order, with another sign or in another unit that stay within the ranges, such as the km/h of a car
+that hardly exceeds 20 mph. Below a header: values that are not what their column's name says, such as steering in
+radians. That the car drives at most 30 mph is certain of the simulator's own logs, which have no header; below one, a
+faster car is believed.
 """
 
 import itertools
@@ -145,17 +146,17 @@ def header_columns(line: int, fields: Sequence[str]) -> tuple[tuple[str, ...], b
 
 
 def number_ranges(is_named: bool) -> dict[str, tuple[int, int]]:
-    """Return the least and greatest value of each column of numbers; is_named: by a header."""
+    """Return the least and greatest value of each column of numbers; is_named: all by a header."""
     return RANGES if is_named else RANGES | {"speed": (0, FASTEST)}
 
 
 def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> np.ndarray:
     """Return which numbers are out of range: bool (n, 4).
 
-    lines: int (n,), in the csv; numbers: float (n, 4), in the order of NUMBERS; is_named: by a header. Raises
+    lines: int (n,), in the csv; numbers: float (n, 4), in the order of NUMBERS; is_named: all by a header. Raises
     UnclearLogError if they show that their columns or units are others than they are taken for. A few steering angles
     or speeds out of range are taken for single errors. Negative pedals are not: they are what steering looks like in a
-    pedal's column. Without a header, neither are pedals that are pressed together, which the simulator never writes,
+    pedal's column. If not is_named, neither are pedals that are pressed together, which the simulator never writes,
     nor more braking than throttle, which may be the two in another order.
     """
     limits = np.array(list(number_ranges(is_named).values()))
@@ -172,7 +173,9 @@ def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> np.
     both = (throttle > 0) & (brake > 0)
     if not is_named and (both.any() or brake.sum() > throttle.sum()):
         at = lines[both if both.any() else brake > 0].min()
-        doubt = "with the throttle" if both.any() else "more than the throttle in the rows without a header"
+        doubt = (
+            "with the throttle" if both.any() else "more than the throttle in the rows without a header that names both"
+        )
         raise UnclearLogError(
             f"line {at}: the brake is pressed {doubt}: are they other columns, or in another order? If not, {REMEDY}",
         )
