@@ -1,8 +1,11 @@
 """What the browser of recordings shows: figures, rows to jump to, and the slow analyses of lane and models."""
 
+import errno
+import os
 import shutil
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +13,14 @@ import pytest
 from browse_process import opened
 from drive_process import awaited
 
-from cloning.base.errors import RecordingError
-from cloning.browse import analyse, analyses, summary
+from cloning.base.errors import RecordingError, message_of
+from cloning.browse import analyse, analyses, library, summary
 from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
 from cloning.browse.library import UnknownError
 from cloning.lane.localise import Localisation
 from cloning.network.network import load_model, steer
 from cloning.recordings.images import read_frame
-from cloning.recordings.log import read_recording
+from cloning.recordings.log import Recording, read_recording, read_uncut
 from cloning.road.track import Track
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -166,3 +169,23 @@ def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", "import sys; sys.exit('started')"))
     recording.retry("offset")
     assert ended(recording.analyses, linked)[-1] == {"state": "failed", "message": "started"}
+
+
+def test_without_file_handles_no_file_is_blamed():
+    """Python may have wanted to open a module of its own."""
+    message = message_of(OSError(errno.EMFILE, os.strerror(errno.EMFILE), "encodings/latin_1.py"))
+    assert message == "Too many open files; end other programs, or raise the limit with `ulimit -n`"
+
+
+def test_threads_that_want_the_same_recording_read_it_once(recording, monkeypatch):
+    read: list[Path] = []
+
+    def slowly(folder: Path) -> Recording:
+        read.append(folder)
+        time.sleep(0.2)
+        return read_uncut(folder)
+
+    monkeypatch.setattr(library, "read_uncut", slowly)
+    with ThreadPoolExecutor() as pool:
+        one, two = pool.map(lambda _: recording.read(), range(2))
+    assert one is two and read == [recording.folder]

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -150,6 +151,9 @@ def test_cuts_over_the_socket(linked):
         wrongs: tuple[object, ...] = ([], {"first": 1, "last": "b", "reason": ""}, one | {"more": ""})
         for wrong in wrongs:
             assert server.ask(f"{here}/cuts", "POST", wrong)[0] == 400
+        for wrong in (b"[" * 100_000, json.dumps(one | {"reason": "\ud800"}).encode()):
+            status, data, _ = server.ask(f"{here}/cuts", "POST", wrong)
+            assert status == 400 and b"A cut is a JSON object with the texts" in data
         refused("is not the centre image", "cuts", "POST", one | {"first": "../x"})
         refused("comes before", "cuts", "POST", one | {"last": names[2]})
         text = f'first image,last image,reason\n{names[10]},{names[10]},"crash, hard"\n'
@@ -170,6 +174,22 @@ def test_cuts_over_the_socket(linked):
         refused(gone, "columns/offset", "POST")
         assert gone in server.get(f"{here}/overview")["message"]
         assert (linked.with_name("elsewhere") / "excluded.csv").read_text(encoding="utf-8") == text
+
+
+def test_others_are_answered_while_a_long_log_is_read(linked):
+    long = linked.with_name("long")
+    long.mkdir()
+    rows = [f"center_{n}.jpg,left_{n}.jpg,right_{n}.jpg,0,1,0,9\n" for n in range(200_000)]
+    (long / "driving_log.csv").write_text("".join(rows), encoding="utf-8")
+    with browsing(linked.parent) as server, ThreadPoolExecutor() as pool:
+        here, answered = server.recordings(), 0
+        server.get(f"{here['lake']}/rows/0")  # reads it
+        reading = pool.submit(server.ask, f"{here['long']}/columns/throttle")
+        while not reading.done():
+            answered += server.ask(f"{here['lake']}/rows/0/center.jpg")[0] == 200
+        status, data, _ = reading.result()
+        assert status == 200 and np.array_equal(np.frombuffer(data, "<f4"), np.ones(200_000))
+    assert answered > 3, "one may be answered before it is read"
 
 
 def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, monkeypatch, capsys):

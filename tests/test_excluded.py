@@ -124,6 +124,8 @@ def test_a_named_pipe_is_refused_and_not_waited_for(linked, name):
     os.mkfifo(linked / name)
     with pytest.raises(RecordingError, match=f"{name}: not a regular file; "):
         read_recording(linked)
+    with pytest.raises(RecordingError, match=r"excluded.csv: "):
+        delete_cut(linked, Cut("a.jpg", "b.jpg", ""))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """lane.csv: what the stand-in simulator writes into it, who reads it, and what is wrong with it."""
 
+import os
 import re
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -66,11 +68,15 @@ def test_the_browser_shows_the_known_offset_and_without_the_file_it_is_estimated
     assert np.array_equal(known(lane.parent).lateral_offset, expected.lateral_offset)
 
 
-def test_rows_that_it_does_not_name_are_not_trusted(lane):
+def test_rows_that_it_does_not_name_are_not_trusted(lane, capsys):
     lines = lane.read_bytes().splitlines(keepends=True)
     lane.write_bytes(b"".join(lines[:31]) + b"another.jpg,9,3\n")
     position = known(lane.parent)
     assert position.trusted[:30].all() and not position.trusted[30:].any()
+    unknown, rows = len(position.trusted) - 30, len(position.trusted)
+    assert (
+        capsys.readouterr().out == f"{lane}: the lane is unknown in {unknown} of {rows} rows, which it does not name\n"
+    )
     assert np.abs(position.lateral_offset).max() < 2
     lane.write_bytes(b"".join(lines[:11])[:-3])
     assert known(lane.parent).trusted.sum() == 9, "a line cut by a kill is left out; the log has no row for it"
@@ -84,7 +90,23 @@ def test_training_says_that_it_is_read_or_why_not(lane, tmp_path):
     lane.unlink()
     lane.mkdir()
     done = run_here(lane.parent, *short)
-    assert done.returncode == 2 and "lane.csv: Is a directory; make it a readable file, or delete it" in done.stderr
+    assert done.returncode == 2 and "lane.csv: not a regular file; make it a readable file, or delete it" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among files")
+def test_a_named_pipe_is_refused_and_not_waited_for(lane):
+    lane.unlink()
+    os.mkfifo(lane)
+    with pytest.raises(RecordingError, match=r"lane.csv: not a regular file; make it a readable file, or delete it"):
+        known(lane.parent)
+
+
+@pytest.mark.parametrize("lines", ["", "center_of_another_drive.jpg,0,0\n"])
+def test_a_file_that_names_no_row_is_refused(lane, lines):
+    lane.write_text(HEADER + lines, encoding="utf-8")
+    message = "names no centre image of a usable row of driving_log.csv; correct it, or delete lane.csv"
+    with pytest.raises(RecordingError, match=f"^{re.escape(str(lane))}: {message}, and the lane is estimated"):
+        known(lane.parent)
 
 
 @pytest.mark.parametrize(
@@ -98,6 +120,7 @@ def test_training_says_that_it_is_read_or_why_not(lane, tmp_path):
         (HEADER + "c.jpg,101,0\n", r"line 2: lateral offset \(m\): '101' is not"),
         (HEADER + "c.jpg,0,90\n", r"line 2: heading error \(radians\): '90' is not a number within ±3.14159"),
         (HEADER + "c.jpg,0.5,0\nc.jpg,0.6,0\n", "line 3: another position for c.jpg"),
+        (HEADER + "/data/IMG/c.jpg,0,0\n", "line 2: '/data/IMG/c.jpg' is not the name of an image alone"),
         (HEADER + '"c.jpg\n', "line 2: unexpected end of data"),
     ],
 )

@@ -175,7 +175,7 @@ def test_plain_rows_are_read_as_all_others(log, monkeypatch):
 @pytest.mark.parametrize(
     "bad, finding, words",
     [
-        (f"{images(9)},0,0.38,0,19647", Finding.OUT_OF_RANGE, "speed 19647 is not in 0..100 (has its decimal"),  # 14
+        (f"{images(9)},0,0.38,0,19647", Finding.OUT_OF_RANGE, "(has its decimal point been lost, or"),  # 14
         ("=======", Finding.MERGE_CONFLICT, "merge"),  # 16
         ("<<<<<<< HEAD", Finding.MERGE_CONFLICT, "merge"),
         ("IMG/center_x.jpg, 0.0", Finding.NOT_A_ROW, "1 image name where center, left, right belong"),  # 18
@@ -331,6 +331,7 @@ def test_an_unnamed_column_is_never_taken_for_another(log, extra, column):
         (["0.5,1.5,0,9.5"], "line 1: throttle is 1.5 here"),
         (["0.5,1,0,-9.5"], "line 1: speed is -9.5 here"),
         (["-12.5,0.5,0,9", "0.5,0.5,0,9", "25,0.5,0,9"], "line 1: steering is -12.5 here, and not in -1..1 in 2 of 3"),
+        (["0,1,0,9", "0,1,0,48.58", "0,1,0,48.58"], "line 2: speed is 48.58 here, and not in 0..32 in 2 of 3"),  # km/h
         (["0,1,0,9", "0.5,0.5,0.5,9.5"], "line 2: the brake is pressed with the throttle: are they other columns"),
         (["0.1,0.5,0,9", "0.1,0,1,30.2"], "line 2: the brake is pressed more than the throttle"),
     ],
@@ -338,8 +339,14 @@ def test_an_unnamed_column_is_never_taken_for_another(log, extra, column):
 def test_numbers_that_show_other_columns_or_units(log, rows, why):
     with pytest.raises(RecordingError, match=rf"driving_log.csv: {why}.*{HEADER}, in their order"):
         log(*usual(numbers=rows))
-    if "brake" in why:  # which a header settles
+    if "brake" in why or "speed is 48.58" in why:  # which a header settles
         assert len(log(HEADER, *usual(numbers=rows))) == len(rows)
+        with pytest.raises(RecordingError, match=r"line \d: (the brake is pressed|speed is 48.58)"):
+            log(HEADER.replace("throttle,brake", "0,0"), *usual(numbers=rows))
+
+
+def test_a_speed_that_the_simulator_never_writes_is_left_out(log):
+    assert findings(log(*usual(), f"{images(9)},0,1,0,48.58")) == [(5, Finding.OUT_OF_RANGE)]
 
 
 def test_a_header_in_other_words_within_the_file_is_refused(log):

@@ -3,6 +3,8 @@
 The message names the file, the line and the remedy. A command prints it to stderr and ends.
 """
 
+import errno
+
 
 class UserError(Exception):
     """An error that the user can correct; the message says what is wrong and what to do."""
@@ -33,7 +35,12 @@ class OutputError(UserError):
 
 
 def message_of(error: UserError | OSError) -> str:
-    """The message for the user; that of an OSError begins with the file's name, as those of a UserError do."""
+    """The message for the user; that of an OSError begins with the file's name, as those of a UserError do.
+
+    When no file can be opened any more, the name is that of any file, and tells nothing.
+    """
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        return f"{error.strerror}; end other programs, or raise the limit with `ulimit -n`"
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     return str(error)

@@ -3,6 +3,7 @@
 import functools
 import hashlib
 import os
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ from cloning.road.autonomy import LIMITS
 
 OPEN = 2  # recordings that are kept in memory: 100,000 rows take 20 MB
 COLUMNS = ("steering", "throttle", "speed", "seconds")  # of the log; the analyses add to them
+
+_wanted: dict[Path, threading.Lock] = {}
+_reading = threading.Lock()
 
 
 class UnknownError(UserError):
@@ -227,9 +231,15 @@ def _rows_cut(folder: Path, cuts: tuple[Cut, ...], recording: Recording) -> np.n
     return np.array(rows, bool).reshape(len(cuts), len(recording))
 
 
-@functools.lru_cache(maxsize=OPEN)
 def _read(folder: Path, version: str) -> Recording:
-    return read_uncut(folder)
+    with _wanted.setdefault(folder, threading.Lock()):  # threads that want the same recording read it once
+        return _read_once(folder, version)
+
+
+@functools.lru_cache(maxsize=OPEN)
+def _read_once(folder: Path, version: str) -> Recording:
+    with _reading:  # one at a time, since each takes memory
+        return read_uncut(folder)
 
 
 @functools.lru_cache(maxsize=6 * OPEN)  # 100,000 rows take 3 MB

@@ -6,9 +6,10 @@ import flask
 import numpy as np
 
 from cloning.base.errors import UserError, message_of
-from cloning.browse.library import Library, UnknownError
+from cloning.browse.library import Library, ShownRecording, UnknownError
 from cloning.browse.replays import NotReplayedError
 from cloning.browse.runs import Runs
+from cloning.recordings.excluded import BYTES
 from cloning.road.autonomy import LIMITS
 from cloning.server import site
 
@@ -28,8 +29,13 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     """
     from cloning.server.libraries import eventlet  # here, because its version is checked first
 
+    eventlet.tpool.setup()  # now, since it fails for good if there are no file handles
     app = flask.Flask(__name__)
     site.prepare(app, "img-src 'self' data:")
+
+    def shown(identifier: str) -> ShownRecording:
+        # Its methods work in threads, so that others are answered while a long log is read.
+        return eventlet.tpool.Proxy(library[identifier])
 
     @app.errorhandler(UserError)
     @app.errorhandler(OSError)
@@ -52,46 +58,46 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/recordings/<identifier>/overview")
     def overview(identifier: str) -> dict[str, Any]:
-        return library[identifier].overview()
+        return shown(identifier).overview()
 
     @app.get("/recordings/<identifier>/details")
     def details(identifier: str) -> dict[str, Any]:
-        return library[identifier].details(limit())
+        return shown(identifier).details(limit())
 
     @app.route("/recordings/<identifier>/replays/<limit>", methods=["POST", "DELETE"])
     def replay(identifier: str, limit: str) -> dict[str, Any]:
-        library[identifier].replay(limit, begin=flask.request.method == "POST")
-        return library[identifier].details(limit)
+        shown(identifier).replay(limit, begin=flask.request.method == "POST")
+        return shown(identifier).details(limit)
 
     @app.get("/recordings/<identifier>/columns/<name>")
     def column(identifier: str, name: str) -> flask.Response:
-        values = library[identifier].column(name, version())
+        values = shown(identifier).column(name, version())
         return flask.Response(np.ascontiguousarray(values, "<f4").tobytes(), mimetype="application/octet-stream")
 
     @app.post("/recordings/<identifier>/columns/<name>")
     def retry(identifier: str, name: str) -> dict[str, Any]:
-        library[identifier].retry(name)
-        return library[identifier].details(limit())
+        shown(identifier).retry(name)
+        return shown(identifier).details(limit())
 
     @app.get("/recordings/<identifier>/rows/<int:row>")
     def row(identifier: str, row: int) -> dict[str, Any]:
-        return library[identifier].row(row, version())
+        return shown(identifier).row(row, version())
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>.jpg")
     def frame(identifier: str, row: int, picture: str) -> flask.Response:
-        return kept(library[identifier].jpeg(row, picture, version(), with_path=True), "image/jpeg")
+        return kept(shown(identifier).jpeg(row, picture, version(), with_path=True), "image/jpeg")
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/<int:model>.png")
     def attention(identifier: str, row: int, picture: str, model: int) -> flask.Response:
-        jpeg = library[identifier].jpeg(row, picture, version())
+        jpeg = shown(identifier).jpeg(row, picture, version())
         # In a thread, so that others are answered meanwhile.
         return kept(eventlet.tpool.execute(library.attention.png, jpeg, library.model(model)), "image/png")
 
     @app.route("/recordings/<identifier>/cuts", methods=["POST", "DELETE"])
     def cut(identifier: str) -> dict[str, Any]:
-        change = library[identifier].cut if flask.request.method == "POST" else library[identifier].restore
+        change = shown(identifier).cut if flask.request.method == "POST" else shown(identifier).restore
         changed = change(**stretch())
-        return library[identifier].details(limit()) | {"changed": changed}
+        return shown(identifier).details(limit()) | {"changed": changed}
 
     @app.get("/runs")
     def found() -> list[dict[str, Any]]:
@@ -129,8 +135,11 @@ def limit() -> str | None:
 
 def stretch() -> dict[str, str]:
     """Return the request's cut: {"first", "last", "reason"}. Ends the request with 400 if it has none."""
-    body = flask.request.get_json()
-    names = {"first", "last", "reason"}
-    if not isinstance(body, dict) or set(body) != names or any(type(text) is not str for text in body.values()):
+    try:
+        body = flask.request.get_json()
+        if not isinstance(body, dict) or set(body) != {"first", "last", "reason"}:
+            raise TypeError
+        "".join(body.values()).encode(**BYTES)
+    except (RecursionError, TypeError, UnicodeEncodeError):  # nested too deeply; no texts; half of a character
         flask.abort(400, "A cut is a JSON object with the texts first, last and reason.")
     return body

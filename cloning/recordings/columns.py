@@ -4,8 +4,11 @@ Below a header, a column is taken if its whole name is understood. Without one, 
 writes: the images of the centre, left and right camera, then steering, throttle, brake and speed. An image is taken if
 its file's whole name tells its camera. What is not understood is refused, and the message has the remedy.
 
-Some things leave no evidence: without a header, or below one that was not meant for them, numbers in another order that
-stay within the ranges; anywhere, values that are not what their column's name says, such as steering in radians.
+Some things leave no evidence. Without a header that names all columns, or below one that was not meant for them:
+numbers in another order, with another sign or in another unit that stay within the ranges, such as the km/h of a car
+that hardly exceeds 20 mph. Below a header: values that are not what their column's name says, such as steering in
+radians. That the car drives at most 30 mph is certain of the simulator's own logs, which have no header; below one, a
+faster car is believed.
 """
 
 import itertools
@@ -26,6 +29,7 @@ REMEDY = (
 NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 IMAGE = re.compile(r"(center|centre|left|right)([\W\d_]*\.jpe?g)", re.IGNORECASE)  # no letters but these
+FASTEST = 32  # mph: the simulator's car is clamped to 30; the largest speed in 6,706 rows of real recordings is 30.7
 MOST_ERRORS = 0.01  # share of a column's values out of range; if there are more, the column is not what it is taken for
 
 # The whole names that headers have for the columns, without the spaces, underscores and hyphens between words.
@@ -141,32 +145,41 @@ def header_columns(line: int, fields: Sequence[str]) -> tuple[tuple[str, ...], b
     return columns, filled != named
 
 
-def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> None:
-    """Raise UnclearLogError if the numbers of rows show that their columns are others than they are taken for.
+def number_ranges(is_named: bool) -> dict[str, tuple[int, int]]:
+    """Return the least and greatest value of each column of numbers; is_named: all by a header."""
+    return RANGES if is_named else RANGES | {"speed": (0, FASTEST)}
 
-    lines: int (n,), in the csv; numbers: float (n, 4), in the order of NUMBERS; is_named: by a header. A few steering
-    angles or speeds out of range are taken for single errors. Negative pedals are not: they are what steering looks
-    like in a pedal's column. Without a header, neither are pedals that are pressed together, which the simulator never
-    writes, nor more braking than throttle, which may be the two in another order.
+
+def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> np.ndarray:
+    """Return which numbers are out of range: bool (n, 4).
+
+    lines: int (n,), in the csv; numbers: float (n, 4), in the order of NUMBERS; is_named: all by a header. Raises
+    UnclearLogError if they show that their columns or units are others than they are taken for. A few steering angles
+    or speeds out of range are taken for single errors. Negative pedals are not: they are what steering looks like in a
+    pedal's column. If not is_named, neither are pedals that are pressed together, which the simulator never writes,
+    nor more braking than throttle, which may be the two in another order.
     """
-    for name, column in zip(NUMBERS, numbers.T, strict=True):
-        least, greatest = RANGES[name]
-        outside = (column < least) | (column > greatest)
+    limits = np.array(list(number_ranges(is_named).values()))
+    is_outside = (numbers < limits[:, 0]) | (numbers > limits[:, 1])
+    for name, column, outside, (least, greatest) in zip(NUMBERS, numbers.T, is_outside.T, limits, strict=True):
         single = name == "steering" or (name == "speed" and column.min(initial=0) >= least)
         if outside.sum() > (max(1, MOST_ERRORS * len(column)) if single else 0):
             at = np.flatnonzero(outside)[np.argmin(lines[outside])]
             raise UnclearLogError(
                 f"line {lines[at]}: {name} is {column[at]:g} here, and not in {least}..{greatest} in {outside.sum()} "
-                f"of {len(column)} rows; if only they are wrong, delete them; if it is another column, {REMEDY}",
+                f"of {len(column)} rows; delete them if only they are wrong; if it is another column or unit, {REMEDY}",
             )
     _, throttle, brake, _ = numbers.T
     both = (throttle > 0) & (brake > 0)
     if not is_named and (both.any() or brake.sum() > throttle.sum()):
         at = lines[both if both.any() else brake > 0].min()
-        doubt = "with the throttle" if both.any() else "more than the throttle in the rows without a header"
+        doubt = (
+            "with the throttle" if both.any() else "more than the throttle in the rows without a header that names both"
+        )
         raise UnclearLogError(
             f"line {at}: the brake is pressed {doubt}: are they other columns, or in another order? If not, {REMEDY}",
         )
+    return is_outside
 
 
 def decimal_comma_readings(tokens: Sequence[str]) -> list[list[str]]:

@@ -7,6 +7,7 @@ import contextlib
 import csv
 import io
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from cloning.base.errors import RecordingError
 from cloning.base.files import write
 from cloning.recordings.format import DRIVING_LOG
+from cloning.recordings.images import NONBLOCKING
 
 if os.name != "nt":
     import fcntl
@@ -24,6 +26,7 @@ EXCLUDED = "excluded.csv"
 HEADER = ("first image", "last image", "reason")
 MAX_REASON = 200  # characters
 BYTES = {"encoding": "utf-8", "errors": "surrogateescape"}  # names of files may hold any bytes
+_changing = threading.Lock()  # for Windows, where no other lock is taken
 
 
 @dataclass(frozen=True)
@@ -124,9 +127,9 @@ def one_line(reason: str) -> str:
 
 
 def _change(folder: Path, change: Callable[[list[str], list[Cut]], list[str]]) -> None:
-    """Replace the file's lines by those that `change` returns, while no other process does the same."""
+    """Replace the file's lines by those that `change` returns, while no other thread or process does the same."""
     path = folder / EXCLUDED
-    with _locked(folder / DRIVING_LOG):
+    with _changing, _locked(folder / DRIVING_LOG):
         lines = _lines(path)
         changed = change(lines, _parse(path, lines))
         if changed != lines:
@@ -137,7 +140,7 @@ def _change(folder: Path, change: Callable[[list[str], list[Cut]], list[str]]) -
 def _locked(log: Path) -> Iterator[None]:
     """Wait for the lock of a recording's log and hold it until the block ends; on Windows there is none."""
     try:
-        file = os.open(log, os.O_RDONLY)
+        file = os.open(log, os.O_RDONLY | NONBLOCKING)
     except OSError as error:
         raise RecordingError(f"{log}: {error.strerror}; put the recording back, or forget its cuts") from None
     try:

@@ -22,8 +22,9 @@ from cloning.recordings.columns import (
     header_columns,
     is_header,
     is_image,
+    number_ranges,
 )
-from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, NUMBERS, RANGES
+from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, NUMBERS
 
 FOLDER = r'(?:(?:[^,"/\\]*+[/\\])++| *)'  # of an image, or blanks
 # A row as the simulator writes it: nearly all are, so these are read at once.
@@ -85,7 +86,7 @@ class RowReader:
         self.repairs: dict[str, list[int]] = {}
         self.rejected: list[Rejected] = []
         self._columns: tuple[str, ...] = COLUMNS  # below the last header, as `header_columns` returns them
-        self._headers = [0]  # their lines; 0 for none
+        self._headers = {0: False}  # line -> whether it names all columns; 0 for none
         self._rows: list[tuple[int, Sequence[str], Sequence[str]]] = []  # line, names and numbers
         self._has_points = False  # a number with a decimal point has been seen
         self._with_commas: list[tuple[int, list[str], list[str]]] = []  # line, names and fields that may be numbers
@@ -120,18 +121,19 @@ class RowReader:
         self._read_decimal_commas()
         lines = np.array([line for line, *_ in self._rows], np.int32)
         numbers = np.array([float(token) for *_, tokens in self._rows for token in tokens]).reshape(-1, len(NUMBERS))
-        below = np.searchsorted(self._headers, lines)
+        below = np.searchsorted(list(self._headers), lines) - 1
+        outside, is_named = np.zeros(numbers.shape, bool), list(self._headers.values())
         for header in np.unique(below):
             rows = below == header
-            check_numbers(lines[rows], numbers[rows], is_named=bool(header > 1))
-        least, greatest = np.array([*RANGES.values()], float).T
-        outside = (numbers < least) | (numbers > greatest)
+            outside[rows] = check_numbers(lines[rows], numbers[rows], is_named[header])
         usable = ~outside.any(1)
         for row in np.flatnonzero(~usable):
             column = outside[row].argmax()
-            what = f"{NUMBERS[column]} {numbers[row, column]:g} is not in {least[column]:g}..{greatest[column]:g}"
-            lost = " (has its decimal point been lost?)" if NUMBERS[column] == "speed" else ""
-            self._reject(int(lines[row]), Finding.OUT_OF_RANGE, f"{what}{lost}; correct or delete the row")
+            name = NUMBERS[column]
+            least, greatest = number_ranges(is_named[below[row]])[name]
+            lost = " (has its decimal point been lost, or is it in another unit?)" if name == "speed" else ""
+            detail = f"{name} {numbers[row, column]:g} is not in {least}..{greatest}{lost}; correct or delete the row"
+            self._reject(int(lines[row]), Finding.OUT_OF_RANGE, detail)
         if open_line in lines[usable]:
             self._repair("the file ends within this line: its last number may be cut short", open_line)
         names = np.array([name.encode(errors="surrogateescape") for _, row, _ in self._rows for name in row], bytes)
@@ -166,7 +168,7 @@ class RowReader:
         while fields and not fields[-1]:
             fields.pop()  # a comma at its end names no column: a value below it is not read
         self._columns, is_filled = header_columns(line, fields)
-        self._headers.append(line)
+        self._headers[line] = not is_filled
         if is_filled:
             self._repair("header lacks names; usual columns taken", line)
 
