@@ -91,7 +91,7 @@ def main() -> int:
     arguments = parser.parse_args()
     one_thread()  # as drive.py does
     try:
-        check_folders(str(arguments.output))
+        check_folders(str(arguments.output), model=arguments.model)
         export(load_model(arguments.model), arguments.output)
     except (UserError, OSError) as error:
         return program.failed("export", error)

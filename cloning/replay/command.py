@@ -58,7 +58,7 @@ def run(options: Options) -> None:
 
     After an error or Ctrl-C, the files are still written, with the recordings replayed until then.
     """
-    check_folders(options.report, options.picture, options.film)
+    check_folders(options.report, options.picture, options.film, model=options.model)
     folders = find_folders(options.folders)
     in_process = options.model is not None
     driver = _driver(options)
