@@ -205,6 +205,24 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
     assert found == (copied if then == "resume" else kept)
 
 
+@pytest.mark.parametrize(
+    "samples, save_seconds", [(150, 1e9), (150, 0), (20, 1e9)], ids=["batch", "save", "validation"]
+)
+def test_a_run_that_diverges_stops_and_saves_nothing_of_it(begun, sample_recording, capsys, samples, save_seconds):
+    """The first step's loss is finite, but the weights after it are not."""
+    before = (begun / "training_log.csv").read_bytes()
+    recipe = replace(REPORT, epochs=2, samples_per_epoch=samples, batch_size=8, learning_rate=np.inf)
+    process = {"device": "cpu", "save_seconds": save_seconds}
+    assert model.train(recipe, [sample_recording], begun / "model.pt", seed=1, **process) == 2
+    message = (
+        "model.py: epoch 1: the loss is not finite any more; start again with a smaller --learning-rate than inf\n"
+    )
+    assert capsys.readouterr().err == message
+    assert seeds(begun) == {"model.pt": 0, "model-best.pt": 0, "model-resume.pt": 1, "model-resume-previous.pt": 0}
+    assert torch.load(begun / "model-resume.pt", weights_only=True)["training"]["images"] == 0
+    assert (begun / "training_log.csv").read_bytes() == before
+
+
 def test_resume_does_not_replace_the_models_of_another_run(begun, sample_recording):
     command = (sample_recording, *SHORT, "--epochs", 1, "--output", begun / "model.pt")
     assert run_here(*command, "--seed", 1).returncode == 0
