@@ -205,9 +205,7 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
     assert found == (copied if then == "resume" else kept)
 
 
-@pytest.mark.parametrize(
-    "samples, save_seconds", [(150, 1e9), (150, 0), (1, 1e9)], ids=["batch", "save", "validation"]
-)
+@pytest.mark.parametrize("samples, save_seconds", [(150, 1e9), (150, 0), (1, 1e9)], ids=["batch", "save", "validation"])
 def test_a_run_that_diverges_stops_and_saves_nothing_of_it(begun, sample_recording, capsys, samples, save_seconds):
     """The first step's loss is finite, but the weights after it are not."""
     before = (begun / "training_log.csv").read_bytes()
