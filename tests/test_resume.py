@@ -15,6 +15,7 @@ from killed import ALL
 from rendered import render_recording
 
 import model
+from cloning.training.stop import StopSignals
 from model import REPORT
 
 
@@ -48,13 +49,15 @@ def begun(one_epoch, tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_interrupted(
-    finished, sample_recording, tmp_path, number
+    finished, sample_recording, tmp_path, name
 ):
-    output = tmp_path / "model.pt"
+    output, number = tmp_path / "model.pt", getattr(signal, name)
     run = started_run(sample_recording, *SHORT, "--output", output, until="Epoch")
     run.send_signal(number)
+    if number == signal.SIGHUP:
+        run.send_signal(number)  # as a closed terminal may do
     _, errors = run.communicate(timeout=120)
     assert run.returncode == 128 + number
     assert errors.startswith("model.py: ") and "--resume" in errors
@@ -70,6 +73,14 @@ def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_inte
     )
     assert ours == theirs
     assert not list(tmp_path.glob("*previous*"))  # a run never takes its own files for an earlier run's
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
+def test_a_training_outlives_its_terminal_after_nohup():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with StopSignals() as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+    assert signal.signal(signal.SIGHUP, before) == signal.SIG_IGN and not stop.received
 
 
 # ----------------------------------------------------------------------------------------------------------------------
