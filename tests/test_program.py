@@ -28,19 +28,24 @@ TOOLS = [
 
 
 @pytest.mark.parametrize(
-    ("program", "command"),
+    ("program", "library", "command"),
     [
-        ("model.py", ["model.py"]),
-        ("drive.py", ["drive.py"]),
-        ("video.py", ["video.py", "run1"]),
-        ("simulator", ["-m", "simulator", "record", "data"]),
-        *((tool, ["-m", f"tools.{tool}"]) for tool in TOOLS),
+        ("model.py", "numpy", ["model.py"]),
+        ("drive.py", "numpy", ["drive.py"]),
+        ("video.py", "numpy", ["video.py", "run1"]),
+        ("simulator", "numpy", ["-m", "simulator", "record", "data"]),
+        ("simulator", "panda3d", ["-m", "simulator", "drive"]),
+        ("simulator", "torch", ["-m", "simulator", "replay", "RECORDING", "--model", "model.pt"]),
+        ("export", "onnx", ["-m", "cloning.network.export", "cloning/network/shipped.pt", "none.onnx"]),
+        ("behavioral-cloning browse", "flask", ["-c", "import cloning.command as c; c.main()", "browse"]),
+        *((tool, "numpy", ["-m", f"tools.{tool}"]) for tool in TOOLS),
     ],
 )
-def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
-    (tmp_path / "numpy.py").write_text(INTERRUPTED_LIBRARY, encoding="utf-8")
+def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, sample_recording, program, library, command):
+    (tmp_path / f"{library}.py").write_text(INTERRUPTED_LIBRARY, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True)
+    command = [sys.executable, *(str(sample_recording) if word == "RECORDING" else word for word in command)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 130
     assert done.stderr.startswith(f"{program}: stopped") and done.stderr.count("\n") == 1
 

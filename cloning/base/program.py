@@ -23,6 +23,7 @@ INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film
 FAILED = 2  # not done: argparse's status for wrong arguments, and that of every other error the user can correct
 NO_MEMORY = "allocate|out of memory|start new thread"  # in a RuntimeError of torch or Python
 name = "python"  # of the command, which begins its messages
+end_at_once: Callable[[int, FrameType | None], None] | None = None  # the handler of `end_on_interrupt`
 
 
 def failed(program: str, error: UserError | OSError) -> int:
@@ -36,7 +37,7 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
 
     An exception would not do: libraries that are interrupted while they load turn it into errors of their own.
     """
-    global name
+    global name, end_at_once
     name = program
 
     def stop(signal_number: int, _: FrameType | None) -> None:
@@ -45,7 +46,18 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
 
     # A shell has its background processes ignore Ctrl-C; leave it so.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        end_at_once = stop
         signal.signal(signal.SIGINT, stop)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """A context in `main` in which Ctrl-C ends the process at once: libraries load, and nothing is to be saved."""
+    before = signal.signal(signal.SIGINT, end_at_once or signal.getsignal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
