@@ -2,6 +2,7 @@
 
 import copy
 import random
+import re
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -216,10 +217,12 @@ def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(saved, tmp_path):
     assert refused >= 50  # most of a file is weights
 
 
-def test_a_file_without_a_digest_is_loaded_and_its_checksums_are_compared(saved, tmp_path):
+def test_a_file_without_a_digest_is_loaded_with_a_warning_and_its_checksums_are_compared(saved, tmp_path, capsys):
     path = tmp_path / "model.pt"
     torch.save(saved, path)
-    assert torch.equal(load_model(path).state_dict()["dense.0.weight"], saved["network"]["dense.0.weight"])
+    for _ in range(2):
+        assert torch.equal(load_model(path).state_dict()["dense.0.weight"], saved["network"]["dense.0.weight"])
+    assert re.fullmatch(f".*: {path}: has no digest, .* not noticed\n", capsys.readouterr().err)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)

@@ -5,6 +5,7 @@ is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (13
 """
 
 import atexit
+import functools
 import io
 import os
 import re
@@ -30,6 +31,12 @@ def failed(program: str, error: UserError | OSError) -> int:
     """Print an error as `PROGRAM: MESSAGE` to stderr and return the exit status."""
     print(f"{program}: {message_of(error)}", file=sys.stderr)
     return FAILED
+
+
+@functools.cache
+def warn_once(message: str) -> None:
+    """Print a warning as `PROGRAM: MESSAGE` to stderr, unless it was printed before."""
+    print(f"{name}: {message}", file=sys.stderr)
 
 
 def end_on_interrupt(program: str, message: str = "stopped") -> None:
