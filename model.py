@@ -35,7 +35,7 @@ from torch import channels_last, manual_seed, nn
 from tqdm import tqdm
 
 from cloning.base.cores import threads
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import write
 from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
 from cloning.network.network import CROP, NETWORKS, SEEN_SHAPE, load_model
@@ -46,7 +46,7 @@ from cloning.recordings.log import CheckedRecording, find_folders, print_finding
 from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import options, summary
 from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, fingerprint, resumed
-from cloning.training.distributed import Ranks
+from cloning.training.distributed import FirstRankFailed, Ranks
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
 from cloning.training.muon import OPTIMIZERS
@@ -321,6 +321,7 @@ class TrainingRun:
             self.epoch()
             started = time.monotonic()
             figures = self.validate()
+            self.check_finite(figures[0])
             progress.seconds += time.monotonic() - started
             is_best = progress.finish_epoch(*figures, self.recipe.best_by)
             if self.ranks.first:  # first: a run killed before `save` repeats this
@@ -348,6 +349,7 @@ class TrainingRun:
                 self.optimizer.step(recipe.rate(progress.done(recipe)))
                 self.optimizer.zero_grad()
                 error, stopped = ranks.summed([float(loss.detach()), float(self.stop.received)], self.device)
+                self.check_finite(error)
                 progress.add(batch.total, error)
                 progress.seconds = time.monotonic() - started
                 bar.update(batch.total)
@@ -369,9 +371,18 @@ class TrainingRun:
         error, metres, driven = self.ranks.summed([error, float(far.sum()), float(len(far))], self.device)
         return error / len(sets) / len(chosen), metres / driven if driven else math.nan
 
+    def check_finite(self, loss: float) -> None:
+        """Raise UserError on rank 0, FirstRankFailed on the others, unless a loss is finite."""
+        if not math.isfinite(loss):
+            epoch, rate = len(self.progress.history) + 1, self.recipe.learning_rate
+            remedy = f"start again with a smaller --learning-rate than {rate:g}"
+            error = UserError(f"epoch {epoch}: the loss is not finite any more; {remedy}")
+            raise error if self.ranks.first else FirstRankFailed
+
     def save(self, *models: Path) -> None:
-        """Write the network to these files, and the state that --resume needs."""
+        """Write the network to these files, and the state that --resume needs. Raises UserError, OSError."""
         if self.ranks.first:
+            self.check_finite(float(sum(values.sum() for values in self.network.state_dict().values())))
             self.checkpoint.save(self.progress, *models)
         self.saved_at = time.monotonic()
 

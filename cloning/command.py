@@ -27,7 +27,9 @@ USAGE = "usage: behavioral-cloning COMMAND …\n\n" + "\n".join(
 def start(module: str) -> int | None:
     """Run a module's `main`; return its exit status."""
     try:
-        return importlib.import_module(module).main()
+        with program.loading():
+            main = importlib.import_module(module).main
+        return main()
     except ModuleNotFoundError as error:  # of an extra of pyproject.toml
         print(f"behavioral-cloning: {error}; `pip install {str(error.name).split('.')[0]}`", file=sys.stderr)
         return program.FAILED

@@ -192,7 +192,8 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
 
 def run_record(arguments: argparse.Namespace) -> int:
     """Record the expert; print its departures and how fast it was recorded."""
-    from simulator.record import record
+    with program.loading():
+        from simulator.record import record
 
     track = Track(arguments.track, arguments.direction)
     begin = time.perf_counter()
@@ -208,12 +209,13 @@ def run_record(arguments: argparse.Namespace) -> int:
 
 def run_drive(arguments: argparse.Namespace) -> int:
     """Let drive.py drive, and write the requested files even if the drive ends early."""
-    from simulator import report, scenery
-    from simulator.cameras import Cameras
-    from simulator.client import Client
-    from simulator.film import ChaseFilm
-    from simulator.run import Run
-    from simulator.world import Scene
+    with program.loading():
+        from simulator import report, scenery
+        from simulator.cameras import Cameras
+        from simulator.client import Client
+        from simulator.film import ChaseFilm
+        from simulator.run import Run
+        from simulator.world import Scene
 
     check_folders(arguments.report, arguments.picture, arguments.film)
     run = Run(Track(arguments.track, arguments.direction), "autonomous")
@@ -241,10 +243,11 @@ def run_drive(arguments: argparse.Namespace) -> int:
 
 def run_correct(arguments: argparse.Namespace) -> int:
     """Let drive.py drive with corrections by the expert; print a lap report and what was recorded."""
-    from simulator import report, scenery
-    from simulator.correct import CorrectedClient
-    from simulator.run import Run
-    from simulator.world import Scene
+    with program.loading():
+        from simulator import report, scenery
+        from simulator.correct import CorrectedClient
+        from simulator.run import Run
+        from simulator.world import Scene
 
     check_name_of_corrections(arguments.folder)
     run = Run(Track(arguments.track, arguments.direction), "autonomous")
@@ -262,7 +265,8 @@ def run_correct(arguments: argparse.Namespace) -> int:
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Let a model drive real recordings."""
-    from cloning.replay import command
+    with program.loading():
+        from cloning.replay import command
 
     options = {name: value for name, value in vars(arguments).items() if name != "run"}
     command.run(command.Options(**options))
@@ -273,8 +277,9 @@ def run_window(arguments: argparse.Namespace) -> int:
     """Open the window in which a person drives or watches."""
     from datetime import datetime
 
-    from simulator.controls import HELP
-    from simulator.window import Window
+    with program.loading():
+        from simulator.controls import HELP
+        from simulator.window import Window
 
     ending = PROBLEM_AREAS[-1] if arguments.autonomous else ""
     folder = arguments.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}{ending}"

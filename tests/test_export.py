@@ -1,6 +1,7 @@
 """An exported model steers like the model file, also in a program that has no PyTorch."""
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -58,3 +59,16 @@ def test_what_is_missing_is_told_and_nothing_is_written(tmp_path):
         assert done.stderr.startswith("export: ") and message in done.stderr and done.stderr.count("\n") == 1
     assert "usage" in run("--help", **without).stdout
     assert os.listdir(tmp_path) == ["libraries"]
+
+
+def test_no_output_replaces_the_model_itself(tmp_path):
+    model, link = shutil.copy(SHIPPED_MODEL, tmp_path), tmp_path / "link.onnx"
+    link.symlink_to(model)
+    for output in (model, tmp_path / ".." / tmp_path.name / "shipped.pt", link):
+        done = run(model, output)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr == f"export: {output}: is the model itself, which would be replaced; name another file\n"
+    command = [sys.executable, "-m", "simulator", "replay", tmp_path, "--model", model, "--report", model]
+    done = warm.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2 and "is the model itself" in done.stderr
+    assert (tmp_path / "shipped.pt").read_bytes() == SHIPPED_MODEL.read_bytes()

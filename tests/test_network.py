@@ -2,6 +2,7 @@
 
 import copy
 import random
+import re
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -216,10 +217,12 @@ def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(saved, tmp_path):
     assert refused >= 50  # most of a file is weights
 
 
-def test_a_file_without_a_digest_is_loaded_and_its_checksums_are_compared(saved, tmp_path):
+def test_a_file_without_a_digest_is_loaded_with_a_warning_and_its_checksums_are_compared(saved, tmp_path, capsys):
     path = tmp_path / "model.pt"
     torch.save(saved, path)
-    assert torch.equal(load_model(path).state_dict()["dense.0.weight"], saved["network"]["dense.0.weight"])
+    for _ in range(2):
+        assert torch.equal(load_model(path).state_dict()["dense.0.weight"], saved["network"]["dense.0.weight"])
+    assert re.fullmatch(f".*: {path}: has no digest, .* not noticed\n", capsys.readouterr().err)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
@@ -266,6 +269,7 @@ NAME = "dense.3.weight"  # (1, 10)
         (NAME, torch.zeros(1, 10, dtype=torch.int32), "int32"),
         (NAME, torch.full((1, 10), -float("inf")), f"{NAME} contains numbers that are not finite"),
         (NAME, torch.full((1, 10), 1e200, dtype=torch.float64), f"{NAME} contains numbers that are not finite"),
+        ("dense.0.weight", torch.full((100, 4224), 1e38), "the network's steering is not finite"),
         (NAME, torch.zeros(1).expand(10**5, 10**5), "more than 30,000,000 bytes"),
         (NAME, torch.zeros(1, 10, device="meta"), "damaged"),
         (NAME, torch.zeros(1, 10).to_sparse(), "damaged"),

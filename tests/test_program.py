@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import warm
-from commands import ROOT
+from commands import HERE, ROOT
 
 from cloning.base.program import FAILED
 
@@ -28,19 +28,24 @@ TOOLS = [
 
 
 @pytest.mark.parametrize(
-    ("program", "command"),
+    ("program", "library", "command"),
     [
-        ("model.py", ["model.py"]),
-        ("drive.py", ["drive.py"]),
-        ("video.py", ["video.py", "run1"]),
-        ("simulator", ["-m", "simulator", "record", "data"]),
-        *((tool, ["-m", f"tools.{tool}"]) for tool in TOOLS),
+        ("model.py", "numpy", ["model.py"]),
+        ("drive.py", "numpy", ["drive.py"]),
+        ("video.py", "numpy", ["video.py", "run1"]),
+        ("simulator", "numpy", ["-m", "simulator", "record", "data"]),
+        ("simulator", "panda3d", ["-m", "simulator", "drive"]),
+        ("simulator", "torch", ["-m", "simulator", "replay", "RECORDING", "--model", "model.pt"]),
+        ("export", "onnx", ["-m", "cloning.network.export", "cloning/network/shipped.pt", "none.onnx"]),
+        ("behavioral-cloning browse", "flask", ["-c", "import cloning.command as c; c.main()", "browse"]),
+        *((tool, "numpy", ["-m", f"tools.{tool}"]) for tool in TOOLS),
     ],
 )
-def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, program, command):
-    (tmp_path / "numpy.py").write_text(INTERRUPTED_LIBRARY, encoding="utf-8")
+def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, sample_recording, program, library, command):
+    (tmp_path / f"{library}.py").write_text(INTERRUPTED_LIBRARY, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True)
+    command = [sys.executable, *(str(sample_recording) if word == "RECORDING" else word for word in command)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 130
     assert done.stderr.startswith(f"{program}: stopped") and done.stderr.count("\n") == 1
 
@@ -96,6 +101,40 @@ def test_a_command_ends_when_all_is_done_and_printed(arguments, later, status, e
     command = [sys.executable, "-c", ENDING_MAIN, *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout.splitlines(), done.stderr) == (status, ["main done", *later], errors)
+
+
+def test_a_command_whose_stdout_is_closed_ends_as_usual():
+    command = ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-c", ENDING_MAIN]
+    done = subprocess.run(command, cwd=ROOT, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (1, b"")
+
+
+FAILING_MAIN = """
+import os, threading, numpy, torch
+from cloning.base import program
+program.end_on_interrupt("test")
+program.run(lambda: {})
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("numpy.empty(1 << 50)", "too little memory is free: Unable to allocate"),
+        ("torch.empty(1 << 50)", "too little memory is free: "),
+        (
+            "[threading.stack_size(1 << 46), threading.Thread().start()]",
+            "too little memory is free: can't start new thread",
+        ),
+        ("print(1, flush=True)", "[Errno 28] No space left on device\n"),
+    ],
+)
+def test_too_little_space_is_a_line_and_status_2(call, message):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-c", FAILING_MAIN.format(call)]
+        done = warm.run(command, cwd=ROOT, env={**os.environ, **HERE}, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == FAILED and done.stderr.startswith(f"test: {message}"), done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_a_command_whose_last_lines_cannot_be_printed_says_so():

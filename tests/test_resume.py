@@ -15,6 +15,7 @@ from killed import ALL
 from rendered import render_recording
 
 import model
+from cloning.training.stop import StopSignals
 from model import REPORT
 
 
@@ -48,13 +49,15 @@ def begun(one_epoch, tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_interrupted(
-    finished, sample_recording, tmp_path, number
+    finished, sample_recording, tmp_path, name
 ):
-    output = tmp_path / "model.pt"
+    output, number = tmp_path / "model.pt", getattr(signal, name)
     run = started_run(sample_recording, *SHORT, "--output", output, until="Epoch")
     run.send_signal(number)
+    if number == signal.SIGHUP:
+        run.send_signal(number)  # as a closed terminal may do
     _, errors = run.communicate(timeout=120)
     assert run.returncode == 128 + number
     assert errors.startswith("model.py: ") and "--resume" in errors
@@ -70,6 +73,14 @@ def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_inte
     )
     assert ours == theirs
     assert not list(tmp_path.glob("*previous*"))  # a run never takes its own files for an earlier run's
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
+def test_a_training_outlives_its_terminal_after_nohup():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with StopSignals() as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+    assert signal.signal(signal.SIGHUP, before) == signal.SIG_IGN and not stop.received
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -205,6 +216,22 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, monkeypatch, ki
     assert found == (copied if then == "resume" else kept)
 
 
+@pytest.mark.parametrize("samples, save_seconds", [(150, 1e9), (150, 0), (1, 1e9)], ids=["batch", "save", "validation"])
+def test_a_run_that_diverges_stops_and_saves_nothing_of_it(begun, sample_recording, capsys, samples, save_seconds):
+    """The first step's loss is finite, but the weights after it are not."""
+    before = (begun / "training_log.csv").read_bytes()
+    recipe = replace(REPORT, epochs=2, samples_per_epoch=samples, batch_size=8, learning_rate=np.inf)
+    process = {"device": "cpu", "save_seconds": save_seconds}
+    assert model.train(recipe, [sample_recording], begun / "model.pt", seed=1, **process) == 2
+    message = (
+        "model.py: epoch 1: the loss is not finite any more; start again with a smaller --learning-rate than inf\n"
+    )
+    assert capsys.readouterr().err == message
+    assert seeds(begun) == {"model.pt": 0, "model-best.pt": 0, "model-resume.pt": 1, "model-resume-previous.pt": 0}
+    assert torch.load(begun / "model-resume.pt", weights_only=True)["training"]["images"] == 0
+    assert (begun / "training_log.csv").read_bytes() == before
+
+
 def test_resume_does_not_replace_the_models_of_another_run(begun, sample_recording):
     command = (sample_recording, *SHORT, "--epochs", 1, "--output", begun / "model.pt")
     assert run_here(*command, "--seed", 1).returncode == 0
@@ -298,7 +325,7 @@ def test_an_unusable_state_is_named(begun, change, words):
     before = {path.name: path.read_bytes() for path in begun.iterdir() if path.is_file()}
     done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
     assert done.returncode == 2
-    assert done.stderr.startswith(f"model.py: {path}: ") and words in done.stderr, done.stderr
+    assert f"model.py: {path}: " in done.stderr and words in done.stderr, done.stderr
     assert "new run without --resume" in done.stderr
     assert {path.name: path.read_bytes() for path in begun.iterdir() if path.is_file()} == before
 

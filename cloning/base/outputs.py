@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -9,9 +10,11 @@ from cloning.base.errors import OutputError, UserError
 from cloning.base.files import write
 
 
-def check_folders(*paths: str | None) -> None:
-    """Raise OutputError, before the work, if an output file is a folder or its folder is missing."""
+def check_folders(*paths: str | None, model: str | Path | None = None) -> None:
+    """Raise OutputError, before the work, if an output is a folder, in no folder, or the model file that is read."""
     for path in paths:
+        if path and model and os.path.exists(path) and os.path.exists(model) and os.path.samefile(path, model):
+            raise OutputError(f"{path}: is the model itself, which would be replaced; name another file")
         if path and not Path(path).absolute().parent.is_dir():
             raise OutputError(f"{path}: no such folder to write it in; make the folder first")
         if path and Path(path).is_dir():

@@ -5,13 +5,15 @@ is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (13
 """
 
 import atexit
+import functools
 import io
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NoReturn
 
@@ -20,6 +22,9 @@ from cloning.base.errors import UserError, message_of
 DONE = 0
 INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film, a car that left the road
 FAILED = 2  # not done: argparse's status for wrong arguments, and that of every other error the user can correct
+NO_MEMORY = "allocate|out of memory|start new thread"  # in a RuntimeError of torch or Python
+name = "python"  # of the command, which begins its messages
+end_at_once: Callable[[int, FrameType | None], None] | None = None  # the handler of `end_on_interrupt`
 
 
 def failed(program: str, error: UserError | OSError) -> int:
@@ -28,11 +33,19 @@ def failed(program: str, error: UserError | OSError) -> int:
     return FAILED
 
 
+@functools.cache
+def warn_once(message: str) -> None:
+    """Print a warning as `PROGRAM: MESSAGE` to stderr, unless it was printed before."""
+    print(f"{name}: {message}", file=sys.stderr)
+
+
 def end_on_interrupt(program: str, message: str = "stopped") -> None:
-    """Make Ctrl-C print this message and end the process at once, with status 130.
+    """Name the command, and make Ctrl-C print this message and end the process at once, with status 130.
 
     An exception would not do: libraries that are interrupted while they load turn it into errors of their own.
     """
+    global name, end_at_once
+    name = program
 
     def stop(signal_number: int, _: FrameType | None) -> None:
         print(f"{program}: {message}", file=sys.stderr, flush=True)
@@ -40,7 +53,18 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
 
     # A shell has its background processes ignore Ctrl-C; leave it so.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        end_at_once = stop
         signal.signal(signal.SIGINT, stop)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """A context in `main` in which Ctrl-C ends the process at once: libraries load, and nothing is to be saved."""
+    before = signal.signal(signal.SIGINT, end_at_once or signal.getsignal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
@@ -70,8 +94,11 @@ def interrupt_deferred() -> Iterator[None]:
 def run(main: Callable[[], int | None]) -> NoReturn:
     """Run a command's main function and end with its exit status; Ctrl-C raises KeyboardInterrupt only in `main`.
 
-    Characters that stdout cannot show, such as undecodable bytes of a file's name, are printed as escapes there.
+    Characters that stdout cannot show, such as undecodable bytes of a file's name, are printed as escapes there. What
+    is printed to a stream that was closed before (`>&-`) is lost.
     """
+    nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # it stays open
+    sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")
     stop = signal.getsignal(signal.SIGINT)
@@ -81,10 +108,17 @@ def run(main: Callable[[], int | None]) -> NoReturn:
         status = main()
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, stop)
-        sys.stdout.flush()
+        with suppress(OSError):  # Ctrl-C has ended the reader of a pipe, too
+            sys.stdout.flush()
         status = 128 + signal.SIGINT
         if callable(stop):
             stop(signal.SIGINT, None)
+    except OSError as error:  # of stdout, for example: a full disk, or a pipe that nobody reads
+        status = failed(name, error)
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not re.search(NO_MEMORY, str(error)):
+            raise
+        status = failed(name, UserError(f"too little memory is free: {str(error) or 'MemoryError'}"))
     finally:
         signal.signal(signal.SIGINT, stop)
     leave(status)

@@ -37,14 +37,15 @@ def export(network: Network, path: Path) -> None:
     Raises UserError without the libraries for it, ModelError if the file steers differently, OSError.
     """
     try:
-        import onnx
-        import onnxruntime
-        import onnxscript  # noqa: F401  # torch's exporter needs it, and says so less clearly
+        with program.loading():
+            import onnx
+            import onnxruntime
+            import onnxscript  # noqa: F401  # torch's exporter needs it, and says so less clearly
     except ImportError as error:
         raise UserError(f"{error}; pip install onnx onnxscript onnxruntime") from None
     frames = check_frames()
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports its steps as warnings
-    with warnings.catch_warnings():
+    with program.loading(), warnings.catch_warnings():  # torch's exporter loads more
         warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 warns of its own code
         exported = torch.onnx.export(
             network,
@@ -91,7 +92,7 @@ def main() -> int:
     arguments = parser.parse_args()
     one_thread()  # as drive.py does
     try:
-        check_folders(str(arguments.output))
+        check_folders(str(arguments.output), model=arguments.model)
         export(load_model(arguments.model), arguments.output)
     except (UserError, OSError) as error:
         return program.failed("export", error)

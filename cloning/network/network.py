@@ -165,8 +165,12 @@ def read_preprocessing(saved: dict[str, Any]) -> tuple[tuple[int, int], float, f
 
 
 def restore_weights(network: Network, saved: dict[str, Any]) -> None:
-    """Give a network the weights of a model file's contents. Raises ValueError if they do not fit."""
+    """Give a network the weights of a model file's contents. Raises ValueError if they do not fit, or are too large."""
     network.load_state_dict(tensors.matching(saved.get("network"), network.state_dict()))
+    try:
+        steer(network, np.zeros(FRAME, np.uint8))
+    except ArithmeticError as error:
+        raise ValueError(str(error)) from None
 
 
 def steer(network: Network, frame: np.ndarray) -> np.float32:

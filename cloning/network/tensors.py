@@ -1,7 +1,7 @@
 """Files of tensors and plain values that carry a digest of their contents; a damaged file is refused.
 
 They are torch's files: zip archives without compression, with a checksum of each entry, which torch does not compare
-when it loads them. Files of earlier versions have no digest and rely on these checksums alone.
+when it loads them. Files of earlier versions have no digest and rely on these checksums alone, which a warning says.
 """
 
 import hashlib
@@ -17,6 +17,7 @@ from typing import IO, Any, TypeGuard
 
 import torch
 
+from cloning.base import program
 from cloning.base.errors import ModelError
 from cloning.base.files import write
 
@@ -56,6 +57,8 @@ def load(path: str | Path, remedy: str) -> dict[str, Any]:
         is_plain = type(error) in (ValueError, zipfile.BadZipFile)
         reason = error if is_plain else type(error).__name__
         raise ModelError(f"{path}: not a model of this project, or damaged ({reason}); {remedy}") from error
+    if digest is None:
+        program.warn_once(f"{path}: has no digest, as of an earlier version: a change of its contents is not noticed")
     return contents
 
 

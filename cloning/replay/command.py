@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import cv2
 from tqdm import tqdm
 
+from cloning.base import program
 from cloning.base.outputs import check_folders, run_all, write_json
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.processes import CAN_FORK, ForkedDrives
@@ -58,7 +59,7 @@ def run(options: Options) -> None:
 
     After an error or Ctrl-C, the files are still written, with the recordings replayed until then.
     """
-    check_folders(options.report, options.picture, options.film)
+    check_folders(options.report, options.picture, options.film, model=options.model)
     folders = find_folders(options.folders)
     in_process = options.model is not None
     driver = _driver(options)
@@ -92,8 +93,9 @@ def run(options: Options) -> None:
 def _driver(options: Options) -> "ModelDriver | ServerDriver":
     """Return the driver; each needs a library of its own, PyTorch or wsproto. Raises ModelError."""
     if options.model:
-        from cloning.network.compute import one_thread
-        from cloning.replay.model_driver import ModelDriver
+        with program.loading():
+            from cloning.network.compute import one_thread
+            from cloning.replay.model_driver import ModelDriver
 
         one_thread()  # other drives run at the same time
         return ModelDriver(options.model)

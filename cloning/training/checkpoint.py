@@ -73,14 +73,13 @@ class Progress:
 
         loss is the mean squared error so far in this epoch, None before its first batch.
         """
-        loss = self.loss / self.images if self.images else None
         return {
             "run": self.run,
             "finished": len(self.history),
             "batches": self.number,
             "images": self.images,
             "seconds": round(self.seconds, 3),
-            "loss": loss if loss is None or math.isfinite(loss) else None,
+            "loss": self.loss / self.images if self.images else None,
         }
 
     def add(self, images: int, loss: float) -> None:

@@ -43,9 +43,10 @@ class Batch:
 def pieces(images: int) -> list[slice]:
     """Return the pieces of a batch of this many images: of about the same size, at most PIECE.
 
-    Their number is even, so that two threads finish together, and the same on every machine, as are then the sums.
+    Their number is even, so that two threads finish together, and the same on every machine, as are then the sums; none
+    is empty.
     """
-    count = 2 * math.ceil(images / (2 * PIECE))
+    count = min(images, 2 * math.ceil(images / (2 * PIECE)))
     edges = [images * piece // count for piece in range(count + 1)] if count else [0]
     return [slice(*ends) for ends in itertools.pairwise(edges)]
 

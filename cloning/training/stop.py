@@ -10,8 +10,8 @@ from cloning.training.distributed import Ranks
 from cloning.training.options import Process
 from cloning.training.run_files import RunFiles
 
-# Windows cannot send SIGTERM, and other systems may lack it.
-SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM") if hasattr(signal, name)]
+# Windows cannot send SIGTERM and has no SIGHUP, and other systems may lack them.
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGHUP", "SIGTERM") if hasattr(signal, name)]
 
 
 class Interrupted(Exception):
@@ -19,7 +19,9 @@ class Interrupted(Exception):
 
 
 class StopSignals:
-    """A context in which Ctrl-C (SIGINT) and SIGTERM are noted; a second signal raises KeyboardInterrupt.
+    """A context in which SIGNALS are noted; after one, Ctrl-C or SIGTERM raises KeyboardInterrupt.
+
+    SIGHUP is that of a closed terminal. What the process ignores already, as after `nohup`, it still does.
 
     received  the number of the signal, 0 without one
     """
@@ -29,7 +31,8 @@ class StopSignals:
         self.received = 0
 
     def __enter__(self) -> "StopSignals":
-        self._handlers = {number: signal.signal(number, self._note) for number in SIGNALS}
+        noted = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+        self._handlers = {number: signal.signal(number, self._note) for number in noted}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -37,9 +40,9 @@ class StopSignals:
             signal.signal(number, handler)
 
     def _note(self, number: int, _: FrameType | None) -> None:
-        if self.received:
+        if self.received and number != getattr(signal, "SIGHUP", None):  # which may come twice
             raise KeyboardInterrupt
-        self.received = number
+        self.received = self.received or number
 
 
 def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:
