@@ -166,14 +166,15 @@ def claim_port(host: str, port: int) -> socket.socket:
 
 
 def noted_signals() -> list[int]:
-    """Return a list to which Ctrl-C and the signals that ask to terminate are added from now on.
+    """Return a list to which Ctrl-C and the signals that ask to terminate are added from now on, but for ignored ones.
 
-    python-engineio would catch an exception raised in their handler.
+    python-engineio would catch an exception raised in their handler. `nohup` ignores SIGHUP.
     """
     noted: list[int] = []
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):  # the third is missing on Windows, the last elsewhere
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), lambda number, _: noted.append(number))
+        number = getattr(signal, name, None)
+        if number and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda received, _: noted.append(received))
     return noted
 
 
