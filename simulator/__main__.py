@@ -1,16 +1,16 @@
 """The simulator's commands: `python -m simulator record`, `drive`, `correct`, `replay` and `window`."""
 
-import argparse
-import functools
-import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
-
 from cloning.base import program
 
 if __name__ == "__main__":
     # Also while the libraries below are loaded.
     program.end_on_interrupt("simulator", "stopped; the files that it has written are complete")
+
+import argparse
+import functools
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from cloning.base.arguments import MAX_PORT, address, number
 from cloning.base.errors import UserError

@@ -8,7 +8,6 @@ import atexit
 import functools
 import io
 import os
-import re
 import signal
 import sys
 import threading
@@ -22,7 +21,7 @@ from cloning.base.errors import UserError, message_of
 DONE = 0
 INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film, a car that left the road
 FAILED = 2  # not done: argparse's status for wrong arguments, and that of every other error the user can correct
-NO_MEMORY = "allocate|out of memory|start new thread"  # in a RuntimeError of torch or Python
+NO_MEMORY = ("allocate", "out of memory", "start new thread")  # in a RuntimeError of torch or Python
 name = "python"  # of the command, which begins its messages
 end_at_once: Callable[[int, FrameType | None], None] | None = None  # the handler of `end_on_interrupt`
 
@@ -116,7 +115,7 @@ def run(main: Callable[[], int | None]) -> NoReturn:
     except OSError as error:  # of stdout, for example: a full disk, or a pipe that nobody reads
         status = failed(name, error)
     except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and not re.search(NO_MEMORY, str(error)):
+        if not isinstance(error, MemoryError) and not any(words in str(error) for words in NO_MEMORY):
             raise
         status = failed(name, UserError(f"too little memory is free: {str(error) or 'MemoryError'}"))
     finally:

@@ -7,15 +7,15 @@ The file takes `frames`, uint8 (n, 160, 320, 3), RGB, as the simulator sends the
 -1..1, positive to the right; values outside must be clipped, as drive.py does. Cropping and scaling are part of it.
 """
 
-import argparse
-import logging
-import warnings
-from pathlib import Path
-
 from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("export")
+
+import argparse
+import logging
+import warnings
+from pathlib import Path
 
 import numpy as np
 import torch
