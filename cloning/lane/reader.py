@@ -109,6 +109,7 @@ def load_network(path: str | Path | None = None) -> LaneNetwork:
     path = path or SHIPPED_WEIGHTS
     remedy = f"train the lane network with `python -m tools.train_lane --output {path}`"
     weights = tensors.load(path, remedy)
+    del weights["digest"]
     network = LaneNetwork()
     try:
         network.load_state_dict(tensors.matching(weights, network.state_dict()))

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from cloning.base import program
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME
 from cloning.network import tensors
@@ -114,6 +115,8 @@ def load_checkpoint(path: str | Path, remedy: str = "`python model.py` trains a 
             f"{path}: the model file has version {tensors.shown(version)}, but this program reads version {VERSION}; "
             "train the model again with `python model.py`"
         )
+    if saved.pop("digest") is None:
+        program.warn_once(f"{path}: has no digest, as of an earlier version: a change of its contents is not noticed")
     return saved
 
 

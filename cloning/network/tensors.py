@@ -1,7 +1,7 @@
 """Files of tensors and plain values that carry a digest of their contents; a damaged file is refused.
 
 They are torch's files: zip archives without compression, with a checksum of each entry, which torch does not compare
-when it loads them. Files of earlier versions have no digest and rely on these checksums alone, which a warning says.
+when it loads them. Files of earlier versions have no digest and rely on these checksums alone.
 """
 
 import hashlib
@@ -17,7 +17,6 @@ from typing import IO, Any, TypeGuard
 
 import torch
 
-from cloning.base import program
 from cloning.base.errors import ModelError
 from cloning.base.files import write
 
@@ -37,6 +36,7 @@ def save(path: str | Path, contents: Mapping[str, object]) -> None:
 def load(path: str | Path, remedy: str) -> dict[str, Any]:
     """Return the contents of a file, without running code from it, with 500 MB of memory at most.
 
+    They include the "digest", None if the file has none, so that its caller can warn of that.
     remedy: how to get a good file, as the end of an error's message. Raises ModelError for a file that is missing, not
     of `save`, or changed since it was saved.
     """
@@ -57,9 +57,7 @@ def load(path: str | Path, remedy: str) -> dict[str, Any]:
         is_plain = type(error) in (ValueError, zipfile.BadZipFile)
         reason = error if is_plain else type(error).__name__
         raise ModelError(f"{path}: not a model of this project, or damaged ({reason}); {remedy}") from error
-    if digest is None:
-        program.warn_once(f"{path}: has no digest, as of an earlier version: a change of its contents is not noticed")
-    return contents
+    return contents | {"digest": digest}
 
 
 def matching(found: object, expected: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
