@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from typing import TextIO
 
 MAX_WAITING = 100  # texts that wait to be printed; more are dropped
@@ -35,8 +36,8 @@ class Unblocked:
 
     def write(self, text: str) -> None:
         """Print a text, unless too many wait already."""
-        if not self.texts.full():
-            self.texts.put(text)
+        with suppress(queue.Full):
+            self.texts.put_nowait(text)
 
     def flush(self) -> None:
         """Do nothing: the thread does."""
