@@ -5,6 +5,11 @@ python drive.py model.pt              # then start the simulator in autonomous m
 python drive.py model.pt run1         # also save each frame in run1/, for `python video.py run1`
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("drive.py")  # also while the libraries below are loaded
+
 import argparse
 import gc
 import itertools
@@ -14,11 +19,6 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("drive.py")  # also while the libraries below are loaded
 
 import numpy as np
 import torch

@@ -13,6 +13,11 @@ bottom, and REPORT has all its figures. A run writes model.pt (the last epoch's 
 in diagnostic_images/. From a program: `train(replace(REPORT, flip=0.0), ["data"], "runs/a/model.pt")`.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("model.py")  # also while the libraries below are loaded
+
 import functools
 import itertools
 import math
@@ -23,11 +28,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("model.py")  # also while the libraries below are loaded
 
 import numpy as np
 from numpy.random import default_rng

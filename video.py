@@ -7,17 +7,17 @@ python video.py run1 --overlay model.pt     # with the model's steering and what
 Exit status: 0 if the film shows every frame, 1 if unreadable ones were left out, 2 if no film was written.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("video.py", "stopped; no film was written")  # also while the libraries below are loaded
+
 import argparse
 import sys
 from collections.abc import Callable
 from datetime import datetime
 from fractions import Fraction
 from pathlib import Path
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("video.py", "stopped; no film was written")  # also while the libraries below are loaded
 
 import numpy as np
 from tqdm import tqdm

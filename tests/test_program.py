@@ -147,3 +147,15 @@ def test_a_command_whose_last_lines_cannot_be_printed_says_so():
     finally:
         os.close(writer)
     assert (done.returncode, done.stderr) == (FAILED, b"stdout: Broken pipe\n")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signal masks")
+def test_ctrl_c_stays_deferred_when_the_first_process_starts():
+    """multiprocessing starts a helper then, and unblocks signals, and Ctrl-C ended the one that starts the others."""
+    code = (
+        "import multiprocessing, signal; from cloning.base import program\n"
+        "with program.interrupt_deferred():\n"
+        "    multiprocessing.get_context('forkserver').Process(target=print).start()\n"
+        "    assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0

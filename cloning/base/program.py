@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from types import FrameType
 from typing import NoReturn
 
@@ -74,6 +75,7 @@ def interrupt_deferred() -> Iterator[None]:
     """
     # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
     if sys.platform != "win32":
+        resource_tracker.ensure_running()  # multiprocessing starts it with the first process, and then unblocks signals
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     received: list[int] = []  # another thread may still receive it
     handler = signal.getsignal(signal.SIGINT)

@@ -8,13 +8,13 @@
 A cut is a line in excluded.csv beside the recording's driving_log.csv, which is never changed.
 """
 
-import argparse
-from pathlib import Path
-
 from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("browse")
+
+import argparse
+from pathlib import Path
 
 from cloning.base.arguments import MAX_PORT, number
 from cloning.base.errors import UserError
