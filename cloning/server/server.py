@@ -15,6 +15,7 @@ from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
+OPENING_INTERVAL = 0.005  # s between two new clients: opening a session costs as much as an answer
 MAX_UNREAD = 64  # packets that wait for a client; the simulator has 3 telemetries in flight
 # The packets that open a session and refuse its connection to Socket.IO, but for the message.
 NO_SESSION = '0{"sid":"none","upgrades":[],"pingInterval":25000,"pingTimeout":60000}\x1e44'
@@ -87,6 +88,7 @@ class Engine(engineio.Server):
         self._async: dict[str, Any] = {**engineio.async_drivers.eventlet._async, "websocket": WebSocketWSGI}
         engineio.socket.Socket = Client  # of which python-engineio makes one for each session
         self.clients: set[Client] = set()
+        self.opening = eventlet.semaphore.Semaphore()
 
     def handle_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
         """Serve a client until its websocket ends, or tell it why not."""
@@ -104,6 +106,8 @@ class Engine(engineio.Server):
                 return refuse(start_response, "400 Bad Request", reason)
             # Socket.IO's clients show a message that comes in a session, and not one that comes with an error status.
             return refuse(start_response, "200 OK", reason, NO_SESSION + json.dumps({"message": reason}))
+        with self.opening:
+            eventlet.sleep(OPENING_INTERVAL)
         if not self._make_room():
             return refuse(start_response, "503 Service Unavailable", f"{MAX_CLIENTS} clients are connected already.")
         environ["QUERY_STRING"] = "EIO=4&transport=websocket"
