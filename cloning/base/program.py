@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
 from types import FrameType
 from typing import NoReturn
 
@@ -75,6 +74,8 @@ def interrupt_deferred() -> Iterator[None]:
     """
     # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
     if sys.platform != "win32":
+        from multiprocessing import resource_tracker  # here, so that nothing delays `end_on_interrupt`
+
         resource_tracker.ensure_running()  # multiprocessing starts it with the first process, and then unblocks signals
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     received: list[int] = []  # another thread may still receive it

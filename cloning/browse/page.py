@@ -27,7 +27,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/runs` and `/runs/N` tell
     of training runs, and `/runs/N/NAME` is a picture of one. An error is {"message"}.
     """
-    from cloning.server.libraries import eventlet  # here, because its version is checked first
+    from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
 
     eventlet.tpool.setup()  # now, since it fails for good if there are no file handles
     app = flask.Flask(__name__)

@@ -78,7 +78,7 @@ class Server(Protocol):
 
 
 def create_app(server: Server, pause: Pause) -> flask.Flask:
-    """Return the web application; pause: of `turns`.
+    """Return the web application; pause: the server's.
 
     `/` is the page, `/live` its figures and pictures as server-sent events. POST to `/set-speed` changes the set speed:
     {"set_speed": text, mph}; the answer is {"set_speed": number}, or {"message"} with 400.
@@ -123,7 +123,7 @@ class Pages:
     """
 
     def __init__(self, server: Server, with_attention: bool, pause: Pause):
-        """with_attention: whether the pictures show what the network looks at; pause: of `turns`."""
+        """with_attention: whether the pictures show what the network looks at; pause: the server's."""
         self.server, self.with_attention, self.pause = server, with_attention, pause
         self.open = 0  # number of pages
         self.interval = -1

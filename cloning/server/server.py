@@ -110,7 +110,7 @@ class Engine(engineio.Server):
             eventlet.sleep(OPENING_INTERVAL)
         if not self._make_room():
             return refuse(start_response, "503 Service Unavailable", f"{MAX_CLIENTS} clients are connected already.")
-        environ["QUERY_STRING"] = "EIO=4&transport=websocket"
+        environ["QUERY_STRING"] = "EIO=4&transport=websocket"  # python-engineio knows no version 3; no other session
         try:
             return super().handle_request(environ, start_response)
         finally:

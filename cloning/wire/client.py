@@ -132,7 +132,7 @@ class Connection:
         self.partial = ""  # message of which not all fragments have arrived
         self.last_ping = time.monotonic()
         self.pong_due_since: float | None = None
-        self.greeted = self.asked = False  # whether the server spoke first; whether it was asked to connect
+        self.asked = False  # whether the server was asked to connect
         agent = [(b"user-agent", b"websocket-sharp/1.0")]
         with self._closed_if_lost():
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0 if real_timing else 1)
@@ -156,7 +156,7 @@ class Connection:
             raise ConnectionLost(reason) from error
 
     def _open_session(self, address: str, until: float) -> None:
-        """Wait for the server's open packet, then ping at once, as the real client does."""
+        """Wait for the server's open packet, ping at once, as the real client does, and ask a silent server."""
         while not self.packets:
             if time.monotonic() > until:
                 raise ConnectionLost(f"{address} accepts connections but does not answer")
@@ -167,17 +167,13 @@ class Connection:
         self._send(PING)
         self.last_ping = self.pong_due_since = time.monotonic()
         until = min(until, time.monotonic() + GREETING_TIMEOUT)
-        while not (self.greeted or self.asked):
-            if (left := until - time.monotonic()) > 0 and len(self.packets) < MAX_WAITING:
-                self._read_socket(left)
-                self.greeted = any(packet.startswith(MESSAGE) for packet in self.packets)
-            else:
-                self._ask_for_connection()
-
-    def _ask_for_connection(self) -> None:
-        """Send CONNECT: a server with python-socketio 5 waits for that, and sends the pings."""
-        self._send(CONNECT)
-        self.asked, self.last_ping, self.pong_due_since = True, math.inf, None
+        while not any(packet.startswith(MESSAGE) for packet in self.packets):
+            if (left := until - time.monotonic()) <= 0 or len(self.packets) >= MAX_WAITING:
+                # A server with python-socketio 5 waits for CONNECT, and sends the pings.
+                self._send(CONNECT)
+                self.asked, self.last_ping, self.pong_due_since = True, math.inf, None
+                break
+            self._read_socket(left)
 
     def _read_socket(self, timeout: float) -> None:
         """Wait up to `timeout` seconds for bytes, and decode them."""
