@@ -24,7 +24,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,7 +50,7 @@ from cloning.training.distributed import FirstRankFailed, Ranks
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
 from cloning.training.muon import OPTIMIZERS
-from cloning.training.observations import CameraViews, Choices, Observations, centre_images
+from cloning.training.observations import CameraViews, Choices, Observations, batch_images, centre_images
 from cloning.training.options import Command, Process, Run
 from cloning.training.pictures import batch_pictures, loss_picture
 from cloning.training.pieces import Batch, SquaredErrors, pieces, predict
@@ -239,19 +239,25 @@ class Generator:
         mine = np.arange(self.recipe.batch_size)[self.ranks.share]
         slots = choices.slots[mine]
         order = np.sort(slots[slots >= 0])  # the slots of this process's images among those of the whole batch
-        images, labels = np.empty((len(order), *SEEN_SHAPE), np.uint8), np.empty(len(order), np.float32)
+        at = np.where(slots < 0, -1, np.searchsorted(order, slots))  # and where they are in its share
+        labels = np.empty(len(order), np.float32)
+        labels[at[at >= 0]] = choices.views.labels[mine][at >= 0]
+        images: Any = np.empty((len(order), *SEEN_SHAPE), np.uint8)
+        parts = list[Future[None]]()
 
-        def make(part: np.ndarray) -> None:
-            for i, (augmentation, seen) in enumerate(zip(augmentations, choices.views.images(part), strict=True)):
-                has = choices.slots[part, i] >= 0
+        def make(part: slice) -> None:
+            for i, (augmentation, seen) in enumerate(zip(augmentations, choices.views.images(mine[part]), strict=True)):
+                has = at[part, i] >= 0
                 if not has.any():
                     continue
-                which, seen = (part, seen) if has.all() else (part[has], seen[has])
-                at = np.searchsorted(order, choices.slots[which, i])
-                images[at] = augmentation.change(seen, CROP[0], *(column[which] for column in choices.augmenting[i]))
-                labels[at] = choices.views.labels[which, i]
+                which, seen = (mine[part], seen) if has.all() else (mine[part][has], seen[has])
+                chosen = (column[which] for column in choices.augmenting[i])
+                images[at[part, i][has]] = augmentation.change(seen, CROP[0], *chosen)
 
-        parts = [self.pool.submit(make, mine[piece]) for piece in pieces(len(mine))]
+        if self.observations.gpu:
+            images = batch_images(choices, augmentations, mine, at)
+        else:
+            parts += [self.pool.submit(make, piece) for piece in pieces(len(mine))]
 
         def wait() -> Batch:
             for part in parts:
@@ -263,7 +269,11 @@ class Generator:
 
     def start_next(self) -> None:
         """Start making one more batch."""
-        self.started.append(self.start_batch(next(self.numbers)))
+        number = next(self.numbers)
+        if self.observations.gpu:  # which makes the images sooner than a thread the choices
+            self.started.append(self.pool.submit(lambda: self.start_batch(number)()).result)
+        else:
+            self.started.append(self.start_batch(number))
 
     def next_batch(self) -> Batch:
         """Return the next batch, and see that enough others are started."""
@@ -292,7 +302,6 @@ class TrainingRun:
         """Raises ModelError if the run is resumed and its data are others."""
         run, training, validation, begin = prepared
         recipe, aim = run.recipe, validation.lanes.from_middle()
-        self.training, self.validation = training, validation
         self.recipe, self.seed, self.process, self.ranks = recipe, run.seed, process, ranks
         self.device, self.files = choose_device(process.device), RunFiles(process.output)
         self.precision = choose_precision(self.device)
@@ -302,6 +311,9 @@ class TrainingRun:
         repeatable(self.device)
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
+        self.training, self.validation = training, validation
+        if self.device.type == "cuda":
+            self.training, self.validation = (part.on_gpu(self.device, self.pool) for part in (training, validation))
         self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, recipe.huber)
         if ranks.world > 1:
             self.errors = nn.parallel.DistributedDataParallel(self.errors)
@@ -309,8 +321,8 @@ class TrainingRun:
         self.optimizer = OPTIMIZERS[recipe.optimizer](self.network.parameters(), recipe.momentum, recipe.weight_decay)
         self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, fingerprint(training, validation))
         self.progress, ahead = self.checkpoint.restore(begin), 2 if self.device.type == "cpu" else 4
-        self.generator = Generator(training, recipe, run.seed, self.pool, ahead, self.progress.number, ranks)
-        self.validation_sets = recipe.validation_sets(validation, recipe, run.seed)
+        self.generator = Generator(self.training, recipe, run.seed, self.pool, ahead, self.progress.number, ranks)
+        self.validation_sets = recipe.validation_sets(self.validation, recipe, run.seed)
         self.held_out = held_out(validation.recordings, validation.recording, validation.row, aim)
         self.pace, self.stop, self.saved_at = summary.Pace(recipe, ranks.first), StopSignals(), time.monotonic()
 

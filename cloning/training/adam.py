@@ -10,6 +10,8 @@ import torch
 from torch import nn
 from torch.optim.adam import adam
 
+from cloning.network.compute import Graphed
+
 AVERAGES = ("step", "exp_avg", "exp_avg_sq")  # torch.optim's names: steps done, averages of gradient and its square
 
 
@@ -26,6 +28,7 @@ class Adam:
         """
         self.parameters, self.momentum, self.weight_decay = list(parameters), momentum, weight_decay
         self.state: dict[int, dict[str, torch.Tensor]] = {}
+        self.graphed = Graphed(self.update_by)
 
     def zeros(self, index: int) -> dict[str, torch.Tensor]:
         """Return a parameter's state before the first step: float32, on its device, in its order in memory."""
@@ -36,11 +39,21 @@ class Adam:
     @torch.no_grad()
     def step(self, learning_rate: float) -> None:
         """Update the parameters by their gradients."""
-        indices = range(len(self.parameters))
-        self.state = self.state or {index: self.zeros(index) for index in indices}
-        self.update(indices, learning_rate)
+        self.state = self.state or {index: self.zeros(index) for index in range(len(self.parameters))}
+        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
+        if gradients[0].device.type == "cuda":
+            self.graphed(torch.full((), learning_rate, device=gradients[0].device), *gradients)
+        else:
+            self.update(range(len(self.parameters)), learning_rate)
 
-    def update(self, indices: Sequence[int], learning_rate: float) -> None:
+    def update_by(self, learning_rate: torch.Tensor, *gradients: torch.Tensor) -> list[torch.Tensor]:
+        """Update the parameters by these gradients, on a GPU; returns nothing."""
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        self.update(range(len(self.parameters)), learning_rate)
+        return []
+
+    def update(self, indices: Sequence[int], learning_rate: float | torch.Tensor) -> None:
         """Update the parameters with these indices, whose state is there, by their gradients."""
         parameters: list[torch.Tensor] = [self.parameters[index] for index in indices]
         steps, averages, squares = ([self.state[index][name] for index in indices] for name in AVERAGES)

@@ -6,17 +6,22 @@ measured in real recordings: the road's median colour in the shade is (0.26, 0.3
 """
 
 import functools
+from typing import TypeVar
 
 import cv2
 import numpy as np
+import torch
 
 from cloning.base.frame import FRAME
 from cloning.network.network import SEEN_SHAPE
+from cloning.training import gpu
 from cloning.training.recipe import Recipe
 
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour
 WIDTHS, SOFTNESS, RAGGED = (4, 400), (0.3, 4), (0, 25)  # pixels: of a shadow, of its edges' blur, of their displacement
+
+Images = TypeVar("Images", np.ndarray, torch.Tensor)  # on the CPU or on a GPU
 
 
 def multiply_channel(images: np.ndarray, channel: int, factors: np.ndarray, to: int, back: int) -> np.ndarray:
@@ -37,8 +42,10 @@ def choose_brightness(recipe: Recipe, rng: np.random.Generator, n: int) -> tuple
     return (rng.uniform(*recipe.brightness, n),)
 
 
-def brighten(images: np.ndarray, first_row: int, factors: np.ndarray) -> np.ndarray:
+def brighten(images: Images, first_row: int, factors: np.ndarray) -> Images:
     """Multiply the HSV value of RGB images, uint8 (n, rows, columns, 3), clipped at 255; factors: (n,)."""
+    if isinstance(images, torch.Tensor):
+        return gpu.brightened(images, gpu.to_device(factors, images.device))[0]
     return multiply_channel(images, 2, factors, cv2.COLOR_RGB2HSV, cv2.COLOR_HSV2RGB)
 
 
@@ -47,7 +54,7 @@ def choose_shadow(recipe: Recipe, rng: np.random.Generator, n: int) -> tuple[np.
     return rng.uniform(*recipe.darkness, n), rng.uniform(0, FRAME[1], (n, 2)), rng.random(n) < 0.5
 
 
-def shade(images: np.ndarray, first_row: int, factors: np.ndarray, lines: np.ndarray, left: np.ndarray) -> np.ndarray:
+def shade(images: Images, first_row: int, factors: np.ndarray, lines: np.ndarray, left: np.ndarray) -> Images:
     """Multiply the HLS lightness of RGB images, uint8 (n, rows, columns, 3), on one side of a line.
 
     first_row: the row of the full frame that is the images' first; factors: (n,); lines: (n, 2), the columns at which
@@ -55,6 +62,8 @@ def shade(images: np.ndarray, first_row: int, factors: np.ndarray, lines: np.nda
     """
     rows = np.arange(first_row, first_row + images.shape[1])
     edges = (lines[:, :1] + (lines[:, 1:] - lines[:, :1]) * rows / FRAME[0]).astype(np.float32)
+    if isinstance(images, torch.Tensor):
+        return gpu.darkened(images, *(gpu.to_device(each, images.device) for each in (factors, edges, left)))[0]
     lit = (np.arange(images.shape[2], dtype=np.float32) < edges[:, :, None]) != left[:, None, None]
     shaded = multiply_channel(images, 1, factors, cv2.COLOR_RGB2HLS, cv2.COLOR_HLS2RGB)
     np.copyto(shaded.view("V3"), images.view("V3"), where=lit[..., None])  # by pixels: takes a tenth of the time
@@ -80,11 +89,11 @@ def sample_shades(share: float, rng: np.random.Generator, n: int) -> np.ndarray:
 def relight(image: np.ndarray, colours: np.ndarray, shade: int) -> np.ndarray:
     """Return an image, uint8 (75, 320, 3), in another light; colours: of `tints`; shade: of `sample_shades`."""
     image = cv2.transform(image, colours)
-    return image if shade < 0 else cv2.multiply(image, _shades()[shade], scale=1 / 255)
+    return image if shade < 0 else cv2.multiply(image, shades()[shade], scale=1 / 255)
 
 
 @functools.cache
-def _shades() -> np.ndarray:
+def shades() -> np.ndarray:
     """Return pictures of shadows, which are always the same: uint8 (SHADES, 75, 320, 3), 255 in the sun."""
     rng = np.random.default_rng(0)
     rows, columns, _ = SEEN_SHAPE

@@ -65,7 +65,7 @@ class Muon(Adam):
             return super().zeros(index)
         return {"momentum": torch.zeros_like(self.parameters[index])}
 
-    def update(self, indices: Sequence[int], learning_rate: float) -> None:
+    def update(self, indices: Sequence[int], learning_rate: float | torch.Tensor) -> None:
         """Update the parameters with these indices, as Adam's."""
         super().update([index for index in indices if not self.is_matrix(index)], learning_rate)
         for index in filter(self.is_matrix, indices):
@@ -75,7 +75,7 @@ class Muon(Adam):
             ahead = parameter.grad.lerp(average, self.matrix_momentum).flatten(1)  # Nesterov's
             far = SIZE_OF_ADAMS_STEP * max(ahead.shape) ** 0.5
             parameter.mul_(1 - learning_rate * self.matrix_decay)
-            parameter.sub_(orthogonal(ahead).reshape(parameter.shape), alpha=learning_rate * far)
+            parameter.sub_(orthogonal(ahead).reshape(parameter.shape) * (learning_rate * far))
 
 
 OPTIMIZERS = {"adam": Adam, "muon": Muon}

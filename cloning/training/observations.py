@@ -1,22 +1,26 @@
 """Observations: the rows that training and validation use, their labels and images, and what a batch has of them."""
 
+import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import cv2
 import numpy as np
+import torch
 
 from cloning.base.errors import RecordingError
 from cloning.base.frame import ROAD_ROWS
 from cloning.base.table import Column, Table
-from cloning.network.network import SEEN_ROWS
+from cloning.network.network import CROP, SEEN_ROWS
 from cloning.recordings.format import CAMERAS, DRIVE_GAP, PROBLEM_AREAS
 from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.log import CheckedRecording, Recording
+from cloning.training.gpu import GpuFrames, to_device
 from cloning.training.lanes import Lanes
-from cloning.training.recipe import Recipe
+from cloning.training.recipe import Augmentation, Recipe
 
 
 class ValidationSet(NamedTuple):
@@ -84,6 +88,22 @@ class Choices(NamedTuple):
     views: Views
 
 
+def batch_images(
+    choices: Choices, augmentations: Sequence[Augmentation], mine: np.ndarray, at: np.ndarray
+) -> torch.Tensor:
+    """Return a process's share of a batch's images: uint8 (k, 75, 320, 3).
+
+    mine: int (n,), the observations of its share; at: int (n, augmentations), where in it each image is, -1 if it is
+    not made.
+    """
+    kinds = zip(augmentations, choices.views.images(mine), choices.augmenting, strict=True)
+    changed: list[Any] = [
+        kind.change(seen, CROP[0], *(column[mine] for column in chosen)) for kind, seen, chosen in kinds
+    ]
+    order = np.argsort(at.ravel())[(at < 0).sum() :]
+    return torch.stack(changed, dim=1).flatten(0, 1)[to_device(order, changed[0].device)]
+
+
 @dataclass(frozen=True)
 class Observations(Table):
     """Observations in columns: one entry for each row of a recording that is used, or for a copy of it.
@@ -95,6 +115,7 @@ class Observations(Table):
     frame       uint64 (n,): digest of the centre image's file
     time        float64 (n,): seconds
     lanes       the lane at each of them, which the report's training does not know
+    gpu         their frames in a GPU's memory, if images are made there
     """
 
     recordings: list[Recording]
@@ -104,6 +125,7 @@ class Observations(Table):
     frame: Column
     time: Column
     lanes: Lanes
+    gpu: GpuFrames | None = None
 
     @classmethod
     def of_rows(cls, recording: CheckedRecording, rows: np.ndarray, steering: np.ndarray, lanes: Lanes) -> Self:
@@ -160,9 +182,46 @@ class Observations(Table):
         """
         return self.recordings[self.recording[at]].road(row, camera, read_checked)
 
-    def center(self, rows: np.ndarray) -> np.ndarray:
-        """Return the centre images of these observations, cropped: uint8 (len(rows), 75, 320, 3), RGB."""
-        return np.stack([self.read_cropped(at, 0) for at in rows])
+    def cropped(self, rows: np.ndarray, cameras: np.ndarray) -> Any:
+        """Return what the network sees of these k frames: uint8 (k, 75, 320, 3), RGB."""
+        if self.gpu:
+            return self.road_on_gpu(rows, self.row[rows], cameras)[:, SEEN_ROWS.start - ROAD_ROWS.start :]
+        return np.stack([self.read_cropped(*one) for one in zip(rows, cameras, strict=True)])
+
+    def center(self, rows: np.ndarray) -> Any:
+        """Return the centre images of these observations, as `cropped` does."""
+        return self.cropped(rows, np.zeros(len(rows), int))
+
+    # ---- on a GPU
+
+    def on_gpu(self, device: torch.device, pool: Executor) -> Self:
+        """Return the observations with their frames in the GPU's memory, or as they are if these don't fit.
+
+        pool: its threads decode the frames.
+        """
+        used, read = list[np.ndarray](), list[Callable[[], np.ndarray]]()
+        for index, recording in enumerate(self.recordings):
+            mine = self.recording == index
+            rows = np.unique(np.concatenate([self.row[mine], self.lanes.earlier[mine]]))
+            images, first = np.unique(recording.images[rows], return_index=True)
+            used.append(np.isin(np.arange(len(recording.names)), images))
+            for row, camera in zip(rows[first // len(CAMERAS)], first % len(CAMERAS), strict=True):
+                read.append(functools.partial(recording.road, row, camera, read_checked))
+        frames = GpuFrames(used, device)
+        if not frames.fit():
+            print("the frames do not fit into the GPU's memory: images are made by the CPU")
+            return self
+        return replace(self, gpu=frames.load(read, pool))
+
+    def road_on_gpu(self, at: np.ndarray, row: np.ndarray, camera: np.ndarray) -> torch.Tensor:
+        """Return the `ROAD_ROWS` of frames of k observations' recordings, from the GPU's memory: uint8 (k, 90, 320, 3).
+
+        at, row, camera: int (k,), the observations, the rows of their recordings, and the cameras.
+        """
+        assert self.gpu
+        recording = self.recording[at]
+        images = [self.recordings[r].images[i, c] for r, i, c in zip(recording, row, camera, strict=True)]
+        return self.gpu.road(recording, np.array(images))
 
 
 def read_checked(path: Path) -> np.ndarray:
@@ -201,12 +260,14 @@ class CameraViews:
 
     def images(self, part: np.ndarray) -> list[np.ndarray]:
         """See Views."""
-        chosen = zip(self.rows[part], self.cameras[part], strict=True)
-        return self._mirrored(np.stack([self.observations.read_cropped(row, camera) for row, camera in chosen]))
+        return self._mirrored(self.observations.cropped(self.rows[part], self.cameras[part]))
 
-    def _mirrored(self, images: np.ndarray) -> list[np.ndarray]:
+    def _mirrored(self, images: Any) -> list[Any]:
         """Return the images, uint8 (n, rows, columns, 3), or the flipped ones, as each augmentation needs them."""
-        flipped = cv2.flip(images.reshape(-1, *images.shape[2:]), 1).reshape(images.shape)
+        if isinstance(images, torch.Tensor):
+            flipped = images.flip(2)
+        else:
+            flipped = cv2.flip(images.reshape(-1, *images.shape[2:]), 1).reshape(images.shape)
         return [flipped if mirrors else images for mirrors in self.mirrors]
 
     def example(self, i: int) -> Example:

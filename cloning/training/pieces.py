@@ -13,8 +13,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from cloning.network.compute import in_precision
+from cloning.network.compute import Graphed, in_precision
 
+GPU_PIECE = 512  # images at most that a GPU predicts together
+GPU_SIZES = 16  # of batches on a GPU are multiples of this, because each size is recorded: see Graphed
 PIECE = 28  # images at most: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -23,30 +25,30 @@ Module = TypeVar("Module", bound=nn.Module)
 class Batch:
     """One process's share of a batch.
 
-    images  uint8 (n, 75, 320, 3), RGB, cropped
+    images  uint8 (n, 75, 320, 3), RGB, cropped; a tensor if they were made on a GPU
     labels  float32 (n,): steering, -1..1
     keep    bool (n, units): the units of the flattened layer that dropout keeps; None: all
     total   images in the whole batch, of all processes
     """
 
-    images: np.ndarray
+    images: Any
     labels: np.ndarray
     keep: np.ndarray | None
     total: int
 
-    def part(self, piece: slice) -> "Batch":
-        """Return some of the images."""
-        keep = None if self.keep is None else self.keep[piece]
-        return Batch(self.images[piece], self.labels[piece], keep, self.total)
+    def part(self, piece: slice) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """Return some images, their labels, and the units that are kept."""
+        keep = None if self.keep is None else torch.from_numpy(self.keep[piece])
+        return torch.as_tensor(self.images[piece]), torch.from_numpy(self.labels[piece]), keep
 
 
-def pieces(images: int) -> list[slice]:
-    """Return the pieces of a batch of this many images: of about the same size, at most PIECE.
+def pieces(images: int, most: int = PIECE) -> list[slice]:
+    """Return the pieces of a batch of this many images: of about the same size, at most `most`.
 
     Their number is even, so that two threads finish together, and the same on every machine, as are then the sums; none
     is empty.
     """
-    count = min(images, 2 * math.ceil(images / (2 * PIECE)))
+    count = min(images, 2 * math.ceil(images / (2 * most)))
     edges = [images * piece // count for piece in range(count + 1)] if count else [0]
     return [slice(*ends) for ends in itertools.pairwise(edges)]
 
@@ -57,16 +59,23 @@ def converted(network: Module, precision: torch.dtype) -> Module:
     return network if same else copy.deepcopy(network).to(precision)
 
 
-def squared_errors(network: nn.Module, batch: Batch, huber: float | None = None) -> torch.Tensor:
+def squared_errors(
+    network: nn.Module,
+    images: torch.Tensor,
+    labels: torch.Tensor,
+    keep: torch.Tensor | None,
+    huber: float | None = None,
+    real: torch.Tensor | None = None,
+) -> torch.Tensor:
     """Return the sum over the images of (predicted - label)², a scalar, float32.
 
-    huber: error beyond which the gradient is that of Huber's loss, which grows linearly; None: at no error. The value
+    images, labels, keep: as in Batch; real: float32 (n,), 0 for an image that does not count, else 1; huber: error
+    beyond which the gradient is that of Huber's loss, which grows linearly; None: at no error. The value
     is the squared errors' nevertheless.
     """
-    device = next(network.parameters()).device
-    keep = None if batch.keep is None else torch.from_numpy(batch.keep).to(device)
-    predicted = network(torch.from_numpy(batch.images).to(device), keep)
-    error = predicted - torch.from_numpy(batch.labels).to(device)
+    error = network(images, keep) - labels
+    if real is not None:
+        error = error * real
     known = error.detach()
     slope = 2 * (known if huber is None else known.clamp(-huber, huber))
     return (known**2 + slope * (error - known)).sum()  # the second term is 0, and has the gradient
@@ -100,6 +109,7 @@ class SquaredErrors(nn.Module):
         self.network, self.precision, self.pool, self.huber = network, precision, pool, huber
         self.device = next(network.parameters()).device
         on_cpu = self.device.type == "cpu"
+        self.graphed = Graphed(self.gradients)
         # In a tuple, because the weights of the copy are not this module's parameters.
         self.converted = (converted(network, precision) if on_cpu else network,)
 
@@ -113,8 +123,32 @@ class SquaredErrors(nn.Module):
             in_pieces = functools.partial(self.in_pieces, batch, meanwhile)
             return WithGradients.apply(in_pieces, *self.network.parameters())
         meanwhile()
+        if self.device.type == "cuda":
+            return WithGradients.apply(functools.partial(self.on_gpu, batch), *self.network.parameters())
+        images, labels, keep = batch.part(slice(None))
         with in_precision(self.precision, self.device):
-            return squared_errors(self.network, batch, self.huber)
+            keep = None if keep is None else keep.to(self.device)
+            return squared_errors(self.network, images.to(self.device), labels.to(self.device), keep, self.huber)
+
+    def on_gpu(self, batch: Batch) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Return the sum and its gradients; images that do not count fill the batch up to one of a few sizes."""
+        n = len(batch.labels)
+        room = -(-n // GPU_SIZES) * GPU_SIZES
+        values = [batch.images, batch.labels, np.ones(n, np.float32), *([] if batch.keep is None else [batch.keep])]
+        arguments = []
+        for each in map(torch.as_tensor, values):
+            arguments.append(torch.zeros((room, *each.shape[1:]), dtype=each.dtype, device=self.device))
+            arguments[-1][:n] = each
+        total, *gradients = self.graphed(*arguments)
+        return total, gradients
+
+    def gradients(
+        self, images: torch.Tensor, labels: torch.Tensor, real: torch.Tensor, keep: torch.Tensor | None = None
+    ) -> list[torch.Tensor]:
+        """Return the sum of the squared errors of real images, and its gradients."""
+        with torch.enable_grad(), in_precision(self.precision, self.device):
+            total = squared_errors(self.network, images, labels, keep, self.huber, real)
+            return [total.detach(), *torch.autograd.grad(total, list(self.network.parameters()))]
 
     def in_pieces(self, batch: Batch, meanwhile: Callable[[], None]) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Return the sum and its gradients, computed in pieces, each by one thread of the pool.
@@ -128,7 +162,8 @@ class SquaredErrors(nn.Module):
 
         def compute(part: slice) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
             with torch.enable_grad():
-                errors = squared_errors(network, batch.part(part), self.huber)
+                images, labels, keep = batch.part(part)
+                errors = squared_errors(network, images, labels, keep, self.huber)
             return errors.detach(), torch.autograd.grad(errors, weights)
 
         done = self.pool.map(compute, pieces(len(batch.labels)))
@@ -142,7 +177,7 @@ class SquaredErrors(nn.Module):
 
 def predict(
     network: nn.Module,
-    images: Callable[[np.ndarray], np.ndarray],
+    images: Callable[[np.ndarray], Any],
     rows: np.ndarray,
     device: torch.device,
     precision: torch.dtype,
@@ -155,7 +190,7 @@ def predict(
 
     def part(chosen: np.ndarray) -> np.ndarray:
         with torch.inference_mode(), in_precision(precision, device):
-            return network(torch.from_numpy(images(chosen)).to(device)).cpu().numpy()
+            return network(torch.as_tensor(images(chosen)).to(device)).cpu().numpy()
 
-    parts = [rows[piece] for piece in pieces(len(rows))]
+    parts = [rows[piece] for piece in pieces(len(rows), PIECE if device.type == "cpu" else GPU_PIECE)]
     return np.concatenate([np.empty(0, np.float32), *pool.map(part, parts)])

@@ -7,6 +7,7 @@ frame, the recovery steering, drives the car from its pose back to the lane's ce
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -135,8 +136,13 @@ def centre_and_poses(observations: Observations, recipe: Recipe, seed: int) -> l
     ]
 
 
-def warped(observations: Observations, rows: np.ndarray, poses: Sequence[Poses]) -> list[np.ndarray]:
+def warped(observations: Observations, rows: np.ndarray, poses: Sequence[Poses]) -> list[Any]:
     """Return what the network sees of these k observations, for each item of poses: uint8 (k, 75, 320, 3), RGB."""
+    if observations.gpu:
+        every, at = Poses.joined(poses), np.tile(rows, len(poses))
+        road = observations.road_on_gpu(at, observations.row[at], every.camera)
+        earlier = observations.road_on_gpu(at, observations.lanes.earlier[at], every.camera)
+        return list(every.on_gpu(road, earlier).split(len(rows)))
     images = [np.empty((len(rows), *SEEN_SHAPE), np.uint8) for _ in poses]
     for i, at in enumerate(rows):
 
