@@ -18,7 +18,9 @@ from cloning.base.outputs import check_folders, run_all, write_json
 from cloning.recordings.format import PROBLEM_AREAS
 from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
 from cloning.road.autonomy import LIMITS
+from cloning.road.generated import LANDS, MARKINGS
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
+from cloning.road.points import LAND, MARKING, MAX_WIDTH, MIN_WIDTH, WIDTH, read_road
 from cloning.road.track import ROADS, Track
 from cloning.wire.protocol import PORT
 
@@ -43,12 +45,23 @@ WAIT: Options = {
 }
 ROAD: Options = {
     "--track": {
-        "default": "lake",
         "help": f"{', '.join(ROADS)}, or a road generated from its number: road-1, road-2 and so on (default lake)",
     },
+    "--road": {
+        "metavar": "FILE",
+        "help": "drive a road of your own: the points of its centre line in m, as CSV (x,y or x,y,z), JSON "
+        "(road_points) or x,y,z@x,y,z; if its last point is not its first, a lap ends there",
+    },
+    "--width": {
+        "type": number(float, MIN_WIDTH, MAX_WIDTH),
+        "help": f"width of the --road in m (default: the file's, or {WIDTH:g})",
+    },
+    "--marking": {"choices": MARKINGS, "help": f"marking of the --road (default: the file's, or {MARKING})"},
+    "--land": {"choices": LANDS, "help": f"land around the --road (default: the file's, or {LAND})"},
     "--direction": {
         "choices": ("ccw", "cw"),
-        "help": "default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads",
+        "help": "default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads; "
+        "as its points are listed on a --road, where for an open one this is called ccw",
     },
     "--look": {
         "type": number(int, 0),
@@ -187,6 +200,19 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def chosen_track(arguments: argparse.Namespace) -> Track:
+    """Return the track that the ROAD options name. Raises UserError."""
+    own = {name: getattr(arguments, name) for name in ("width", "marking", "land")}
+    given = {name: value for name, value in own.items() if value is not None}
+    if arguments.road is None:
+        if given:
+            raise UserError(f"--{next(iter(given))} is of a road of your own: name its file with --road")
+        return Track("lake" if arguments.track is None else arguments.track, arguments.direction)
+    if arguments.track is not None:
+        raise UserError("--track and --road name two roads; leave one of them out")
+    return Track(read_road(arguments.road, **given), arguments.direction)
+
+
 # Each function imports what its command needs, because `--help` and wrong arguments need neither panda3d nor torch.
 
 
@@ -195,7 +221,7 @@ def run_record(arguments: argparse.Namespace) -> int:
     with program.loading():
         from simulator.record import record
 
-    track = Track(arguments.track, arguments.direction)
+    track = chosen_track(arguments)
     begin = time.perf_counter()
     run, rows = record(
         arguments.folder, track, arguments.laps, arguments.speed, arguments.seed, arguments.look, arguments.recovery
@@ -218,8 +244,8 @@ def run_drive(arguments: argparse.Namespace) -> int:
         from simulator.world import Scene
 
     check_folders(arguments.report, arguments.picture, arguments.film)
-    run = Run(Track(arguments.track, arguments.direction), "autonomous")
-    scene = Scene(scenery.build(arguments.track, arguments.look))
+    run = Run(chosen_track(arguments), "autonomous")
+    scene = Scene(scenery.build(run.track.source, arguments.look))
     client = Client(
         run, Cameras(scene, ("center",)), arguments.host, arguments.port, arguments.wait, arguments.realtime
     )
@@ -250,9 +276,9 @@ def run_correct(arguments: argparse.Namespace) -> int:
         from simulator.world import Scene
 
     check_name_of_corrections(arguments.folder)
-    run = Run(Track(arguments.track, arguments.direction), "autonomous")
+    run = Run(chosen_track(arguments), "autonomous")
     with RecordingWriter(arguments.folder) as recording:
-        scene = Scene(scenery.build(arguments.track, arguments.look))
+        scene = Scene(scenery.build(run.track.source, arguments.look))
         client = CorrectedClient(run, scene, arguments.speed, recording, arguments.host, arguments.port, arguments.wait)
 
         def print_report() -> None:
@@ -284,7 +310,7 @@ def run_window(arguments: argparse.Namespace) -> int:
     ending = PROBLEM_AREAS[-1] if arguments.autonomous else ""
     folder = arguments.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}{ending}"
     server = (arguments.host, arguments.port) if arguments.autonomous else None
-    opened = Window(Track(arguments.track, arguments.direction), folder, arguments.look, server)
+    opened = Window(chosen_track(arguments), folder, arguments.look, server)
     print(HELP, flush=True)
     try:
         opened.run()

@@ -67,9 +67,9 @@ class CorrectedClient(Client):
         if self.correcting:
             self.steering, self.throttle = commands
             self.expert_time += STEP
-        departures = len(self.run.departures)
+        departures, at_end = len(self.run.departures), self.run.at_end
         super().step()
-        if len(self.run.departures) > departures:
+        if at_end or len(self.run.departures) > departures:
             self.correcting = False
 
     def summary(self) -> str:

@@ -31,6 +31,7 @@ from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
+from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
 from simulator import scenery
@@ -73,7 +74,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        track: str = "lake",
+        track: str | PointRoad = "lake",
         direction: str | None = None,
         look: int = 0,
         speed: float = TOP_SPEED_MPH,
@@ -83,13 +84,15 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
     ):
         """Build the track's scene. Raises TrackError for an unknown track, SimulatorError for other arguments.
 
-        track: "lake", "jungle", "road-1", "road-2", …; direction: "ccw", "cw" or None for that of the real simulator;
+        track: "lake", "jungle", "road-1", "road-2", …, or a road of cloning.road.points;
+        direction: "ccw", "cw" or None for that of the real simulator, or in which the road's points are listed;
         look: 0 like the real simulator, any greater number in other light, colours, textures and plants; speed: set
         speed in mph, 1 to 30, which the car never exceeds; laps: after which an episode is truncated, such as 0.5;
         random_start: begin each episode anywhere on the centre line instead of where the autonomous mode does;
         render_mode: "rgb_array" (a view from behind the car) or None.
         """
-        check("track", track, lambda name: isinstance(name, str), "a name, such as 'lake', 'jungle' or 'road-1'")
+        named = "a name, such as 'lake', 'jungle' or 'road-1', or a road of cloning.road.points"
+        check("track", track, lambda source: isinstance(source, str | PointRoad), named)
         check("direction", direction, lambda name: name in ("ccw", "cw", None), "'ccw', 'cw' or None")
         check("look", look, lambda number: number >= 0 and number % 1 == 0, "a whole number from 0")
         check("speed", speed, lambda mph: 1 <= mph <= TOP_SPEED_MPH, f"1 to {TOP_SPEED_MPH} (mph)")

@@ -21,6 +21,7 @@ from cloning.base import program
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError
 from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
+from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
 from simulator import scenery
@@ -57,17 +58,17 @@ def _start_renderer() -> None:
 
 
 @functools.cache
-def _cameras(track: str, look: int) -> Cameras:
-    return Cameras(Scene(scenery.build(track, look)))
+def _cameras(source: str | PointRoad, look: int) -> Cameras:
+    return Cameras(Scene(scenery.build(source, look)))
 
 
-def _prepare(track: str, look: int) -> None:
-    _cameras(track, look)
+def _prepare(source: str | PointRoad, look: int) -> None:
+    _cameras(source, look)
 
 
-def _render(track: str, look: int, transform: TransformState) -> list[bytes]:
+def _render(source: str | PointRoad, look: int, transform: TransformState) -> list[bytes]:
     """Return the three cameras' JPEGs, which depend on the car's pose alone; runs in a rendering process."""
-    return [jpeg(frame) for frame in _cameras(track, look).frames(transform)]
+    return [jpeg(frame) for frame in _cameras(source, look).frames(transform)]
 
 
 def sample(run: Run) -> dict[str, Any]:
@@ -114,7 +115,7 @@ def record(
             recording = stack.enter_context(RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)))
             pool = stack.enter_context(ProcessPoolExecutor(renderers, _renderers_context(), _start_renderer))
             for _ in range(renderers):  # each starts a process
-                pool.submit(_prepare, track.name, look)
+                pool.submit(_prepare, track.source, look)
         bar = stack.enter_context(tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None))
 
         def write() -> None:
@@ -123,9 +124,13 @@ def record(
 
         try:
             while run.travelled < laps * track.length:
+                if run.at_end:
+                    while pending:
+                        write()
+                    recording.begin_drive()
                 run.step(*expert.drive(run))
                 if clock.due(run.time) and expert.recordable:
-                    images = pool.submit(_render, track.name, look, run.car.node.get_transform())
+                    images = pool.submit(_render, track.source, look, run.car.node.get_transform())
                     pending.append((images, sample(run)))
                     if len(pending) > 2 * renderers:
                         write()

@@ -163,7 +163,7 @@ def write_picture(path: str | Path, run: Run) -> None:
     FigureCanvasAgg(figure)
     above, along = figure.subplots(2, 1, height_ratios=[map_inches[1], 1.7])
     above.set_aspect("equal")
-    ring = np.r_[np.arange(len(track.points)), 0]
+    ring = track.wrap(np.arange(round(track.length / track.step) + 1))
     for column, side in enumerate((LEFT, RIGHT)):
         edge = track.points[ring, :2] + side * track.rightward[ring] * track.edges[ring, column, None]
         above.plot(*edge.T, color="0.6", linewidth=0.7)

@@ -59,13 +59,15 @@ class Run:
     steering    of the last step, -1..1, right positive
     throttle    of the last step, -1..1, negative brakes
     lap_times   simulated seconds since the start at which each lap ended
+    at_end      whether the car has come to the end of an open road; the next step then begins at its start again
     """
 
     def __init__(self, track: Track, start: str = "training"):
         """start: the mode of the real simulator whose starting position is used, "training" or "autonomous"."""
         self.track = track
         self.car = Car(build_physics(track))
-        self.s, self.offset = track.starts[start], 0.0
+        self.start, self.at_end = track.starts[start], False
+        self.s, self.offset = self.start, 0.0
         self.time, self.travelled, self.distance = 0.0, 0.0, 0.0
         self.departures: list[Departure] = []
         self.lap_times: list[float] = []
@@ -114,6 +116,9 @@ class Run:
 
         steering, throttle: see `Car.step`.
         """
+        if self.at_end:
+            self.s, self.travelled, self.at_end = self.start, self.laps * self.track.length, False
+            self.set_back()
         self.steering, self.throttle = steering, throttle
         self.car.step(steering, throttle)
         self.time += STEP
@@ -125,6 +130,7 @@ class Run:
         self.distance += self.car.speed * STEP
         if self.travelled >= (self.laps + 1) * length:
             self.lap_times.append(self.time)
+            self.at_end = not self.track.closed
         trajectory = self.trajectory
         trajectory.x.append(position.x)
         trajectory.y.append(position.y)
@@ -138,7 +144,7 @@ class Run:
 
     def off_road(self) -> str:
         """Return the side on which a wheel is beyond the edge of the road, "left" or "right", or an empty string."""
-        i = int(self.s / self.track.step)
+        i = self.track.index(self.s)
         edges = self.track.edges[i - 3 : i + 3]
         if abs(self.offset) + WHEEL_REACH < edges.min(initial=WHEEL_REACH if i < 3 else np.inf):
             return ""  # the usual case: no wheel can reach an edge

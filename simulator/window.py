@@ -80,7 +80,7 @@ class Window(ShowBase):
         self.win.request_properties(properties)
         self.disable_mouse()
         self.simulation = Run(track, "autonomous" if server else "training")
-        self.scene = Scene(scenery.build(track.name, look))
+        self.scene = Scene(scenery.build(track.source, look))
         self.scene.root.reparent_to(self.render)
         self.cameras = Cameras(self.scene)
         self.controls, self.gamepad = Controls(), Gamepad()
@@ -141,6 +141,8 @@ class Window(ShowBase):
             self.simulated_until = max(self.simulated_until + STEP, now - MAX_DELAY)
             self.controls.step(held, mouse, pad)
             self.simulation.car.speed_limit = self.controls.set_speed * MPH
+            if self.simulation.at_end and self.recording_on:
+                self.begin_drive()
             self.simulation.step(driver.steering, driver.throttle)
             if self.recording and self.recording_on and by_hand and self.clock.due(self.simulation.time):
                 write_row(self.recording, self.cameras, self.simulation)

@@ -38,23 +38,24 @@ def configure_engine() -> None:
 
 
 def build_physics(track: Track) -> bullet.BulletWorld:
-    """Return a physics world with the track's ground: a plane for a flat track, else a mesh along it."""
+    """Return a physics world with the track's ground: a plane for a level track, else a mesh along it."""
     configure_engine()
     physics = bullet.BulletWorld()
     physics.set_gravity(core.Vec3(0, 0, -GRAVITY))
     body = bullet.BulletRigidBodyNode("ground")
-    if track.points[:, 2].any():
+    heights = track.points[:, 2]
+    if np.ptp(heights):
         mesh = bullet.BulletTriangleMesh()
         across = np.c_[track.rightward, np.zeros(len(track.rightward))] * GROUND_HALF_WIDTH
         edges = (track.points + side * across for side in (LEFT, RIGHT))
         left, right = ([core.Point3(*point) for point in edge.tolist()] for edge in edges)
-        for i in range(len(left)):
+        for i in range(len(left) if track.closed else len(left) - 1):
             j = (i + 1) % len(left)
             mesh.add_triangle(left[i], right[i], right[j])
             mesh.add_triangle(left[i], right[j], left[j])
         body.add_shape(bullet.BulletTriangleMeshShape(mesh, False))
     else:
-        body.add_shape(bullet.BulletPlaneShape(core.Vec3(0, 0, 1), 0))
+        body.add_shape(bullet.BulletPlaneShape(core.Vec3(0, 0, 1), float(heights[0])))
     physics.attach(body)
     return physics
 

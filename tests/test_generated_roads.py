@@ -133,7 +133,7 @@ def test_records_a_generated_road(tmp_path):
 @pytest.mark.parametrize("number", range(1, 6))
 def test_the_land_never_covers_the_road(number):
     track = Track(f"road-{number}")
-    terrain = Terrain(track, LANDS[number - 1], np.random.default_rng(number), relief=1.5)
+    terrain = Terrain(track, LANDS[generate(number).land], np.random.default_rng(number), relief=1.5)
     for right in np.linspace(-1, 1, 9) * (track.edges[0, 0] + 1):
         positions = track.points[:, :2] + right * track.rightward
         assert np.all(terrain.height_at(positions[:, ::-1]) < track.points[:, 2] - 0.4)
@@ -143,7 +143,7 @@ def test_the_land_never_covers_the_road(number):
 def test_roads_are_marked_as_they_say(number):
     """The colours painted across the road, and what stands or lies at its right edge."""
     marking, track = generate(number).marking, Track(f"road-{number}")
-    light, palette = weather(np.random.default_rng(0), LANDS[0])
+    light, palette = weather(np.random.default_rng(0), LANDS["meadow"])
     soil = np.full((4, 4, 3), 255, np.uint8)
     surface, *others = road_meshes(track, marking, np.random.default_rng(0), Look(light, palette), soil)
     half_width = np.linalg.norm(surface.points[6, :2] - surface.points[0, :2]) / 2

@@ -42,7 +42,7 @@ from cloning.network.network import load_checkpoint
 from cloning.recordings.log import find_folders
 from cloning.replay.score import ORACLE, DrivingMetrics, ReplayReport
 from cloning.road.generated import road_number
-from cloning.road.track import ROADS, find_road
+from cloning.road.track import ROADS, find_points
 from cloning.server.server import MAX_CLIENTS
 from simulator.report import LapReport
 from tools.command import ROOT, command_line, python, run_tool
@@ -173,7 +173,7 @@ def network_of(board: Board, options: argparse.Namespace) -> NetworkResults:
 def measure(options: argparse.Namespace) -> None:
     """Drive the model on the chosen courses, and write the tables after each result. Raises UserError."""
     for track in options.tracks:
-        find_road(track)
+        find_points(track)
     folders = find_folders(options.recordings) if options.recordings else []
     chosen = product(options.tracks, DIRECTIONS, options.looks)
     courses = list(dict.fromkeys((track, direction, look_of(track, look)) for track, direction, look in chosen))

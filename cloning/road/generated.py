@@ -1,4 +1,4 @@
-"""Roads made from a number: closed loops with bends, hills and one of the usual markings.
+"""Roads of points; and those made from a number: closed loops with bends, hills and one of the usual markings.
 
 A random polygon gets round corners and is smoothed; polygons that give too sharp a bend or come too close to themselves
 are refused. The random numbers depend on the road's number alone, so a number always gives the same road.
@@ -13,6 +13,7 @@ from numpy.random import Generator
 
 # Yellow double lines as on the lake, white lines as in the jungle, or no lines and only such an edge.
 MARKINGS = ("yellow double", "white", "kerb", "grass", "dirt", "wall", "rail")
+LANDS = ("meadow", "forest", "desert", "canyon", "highland")
 NAME = re.compile("road-([1-9][0-9]{0,8})")
 SPACING = 2.0  # m between the points
 MIN_LENGTH, MAX_LENGTH = 600.0, 1500.0  # m
@@ -25,18 +26,37 @@ ROUNDING = 9.0  # m over which corners are averaged, so that the steering need n
 FLAT_SHARE = 0.12  # share of roads without hills
 
 
-@dataclass(frozen=True)
-class GeneratedRoad:
-    """A road made from a number.
+@dataclass(frozen=True, eq=False)
+class PointRoad:
+    """A road given by the points of its centre line; roads of the same content are equal.
 
-    points   float64 (n, 3): m, the centre line of a closed loop, counter-clockwise, about 2 m apart
+    name     of the track
+    points   float64 (n, 3): m east, north and up; the first point of a closed loop is not repeated
     width    m, of the road surface
     marking  one of MARKINGS
+    land     one of LANDS
+    closed   whether it is a loop; an open road is driven from its first point to its last
+    lead     m that an open road goes on straight before its first and after its last point
+    seed     of the random numbers of its land and light
     """
 
+    name: str
     points: np.ndarray
     width: float
     marking: str
+    land: str
+    closed: bool = True
+    lead: float = 0.0
+    seed: int = 0
+
+    def _content(self) -> tuple[object, ...]:
+        return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in vars(self).values())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PointRoad) and self._content() == other._content()
+
+    def __hash__(self) -> int:
+        return hash(self._content())
 
 
 def road_number(name: str) -> int | None:
@@ -45,15 +65,19 @@ def road_number(name: str) -> int | None:
     return int(match[1]) if match else None
 
 
-def generate(number: int) -> GeneratedRoad:
-    """Return the road of a number, 1 or more."""
+def generate(number: int) -> PointRoad:
+    """Return the road of a number, 1 or more: counter-clockwise, with points about 2 m apart.
+
+    35 roads one after another have all combinations of marking and land.
+    """
     rng = np.random.default_rng(number)
     width = rng.uniform(MIN_WIDTH, MAX_WIDTH)
     winding = 2 * np.pi * rng.uniform(1, 2.3)
     flat = next(loop for loop in (draw_loop(rng, winding) for _ in itertools.count()) if loop is not None)
     points = np.c_[flat, hills(rng, len(flat))]
     # Rounded, because the last bit of a sine differs from machine to machine.
-    return GeneratedRoad(points.round(4), round(width, 2), MARKINGS[(number - 1) % len(MARKINGS)])
+    marking, land = (kinds[(number - 1) % len(kinds)] for kinds in (MARKINGS, LANDS))
+    return PointRoad(f"road-{number}", points.round(4), round(width, 2), marking, land, seed=number)
 
 
 def draw_loop(rng: Generator, winding: float) -> np.ndarray | None:

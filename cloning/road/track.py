@@ -1,14 +1,16 @@
 """The tracks: their centre lines and edges, and the position of a point relative to them."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from cloning.base.errors import TrackError
-from cloning.road.generated import generate, road_number
+from cloning.road.generated import PointRoad, generate, road_number
 from cloning.road.motion import right_of, wrap_angle
 
+FOLDER = Path(__file__).parent
 LEFT, RIGHT = -1, 1  # sides of a road, with the signs of lateral offsets
 
 
@@ -89,18 +91,20 @@ ROADS = {
 }
 
 
-def find_road(name: str) -> tuple[Road, np.ndarray]:
-    """Return a track's properties and the points of its centre line, float64 (n, 2) or (n, 3), m.
+def find_points(source: str | PointRoad) -> PointRoad | None:
+    """Return the road of points that a track's source is, or None for the real simulator's tracks.
 
-    name: a key of ROADS, or road-N for the generated road of the number N. Raises TrackError if there is none.
+    source: a key of ROADS, road-N for the generated road of the number N, or a road of points itself. Raises TrackError
+    if there is no such track.
     """
-    if name in ROADS:
-        return ROADS[name], np.loadtxt(Path(__file__).with_name(f"{name}.csv"), delimiter=",", skiprows=1)
-    number = road_number(name)
+    if isinstance(source, PointRoad) or source in ROADS:
+        return source if isinstance(source, PointRoad) else None
+    number = road_number(source)
     if number is None:
-        raise TrackError(f"{name[:40]}: there is no such track; there are {', '.join(ROADS)}, road-1, road-2 and so on")
-    generated = generate(number)
-    return Road(forward="ccw", edge=generated.width / 2), generated.points
+        raise TrackError(
+            f"{source[:40]}: there is no such track; there are {', '.join(ROADS)}, road-1, road-2 and so on"
+        )
+    return generate(number)
 
 
 class Track:
@@ -114,50 +118,90 @@ class Track:
     edges      float64 (n, 2): metres from the centre line to the left and the right edge of the road surface
     length     of a lap, m
     step       between two points, m
+    source     what it was made from, see `find_points`
+    closed     whether it is a loop
+    first      number of points before s = 0: an open road goes on straight beyond both ends
     starts     s at which the modes "training" and "autonomous" start
     """
 
-    def __init__(self, name: str, direction: str | None = None):
-        """Load a track; name: see `find_road`; direction: "cw", "ccw" or None for the road's `forward`.
+    def __init__(self, source: str | PointRoad, direction: str | None = None):
+        """Load a track; source: see `find_points`; direction: "cw", "ccw" or None for the road's `forward`.
 
-        Raises TrackError if there is no such track.
+        An open road's `forward` is "ccw", whatever its shape. Raises TrackError if there is no such track.
         """
-        from scipy.interpolate import CubicSpline  # large, and not needed to train as the report does
-
-        road, listed = find_road(name)
-        self.name, self.direction = name, direction or road.forward
+        self.source, of_points = source, find_points(source)
+        if of_points is None:
+            road, listed = ROADS[str(source)], np.loadtxt(FOLDER / f"{source}.csv", delimiter=",", skiprows=1)
+        else:
+            listed = of_points.points
+            x, y = listed[:, :2].T
+            clockwise = of_points.closed and (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0
+            road = Road(forward="cw" if clockwise else "ccw", edge=of_points.width / 2)
+        self.name = of_points.name if of_points else str(source)
+        self.direction, self.closed = direction or road.forward, of_points is None or of_points.closed
         if listed.shape[1] == 2:
             listed = np.c_[listed, np.zeros(len(listed))]
-        points = np.vstack([listed, listed[:1]])
-        chord = np.r_[0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-        fine = CubicSpline(chord, points, bc_type="periodic")(np.arange(0, chord[-1], 0.05))
-        fine = np.vstack([fine, fine[:1]])
-        along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(fine[:, :2], axis=0), axis=1))]
-        self.length = float(along[-1])
-        n = round(self.length)
-        self.step = self.length / n
-        self.points = np.column_stack([np.interp(np.arange(n) * self.step, along, fine[:, i]) for i in range(3)])
+        self.points: np.ndarray
+        self._place_points(listed, of_points.lead if of_points else 0.0)
+        n = len(self.points)
         self.edges = np.full((n, 2), road.edge)
         for kerb in road.kerbs:
             self.edges[self._indices(kerb.start, kerb.end), 0 if kerb.side == LEFT else 1] = road.kerb_edge
         if road.bridge_edge is not None:
             self.edges[self._indices(*road.bridge)] = road.bridge_edge
-        if self.direction != road.forward:  # the first point remains the first
-            self.points = np.roll(self.points[::-1], 1, axis=0)
-            self.edges = np.roll(self.edges[::-1, ::-1], 1, axis=0)
-        around = np.roll(self.points, -1, axis=0) - np.roll(self.points, 1, axis=0)
+        if self.direction != road.forward:  # a loop's first point remains the first
+            self.points = np.roll(self.points[::-1], 1 if self.closed else 0, axis=0)
+            self.edges = np.roll(self.edges[::-1, ::-1], 1 if self.closed else 0, axis=0)
+        before, after = self._beyond(self.points)
+        around = np.vstack([self.points[1:], after]) - np.vstack([before, self.points[:-1]])
         flat = np.linalg.norm(around[:, :2], axis=1)
         tangent = around[:, :2] / flat[:, None]
         self.rightward = right_of(tangent)
         self.grade = around[:, 2] / flat
         self.heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-        turn = np.diff(np.r_[self.heading, self.heading[0] + self.turns()])
+        turn = np.diff(np.r_[self.heading, self.heading[0] + self.turns() if self.closed else self.heading[-1]])
+        ends = (turn[-3:], turn[:2]) if self.closed else (np.zeros(3), np.zeros(2))
         kernel = np.ones(5) / 5
-        self.curvature = -np.convolve(np.r_[turn[-3:], turn, turn[:2]], kernel, "valid")[:n] / self.step
+        self.curvature = -np.convolve(np.r_[ends[0], turn, ends[1]], kernel, "valid")[:n] / self.step
         self.starts = {
             mode: self.locate(*start)[0] if start else 0.0
             for mode, start in (("training", road.training), ("autonomous", road.autonomous))
         }
+
+    def _place_points(self, listed: np.ndarray, lead: float) -> None:
+        """Place points about 1 m apart on a smooth curve through those listed, float64 (n, 3).
+
+        lead: m of straight road before and after an open road.
+        """
+        from scipy.interpolate import CubicSpline  # large, and not needed to train as the report does
+
+        ring = np.vstack([listed, listed[:1]]) if self.closed else listed
+        chord = np.r_[0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))]
+        curve = CubicSpline(chord, ring, bc_type="periodic" if self.closed else "natural")
+        fine = np.vstack([curve(np.arange(0, chord[-1], 0.05)), ring[-1:]])
+        along = np.r_[0, np.cumsum(np.linalg.norm(np.diff(fine[:, :2], axis=0), axis=1))]
+        self.length = float(along[-1])
+        n = round(self.length)
+        self.step = self.length / n
+        s = np.arange(n if self.closed else n + 1) * self.step
+        self.points = np.column_stack([np.interp(s, along, fine[:, i]) for i in range(3)])
+        self.first = round(lead / self.step)
+        if self.first:
+            before, after = self._beyond(self.points)
+            steps = np.arange(1, self.first + 1)[:, None]
+            start, end = self.points[0], self.points[-1]
+            self.points = np.vstack([start + steps[::-1] * (before - start), self.points, end + steps * (after - end)])
+
+    def _beyond(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points before the first and after the last one, (3,): of the loop, or straight on."""
+        if self.closed:
+            return points[-1], points[0]
+        return 2 * points[0] - points[1], 2 * points[-1] - points[-2]
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """The first and the last s at which there is road: those of a lap, or of an open road with its leads."""
+        return -self.first * self.step, self.length + self.first * self.step
 
     def turns(self) -> float:
         """Return by how many radians the heading grows over a lap."""
@@ -167,16 +211,18 @@ class Track:
         """Return the indices of the points from `start` to `end` metres along the file's direction."""
         return np.arange(round(start / self.step), round(end / self.step) + 1) % len(self.points)
 
+    def wrap(self, i: np.ndarray) -> np.ndarray:
+        """Return the index of each i-th point from s = 0 on, int (n,): round the loop, or up to an open road's ends."""
+        return i % len(self.points) if self.closed else np.clip(i + self.first, 0, len(self.points) - 1)
+
     def index(self, s: float) -> int:
         """Return the index of the last point at or before s metres along the track."""
-        return int(s / self.step) % len(self.points)
+        return int(self.wrap(np.array(math.floor(s / self.step))))
 
     def at(self, s: float, right: float = 0.0) -> Pose:
         """Return the pose at s metres along the track, `right` metres to the right of the centre line."""
-        n = len(self.points)
-        i, part = divmod(s / self.step, 1)
-        i = int(i) % n
-        j = (i + 1) % n
+        number, part = divmod(s / self.step, 1)
+        i, j = self.wrap(int(number) + np.arange(2)).tolist()
         x, y, z = self.points[i] * (1 - part) + self.points[j] * part
         heading = self.heading[i] + part * wrap_angle(self.heading[j] - self.heading[i])
         grade = self.grade[i] * (1 - part) + self.grade[j] * part
@@ -188,17 +234,18 @@ class Track:
         near: s shortly before. Only points within 15 m of it are searched, which is fast and keeps the car on its road
         where the track crosses itself.
         """
-        n = len(self.points)
         if near is None:
-            indices = np.arange(n)
+            indices = np.arange(len(self.points))
         else:
-            indices = np.arange(int(near / self.step) - 15, int(near / self.step) + 16) % n
+            indices = self.wrap(np.arange(int(near / self.step) - 15, int(near / self.step) + 16))
         away = self.points[indices, :2] - (x, y)
         i = int(indices[np.argmin(np.einsum("ij,ij->i", away, away))])
         dx, dy = x - self.points[i, 0], y - self.points[i, 1]
         right_x, right_y = self.rightward[i]
         ahead = dy * right_x - dx * right_y  # the tangent is the vector to the right, turned left
         bend = 1 - self.curvature[i] * (dx * right_x + dy * right_y)
-        s = (i * self.step + ahead / max(bend, 0.2)) % self.length
+        s = (i - self.first) * self.step + ahead / max(bend, 0.2)
+        if self.closed:
+            s %= self.length
         there = self.at(s)
         return s, float((x - there.x) * np.sin(there.heading) - (y - there.y) * np.cos(there.heading))

@@ -4,31 +4,31 @@ from dataclasses import replace
 
 import numpy as np
 
-from cloning.road.generated import road_number
-from cloning.road.track import Track
+from cloning.road.generated import PointRoad
+from cloning.road.track import Track, find_points
 from simulator.scenery import generated, jungle, lake
 from simulator.scenery.looks import SHADOWED, expose, make_shade_style
 from simulator.scenery.parts import Scenery
 from simulator.scenery.shade import Shade
 
 
-def build(track: str, look: int = 0) -> Scenery:
-    """Return the scenery of a track that `cloning.road.track.Track` knows.
+def build(source: str | PointRoad, look: int = 0) -> Scenery:
+    """Return the scenery of a track; source: what `cloning.road.track.Track` takes.
 
-    Look 0 resembles the real simulator, or is a generated road's own; any other number gives other light, textures and
+    Look 0 resembles the real simulator, or is a road of points' own; any other number gives other light, textures and
     plants on the same road. Look n + SHADOWED is look n with shadows, and brighter if its road would be darker than in
     any real frame.
     """
-    number, base = road_number(track), look % SHADOWED
-    if number is None:
-        scenes = {"lake": lake, "jungle": jungle}[track]
+    road_of_points, base = find_points(source), look % SHADOWED
+    if road_of_points is None:
+        scenes = {"lake": lake, "jungle": jungle}[str(source)]
         scenery, elevation = scenes.scenery(base), scenes.SHADOW_ELEVATION
     else:
-        scenery, elevation = generated.scenery(number, base), generated.SHADOW_ELEVATION
+        scenery, elevation = generated.scenery(road_of_points, base), generated.SHADOW_ELEVATION
     style = make_shade_style(look)
     if style is None:
         return scenery
-    shade = Shade(Track(track), scenery.meshes, scenery.light, style, elevation)
+    shade = Shade(Track(source), scenery.meshes, scenery.light, style, elevation)
     # Of the meshes along the road the asphalt has the most points. Its darkest 2 % are left out as single spots; the
     # shade of cliffs, where it is part of the colours, covers more.
     road = max((mesh for mesh in scenery.meshes if mesh.road is not None), key=lambda mesh: len(mesh.points))

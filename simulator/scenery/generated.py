@@ -1,4 +1,4 @@
-"""The scenery of generated roads: one of five lands, and what the road's own marking puts at its edges."""
+"""The scenery of roads of points, generated or one's own: one of five lands, and what the road's marking puts at it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from numpy.random import Generator
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.distance import cdist
 
-from cloning.road.generated import generate
+from cloning.road.generated import PointRoad
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.scenery import looks, planting, textures
 from simulator.scenery.jungle import CLEAR_DISTANCE, DASH, GAP
@@ -140,8 +140,7 @@ HIGHLAND = Land(
     ),
     boulders=14,
 )
-# Road n has the land at (n - 1) modulo their number, as it has the marking; 35 roads have all combinations.
-LANDS = (MEADOW, FOREST, DESERT, CANYON, HIGHLAND)
+LANDS = {"meadow": MEADOW, "forest": FOREST, "desert": DESERT, "canyon": CANYON, "highland": HIGHLAND}
 COMMON_COLOURS: Palette = {
     "zenith": (0.20, 0.33, 0.57),
     "horizon": (0.62, 0.73, 0.88),
@@ -193,11 +192,10 @@ class Terrain:
         low, high = road[:, :2].min(axis=0) - GROUND_MARGIN, road[:, :2].max(axis=0) + GROUND_MARGIN
         self.axes = [grid_axis(*ends) for ends in zip(low, high, strict=True)]
         self.positions = np.stack(np.meshgrid(*self.axes), axis=-1)
-        rows, columns = self.positions.shape[:2]
-        away = cdist(self.positions.reshape(-1, 2), road[:, :2]).reshape(rows, columns, -1)
-        self.distance = away.min(axis=-1)
-        weight = 1 / np.maximum(away, 1.0) ** 4
-        level = (weight * road[:, 2]).sum(axis=-1) / weight.sum(axis=-1)
+        # Row by row, because a road of some kilometres has gigabytes of distances.
+        away = (cdist(row, road[:, :2]) for row in self.positions)
+        nearest = [self._near(distances, road[:, 2]) for distances in away]
+        self.distance, level, lowest = np.moveaxis(np.array(nearest), 1, 0)
         slow = sample(textures.clouds(rng, 256, 24, 4), self.positions)
         rough = sample(textures.clouds(rng, 256, 6, 3), self.positions)
         foot, reach = land.slope
@@ -208,10 +206,19 @@ class Terrain:
         if land.terrace:
             tall = np.round(np.maximum(tall, 0) / land.terrace) * land.terrace
         bumps = 0.3 * rough * np.clip((self.distance - 8) / 8, 0, 1)
-        lowest = np.where(away < CLEAR_DISTANCE, road[:, 2], np.inf).min(axis=-1)
         self.height = np.minimum(level - 0.3 + tall * rise + bumps, lowest - 0.8)
         self.height_at = RegularGridInterpolator(self.axes[::-1], self.height)
         self.distance_at = RegularGridInterpolator(self.axes[::-1], self.distance)
+
+    @staticmethod
+    def _near(away: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return for positions at distances (n, k) m from a road's points their distance from it, and its height there.
+
+        heights: (k,), m; the height is a mean with more weight to nearer points, and then the lowest of near ones.
+        """
+        weight = 1 / np.maximum(away, 1.0) ** 4
+        level = (weight * heights).sum(axis=-1) / weight.sum(axis=-1)
+        return away.min(axis=-1), level, np.where(away < CLEAR_DISTANCE, heights, np.inf).min(axis=-1)
 
 
 def grid_axis(low: float, high: float) -> np.ndarray:
@@ -248,7 +255,7 @@ def road(track: Track, marking: str, rng: Generator, look: Look, soil: np.ndarra
         "white": (Line(edge - 0.12, 0.12, palette["white"]), Line(0.0, 0.11, palette["white"], DASH / (DASH + GAP))),
     }.get(marking, ())
     asphalt = textures.asphalt(rng, grain=rng.uniform(0.03, 0.12) * look.grain, spots=look.spots)
-    s, painted = distances(0, track.length, 2.0), textures.paint_lines(asphalt, palette["asphalt"], end, lines)
+    s, painted = distances(*track.extent, 2.0), textures.paint_lines(asphalt, palette["asphalt"], end, lines)
     material = Material(palette["asphalt"], painted, DASH + GAP)
     meshes = [replace(surface(track, s, end, material), sheen=look.sheen)]
     for side in (LEFT, RIGHT):
@@ -262,10 +269,10 @@ def road(track: Track, marking: str, rng: Generator, look: Look, soil: np.ndarra
 
 def border(track: Track, marking: str, side: int, look: Look, soil: np.ndarray) -> list[Mesh]:
     """Return what marks the road's edge on one side, where lines or grass do not."""
-    s, edge, palette = distances(0, track.length, 2.0), float(track.edges[0, 0]), look.palette
+    s, edge, palette = distances(*track.extent, 2.0), float(track.edges[0, 0]), look.palette
     if marking == "kerb":
         stripes = Material(palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
-        return [roadside(track, distances(0, track.length), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
+        return [roadside(track, distances(*track.extent), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
     if marking == "dirt":
         dirt = Material(palette["dirt"], soil, 5.0)
         return [roadside(track, s, side, (edge - 0.02, edge + 1.3), (0.0, -0.02), dirt)]
@@ -283,7 +290,8 @@ def border(track: Track, marking: str, side: int, look: Look, soil: np.ndarray) 
 def posts(track: Track, look: Look) -> list[Mesh]:
     """Return the posts of the rails on both sides."""
     offset, white, boxes = float(track.edges[0, 0]) + RAIL_DISTANCE + 0.06, textures.plain(), []
-    for s in np.arange(0, track.length - POST_SPACING / 2, POST_SPACING):
+    start, end = track.extent
+    for s in np.arange(start, end - POST_SPACING / 2, POST_SPACING):
         for side in (LEFT, RIGHT):
             pose = track.at(s, side * offset)
             foot = (pose.x, pose.y, pose.z - 0.5)
@@ -322,20 +330,20 @@ def boulders(terrain: Terrain, land: Land, rng: Generator, light: Light, palette
     return [illuminate(merge(meshes), light)] if meshes else []
 
 
-def scenery(number: int, look: int) -> Scenery:
-    """Return the scenery of a generated road in a look; 0 is the road's own.
+def scenery(source: PointRoad, look: int) -> Scenery:
+    """Return the scenery of a road in a look; 0 is the road's own.
 
     The calls draw from one generator, so their order matters.
     """
-    track, marking, land = Track(f"road-{number}"), generate(number).marking, LANDS[(number - 1) % len(LANDS)]
-    appearance = looks.make_look(look, *weather(np.random.default_rng([number, 1]), land))
+    track, land = Track(source), LANDS[source.land]
+    appearance = looks.make_look(look, *weather(np.random.default_rng([source.seed, 1]), land))
     light, palette = appearance.light, appearance.palette
-    rng = np.random.default_rng([number, look])
+    rng = np.random.default_rng([source.seed, look])
     terrain = Terrain(track, land, rng, appearance.relief)
     soil = textures.soil(rng)
     meshes = [
         ground(terrain, rng, light, palette, soil),
-        *road(track, marking, rng, appearance, soil),
+        *road(track, source.marking, rng, appearance, soil),
         planting.mountains(rng, light, palette["ground"], soil),
         *boulders(terrain, land, rng, light, palette),
         *vegetation(terrain, land, rng, palette, appearance.plants),

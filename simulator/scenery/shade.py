@@ -171,8 +171,7 @@ class Shade:
         s = stretch * STRETCH - OVERLAP + (np.arange(rows)[::-1] + 0.5) / rows * LENGTH
         offset = ((np.arange(columns) + 0.5) / columns * 2 - 1) * HALF_WIDTH
         track, (index, part) = self.track, np.divmod(s / self.track.step, 1)
-        i = index.astype(int) % len(track.points)
-        j, part = (i + 1) % len(track.points), part[:, None]
+        i, j, part = track.wrap(index.astype(int)), track.wrap(index.astype(int) + 1), part[:, None]
         middle = track.points[i] * (1 - part) + track.points[j] * part
         across = track.rightward[i] * (1 - part) + track.rightward[j] * part
         points = np.repeat(middle[:, None], columns, axis=1)

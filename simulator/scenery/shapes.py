@@ -140,7 +140,7 @@ def ribbon(track: Track, s: ArrayLike, offsets: ArrayLike, heights: ArrayLike, m
     """
     s, offsets = np.asarray(s, float), np.asarray(offsets, float)
     n, k = len(s), len(offsets)
-    index = np.round(s / track.step).astype(int) % len(track.points)
+    index = track.wrap(np.round(s / track.step).astype(int))
     points = np.empty((n, k, 3))
     points[:, :, :2] = track.points[index, None, :2] + track.rightward[index, None] * offsets[None, :, None]
     points[:, :, 2] = track.points[index, None, 2] + np.broadcast_to(heights, (n, k))

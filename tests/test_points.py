@@ -1,0 +1,198 @@
+"""Roads of one's own: read from files, refused with reason and place, driven, recorded."""
+
+import json
+import math
+import pickle
+
+import numpy as np
+import pytest
+from scenes import Here
+
+from cloning.base.errors import TrackError
+from cloning.lane.known import known_position
+from cloning.recordings.log import read_recording
+from cloning.road.generated import LANDS, MARKINGS, PointRoad
+from cloning.road.motion import MPH
+from cloning.road.points import make_road, read_road
+from cloning.road.track import Track
+from simulator import __main__ as simulator
+from simulator import record, report, scenery
+from simulator.environment import Drive
+from simulator.expert import Expert
+from simulator.run import Run
+
+TURN = np.linspace(0, 2 * math.pi, 61)
+CIRCLE = np.c_[50 * np.cos(TURN), 50 * np.sin(TURN)]  # its last point is its first
+BEND = [(0, 0), (30, 0), (55, 8), (80, 30)]
+
+
+def test_a_circle_is_measured_as_a_circle():
+    track = Track(make_road(CIRCLE, width=7))
+    assert track.closed
+    assert track.direction == "ccw"
+    assert track.length == pytest.approx(2 * math.pi * 50, rel=1e-3)
+    assert track.curvature == pytest.approx(np.full(len(track.points), -1 / 50), rel=0.02)  # to the left
+    assert track.locate(53, 0) == (pytest.approx(0, abs=0.1), pytest.approx(3, abs=0.01))
+    assert np.all(track.edges == 3.5)
+    assert Track(make_road(CIRCLE[::-1])).direction == "cw"
+    assert Track(make_road(CIRCLE[:-1], closed=True)).length == pytest.approx(track.length)
+
+
+@pytest.mark.parametrize("direction", ["ccw", "cw"])
+def test_an_open_road_begins_and_ends_at_its_ends_and_goes_on_straight_beyond(direction):
+    track = Track(make_road([(0, 0, 2), (40, 0, 2), (80, 0, 6)]), direction)
+    start, end = ((0, 0, 2), (80, 0, 6))[:: 1 if direction == "ccw" else -1]
+    first, last = track.at(0), track.at(track.length)
+    assert (first.x, first.y, first.z) == pytest.approx(start, abs=1e-6)
+    assert (last.x, last.y, last.z) == pytest.approx(end, abs=1e-6)
+    forward = 1 if direction == "ccw" else -1
+    assert track.at(track.length + 20).x == pytest.approx(end[0] + 20 * forward, abs=0.1)
+    assert track.at(-20).x == pytest.approx(start[0] - 20 * forward, abs=0.1)
+    for s in (-20.0, 0.0, 33.3, track.length + 20):
+        pose = track.at(s, 1.5)
+        assert track.locate(pose.x, pose.y, near=s) == (pytest.approx(s, abs=1e-6), pytest.approx(1.5, abs=1e-6))
+    assert track.starts == {"training": 0.0, "autonomous": 0.0}
+
+
+def test_forms_of_a_file_give_the_same_road(tmp_path):
+    files = {
+        "a.csv": "x,y\n0,0\n30,0\n55,8\n80,30\n",
+        "b.txt": "0,0,0\n30,0,0\n55,8,0\n80,30,0",
+        "c.json": json.dumps(BEND),
+        "d": json.dumps({"road_points": BEND, "risk": "anything"}),
+        "e.road": "@".join(f"{x},0.0,{y}" for x, y in BEND),  # y is up
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        assert read_road(tmp_path / name, name="road") == make_road(BEND)
+    assert read_road(tmp_path / "a.csv").name == "a"
+    own = {"road_points": CIRCLE[:-1].tolist(), "closed": True, "width": 6.5, "marking": "rail", "land": "canyon"}
+    (tmp_path / "own.json").write_text(json.dumps(own))
+    road = read_road(tmp_path / "own.json", land="desert")
+    assert (road.closed, road.width, road.marking, road.land) == (True, 6.5, "rail", "desert")
+    heights = read_road(tmp_path / "e.road").points[:, 2]
+    assert np.all(heights == 0)
+
+
+def test_equal_roads_are_equal_also_in_another_process():
+    road = make_road(BEND)
+    copy = pickle.loads(pickle.dumps(road))
+    assert copy == road == make_road(BEND)
+    assert hash(copy) == hash(road)
+    assert road != make_road(BEND, width=6)
+
+
+EIGHT = np.c_[60 * np.cos(TURN), 40 * np.sin(2 * TURN)]
+REFUSED = [
+    ({"points": EIGHT}, r"crosses itself, 107 m along it \(0.1, 0.2\) and 322 m along it"),
+    ({"points": [(0, 0), (60, 0), (75, 7), (75, 13), (60, 7), (0, 7)]}, "folds|comes within"),
+    (
+        {"points": np.c_[4 * np.cos(TURN), 60 * np.sin(TURN)]},
+        r"folds within its own width, \d+ m along it \(-?0",
+    ),
+    ({"points": [(0, 0), (5, 0)]}, "5.0 m long; it must be 20 to 5000 m"),
+    ({"points": [(0, 0), (9000, 0)]}, "9000.0 m long"),
+    ({"points": [(0, 0)]}, "1 different points; a road needs 2"),
+    ({"points": []}, "0 different points"),
+    ({"points": [(0, 0), (30, 0), (0, 0)]}, "2 different points; a road needs 2, and a closed one 3"),
+    ({"points": [(0, 0, 0), (30, 0, 20)]}, "too steep"),
+    ({"points": [(0, 0), (math.nan, 0)]}, "point 2 is"),
+    ({"points": [(0, 0), (5e6, 0)]}, "point 2 is"),
+    ({"points": [(0, 0), ("a", 0)]}, "point 2 is"),
+    ({"points": [(0, 0), 7]}, "point 2 is 7"),
+    ({"points": BEND, "width": 30}, "width 30: it must be 5 to 12"),
+    ({"points": BEND, "width": "8"}, "width '8'"),
+    ({"points": BEND, "marking": "blue"}, "marking 'blue': it must be one of yellow double"),
+    ({"points": BEND, "land": ["sea"]}, "land .*: it must be one of meadow"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "reason"), REFUSED)
+def test_what_is_no_road_is_refused_with_reason_and_place(arguments, reason):
+    with pytest.raises(TrackError, match=reason):
+        make_road(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("0,0\n30;0\n", "line 2: 30;0 is not a point"),
+        ("0,0\n30,0\nfoo\n", "line 3: foo"),
+        ("0,0,0@30,0@60,0,0", "point 2: '30,0' is not x,y,z"),
+        ('{"road_points": [[0, 0], [30, 0]', "not JSON"),
+        ('{"points": [[0, 0], [30, 0]]}', 'under the key "road_points"'),
+        ('{"road_points": [[0, 0], [30, 0]], "closed": 1}', "closed 1: it must be true or false"),
+        ("", "0 different points"),
+        ("\x00\x01", "0 different points"),
+    ],
+)
+def test_what_is_no_file_of_points_is_refused(text, reason, tmp_path):
+    (tmp_path / "road").write_text(text)
+    with pytest.raises(TrackError, match=f"{tmp_path}/road: .*{reason}"):
+        read_road(tmp_path / "road")
+
+
+def test_a_missing_file_and_options_that_do_not_go_together_are_clear_errors(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "road.csv").write_text("0,0\n30,0\n")
+    for more, reason in (
+        (["--road", "none.csv"], "none.csv: No such file"),
+        (["--road", "."], ".: Is a directory"),
+        (["--road", "road.csv", "--track", "lake"], "leave one of them out"),
+        (["--land", "desert"], "--land is of a road of your own"),
+    ):
+        assert simulator.main(["record", "folder", *more]) == 2
+        assert reason in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["road.csv"]
+
+
+def test_every_lap_of_an_open_road_starts_at_rest_at_its_start_and_ends_at_its_end(tmp_path):
+    run = Run(Track(make_road(BEND)))
+    expert = Expert(run.track, top_speed=15 * MPH)
+    run.car.speed_limit = 15 * MPH
+    begun = []
+    while run.laps < 2:
+        new = run.at_end or not run.time
+        run.step(*expert.drive(run))
+        if new:
+            begun.append((run.travelled, run.car.speed))
+    assert run.at_end
+    assert run.s == pytest.approx(run.track.length, abs=0.2)
+    (first, slow), (second, slow_again) = begun
+    assert (first, second) == (pytest.approx(0, abs=0.01), pytest.approx(run.track.length, abs=0.01))
+    assert max(slow, slow_again) < 0.1
+    assert not run.departures
+    assert report.lap_report(run)["laps"] == 2
+    report.write_picture(tmp_path / "map.png", run)
+    assert (tmp_path / "map.png").stat().st_size > 10_000
+
+
+def test_the_command_records_an_open_road_with_a_drive_a_lap_and_its_lane(tmp_path, monkeypatch):
+    monkeypatch.setattr(record, "ProcessPoolExecutor", Here)
+    (tmp_path / "road.json").write_text(json.dumps({"road_points": BEND[:2], "marking": "kerb"}))
+    folder, road = str(tmp_path / "recording"), str(tmp_path / "road.json")
+    assert simulator.main(["record", folder, "--road", road, "--laps", "2", "--land", "desert"]) == 0
+    recording = read_recording(folder)
+    assert np.sum(np.diff(recording.time) > 1.0) == 1
+    lane = known_position(recording)
+    assert lane
+    assert lane.trusted.all()
+    assert 0 < np.abs(lane.lateral_offset).max() < 2
+
+
+def test_an_episode_on_an_open_road_ends_with_success_at_its_end():
+    env = Drive(make_road([(0, 0), (30, 0)], width=6), speed=15)
+    frame, info = env.reset()
+    terminated = truncated = False
+    while not (terminated or truncated):
+        frame, _, terminated, truncated, info = env.step(np.array([0.0, 1.0]))
+    assert (terminated, truncated, info["laps"]) == (False, True, 1)
+    assert frame[100:].std() > 5
+    env.close()
+
+
+def test_every_marking_and_land_can_be_built():
+    for i in range(max(len(MARKINGS), len(LANDS))):
+        road = make_road(BEND, marking=MARKINGS[i % len(MARKINGS)], land=LANDS[i % len(LANDS)])
+        assert isinstance(road, PointRoad)
+        assert len(scenery.build(road, 10_000 * (i == 1)).meshes) > 4
