@@ -45,7 +45,7 @@ WAIT: Options = {
 }
 ROAD: Options = {
     "--track": {
-        "help": f"{', '.join(ROADS)}, or a road generated from its number: road-1, road-2 and so on (default lake)",
+        "help": f"{', '.join(ROADS)}, or a road generated from its number: road-1, mountain-1 and so on (default lake)",
     },
     "--road": {
         "metavar": "FILE",

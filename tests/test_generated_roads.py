@@ -16,12 +16,35 @@ from simulator.scenery.generated import road as road_meshes
 from simulator.scenery.looks import Look
 
 NUMBERS = range(1, 101)
-NO_ROADS = ["road-0", "road--1", "road-1.5", "road-x", "road-01", "road-", "road-1e3", "Road-1", "moon", ""]
+NO_ROADS = [
+    "mountain-0",
+    "road-0",
+    "road--1",
+    "road-1.5",
+    "road-x",
+    "road-01",
+    "road-",
+    "road-1e3",
+    "Road-1",
+    "moon",
+    "",
+]
+
+
+def generated(name):
+    road = generate(name)
+    assert road is not None
+    return road
 
 
 @pytest.fixture(scope="module")
 def roads():
-    return [generate(number) for number in NUMBERS]
+    return [generated(f"road-{number}") for number in NUMBERS]
+
+
+@pytest.fixture(scope="module")
+def mountains():
+    return [generated(f"mountain-{number}") for number in range(1, 31)]
 
 
 def derivatives(points):
@@ -40,25 +63,41 @@ def crosses(a, b, c, d):
     return (side(a, b, c) * side(a, b, d) < 0) & (side(c, d, a) * side(c, d, b) < 0)
 
 
-def test_roads_are_closed_loops_of_600_to_1500_metres(roads):
-    for road in roads:
+def test_roads_are_closed_loops_of_600_to_1500_metres(roads, mountains):
+    for road in roads + mountains:
         steps = np.linalg.norm(road.points - np.roll(road.points, 1, axis=0), axis=1)
-        assert np.ptp(steps) < 0.1  # also from the last point to the first
+        assert np.ptp(steps) < 0.2  # also from the last point to the first
         assert 600 <= steps.sum() <= 1500
         x, y = road.points[:, :2].T
         assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() > 0, "its points are listed counter-clockwise"
 
 
-def test_roads_keep_away_from_themselves(roads):
-    """Parts 50 m or more apart along the road leave room for two roads and 4 m between them; none cross."""
-    for road in roads[:40]:
+def test_roads_keep_away_from_themselves(roads, mountains):
+    """Parts 50 m or more apart along the road leave room for two roads, and 2 m between them; none cross."""
+    for road in roads[:40] + mountains:
         points, n = road.points[:, :2], len(road.points)
         apart = np.abs(np.arange(n)[:, None] - np.arange(n))
         apart = np.minimum(apart, n - apart)
         distance = np.hypot(*(points[:, None] - points).transpose(2, 0, 1))
-        assert distance[apart >= 25].min() >= 2 * road.width + 4
+        assert distance[apart >= 25].min() >= 2 * road.width + (2 if road in mountains else 4)
         ends = np.roll(points, -1, axis=0)
         assert not crosses(points[:, None], ends[:, None], points, ends)[apart > 1].any()
+
+
+def test_mountain_roads_are_as_winding_and_as_steep_as_the_jungle(mountains):
+    """Half of the jungle has a radius below 21 m; it turns by seven circles a km; its grades reach 0.32."""
+    tracks = [Track(road.name) for road in mountains]
+    turning = [np.abs(track.curvature).sum() * track.step / 2 / np.pi / track.length * 1000 for track in tracks]
+    radii = [1 / np.abs(track.curvature).max() for track in tracks]
+    assert min(turning) > 3.5
+    assert 7.5 < min(radii) < 8.5
+    assert np.median([np.abs(track.grade).max() for track in tracks]) > 0.25
+    assert max(np.abs(track.grade).max() for track in tracks) < 0.325
+    driven = Run(tracks[2])
+    expert = Expert(tracks[2], seed=3)
+    while driven.travelled < 300:
+        driven.step(*expert.drive(driven))
+    assert not driven.departures
 
 
 def test_bends_grades_and_widths_stay_within_limits_and_come_near_them(roads):
@@ -79,7 +118,7 @@ def test_bends_grades_and_widths_stay_within_limits_and_come_near_them(roads):
 
 
 def test_a_number_gives_the_same_road_in_every_process_and_on_every_machine():
-    road = generate(7)
+    road = generated("road-7")
     # Fixed: these change only if the generator does, and with it every road that somebody has named by its number.
     assert (len(road.points), road.width, road.marking) == (704, 8.5, "rail")
     pinned = np.array([[-78.7433, 131.9268, 0.4881], [-6.4434, -174.1179, -1.7779]])
@@ -88,7 +127,7 @@ def test_a_number_gives_the_same_road_in_every_process_and_on_every_machine():
 
 @pytest.mark.parametrize("direction", ["ccw", "cw"])
 def test_a_track_of_a_generated_road_lies_where_the_road_does(direction):
-    road, track = generate(3), Track("road-3", direction)
+    road, track = generated("road-3"), Track("road-3", direction)
     assert (track.name, track.direction, Track("road-3").direction) == ("road-3", direction, "ccw")
     assert np.all(track.edges == road.width / 2)
     assert track.points[0] == pytest.approx(road.points[0], abs=1e-6)
@@ -133,7 +172,7 @@ def test_records_a_generated_road(tmp_path):
 @pytest.mark.parametrize("number", range(1, 6))
 def test_the_land_never_covers_the_road(number):
     track = Track(f"road-{number}")
-    terrain = Terrain(track, LANDS[generate(number).land], np.random.default_rng(number), relief=1.5)
+    terrain = Terrain(track, LANDS[generated(f"road-{number}").land], np.random.default_rng(number), relief=1.5)
     for right in np.linspace(-1, 1, 9) * (track.edges[0, 0] + 1):
         positions = track.points[:, :2] + right * track.rightward
         assert np.all(terrain.height_at(positions[:, ::-1]) < track.points[:, 2] - 0.4)
@@ -142,7 +181,7 @@ def test_the_land_never_covers_the_road(number):
 @pytest.mark.parametrize("number", range(1, len(MARKINGS) + 1))
 def test_roads_are_marked_as_they_say(number):
     """The colours painted across the road, and what stands or lies at its right edge."""
-    marking, track = generate(number).marking, Track(f"road-{number}")
+    marking, track = generated(f"road-{number}").marking, Track(f"road-{number}")
     light, palette = weather(np.random.default_rng(0), LANDS["meadow"])
     soil = np.full((4, 4, 3), 255, np.uint8)
     surface, *others = road_meshes(track, marking, np.random.default_rng(0), Look(light, palette), soil)

@@ -211,7 +211,7 @@ def main(argv: list[str] | None = None) -> int:
     names = "recordings that the model was trained on, besides those that its file names (default: none)"
     add("--trained-on", nargs="*", default=[], metavar="NAME", help=names)
     add("--recordings", nargs="*", default=[], help="to replay, or folders of recordings (default: none)")
-    tracks = f"tracks to drive, also road-1, road-2 and so on (default: {' '.join(ROADS)})"
+    tracks = f"tracks to drive, also road-1, mountain-1 and so on (default: {' '.join(ROADS)})"
     add("--tracks", nargs="*", default=list(ROADS), help=tracks)
     speeds = "set speeds in mph (default 9 15 30)"
     add("--speeds", nargs="*", type=number(int, 1, 30), default=[9, 15, 30], help=speeds)

@@ -18,7 +18,8 @@ def layer_table(network: Network) -> str:
         ("dropout_1", "Dropout", nn.Identity()),
         *((f"dense_{i}", "Dense", layer) for i, layer in enumerate(network.dense, 1)),
     ]
-    rows, previous, x = list[str](), "lambda_input_1", torch.zeros(1, FRAME[2], *FRAME[:2])
+    device = next(network.parameters()).device
+    rows, previous, x = list[str](), "lambda_input_1", torch.zeros(1, FRAME[2], *FRAME[:2], device=device)
     with torch.no_grad():
         for name, keras_type, layer in layers:
             x = layer(x)

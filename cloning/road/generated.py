@@ -14,16 +14,77 @@ from numpy.random import Generator
 # Yellow double lines as on the lake, white lines as in the jungle, or no lines and only such an edge.
 MARKINGS = ("yellow double", "white", "kerb", "grass", "dirt", "wall", "rail")
 LANDS = ("meadow", "forest", "desert", "canyon", "highland")
-NAME = re.compile("road-([1-9][0-9]{0,8})")
 SPACING = 2.0  # m between the points
 MIN_LENGTH, MAX_LENGTH = 600.0, 1500.0  # m
 MIN_WIDTH, MAX_WIDTH = 6.0, 10.0  # m
-MIN_RADIUS = 12.0  # m, of the centre line
-MAX_GRADE, MIN_CREST_RADIUS = 0.25, 40.0  # dz/ds; m, of the height over the distance
-CLEARANCE = 2 * MAX_WIDTH + 4.0  # m between the centre lines of two parts of the road, which are
-APART = 50.0  # m or more apart along the road: a bend of the smallest radius turns back in less
-ROUNDING = 9.0  # m over which corners are averaged, so that the steering need not jump at them
-FLAT_SHARE = 0.12  # share of roads without hills
+APART = 50.0  # m or more along the road are between two parts of it that must keep a distance
+
+
+@dataclass(frozen=True)
+class Course:
+    """What all generated roads of one kind have in common; ranges are (least, most).
+
+    seed        of their random numbers, before a road's own number
+    corners     of the polygon
+    nearest     range of the distance from the middle to the nearest corner, as a share of that to the farthest
+    radius      m, of the centre line, at least
+    rounding    m over which corners are averaged, so that the steering need not jump at them
+    turns       full circles that the bends to both sides have together, at least
+    clearance   m between the centre lines of two parts of the road
+    flat        share of roads without hills
+    wave        m, the shortest wave of the hills
+    grade       the steepest, dz/ds
+    steepness   range of a road's steepest grade, as a share of `grade`
+    crest       m, radius of the height over the distance, at least
+    """
+
+    seed: tuple[int, ...]
+    corners: tuple[int, int]
+    nearest: tuple[float, float]
+    radius: float
+    rounding: float
+    turns: tuple[float, float]
+    clearance: float
+    flat: float
+    wave: float
+    grade: float
+    steepness: tuple[float, float]
+    crest: float
+
+
+COURSES = {
+    "road": Course(
+        seed=(),
+        corners=(8, 20),
+        nearest=(0.1, 0.5),
+        radius=12.0,
+        rounding=9.0,
+        turns=(1, 2.3),
+        clearance=24.0,
+        flat=0.12,
+        wave=90.0,
+        grade=0.25,
+        steepness=(0.1, 0.97),
+        crest=40.0,
+    ),
+    # As winding and as steep as the simulator's jungle, whose bends have a radius of 8 m and more, half of the track
+    # below 21 m, with grades of up to 0.32 and crests of 37 m and more.
+    "mountain": Course(
+        seed=(1,),
+        corners=(30, 50),
+        nearest=(0.2, 0.6),
+        radius=7.5,
+        rounding=5.0,
+        turns=(5, 6.5),
+        clearance=22.0,
+        flat=0.0,
+        wave=40.0,
+        grade=0.32,
+        steepness=(0.7, 1.0),
+        crest=35.0,
+    ),
+}
+NAME = re.compile(f"({'|'.join(COURSES)})-([1-9][0-9]{{0,8}})")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,51 +121,55 @@ class PointRoad:
 
 
 def road_number(name: str) -> int | None:
-    """Return the number in the name of a generated road, as road-7, or None if it is no such name."""
+    """Return the number in the name of a generated road, as road-7 or mountain-7, or None if it is no such name."""
     match = NAME.fullmatch(name)
-    return int(match[1]) if match else None
+    return int(match[2]) if match else None
 
 
-def generate(number: int) -> PointRoad:
-    """Return the road of a number, 1 or more: counter-clockwise, with points about 2 m apart.
+def generate(name: str) -> PointRoad | None:
+    """Return the generated road of this name: counter-clockwise, with points about 2 m apart; None if there is none.
 
     35 roads one after another have all combinations of marking and land.
     """
-    rng = np.random.default_rng(number)
+    match = NAME.fullmatch(name)
+    if not match:
+        return None
+    course, number = COURSES[match[1]], int(match[2])
+    rng = np.random.default_rng([*course.seed, number] if course.seed else number)
     width = rng.uniform(MIN_WIDTH, MAX_WIDTH)
-    winding = 2 * np.pi * rng.uniform(1, 2.3)
-    flat = next(loop for loop in (draw_loop(rng, winding) for _ in itertools.count()) if loop is not None)
-    points = np.c_[flat, hills(rng, len(flat))]
+    winding = 2 * np.pi * rng.uniform(*course.turns)
+    flat = next(loop for loop in (draw_loop(rng, course, winding) for _ in itertools.count()) if loop is not None)
+    points = np.c_[flat, hills(rng, course, len(flat))]
     # Rounded, because the last bit of a sine differs from machine to machine.
     marking, land = (kinds[(number - 1) % len(kinds)] for kinds in (MARKINGS, LANDS))
-    return PointRoad(f"road-{number}", points.round(4), round(width, 2), marking, land, seed=number)
+    return PointRoad(name, points.round(4), round(width, 2), marking, land, seed=number)
 
 
-def draw_loop(rng: Generator, winding: float) -> np.ndarray | None:
+def draw_loop(rng: Generator, course: Course, winding: float) -> np.ndarray | None:
     """Draw a closed curve, float64 (n, 2), m, about its middle; None if it breaks one of the limits.
 
     winding: radians that its bends to both sides have together, at least.
     """
-    corners = int(rng.integers(8, 21))
+    corners = int(rng.integers(*course.corners, endpoint=True))
     turn = 2 * np.pi * (np.arange(corners) + rng.uniform(-0.35, 0.35, corners)) / corners
-    reach = rng.uniform(rng.uniform(0.1, 0.5), 1, corners)
+    reach = rng.uniform(rng.uniform(*course.nearest), 1, corners)
     turn += rng.uniform(-1.3, 1.3) * reach  # twisted, so that not every part is visible from the middle
     polygon = np.stack([reach * np.cos(turn) * rng.uniform(1, 1.8), reach * np.sin(turn)], axis=-1)
     perimeter = np.linalg.norm(polygon - np.roll(polygon, 1, axis=0), axis=1).sum()
     polygon *= rng.uniform(1.1 * MIN_LENGTH, 1.1 * MAX_LENGTH) / perimeter
-    radii = rng.uniform(1.1, 2) * MIN_RADIUS * rng.uniform(1, 4, corners)
-    loop = round_corners(polygon, radii, 1.1 * MIN_RADIUS)
+    radii = rng.uniform(1.1, 2) * course.radius * rng.uniform(1, 4, corners)
+    loop = round_corners(polygon, radii, 1.1 * course.radius)
     if loop is None:
         return None
     loop = resample(loop, 1.0)
     for _ in range(2):
-        loop = moving_average(loop, round(ROUNDING))
+        loop = moving_average(loop, round(course.rounding))
     loop = resample(loop, SPACING)
     bends = curvatures(loop)
     length = len(loop) * SPACING
-    if not MIN_LENGTH + SPACING < length < MAX_LENGTH - SPACING or np.abs(bends).max() * 1.02 > 1 / MIN_RADIUS:
+    if not MIN_LENGTH + SPACING < length < MAX_LENGTH - SPACING or np.abs(bends).max() * 1.02 > 1 / course.radius:
         return None
-    if np.abs(bends).sum() * SPACING < winding or closest_approach(loop) < CLEARANCE:
+    if np.abs(bends).sum() * SPACING < winding or closest_approach(loop) < course.clearance:
         return None
     start = np.argmin(moving_average(np.abs(bends)[:, None], round(40 / SPACING))[:, 0])  # where it is straightest
     return np.roll(loop, -start, axis=0) - (loop.min(axis=0) + loop.max(axis=0)) / 2
@@ -162,13 +227,13 @@ def closest_approach(loop: np.ndarray) -> float:
     )
 
 
-def hills(rng: Generator, n: int) -> np.ndarray:
-    """Return heights in m along a closed curve of n points: waves of 90 m and more, or 0 for a flat road."""
-    if rng.uniform() < FLAT_SHARE:
+def hills(rng: Generator, course: Course, n: int) -> np.ndarray:
+    """Return heights in m along a closed curve of n points; all are 0 on a flat road."""
+    if rng.uniform() < course.flat:
         return np.zeros(n)
-    waves = np.arange(1, int(n * SPACING / 90) + 1)
+    waves = np.arange(1, int(n * SPACING / course.wave) + 1)
     phases = 2 * np.pi * (waves * np.arange(n)[:, None] / n + rng.uniform(0, 1, len(waves)))
     height = (np.sin(phases) * rng.uniform(0, 1, len(waves)) / waves ** rng.uniform(0.5, 1.5)).sum(axis=1)
     steepest = np.abs(np.roll(height, -1) - height).max() / SPACING
     sharpest = np.abs(np.roll(height, -1) - 2 * height + np.roll(height, 1)).max() / SPACING**2
-    return height * min(rng.uniform(0.1, 0.97) * MAX_GRADE / steepest, 1 / (MIN_CREST_RADIUS * sharpest))
+    return height * min(rng.uniform(*course.steepness) * course.grade / steepest, 1 / (course.crest * sharpest))

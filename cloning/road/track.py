@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.errors import TrackError
-from cloning.road.generated import PointRoad, generate, road_number
+from cloning.road.generated import COURSES, PointRoad, generate
 from cloning.road.motion import right_of, wrap_angle
 
 FOLDER = Path(__file__).parent
@@ -94,17 +94,16 @@ ROADS = {
 def find_points(source: str | PointRoad) -> PointRoad | None:
     """Return the road of points that a track's source is, or None for the real simulator's tracks.
 
-    source: a key of ROADS, road-N for the generated road of the number N, or a road of points itself. Raises TrackError
+    source: a key of ROADS, road-N or mountain-N for a generated road, or a road of points itself. Raises TrackError
     if there is no such track.
     """
     if isinstance(source, PointRoad) or source in ROADS:
         return source if isinstance(source, PointRoad) else None
-    number = road_number(source)
-    if number is None:
-        raise TrackError(
-            f"{source[:40]}: there is no such track; there are {', '.join(ROADS)}, road-1, road-2 and so on"
-        )
-    return generate(number)
+    road = generate(source)
+    if road is None:
+        known = ", ".join((*ROADS, *(f"{kind}-1, {kind}-2 and so on" for kind in COURSES)))
+        raise TrackError(f"{source[:40]}: there is no such track; there are {known}")
+    return road
 
 
 class Track:

@@ -60,7 +60,7 @@ def converted(network: Module, precision: torch.dtype) -> Module:
 
 
 def squared_errors(
-    network: nn.Module,
+    network: Callable[..., torch.Tensor],
     images: torch.Tensor,
     labels: torch.Tensor,
     keep: torch.Tensor | None,
@@ -146,9 +146,12 @@ class SquaredErrors(nn.Module):
         self, images: torch.Tensor, labels: torch.Tensor, real: torch.Tensor, keep: torch.Tensor | None = None
     ) -> list[torch.Tensor]:
         """Return the sum of the squared errors of real images, and its gradients."""
+        # As new variables, because what autograd keeps of the parameters belongs to another of the GPU's streams.
+        weights = {name: each.detach().requires_grad_() for name, each in self.network.named_parameters()}
+        network = functools.partial(torch.func.functional_call, self.network, weights)
         with torch.enable_grad(), in_precision(self.precision, self.device):
-            total = squared_errors(self.network, images, labels, keep, self.huber, real)
-            return [total.detach(), *torch.autograd.grad(total, list(self.network.parameters()))]
+            total = squared_errors(lambda *inputs: network(inputs), images, labels, keep, self.huber, real)
+            return [total.detach(), *torch.autograd.grad(total, list(weights.values()))]
 
     def in_pieces(self, batch: Batch, meanwhile: Callable[[], None]) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Return the sum and its gradients, computed in pieces, each by one thread of the pool.
