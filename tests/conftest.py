@@ -26,7 +26,7 @@ def pytest_configure():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport():
-    """Where all can be installed, as in the GitHub workflow, a skipped test fails, unless it lacks recordings or a GPU."""
+    """Where all can be installed, as on GitHub, a skipped test fails unless it lacks recordings or a GPU."""
     report = yield
     why = str(report.longrepr)
     if os.environ.get("NO_SKIPS") and report.skipped and real_recordings.MISSING not in why and "a GPU" not in why:
