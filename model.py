@@ -269,11 +269,7 @@ class Generator:
 
     def start_next(self) -> None:
         """Start making one more batch."""
-        number = next(self.numbers)
-        if self.observations.gpu:  # which makes the images sooner than a thread the choices
-            self.started.append(self.pool.submit(lambda: self.start_batch(number)()).result)
-        else:
-            self.started.append(self.start_batch(number))
+        self.started.append(self.start_batch(next(self.numbers)))
 
     def next_batch(self) -> Batch:
         """Return the next batch, and see that enough others are started."""
@@ -320,7 +316,8 @@ class TrainingRun:
         self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
         self.optimizer = OPTIMIZERS[recipe.optimizer](self.network.parameters(), recipe.momentum, recipe.weight_decay)
         self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, fingerprint(training, validation))
-        self.progress, ahead = self.checkpoint.restore(begin), 2 if self.device.type == "cpu" else 4
+        # Only one batch ahead on a GPU, in this thread, which makes it while the GPU computes.
+        self.progress, ahead = self.checkpoint.restore(begin), 1 if self.training.gpu else 2
         self.generator = Generator(self.training, recipe, run.seed, self.pool, ahead, self.progress.number, ranks)
         self.validation_sets = recipe.validation_sets(self.validation, recipe, run.seed)
         self.held_out = held_out(validation.recordings, validation.recording, validation.row, aim)

@@ -5,7 +5,6 @@ import ctypes
 import functools
 import os
 import sys
-import threading
 from collections.abc import Callable, Sequence
 
 import torch
@@ -89,10 +88,9 @@ def one_thread() -> None:
 class Graphed:
     """A function of tensors that a GPU repeats by itself, because Python starts its kernels more slowly than they run.
 
-    It is recorded as a CUDA graph, for each shape of its arguments in the second call with this shape.
+    It is recorded as a CUDA graph, for each shape of its arguments in the second call with this shape. Meanwhile no
+    other thread may use the GPU, or the recording fails.
     """
-
-    one_at_a_time = threading.Lock()
 
     def __init__(self, function: Callable[..., Sequence[torch.Tensor]]):
         """function: does not wait for the GPU, and uses only tensors that stay where they are."""
@@ -104,18 +102,18 @@ class Graphed:
         if arguments[0].device.type != "cuda":
             return self.function(*arguments)
         key = tuple((each.shape, each.dtype) for each in arguments)
-        with self.one_at_a_time:  # until the results are copied
-            if key not in self.recorded:
-                self.recorded[key] = None
-                return self.function(*arguments)
-            if (recorded := self.recorded[key]) is None:
-                graph, inputs = torch.cuda.CUDAGraph(), [each.clone() for each in arguments]
-                with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                    results = self.function(*inputs)
-                recorded = self.recorded[key] = graph, inputs, results
-            graph, inputs, results = recorded
-            torch._foreach_copy_(inputs, list(arguments))
-            graph.replay()
-            copies = [torch.empty_like(each) for each in results]
+        if key not in self.recorded:
+            self.recorded[key] = None
+            return self.function(*arguments)
+        if (recorded := self.recorded[key]) is None:
+            graph, inputs = torch.cuda.CUDAGraph(), [each.clone() for each in arguments]
+            with torch.cuda.graph(graph):
+                results = self.function(*inputs)
+            recorded = self.recorded[key] = graph, inputs, results
+        graph, inputs, results = recorded
+        torch._foreach_copy_(inputs, list(arguments))
+        graph.replay()
+        copies = [torch.empty_like(each) for each in results]
+        if copies:
             torch._foreach_copy_(copies, list(results))
-            return copies
+        return copies

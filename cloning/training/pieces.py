@@ -122,9 +122,11 @@ class SquaredErrors(nn.Module):
         if self.device.type == "cpu":
             in_pieces = functools.partial(self.in_pieces, batch, meanwhile)
             return WithGradients.apply(in_pieces, *self.network.parameters())
-        meanwhile()
         if self.device.type == "cuda":
-            return WithGradients.apply(functools.partial(self.on_gpu, batch), *self.network.parameters())
+            total = WithGradients.apply(functools.partial(self.on_gpu, batch), *self.network.parameters())
+            meanwhile()
+            return total
+        meanwhile()
         images, labels, keep = batch.part(slice(None))
         with in_precision(self.precision, self.device):
             keep = None if keep is None else keep.to(self.device)
@@ -188,12 +190,15 @@ def predict(
 ) -> np.ndarray:
     """Return the network's steering for these observations: float32 (len(rows),).
 
-    rows: int (k,), indices; images: from indices to images, as in ValidationSet; pool: its threads share the work.
+    rows: int (k,), indices; images: from indices to images, as in ValidationSet; pool: its threads share the work
+    on a CPU.
     """
 
     def part(chosen: np.ndarray) -> np.ndarray:
         with torch.inference_mode(), in_precision(precision, device):
             return network(torch.as_tensor(images(chosen)).to(device)).cpu().numpy()
 
-    parts = [rows[piece] for piece in pieces(len(rows), PIECE if device.type == "cpu" else GPU_PIECE)]
-    return np.concatenate([np.empty(0, np.float32), *pool.map(part, parts)])
+    on_cpu = device.type == "cpu"
+    parts = [rows[piece] for piece in pieces(len(rows), PIECE if on_cpu else GPU_PIECE)]
+    done = pool.map(part, parts) if on_cpu else map(part, parts)
+    return np.concatenate([np.empty(0, np.float32), *done])

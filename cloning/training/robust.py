@@ -123,7 +123,9 @@ class PoseViews:
         """See `observations.Views`."""
         frames = self.observations.frames(self.rows[i])
         labels = self.observations.lanes.camera_labels(self.rows[i])
-        return Example(frames, labels, self.images(np.array([i])), CROP[0], [each.title(i) for each in self.poses])
+        one = np.array([i])
+        images = warped(replace(self.observations, gpu=None), self.rows[one], [each.take(one) for each in self.poses])
+        return Example(frames, labels, images, CROP[0], [each.title(i) for each in self.poses])
 
 
 def centre_and_poses(observations: Observations, recipe: Recipe, seed: int) -> list[ValidationSet]:
