@@ -71,7 +71,7 @@ def test_forward_is_the_reports(network, frames):
 
 
 def in_blocks(x, weight, bias):
-    return nn.functional.conv2d(fast_conv.in_blocks(x), fast_conv.in_blocks(weight), bias)
+    return nn.functional.conv2d(fast_conv.InBlocks.apply(x), fast_conv.in_blocks(weight), bias)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,8 @@ def test_a_fast_convolution_and_its_gradients_are_torchs(fast, shape):
     gradients = torch.autograd.grad(out, inputs, direction)
     for got, wanted in zip(gradients, torch.autograd.grad(expected, inputs, direction), strict=True):
         torch.testing.assert_close(got, wanted, rtol=1e-12, atol=1e-11)
-    assert fast is in_blocks or gradients[0].is_contiguous(memory_format=torch.channels_last)
+    padded = fast is in_blocks and (shape[2] % 2 or shape[3] % 2)  # what was padded is cut off, without a copy
+    assert padded or gradients[0].is_contiguous(memory_format=torch.channels_last)
 
 
 def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):
