@@ -1,0 +1,158 @@
+"""The simulator joined to another program's server, in one of the dialects of `simulator.dialects`."""
+
+import argparse
+import os
+import shlex
+import sys
+import time
+from pathlib import Path
+
+from cloning.base.errors import SimulatorError
+from cloning.base.files import written_whole
+from cloning.wire.client import ConnectionLost, parse_event
+from cloning.wire.session import MAX_UNASKED, ClientSession
+from simulator.car import STEP
+from simulator.client import MAX_CATCH_UP
+from simulator.dialects import Dialect
+
+ASK_AGAIN = 5.0  # s without an answer, after which the telemetry is sent again: programs drop some
+SETTLE = 0.2  # s without a word from the server, after which its greeting is over
+STILL = 1 / 15  # s of real time between two telemetries while simulated time stands still
+MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 200,000
+
+
+class Joined(ClientSession):
+    """Sends telemetry to a server and does what it says, until the server has gone for `wait` seconds.
+
+    In lock-step simulated time waits for the answer to each telemetry; in real time it follows the wall clock.
+    """
+
+    def __init__(self, dialect: Dialect, host: str, port: int, wait: float, realtime: bool, rate: float):
+        """rate: telemetries a simulated second, at most 50; wait: s to wait for a server."""
+        super().__init__(host, port, wait, max_packet=MAX_PACKET)
+        self.dialect, self.realtime, self.period = dialect, realtime, max(STEP, 1 / rate)
+        self.frames, self.time, self.due = 0, 0.0, 0.0  # sent; simulated s in all; when the next is due
+        self._origin = 0.0  # time.perf_counter() at simulated second 0, in real time
+
+    def run(self) -> None:
+        """Join a server, again and again. Raises SimulatorError if there is none, UserError for an impossible wish."""
+        while True:
+            try:
+                self.connect()
+                try:
+                    self._exchange()
+                except ConnectionLost as error:
+                    self.count_reconnection(error)
+                finally:
+                    self.close()
+            except SimulatorError:
+                if not self.frames:
+                    raise
+                return
+
+    def no_answer(self) -> SimulatorError:
+        """Return the error for a server that is missing or has gone."""
+        host, port = self.address
+        return SimulatorError(f"{self._lost or 'no answer'}; no server at {host}:{port} for {self.wait:g} s")
+
+    def _exchange(self) -> None:
+        """Send and receive until the connection is lost. Raises ConnectionLost."""
+        self._listen(SETTLE)
+        self._origin = time.perf_counter() - self.time
+        while True:
+            while not self.dialect.ready:
+                self._listen(ASK_AGAIN)
+            self.connection.send(self.dialect.telemetry())
+            self.frames += 1
+            if self._await_answer():
+                self._drive()
+
+    def _listen(self, pause: float) -> bool:
+        """Do what the server says until it is silent for `pause` seconds; return whether it answered a telemetry."""
+        answered = False
+        for _ in range(MAX_UNASKED):
+            packet = self.connection.receive(pause)
+            if packet is None:
+                break
+            answered = self._handle(packet) or answered
+            pause = self.dialect.more if answered else 0.0
+        return answered
+
+    def _handle(self, packet: str) -> bool:
+        """Do what a packet says, and send what the dialect replies; return whether it answers a telemetry."""
+        event = parse_event(packet)
+        if event is None:
+            return False
+        if self.realtime:
+            self._catch_up()
+        answered = self.dialect.handle(*event)
+        self._reply()
+        return answered
+
+    def _reply(self) -> None:
+        for reply in self.dialect.replies:
+            self.connection.send(reply)
+        self.dialect.replies.clear()
+
+    def _await_answer(self) -> bool:
+        """Return whether the telemetry was answered; if not, it has to be sent again."""
+        until = time.monotonic() + ASK_AGAIN
+        while (left := until - time.monotonic()) > 0:
+            if self._listen(min(left, STEP) if self.realtime else left):
+                self.progressed()
+                return True
+            if self.realtime:
+                self._catch_up()
+        return False
+
+    def _drive(self) -> None:
+        """Drive until the next telemetry is due."""
+        if self.dialect.still:
+            self._origin += STILL
+            self._listen(STILL)
+            self.due = self.time
+            return
+        self.due += self.period
+        if self.realtime:
+            while self.time < self.due - 1e-9 and not self.dialect.still:
+                self._listen(max(0.0, min(STEP, self._origin + self.due - time.perf_counter())))
+                self._catch_up()
+            self.due = max(self.due, self.time)
+        while not self.realtime and self.time < self.due - 1e-9 and not self.dialect.still:
+            self._step()
+        self._reply()
+
+    def _step(self) -> None:
+        self.dialect.step()
+        self.time += STEP
+
+    def _catch_up(self) -> None:
+        """Let simulated time follow the wall clock; what cannot be caught up at once is skipped."""
+        behind = int((time.perf_counter() - self._origin - self.time) / STEP + 1e-6)
+        if behind > MAX_CATCH_UP or self.dialect.still:
+            self._origin += STEP * max(0, behind - (0 if self.dialect.still else MAX_CATCH_UP))
+        for _ in range(min(behind, MAX_CATCH_UP)):
+            if self.dialect.still:
+                break
+            self._step()
+
+
+def write_launcher(arguments: argparse.Namespace) -> None:
+    """Write the program `arguments.launcher`, which runs `join` with the other arguments and with its own after them.
+
+    Raises SimulatorError.
+    """
+    options = ["join", "--dialect", arguments.dialect, *["--realtime"] * arguments.realtime]
+    for name in ("host", "port", "wait", "track", "road", "width", "marking", "land", "direction", "look", "fps"):
+        value = getattr(arguments, name)
+        if value is not None:
+            options += [f"--{name}", os.path.abspath(value) if name == "road" else str(value)]
+    command = shlex.join([sys.executable, "-m", "simulator", *options])
+    here = f'PYTHONPATH={shlex.quote(str(Path(__file__).parents[1]))}"${{PYTHONPATH:+:$PYTHONPATH}}"'
+    path = Path(arguments.launcher)
+    try:
+        with written_whole(path) as temporary:
+            temporary.write_text(f'#!/bin/sh\n{here} exec {command} "$@"\n', encoding="utf-8")
+            temporary.chmod(0o755)
+    except OSError as error:
+        raise SimulatorError(f"{path}: {error.strerror}; name a file in a folder that can be written") from error
