@@ -209,9 +209,12 @@ def add_join(commands: "Subparsers") -> None:
         "(maxitwo, perturbation-drive, MultiSim); episodes: on named tracks, in weathers (udacity-gym)",
     )
     parser.add_argument(
-        "--realtime",
-        action="store_true",
-        help="simulated time follows the wall clock; by default it waits for the answer to each telemetry",
+        "--pace",
+        type=number(float, 0, 100),
+        default=0.0,
+        metavar="FACTOR",
+        help="let simulated time follow the wall clock: 1 in real time, 0.5 half as fast; by default it waits for the "
+        "answer to each telemetry, which is too fast for programs that answer at once and think later, as maxitwo's",
     )
     parser.add_argument(
         "--fps",
@@ -383,7 +386,7 @@ def run_join(arguments: argparse.Namespace) -> int:
         own = given_for_road(arguments)
         track = chosen_track(arguments, needs_file=False)
         dialect = DIALECTS[arguments.dialect](Stage(track.source, arguments.direction, arguments.look, own))
-        joined = Joined(dialect, arguments.host, arguments.port, arguments.wait, arguments.realtime, arguments.fps)
+        joined = Joined(dialect, arguments.host, arguments.port, arguments.wait, arguments.pace, arguments.fps)
         begin = time.perf_counter()
         try:
             joined.run()

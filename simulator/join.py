@@ -24,15 +24,18 @@ MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 2
 class Joined(ClientSession):
     """Sends telemetry to a server and does what it says, until the server has gone for `wait` seconds.
 
-    In lock-step simulated time waits for the answer to each telemetry; in real time it follows the wall clock.
+    In lock-step simulated time waits for the answer to each telemetry; otherwise it follows the wall clock.
     """
 
-    def __init__(self, dialect: Dialect, host: str, port: int, wait: float, realtime: bool, rate: float):
-        """rate: telemetries a simulated second, at most 50; wait: s to wait for a server."""
+    def __init__(self, dialect: Dialect, host: str, port: int, wait: float, pace: float, rate: float):
+        """wait: s to wait for a server; pace: simulated s a second, 0 for lock-step.
+
+        rate: telemetries a simulated second, at most 50.
+        """
         super().__init__(host, port, wait, max_packet=MAX_PACKET)
-        self.dialect, self.realtime, self.period = dialect, realtime, max(STEP, 1 / rate)
+        self.dialect, self.pace, self.period = dialect, pace, max(STEP, 1 / rate)
         self.frames, self.time, self.due = 0, 0.0, 0.0  # sent; simulated s in all; when the next is due
-        self._origin = 0.0  # time.perf_counter() at simulated second 0, in real time
+        self._origin = 0.0  # simulated s at time.perf_counter() 0, with a pace
 
     def run(self) -> None:
         """Join a server, again and again. Raises SimulatorError if there is none, UserError for an impossible wish."""
@@ -58,7 +61,7 @@ class Joined(ClientSession):
     def _exchange(self) -> None:
         """Send and receive until the connection is lost. Raises ConnectionLost."""
         self._listen(SETTLE)
-        self._origin = time.perf_counter() - self.time
+        self._origin = self.time - self.pace * time.perf_counter()
         while True:
             while not self.dialect.ready:
                 self._listen(ASK_AGAIN)
@@ -83,7 +86,7 @@ class Joined(ClientSession):
         event = parse_event(packet)
         if event is None:
             return False
-        if self.realtime:
+        if self.pace:
             self._catch_up()
         answered = self.dialect.handle(*event)
         self._reply()
@@ -98,27 +101,27 @@ class Joined(ClientSession):
         """Return whether the telemetry was answered; if not, it has to be sent again."""
         until = time.monotonic() + ASK_AGAIN
         while (left := until - time.monotonic()) > 0:
-            if self._listen(min(left, STEP) if self.realtime else left):
+            if self._listen(min(left, STEP) if self.pace else left):
                 self.progressed()
                 return True
-            if self.realtime:
+            if self.pace:
                 self._catch_up()
         return False
 
     def _drive(self) -> None:
         """Drive until the next telemetry is due."""
         if self.dialect.still:
-            self._origin += STILL
             self._listen(STILL)
+            self._origin = self.time - self.pace * time.perf_counter()
             self.due = self.time
             return
         self.due += self.period
-        if self.realtime:
+        if self.pace:
             while self.time < self.due - 1e-9 and not self.dialect.still:
-                self._listen(max(0.0, min(STEP, self._origin + self.due - time.perf_counter())))
+                self._listen(max(0.0, min(STEP, (self.due - self._now()) / self.pace)))
                 self._catch_up()
             self.due = max(self.due, self.time)
-        while not self.realtime and self.time < self.due - 1e-9 and not self.dialect.still:
+        while not self.pace and self.time < self.due - 1e-9 and not self.dialect.still:
             self._step()
         self._reply()
 
@@ -126,15 +129,18 @@ class Joined(ClientSession):
         self.dialect.step()
         self.time += STEP
 
+    def _now(self) -> float:
+        """Return the simulated time that it should be by the wall clock."""
+        return self._origin + self.pace * time.perf_counter()
+
     def _catch_up(self) -> None:
         """Let simulated time follow the wall clock; what cannot be caught up at once is skipped."""
-        behind = int((time.perf_counter() - self._origin - self.time) / STEP + 1e-6)
-        if behind > MAX_CATCH_UP or self.dialect.still:
-            self._origin += STEP * max(0, behind - (0 if self.dialect.still else MAX_CATCH_UP))
+        behind = int((self._now() - self.time) / STEP + 1e-6)
         for _ in range(min(behind, MAX_CATCH_UP)):
-            if self.dialect.still:
-                break
-            self._step()
+            if not self.dialect.still:
+                self._step()
+        if behind > MAX_CATCH_UP or self.dialect.still:
+            self._origin = self.time - self.pace * time.perf_counter()
 
 
 def write_launcher(arguments: argparse.Namespace) -> None:
@@ -142,8 +148,9 @@ def write_launcher(arguments: argparse.Namespace) -> None:
 
     Raises SimulatorError.
     """
-    options = ["join", "--dialect", arguments.dialect, *["--realtime"] * arguments.realtime]
-    for name in ("host", "port", "wait", "track", "road", "width", "marking", "land", "direction", "look", "fps"):
+    options = ["join", "--dialect", arguments.dialect]
+    road = ("track", "road", "width", "marking", "land", "direction", "look")
+    for name in ("host", "port", "wait", *road, "pace", "fps"):
         value = getattr(arguments, name)
         if value is not None:
             options += [f"--{name}", os.path.abspath(value) if name == "road" else str(value)]

@@ -57,7 +57,7 @@ def number(data, key):
     return float(data[key])
 
 
-@pytest.mark.parametrize("more", [[], ["--realtime"]])
+@pytest.mark.parametrize("more", [[], ["--pace", "2"]])
 def test_measures_are_sent_with_the_telemetry(more, capsys):
     def answer(data, n):
         time = number(data, "sim_time")
