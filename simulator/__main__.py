@@ -1,4 +1,4 @@
-"""The simulator's commands: `python -m simulator record`, `drive`, `correct`, `replay` and `window`."""
+"""The simulator's commands: `python -m simulator record`, `drive`, `correct`, `replay`, `window`, `join`."""
 
 from cloning.base import program
 
@@ -7,15 +7,17 @@ if __name__ == "__main__":
     program.end_on_interrupt("simulator", "stopped; the files that it has written are complete")
 
 import argparse
+import contextlib
 import functools
+import os
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from cloning.base.arguments import MAX_PORT, address, number
 from cloning.base.errors import UserError
-from cloning.base.outputs import check_folders, run_all, write_json
-from cloning.recordings.format import PROBLEM_AREAS
+from cloning.base.outputs import check_folders, plural, run_all, write_json
+from cloning.recordings.format import PROBLEM_AREAS, SAMPLE_RATE
 from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
 from cloning.road.autonomy import LIMITS
 from cloning.road.generated import LANDS, MARKINGS
@@ -189,23 +191,72 @@ def add_window(commands: "Subparsers") -> None:
     )
 
 
+def add_join(commands: "Subparsers") -> None:
+    """Add `join`."""
+    parser = add_command(
+        commands,
+        run_join,
+        "let another team's test program drive, in place of the modified simulator that it expects",
+        *(SERVER, WAIT, ROAD),
+        epilog="It ends when the program's server has gone for --wait seconds. Unity's own options, with which such "
+        "programs start their simulator, are accepted: -logFile FILE takes the messages, and -batchmode is always so.",
+    )
+    parser.add_argument(
+        "--dialect",
+        choices=("measures", "roads", "episodes"),
+        required=True,
+        help="measures: telemetry with cte, laps and so on (SelfOracle, ThirdEye); roads: the program sends roads "
+        "(maxitwo, perturbation-drive, MultiSim); episodes: on named tracks, in weathers (udacity-gym)",
+    )
+    parser.add_argument(
+        "--pace",
+        type=number(float, 0, 100),
+        default=0.0,
+        metavar="FACTOR",
+        help="let simulated time follow the wall clock: 1 in real time, 0.5 half as fast; by default it waits for the "
+        "answer to each telemetry, which is too fast for programs that answer at once and think later, as maxitwo's",
+    )
+    parser.add_argument(
+        "--fps",
+        type=number(float, 1, 1000),
+        default=SAMPLE_RATE,
+        help="telemetries a simulated second, of which there are at most 50 (default %(default)s)",
+    )
+    parser.add_argument(
+        "--launcher",
+        metavar="NAME.x86_64",
+        help="only write a program that runs this command with these options and its own; programs that start the "
+        "simulator themselves take it for the simulator",
+    )
+    parser.add_argument("-logFile", dest="log", metavar="FILE", help=argparse.SUPPRESS)
+    parser.add_argument("-batchmode", action="store_true", help=argparse.SUPPRESS)
+
+
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; its `run` is the command's function."""
     parser = argparse.ArgumentParser(
         prog="python -m simulator", description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
-    for add in (add_replay, add_record, add_drive, add_correct, add_window):
+    for add in (add_replay, add_record, add_drive, add_correct, add_window, add_join):
         add(commands)
     return parser.parse_args(argv)
 
 
-def chosen_track(arguments: argparse.Namespace) -> Track:
-    """Return the track that the ROAD options name. Raises UserError."""
+def given_for_road(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the given options about a road of one's own, as `make_road` takes them."""
     own = {name: getattr(arguments, name) for name in ("width", "marking", "land")}
-    given = {name: value for name, value in own.items() if value is not None}
+    return {name: value for name, value in own.items() if value is not None}
+
+
+def chosen_track(arguments: argparse.Namespace, needs_file: bool = True) -> Track:
+    """Return the track that the ROAD options name; needs_file: for options about a road of one's own.
+
+    Raises UserError.
+    """
+    given = given_for_road(arguments)
     if arguments.road is None:
-        if given:
+        if given and needs_file:
             raise UserError(f"--{next(iter(given))} is of a road of your own: name its file with --road")
         return Track("lake" if arguments.track is None else arguments.track, arguments.direction)
     if arguments.track is not None:
@@ -316,6 +367,37 @@ def run_window(arguments: argparse.Namespace) -> int:
         opened.run()
     finally:
         opened.finish()
+    return program.DONE
+
+
+def run_join(arguments: argparse.Namespace) -> int:
+    """Let another program's server drive; print what was driven."""
+    with program.loading():
+        from simulator.dialects import DIALECTS, Stage
+        from simulator.join import Joined, write_launcher
+
+    if arguments.launcher:
+        write_launcher(arguments)
+        return program.DONE
+    with open(arguments.log or os.devnull, "w", encoding="utf-8", buffering=1) as log, contextlib.ExitStack() as stack:
+        if arguments.log:
+            stack.enter_context(contextlib.redirect_stdout(log))
+            stack.enter_context(contextlib.redirect_stderr(log))
+        own = given_for_road(arguments)
+        track = chosen_track(arguments, needs_file=False)
+        dialect = DIALECTS[arguments.dialect](Stage(track.source, arguments.direction, arguments.look, own))
+        joined = Joined(dialect, arguments.host, arguments.port, arguments.wait, arguments.pace, arguments.fps)
+        begin = time.perf_counter()
+        try:
+            joined.run()
+        except UserError as error:
+            return program.failed("simulator", error)
+        finally:
+            seconds = time.perf_counter() - begin
+            print(
+                f"{plural(dialect.episodes, 'episode')}, {plural(joined.frames, 'telemetry', 'telemetries')}, "
+                f"{joined.time:.0f} simulated seconds in {seconds:.0f} s"
+            )
     return program.DONE
 
 

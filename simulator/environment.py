@@ -26,6 +26,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, InvalidAction, ResetNeeded
+from gymnasium.utils import EzPickle
 
 from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
@@ -42,6 +43,7 @@ from simulator.world import Scene, free_unused
 
 ID = "behavioral-cloning/Drive-v0"
 MAX_STEPS = 10 * 60 * SAMPLE_RATE  # ten simulated minutes, so that the episode of a car that stands still ends, too
+OPTIONS = ("s", "offset", "turn", "track", "direction", "look")  # of reset
 DEPARTURE_PENALTY = 100.0  # m of progress; Gymnasium's CarRacing gives the same for leaving its playfield
 
 
@@ -55,7 +57,20 @@ def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> 
         raise SimulatorError(f"{name} {value!r}: it must be {allowed}")
 
 
-class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
+def check_look(look: Any) -> None:
+    """Raise SimulatorError if a look is not a number of one."""
+    check("look", look, lambda number: number >= 0 and number % 1 == 0, "a whole number from 0")
+
+
+def make_track(track: Any, direction: Any) -> Track:
+    """Return the track that an argument or option names. Raises TrackError, or SimulatorError for other types."""
+    named = "a name, such as 'lake', 'jungle' or 'road-1', or a road of cloning.road.points"
+    check("track", track, lambda source: isinstance(source, str | PointRoad), named)
+    check("direction", direction, lambda name: name in ("ccw", "cw", None), "'ccw', 'cw' or None")
+    return Track(track, direction)
+
+
+class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
     """Drive the simulator's car by its centre camera; a step lasts one frame, 1/15 s of simulated time.
 
     | | |
@@ -66,8 +81,10 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
     | terminated | the car left the road with a wheel (kerbs belong to the road); `reset` starts again |
     | truncated | the laps are finished, or, by Gymnasium's own wrapper, after `max_episode_steps` (default 9000) |
     | info | `s`: m along the track; `offset`: lateral offset in m, right positive; `speed`: mph; `departures`: 0 or 1; `laps`: finished laps |
+    | info, in gym-donkeycar's names | `cte`: as offset; `pos`: m east, up and north, as in Unity; `hit`: "none", or the side on which the car left the road; `lap_count`: as laps; `last_lap_time`: s, 0 before the first |
 
-    The same seed, options and actions give the same frames, bit for bit.
+    The same seed, options and actions give the same frames, bit for bit. A pickled environment becomes one with the
+    same arguments that waits for `reset`.
     """  # noqa: E501 - lines of a table
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": SAMPLE_RATE}  # noqa: RUF012 - as Gymnasium declares it
@@ -91,16 +108,16 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         random_start: begin each episode anywhere on the centre line instead of where the autonomous mode does;
         render_mode: "rgb_array" (a view from behind the car) or None.
         """
-        named = "a name, such as 'lake', 'jungle' or 'road-1', or a road of cloning.road.points"
-        check("track", track, lambda source: isinstance(source, str | PointRoad), named)
-        check("direction", direction, lambda name: name in ("ccw", "cw", None), "'ccw', 'cw' or None")
-        check("look", look, lambda number: number >= 0 and number % 1 == 0, "a whole number from 0")
+        EzPickle.__init__(self, track, direction, look, speed, laps, random_start, render_mode)
+        self.track = make_track(track, direction)
+        check_look(look)
         check("speed", speed, lambda mph: 1 <= mph <= TOP_SPEED_MPH, f"1 to {TOP_SPEED_MPH} (mph)")
         check("laps", laps, lambda number: 0 < number < math.inf, "a number above 0")
+        check("random_start", random_start, lambda value: isinstance(value, bool), "True or False")
         check("render_mode", render_mode, lambda mode: mode in ("rgb_array", None), "'rgb_array' or None")
         self.observation_space = spaces.Box(0, 255, FRAME, np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.track, self.speed, self.laps, self.random_start = Track(track, direction), speed, laps, random_start
+        self.look, self.speed, self.laps, self.random_start = look, speed, laps, random_start
         scene = Scene(scenery.build(track, look))
         self.cameras = Cameras(scene, ("center",))
         self.render_mode, self.view = render_mode, ChaseView(scene) if render_mode else None
@@ -111,18 +128,23 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin an episode, with the car at rest on its springs; return the first frame and info.
 
-        seed: of the random starts; options: "s", m along the track, 0 up to its length, and "offset", lateral offset in
-        m, right positive (default 0), say where to start. Raises SimulatorError if the road is not there, and
-        gymnasium's ClosedEnvironmentError after `close`.
+        seed: of the random starts. Of the options "s", m along the track, 0 up to its length, "offset", lateral offset
+        in m, right positive (default 0), and "turn", radians from the road's direction to the right (default 0), say
+        where to start; "track", "direction" and "look", as above, which road to drive from now on. Raises TrackError or
+        SimulatorError if there is no road, and gymnasium's ClosedEnvironmentError after `close`.
         """
         self._check_open()
         super().reset(seed=seed)
         self.state = "ended"  # until the car stands on the road
+        options = {} if options is None else options
+        if not isinstance(options, dict) or options.keys() - set(OPTIONS):
+            raise SimulatorError(f"options {options!r}: the options of reset are {', '.join(OPTIONS)}, in a dict")
+        self._choose_road(options)
         self.run = Run(self.track, "autonomous")
         self.run.car.speed_limit = self.speed * MPH
         if self.random_start:
             self.run.s = self.np_random.uniform(0, self.track.length)
-        self._set_on_road(options or {})
+        self._set_on_road(options)
         self.clock = SampleClock(1 / SAMPLE_RATE)
         self.state = "driving"
         return self._frame(), self._info()
@@ -131,16 +153,31 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.state == "closed":
             raise ClosedEnvironmentError("the environment is closed: make another one")
 
+    def _choose_road(self, options: dict[str, Any]) -> None:
+        """Build the road that the options name, if it is another one. Raises SimulatorError, TrackError."""
+        if not options.keys() & {"track", "direction", "look"}:
+            return
+        source, look = options.get("track", self.track.source), options.get("look", self.look)
+        track = make_track(source, options.get("direction", None if "track" in options else self.track.direction))
+        check_look(look)
+        if (source, look) != (self.track.source, self.look):
+            scene = Scene(scenery.build(source, look))
+            self.cameras.move(scene)
+            if self.view:
+                self.view.move(scene)
+            free_unused()
+        self.track, self.look = track, look
+
     def _set_on_road(self, options: dict[str, Any]) -> None:
         """Set the car on the road; options: see `reset`. Raises SimulatorError."""
-        if not isinstance(options, dict) or options.keys() - {"s", "offset"}:
-            raise SimulatorError(f"options {options!r}: the options of reset are s and offset, in a dict")
+        turn = options.get("turn", 0.0)
+        check("turn", turn, lambda radians: -math.pi <= radians <= math.pi, "-π to π (radians)")
         s, offset = options.get("s", self.run.s), options.get("offset", 0.0)
         length = self.track.length
         check("s", s, lambda metres: 0 <= metres < length, f"at least 0 and less than {length:.1f} (m)")
         check("offset", offset, math.isfinite, "a number (m)")
         self.run.s = float(s)
-        self.run.set_back(float(offset))
+        self.run.set_back(float(offset), turn=float(turn))
         if side := self.run.off_road():
             left, right = self.track.edges[self.track.index(self.run.s)]
             raise SimulatorError(
@@ -179,12 +216,20 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _info(self) -> dict[str, Any]:
         """Return the present state; see the class."""
+        run = self.run
+        east, north, up = run.car.node.get_pos()
+        lap_times = [0.0, *run.lap_times]
         return {
-            "s": float(self.run.s),
-            "offset": self.run.offset,
-            "speed": self.run.speed_mph,
-            "departures": len(self.run.departures),
-            "laps": self.run.laps,
+            "s": float(run.s),
+            "offset": run.offset,
+            "speed": run.speed_mph,
+            "departures": len(run.departures),
+            "laps": run.laps,
+            "cte": run.offset,
+            "pos": (east, up, north),
+            "hit": run.departures[-1].side if run.departures else "none",
+            "lap_count": run.laps,
+            "last_lap_time": lap_times[-1] - lap_times[-2] if run.laps else 0.0,
         }
 
     def render(self) -> np.ndarray | None:

@@ -31,10 +31,15 @@ class ChaseView:
     """The view from behind the car."""
 
     def __init__(self, scene: Scene):
-        self.scene = scene
-        self.camera = scene.root.attach_new_node(Camera("film", lens(FILM_ROWS, FILM_COLUMNS)))
+        self.camera = NodePath(Camera("film", lens(FILM_ROWS, FILM_COLUMNS)))
         self.camera.node().set_camera_mask(OUTSIDE)
+        self.move(scene)
         self.buffer = Buffer(FILM_ROWS, FILM_COLUMNS, [self.camera])
+
+    def move(self, scene: Scene) -> None:
+        """Look at another scene from now on."""
+        self.scene = scene
+        self.camera.reparent_to(scene.root)
 
     def frame(self, run: Run) -> np.ndarray:
         """Render the view with its caption: uint8 (360, 640, 3), RGB."""

@@ -1,6 +1,7 @@
 """The Gymnasium environment: against Gymnasium's own checks, and against the simulator driven without it."""
 
 import math
+import pickle
 import re
 import textwrap
 from typing import Any
@@ -14,6 +15,7 @@ from panda3d.core import RenderState
 
 from cloning.base.errors import SimulatorError, TrackError
 from cloning.recordings.format import SAMPLE_RATE
+from cloning.road.points import make_road
 from simulator import environment, scenery
 from simulator.cameras import Cameras
 from simulator.car import STEP
@@ -150,6 +152,8 @@ def test_environments_in_processes_of_their_own_see_the_same(lake):
         ({"laps": math.nan}, "a number above 0"),
         ({"track": 3}, "a name, such as 'lake'"),
         ({"speed": "fast"}, r"1 to 30 \(mph\)"),
+        ({"random_start": "no"}, "True or False"),
+        ({"look": "sunny"}, "a whole number"),
     ],
 )
 def test_wrong_arguments_are_reported(arguments, message):
@@ -167,10 +171,15 @@ def test_wrong_arguments_are_reported(arguments, message):
         ({"s": math.nan}, "less than 1137.9"),
         ({"offset": -3.5, "s": 300}, "the road's left edge; at 300.0 m the edges are at -3.95 and 3.95 m"),
         ({"offset": math.inf}, "it must be a number"),
-        ({"speed": 3}, "the options of reset are s and offset"),
+        ({"speed": 3}, "the options of reset are s, offset, turn, track"),
         ({"s": "300"}, "less than 1137.9"),
         ({"offset": None}, "it must be a number"),
-        ([300], "the options of reset are s and offset"),
+        ({"turn": "left"}, "it must be -π to π"),
+        ({"turn": 4}, "it must be -π to π"),
+        ({"look": -1}, "a whole number"),
+        ({"track": 7}, "a name, such as 'lake'"),
+        ({"direction": "up"}, "'ccw', 'cw' or None"),
+        ([300], "the options of reset are s, offset, turn, track"),
     ],
 )
 def test_wrong_options_are_reported_and_begin_no_episode(lake, options, message):
@@ -186,6 +195,51 @@ def test_an_action_that_is_not_two_finite_numbers_is_refused(lake, action):
     lake.reset()
     with pytest.raises(InvalidAction, match="two finite numbers"):
         lake.step(action)
+
+
+def test_reset_chooses_the_road_the_look_and_the_start(lake):
+    env = environment.Drive(laps=1, render_mode="rgb_array")
+    road = make_road([(0, 0), (30, 0), (60, 9)], width=7)
+    frame, _ = env.reset(options={"track": road, "look": 3, "s": 20, "offset": 1.0, "turn": 0.1})
+    other = environment.Drive(road, look=3)
+    expected, _ = other.reset(options={"s": 20, "offset": 1.0, "turn": 0.1})
+    assert np.array_equal(frame, expected)
+    assert env.run.lane == pytest.approx((1.0, 0.1), abs=0.01)
+    view: Any = env.render()
+    assert view.std() > 10
+    assert env.reset()[1]["s"] == 0, "it stays on the road"
+    backwards = env.reset(options={"direction": "cw"})[1]["pos"]
+    assert backwards == pytest.approx((60, 0, 9), abs=0.1)
+    with pytest.raises(TrackError, match="moon"):
+        env.reset(options={"track": "moon"})
+    lake_frame, _ = env.reset(options={"track": "lake", "look": 0})
+    assert np.array_equal(lake_frame, lake.reset()[0])
+
+
+def test_info_has_the_names_that_users_of_gym_donkeycar_know():
+    env = environment.Drive(make_road([(0, 0, 3), (0, 30, 3)]), laps=2)
+    info = env.reset(options={"offset": 0.5})[1]
+    assert info["pos"] == pytest.approx((0.5, 3, 0), abs=0.1)
+    assert (info["cte"], info["hit"], info["lap_count"], info["last_lap_time"]) == (0.5, "none", 0, 0.0)
+    while not info["lap_count"]:
+        info = env.step(np.asarray([0, 1]))[4]
+    first = info["last_lap_time"]
+    assert first == env.run.lap_times[0] > 2
+    while info["hit"] == "none":
+        info = env.step(np.asarray([-1, 1]))[4]
+    assert info["hit"] == "left"
+    assert info["last_lap_time"] == first
+
+
+def test_a_pickled_environment_drives_as_the_original():
+    env = environment.Drive(make_road([(0, 0), (50, 9)]), look=2, speed=12, random_start=True)
+    frames, _ = drive(env, [(0.1, 1.0)] * 3, seed=4)
+    copy = pickle.loads(pickle.dumps(env))
+    with pytest.raises(ResetNeeded):
+        copy.step(np.zeros(2))
+    assert np.array_equal(drive(copy, [(0.1, 1.0)] * 3, seed=4)[0], frames)
+    env.close()
+    copy.close()
 
 
 def test_a_closed_environment_frees_its_scene_and_says_that_it_is_closed():

@@ -47,13 +47,15 @@ def make_road(
     marking: str = MARKING,
     land: str = LAND,
     name: str = "road",
+    checked: bool = True,
 ) -> PointRoad:
     """Return a road whose centre line is a smooth curve through points (x, y) or (x, y, z), m.
 
     closed: join the last point to the first; None: if they are the same point. width: 5 to 12 m; marking: one of
-    MARKINGS; land: one of LANDS; name: of the track in reports. Raises TrackError, with the reason and the place, for a
-    road that crosses itself or comes too near to itself, bends within its own width, is too short, too long or too
-    steep, and for values that are not as described.
+    MARKINGS; land: one of LANDS; name: of the track in reports; checked: refuse a faulty course.
+
+    Raises TrackError, with the reason and the place, for a road that crosses itself or comes too near to itself,
+    bends within its own width, is too short, too long or too steep, and for values that are not as described.
     """
     numbers = _numbers(points)
     near = np.linalg.norm(np.diff(numbers, axis=0), axis=1) < SAME_POINT
@@ -80,7 +82,7 @@ def make_road(
         reason = _fault(road)
         if not reason:
             break
-    if reason:
+    if reason and checked:
         raise TrackError(reason)
     return road
 

@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from wsproto import ConnectionType, WSConnection
 from wsproto.connection import ConnectionState
@@ -48,23 +49,33 @@ class Answer:
     throttle: float | None = None
 
 
-def parse_answer(packet: str) -> Answer | None:
-    """Return the answer in an Engine.IO packet, or None if the simulator could not use it.
-
-    The numbers must be strings: the real simulator silently ignores anything else. They are clipped to -1..1.
-    """
+def parse_event(packet: str) -> tuple[str, Any] | None:
+    """Return the name and the data of the event in an Engine.IO packet, or None if it holds no event."""
     if not packet.startswith(EVENT):
         return None
     try:
         contents = json.loads(packet[len(EVENT) :])
     except (ValueError, RecursionError):  # not JSON, or nested too deep
         return None
-    if not isinstance(contents, list) or not contents:
+    if not isinstance(contents, list) or not contents or not isinstance(contents[0], str):
         return None
-    event, data = contents[0], contents[1] if len(contents) > 1 else None
-    if event == "manual":
+    return contents[0], contents[1] if len(contents) > 1 else None
+
+
+def parse_answer(packet: str) -> Answer | None:
+    """Return the answer in an Engine.IO packet, or None if the simulator could not use it."""
+    name, data = parse_event(packet) or ("", None)
+    if name == "manual":
         return Answer()
-    if event != "steer" or not isinstance(data, dict):
+    return parse_commands(data) if name == "steer" else None
+
+
+def parse_commands(data: Any) -> Answer | None:
+    """Return the steering and throttle in an event's data, or None if the simulator could not use them.
+
+    The numbers must be strings: the real simulator silently ignores anything else. They are clipped to -1..1.
+    """
+    if not isinstance(data, dict):
         return None
     steering, throttle = (_number(data.get(key)) for key in ("steering_angle", "throttle"))
     if steering is None or throttle is None:
@@ -82,6 +93,11 @@ def _number(text: object) -> float | None:
     return max(-1.0, min(1.0, value)) if math.isfinite(value) else None
 
 
+def event_packet(name: str, data: Any) -> str:
+    """Return the packet of an event with its data."""
+    return EVENT + json.dumps([name, data], separators=(",", ":"))
+
+
 def telemetry_packet(steering: float, throttle: float, speed: float, jpeg: bytes) -> str:
     """Return the telemetry packet for a frame.
 
@@ -93,7 +109,7 @@ def telemetry_packet(steering: float, throttle: float, speed: float, jpeg: bytes
         "speed": f"{speed:.4f}",
         "image": base64.b64encode(jpeg).decode(),
     }
-    return EVENT + json.dumps(["telemetry", values], separators=(",", ":"))
+    return event_packet("telemetry", values)
 
 
 MANUAL_TELEMETRY = f'{EVENT}["telemetry",null]'  # while the human driver holds W or S
@@ -102,7 +118,7 @@ MANUAL_TELEMETRY = f'{EVENT}["telemetry",null]'  # while the human driver holds 
 class Connection:
     """A connection to the server; sends and receives Engine.IO packets, as text.
 
-    Whatever the server sends, it takes no more memory than a packet of MAX_PACKET and READ_BYTES. When the connection
+    Whatever the server sends, it takes no more memory than a packet of `max_packet` and READ_BYTES. When the connection
     is lost, its socket is closed.
     """
 
@@ -113,11 +129,13 @@ class Connection:
         real_timing: bool,
         timeout: float = CONNECT_TIMEOUT,
         send_timeout: float = SEND_TIMEOUT,
+        max_packet: int = MAX_PACKET,
     ):
         """Connect, and wait until the server has opened a session.
 
         real_timing: write as the real client does, each fragment on its own and with Nagle's algorithm; otherwise
-        a whole packet at once. timeout: s until the session is open; send_timeout: s for the server to take a packet.
+        a whole packet at once. timeout: s until the session is open; send_timeout: s for the server to take a packet;
+        max_packet: characters that a packet of the server may have.
         Raises ConnectionLost.
         """
         until = time.monotonic() + timeout
@@ -126,7 +144,7 @@ class Connection:
             self.socket = socket.create_connection((host, port), timeout=timeout)
         except (OSError, UnicodeError) as error:  # UnicodeError: a name that no host can have
             raise ConnectionLost(f"no server at {address} ({getattr(error, 'strerror', None) or error})") from error
-        self.real_timing, self.send_timeout = real_timing, send_timeout
+        self.real_timing, self.send_timeout, self.max_packet = real_timing, send_timeout, max_packet
         self.protocol = WSConnection(ConnectionType.CLIENT)
         self.packets: deque[str] = deque()  # received, but not yet returned by `receive`
         self.partial = ""  # message of which not all fragments have arrived
@@ -197,8 +215,8 @@ class Connection:
             self._write(self.protocol.send(event.response()))
         elif isinstance(event, TextMessage):
             self.partial += event.data
-            if len(self.partial) > MAX_PACKET:
-                raise ConnectionLost(f"the server sent a message of more than {MAX_PACKET} characters")
+            if len(self.partial) > self.max_packet:
+                raise ConnectionLost(f"the server sent a message of more than {self.max_packet} characters")
             if event.message_finished:
                 self.packets.append(self.partial)
                 self.partial = ""

@@ -10,6 +10,7 @@ from cloning.wire.client import (
     CONNECT,
     CONNECT_TIMEOUT,
     GREETING_TIMEOUT,
+    MAX_PACKET,
     MESSAGE,
     SEND_TIMEOUT,
     Answer,
@@ -30,9 +31,9 @@ class ClientSession:
     (`request_answer` returned it, or `progressed` was called) lets `wait` seconds begin anew.
     """
 
-    def __init__(self, host: str, port: int, wait: float, real_timing: bool = False):
-        """wait: seconds to wait for a server to appear, or for a usable answer; real_timing: see Connection."""
-        self.address, self.wait, self.real_timing = (host, port), wait, real_timing
+    def __init__(self, host: str, port: int, wait: float, real_timing: bool = False, max_packet: int = MAX_PACKET):
+        """wait: seconds to wait for a server to appear, or for a usable answer; the others: see Connection."""
+        self.address, self.wait, self.real_timing, self.max_packet = (host, port), wait, real_timing, max_packet
         self.round_trips: list[float] = []  # s
         self.unusable = self.reconnections = 0
         self._connection: Connection | None = None
@@ -59,7 +60,11 @@ class ClientSession:
             left = max(RETRY_INTERVAL, self._patience_ends() - time.monotonic())
             try:
                 self._connection = Connection(
-                    *self.address, self.real_timing, min(CONNECT_TIMEOUT, left), min(SEND_TIMEOUT, self.wait)
+                    *self.address,
+                    self.real_timing,
+                    min(CONNECT_TIMEOUT, left),
+                    min(SEND_TIMEOUT, self.wait),
+                    self.max_packet,
                 )
             except ConnectionLost as error:
                 self._wait_after(error)

@@ -1,0 +1,320 @@
+"""The dialects in which other people's programs speak to the simulator, each on the same wire as drive.py's.
+
+measures  telemetry with what the simulator knows besides, as strings (SelfOracle, ThirdEye)
+roads     the program sends roads as text, and has the car set back to their start (maxitwo, perturbation-drive,
+          MultiSim)
+episodes  the program starts episodes on a track, in a weather and a light, and pauses them (udacity-gym)
+
+All three programs are servers; the simulator connects to them. Lateral offsets (`cte`) are in m, right positive;
+`pos_x`, `pos_y`, `pos_z` are m east, up and north, as in Unity.
+"""
+
+import base64
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cloning.base.errors import TrackError
+from cloning.road.generated import PointRoad
+from cloning.road.motion import FULL_LOCK, MPH
+from cloning.road.points import make_road, parse_track_string
+from cloning.road.track import Track
+from cloning.wire.client import Answer, event_packet, parse_commands
+from simulator import scenery
+from simulator.cameras import Cameras, jpeg
+from simulator.run import Run
+from simulator.scenery.segments import segments
+from simulator.scenery.weather import in_weather
+from simulator.world import Scene, free_unused
+
+SECTOR = 10.0  # m of road that waypoints and sectors count
+AHEAD = 5.0  # m ahead of the car: where `next_cte` is measured, if it goes straight on
+LOST = 7.0  # m from the centre line at which a car that nobody sets back is set back
+DAY = 120.0  # simulated s of a day and its night
+DARKEST = 0.35  # brightness at midnight, of that at noon
+ROAD_END = "end of the road"  # `hit` there
+TRACKS = {"mountain": "road-40"}  # by the program's name; the others are called as here
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What the sent roads look like, and the track before the first one.
+
+    source, direction, look  of the track that lies there at the start, see Track and `scenery.build`
+    road                     width, marking and land of the roads that a program sends, as `make_road` takes them
+    """
+
+    source: str | PointRoad
+    direction: str | None
+    look: int
+    road: dict[str, Any]
+
+
+class Dialect:
+    """A track with a car that a program drives; a subclass says in which words.
+
+    run    the present drive
+    still  whether simulated time stands still until the program says something else
+    ready  whether the program is to get telemetry
+    more   s after an answer in which more may come that belongs to it
+    """
+
+    more = 0.0
+
+    def __init__(self, stage: Stage):
+        self.stage, self.still, self.ready, self.episodes = stage, False, True, 0
+        self.views: list[Cameras] = []
+        self.steering = self.throttle = 0.0
+        self.replies: list[str] = []  # packets to send besides telemetry
+        self.open(stage.source, stage.direction)
+
+    def open(self, source: str | PointRoad, direction: str | None = None) -> None:
+        """Build a track, and set the car at its start. Raises TrackError."""
+        self.track = Track(source, direction)
+        for i, built in enumerate(self.build(source)):
+            if i < len(self.views):
+                self.views[i].move(Scene(built))
+            else:
+                self.views.append(Cameras(Scene(built), ("center",)))
+        free_unused()
+        self.restart()
+
+    def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
+        """Return what the telemetry's images show."""
+        return [scenery.build(source, self.stage.look)]
+
+    def restart(self) -> None:
+        """Set the car at the start of its road, at rest."""
+        self.run = Run(self.track, "autonomous")
+        self.steering = self.throttle = 0.0
+
+    def step(self) -> None:
+        """Drive for one physics step."""
+        self.episodes += not self.run.time
+        self.advance()
+
+    def advance(self) -> None:
+        """Drive for one physics step, after which a car that has left the road is set back."""
+        self.run.step(self.steering, self.throttle)
+
+    def apply(self, answer: Answer | None) -> bool:
+        """Drive as a program commands; return whether it can be used."""
+        if answer is None:
+            return False
+        if answer.steering is not None and answer.throttle is not None:
+            self.steering, self.throttle = answer.steering, answer.throttle
+        return True
+
+    def handle(self, event: str, data: Any) -> bool:
+        """Do what an event says; return whether it answers a telemetry. Raises UserError."""
+        raise NotImplementedError
+
+    def telemetry(self) -> str:
+        """Return the packet for the present state."""
+        raise NotImplementedError
+
+    def frame(self) -> np.ndarray:
+        """Render the centre camera: uint8 (160, 320, 3), RGB."""
+        return self.views[0].frames(self.run.car.node.get_transform())[0]
+
+    def state(self, speed_unit: float = 1.0) -> dict[str, str]:
+        """Return what all dialects tell; speed_unit: m/s."""
+        x, y, z = self.run.car.node.get_pos()
+        return {
+            "steering_angle": f"{FULL_LOCK * self.steering:.4f}",
+            "throttle": f"{self.throttle:.4f}",
+            "speed": f"{self.run.car.speed / speed_unit:.4f}",
+            "cte": f"{self.run.offset:.4f}",
+            "image": base64.b64encode(jpeg(self.frame())).decode(),
+            "pos_x": f"{x:.4f}",
+            "pos_y": f"{z:.4f}",
+            "pos_z": f"{y:.4f}",
+        }
+
+
+class Measures(Dialect):
+    """Telemetry with lap, waypoint, out-of-bound episodes and so on; steering as usual. Nothing can be crashed into."""
+
+    def handle(self, event: str, data: Any) -> bool:
+        """Steer, or drive on as before."""
+        return event == "manual" or (event == "steer" and self.apply(parse_commands(data)))
+
+    def telemetry(self) -> str:
+        """Return the usual telemetry, speed in mph, and the measures."""
+        run = self.run
+        offset, heading_error = run.lane
+        return event_packet(
+            "telemetry",
+            self.state(MPH)
+            | {
+                "brake": f"{max(0.0, -self.throttle):.4f}",
+                "lapNumber": str(run.laps + 1),
+                "currentWayPoint": str(int(run.s // SECTOR)),
+                "crash": "0",
+                "tot_obes": str(len(run.departures)),
+                "tot_crashes": "0",
+                "distance": f"{run.distance:.4f}",
+                "sim_time": f"{run.time:.4f}",
+                "ang_diff": f"{math.degrees(heading_error):.4f}",
+                "cte": f"{offset:.4f}",
+            },
+        )
+
+
+class Roads(Dialect):
+    """Roads sent as text; the car stays where it leaves them until the program sets it back. Speed is in m/s."""
+
+    def __init__(self, stage: Stage):
+        super().__init__(stage)
+        self.text = ""  # of the road that lies there
+        self.still = True
+
+    def handle(self, event: str, data: Any) -> bool:
+        """Steer, lay a road, or set the car back at its start. Raises TrackError for a text that is no road."""
+        if event == "steer":
+            self.still = self.run.at_end
+            return self.apply(parse_commands(data))
+        if event == "reset":
+            if self.run.time:
+                self.restart()
+            self.still = True
+            return True
+        if event != "track" or not isinstance(data, dict) or not isinstance(data.get("track_string"), str):
+            return False
+        self.text, self.still = data["track_string"], True
+        # Programs check their roads by rules of their own, so a faulty course is laid all the same.
+        self.open(make_road(parse_track_string(self.text), name="sent", checked=False, **self.stage.road))
+        return True
+
+    def advance(self) -> None:
+        """Drive for one physics step; at the road's end, the car stops."""
+        self.run.advance(self.steering, self.throttle)
+        if abs(self.run.offset) > LOST:
+            self.run.set_back()
+        self.still = self.run.at_end
+
+    def telemetry(self) -> str:
+        """Return the telemetry with the road that lies there and what was hit: the end of the road, or none."""
+        yaw = math.pi / 2 - self.run.car.heading  # from north to the right, as in Unity
+        turn = (0.0, math.sin(yaw / 2), 0.0, math.cos(yaw / 2), 0.0, math.degrees(yaw) % 360, 0.0)
+        more = {
+            "cte_pid": f"{self.run.offset:.4f}",
+            "hit": ROAD_END if self.run.at_end else "none",
+            "track": self.text,
+            "angl": f"{math.degrees(self.run.lane[1]):.4f}",
+            # The car's attitude, of which only the heading is told: a quaternion x, y, z, w and Euler angles in degrees
+            **{f"angle{i}": f"{value:.6f}" for i, value in enumerate(turn, 1)},
+        }
+        return event_packet("telemetry", self.state() | more)
+
+
+class Episodes(Dialect):
+    """Episodes on a named track, in a weather, by day or through day and night; with pauses, metrics and segments.
+
+    Telemetry goes on in a pause, because the program resumes in its answer to one. Speed is in m/s.
+    """
+
+    more = 0.003  # after its action, the program sends whether to go on, and perhaps another episode
+
+    def __init__(self, stage: Stage):
+        self.weather, self.day = "sunny", True
+        self.tone: np.ndarray | None = None  # of the camera by day
+        super().__init__(stage)
+        self.ready = False
+        self.told = 0  # departures of which the program knows
+
+    def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
+        """Return the scenery in its weather, and the same in the colours of its segments."""
+        built = scenery.build(source, self.stage.look)
+        return [in_weather(built, self.weather), segments(built)]
+
+    def open(self, source: str | PointRoad, direction: str | None = None) -> None:
+        """Build a track in its weather, and set the car at its start. Raises TrackError."""
+        super().open(source, direction)
+        self.tone = self.views[0].scene.scenery.tone
+
+    def handle(self, event: str, data: Any) -> bool:
+        """Steer, start or end an episode, pause or go on. Raises UserError for an unknown track or weather."""
+        if event == "action":
+            return self.apply(parse_commands(data))
+        if event in ("pause_sim", "resume_sim"):
+            self.still = event == "pause_sim"
+            self.replies.append(event_packet("sim_paused" if self.still else "sim_resumed", {}))
+        elif event == "end_episode" and self.ready:
+            self.ready = False
+            self.replies.append(event_packet("episode_metrics", self.metrics()))
+            self.replies.append(event_packet("episode_events", [self.departure(i) for i in range(self.told)]))
+        elif event == "start_episode" and isinstance(data, dict):
+            self.start(*(str(data.get(key)) for key in ("track_name", "weather_name", "daytime_name")))
+        return False
+
+    def start(self, track: str, weather: str, daytime: str) -> None:
+        """Begin an episode; daytime: "day" or "daynight". Raises UserError."""
+        if daytime not in ("day", "daynight"):
+            raise TrackError(f"{daytime[:40]}: there is no such daytime; there are day and daynight")
+        source: str | PointRoad = TRACKS.get(track, track)
+        changed = (source, weather) != (self.track.source, self.weather)
+        self.weather, self.day = weather, daytime == "day"
+        if changed:
+            self.open(source)
+        self.restart()
+        self.ready, self.still, self.told = True, False, 0
+
+    def advance(self) -> None:
+        """Drive for one physics step, and tell the program if the car has left the road."""
+        super().advance()
+        for i in range(self.told, len(self.run.departures)):
+            self.replies.append(event_packet("episode_event", self.departure(i)))
+            self.told += 1
+
+    def departure(self, i: int) -> dict[str, str]:
+        """Return what the program is told about the i-th departure."""
+        left = self.run.departures[i]
+        place = {"pos_x": f"{left.x:.4f}", "pos_z": f"{left.y:.4f}", "sector": str(int(left.s // SECTOR))}
+        return {"event": "out_of_bounds", "time": f"{left.time:.2f}", "speed": f"{left.speed:.4f}", **place}
+
+    def metrics(self) -> dict[str, str]:
+        """Return the measures of the episode that ends; m, s and m/s."""
+        run = self.run
+        offset = np.abs(run.trajectory.offset or [0.0])
+        return {
+            "track": run.track.name,
+            "time": f"{run.time:.2f}",
+            "distance": f"{run.distance:.2f}",
+            "laps": str(run.laps),
+            "out_of_bounds": str(len(run.departures)),
+            "mean_cte": f"{offset.mean():.4f}",
+            "max_cte": f"{offset.max():.4f}",
+            "mean_speed": f"{run.distance / run.time if run.time else 0.0:.4f}",
+        }
+
+    def frame(self) -> np.ndarray:
+        """Render the centre camera, darker at night."""
+        scene = self.views[0].scene
+        light = 1.0 if self.day else (1 + DARKEST) / 2 + (1 - DARKEST) / 2 * math.cos(2 * math.pi * self.run.time / DAY)
+        tone = np.eye(3, 4, dtype=np.float32) if self.tone is None else self.tone
+        scene.scenery = replace(scene.scenery, tone=self.tone if light == 1 else (tone * light).astype(np.float32))
+        return super().frame()
+
+    def telemetry(self) -> str:
+        """Return the telemetry with lap, sector and the image of the segments, a PNG."""
+        run = self.run
+        pose, (x, y, _) = run.car.heading, run.car.node.get_pos()
+        ahead = self.track.locate(x + AHEAD * math.cos(pose), y + AHEAD * math.sin(pose), run.s)[1]
+        colours = self.views[1].segments(run.car.node.get_transform())
+        encoded, png = cv2.imencode(".png", cv2.cvtColor(colours, cv2.COLOR_RGB2BGR))
+        assert encoded
+        more = {
+            "next_cte": f"{ahead:.4f}",
+            "lap": str(run.laps + 1),
+            "sector": str(int(run.s // SECTOR)),
+            "semantic_segmentation": base64.b64encode(png.tobytes()).decode(),
+        }
+        return event_packet("car_telemetry", self.state() | more)
+
+
+DIALECTS: dict[str, Callable[[Stage], Dialect]] = {"measures": Measures, "roads": Roads, "episodes": Episodes}

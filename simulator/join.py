@@ -1,0 +1,165 @@
+"""The simulator joined to another program's server, in one of the dialects of `simulator.dialects`."""
+
+import argparse
+import os
+import shlex
+import sys
+import time
+from pathlib import Path
+
+from cloning.base.errors import SimulatorError
+from cloning.base.files import written_whole
+from cloning.wire.client import ConnectionLost, parse_event
+from cloning.wire.session import MAX_UNASKED, ClientSession
+from simulator.car import STEP
+from simulator.client import MAX_CATCH_UP
+from simulator.dialects import Dialect
+
+ASK_AGAIN = 5.0  # s without an answer, after which the telemetry is sent again: programs drop some
+SETTLE = 0.2  # s without a word from the server, after which its greeting is over
+STILL = 1 / 15  # s of real time between two telemetries while simulated time stands still
+MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 200,000
+
+
+class Joined(ClientSession):
+    """Sends telemetry to a server and does what it says, until the server has gone for `wait` seconds.
+
+    In lock-step simulated time waits for the answer to each telemetry; otherwise it follows the wall clock.
+    """
+
+    def __init__(self, dialect: Dialect, host: str, port: int, wait: float, pace: float, rate: float):
+        """wait: s to wait for a server; pace: simulated s a second, 0 for lock-step.
+
+        rate: telemetries a simulated second, at most 50.
+        """
+        super().__init__(host, port, wait, max_packet=MAX_PACKET)
+        self.dialect, self.pace, self.period = dialect, pace, max(STEP, 1 / rate)
+        self.frames, self.time, self.due = 0, 0.0, 0.0  # sent; simulated s in all; when the next is due
+        self._origin = 0.0  # simulated s at time.perf_counter() 0, with a pace
+
+    def run(self) -> None:
+        """Join a server, again and again. Raises SimulatorError if there is none, UserError for an impossible wish."""
+        while True:
+            try:
+                self.connect()
+                try:
+                    self._exchange()
+                except ConnectionLost as error:
+                    self.count_reconnection(error)
+                finally:
+                    self.close()
+            except SimulatorError:
+                if not self.frames:
+                    raise
+                return
+
+    def no_answer(self) -> SimulatorError:
+        """Return the error for a server that is missing or has gone."""
+        host, port = self.address
+        return SimulatorError(f"{self._lost or 'no answer'}; no server at {host}:{port} for {self.wait:g} s")
+
+    def _exchange(self) -> None:
+        """Send and receive until the connection is lost. Raises ConnectionLost."""
+        self._listen(SETTLE)
+        self._origin = self.time - self.pace * time.perf_counter()
+        while True:
+            while not self.dialect.ready:
+                self._listen(ASK_AGAIN)
+            self.connection.send(self.dialect.telemetry())
+            self.frames += 1
+            if self._await_answer():
+                self._drive()
+
+    def _listen(self, pause: float) -> bool:
+        """Do what the server says until it is silent for `pause` seconds; return whether it answered a telemetry."""
+        answered = False
+        for _ in range(MAX_UNASKED):
+            packet = self.connection.receive(pause)
+            if packet is None:
+                break
+            answered = self._handle(packet) or answered
+            pause = self.dialect.more if answered else 0.0
+        return answered
+
+    def _handle(self, packet: str) -> bool:
+        """Do what a packet says, and send what the dialect replies; return whether it answers a telemetry."""
+        event = parse_event(packet)
+        if event is None:
+            return False
+        if self.pace:
+            self._catch_up()
+        answered = self.dialect.handle(*event)
+        self._reply()
+        return answered
+
+    def _reply(self) -> None:
+        for reply in self.dialect.replies:
+            self.connection.send(reply)
+        self.dialect.replies.clear()
+
+    def _await_answer(self) -> bool:
+        """Return whether the telemetry was answered; if not, it has to be sent again."""
+        until = time.monotonic() + ASK_AGAIN
+        while (left := until - time.monotonic()) > 0:
+            if self._listen(min(left, STEP) if self.pace else left):
+                self.progressed()
+                return True
+            if self.pace:
+                self._catch_up()
+        return False
+
+    def _drive(self) -> None:
+        """Drive until the next telemetry is due."""
+        if self.dialect.still:
+            self._listen(STILL)
+            self._origin = self.time - self.pace * time.perf_counter()
+            self.due = self.time
+            return
+        self.due += self.period
+        if self.pace:
+            while self.time < self.due - 1e-9 and not self.dialect.still:
+                self._listen(max(0.0, min(STEP, (self.due - self._now()) / self.pace)))
+                self._catch_up()
+            self.due = max(self.due, self.time)
+        while not self.pace and self.time < self.due - 1e-9 and not self.dialect.still:
+            self._step()
+        self._reply()
+
+    def _step(self) -> None:
+        self.dialect.step()
+        self.time += STEP
+
+    def _now(self) -> float:
+        """Return the simulated time that it should be by the wall clock."""
+        return self._origin + self.pace * time.perf_counter()
+
+    def _catch_up(self) -> None:
+        """Let simulated time follow the wall clock; what cannot be caught up at once is skipped."""
+        behind = int((self._now() - self.time) / STEP + 1e-6)
+        for _ in range(min(behind, MAX_CATCH_UP)):
+            if not self.dialect.still:
+                self._step()
+        if behind > MAX_CATCH_UP or self.dialect.still:
+            self._origin = self.time - self.pace * time.perf_counter()
+
+
+def write_launcher(arguments: argparse.Namespace) -> None:
+    """Write the program `arguments.launcher`, which runs `join` with the other arguments and with its own after them.
+
+    Raises SimulatorError.
+    """
+    options = ["join", "--dialect", arguments.dialect]
+    road = ("track", "road", "width", "marking", "land", "direction", "look")
+    for name in ("host", "port", "wait", *road, "pace", "fps"):
+        value = getattr(arguments, name)
+        if value is not None:
+            options += [f"--{name}", os.path.abspath(value) if name == "road" else str(value)]
+    command = shlex.join([sys.executable, "-m", "simulator", *options])
+    here = f'PYTHONPATH={shlex.quote(str(Path(__file__).parents[1]))}"${{PYTHONPATH:+:$PYTHONPATH}}"'
+    path = Path(arguments.launcher)
+    try:
+        with written_whole(path) as temporary:
+            temporary.write_text(f'#!/bin/sh\n{here} exec {command} "$@"\n', encoding="utf-8")
+            temporary.chmod(0o755)
+    except OSError as error:
+        raise SimulatorError(f"{path}: {error.strerror}; name a file in a folder that can be written") from error

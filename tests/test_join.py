@@ -1,0 +1,330 @@
+"""Other people's programs, played by servers here: each dialect, many episodes, the launcher, a server that goes."""
+
+import base64
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import socketio
+from socketio.exceptions import ConnectionRefusedError
+from steer_server import Server, unused_port
+from werkzeug.serving import make_server
+
+from cloning.base.errors import TrackError
+from cloning.recordings.images import decode
+from simulator.__main__ import main
+from simulator.dialects import Episodes, Roads, Stage
+from simulator.scenery.segments import CAR, GROUND, ROAD, SKY
+
+ROADS = ["0,1.9,0@25,1.9,0@40,1.9,3", "125.0,1.9,5.0@125.0,1.9,25.0@128.0,1.9,45.0"]
+LAKE = Stage("lake", None, 0, {})
+
+
+class Program(Server):
+    """A server whose `answer(data, n)` returns the events for a telemetry's data, or None to hang up."""
+
+    def __init__(self, answer):
+        self.answer, self.data = answer, []
+        super().__init__(self.reply_to)
+
+    def reply_to(self, packet, n):
+        event, data = json.loads(packet[2:])
+        assert event == "telemetry"
+        self.data.append(data)
+        answers = self.answer(data, n)
+        return None if answers is None else ["42" + json.dumps(answer) for answer in answers]
+
+
+def join(dialect, server, *more):
+    return main(["join", "--dialect", dialect, "--port", str(server.port), "--wait", "0.3", *more])
+
+
+def steer(steering, throttle):
+    return ["steer", {"steering_angle": str(steering), "throttle": str(throttle)}]
+
+
+def number(data, key):
+    return float(data[key])
+
+
+@pytest.mark.parametrize("more", [[], ["--pace", "2"]])
+def test_measures_are_sent_with_the_telemetry(more, capsys):
+    def answer(data, n):
+        time = number(data, "sim_time")
+        return [steer(0.1 if time > 1.5 else 0, 1)] if time < 3 else None
+
+    with Program(answer) as program:
+        assert join("measures", program, *more, "--look", "1") == 0
+    assert f"1 episode, {len(program.data)} telemetries, " in capsys.readouterr().out
+    first, last = program.data[0], program.data[-1]
+    assert all(isinstance(value, str) for value in last.values())
+    assert decode(base64.b64decode(last["image"])).shape == (160, 320, 3)
+    assert (first["lapNumber"], first["crash"], first["tot_crashes"], first["tot_obes"]) == ("1", "0", "0", "0")
+    assert number(last, "cte") > 0.1, "it has steered to the right"
+    assert number(last, "ang_diff") > 2
+    assert number(last, "distance") > 5
+    assert number(last, "speed") > 8  # mph
+    times = [number(data, "sim_time") for data in program.data]
+    if not more:  # in lock-step the frames are those of any other run
+        assert times == pytest.approx(np.ceil(np.arange(len(times)) / 15 / 0.02 - 1e-6) * 0.02)
+
+
+def test_a_departure_is_an_out_of_bound_episode_and_the_car_is_set_back():
+    def answer(data, n):
+        return [steer(1 if n > 25 else 0, 1)] if data["tot_obes"] == "0" else None
+
+    with Program(answer) as program:
+        assert join("measures", program) == 0
+    assert program.data[-1]["tot_obes"] == "1"
+    assert abs(number(program.data[-1], "cte")) < 0.5
+
+
+class RoadTests:
+    """A test program of the dialect of roads: it drives each road to its end, or off it."""
+
+    def __init__(self, plan):
+        self.plan = iter(plan)  # steering on each road
+        self.road, self.steering, self.done, self.sent = None, 0.0, True, False
+        self.results = []
+
+    def __call__(self, data, n):
+        if self.done:
+            if self.road and data["track"] == self.road and number(data, "speed") > 0.01:
+                return [["reset", {}]]
+            steering = next(self.plan, None)
+            if steering is None:
+                return None
+            self.steering = steering
+            self.road, self.done, self.sent = ROADS[len(self.results) % len(ROADS)], False, False
+        if data["track"] != self.road:
+            assert not self.sent, "the road is there at once"
+            self.sent = True
+            return [["track", {"track_string": self.road}]]
+        if abs(number(data, "cte")) > 3 or data["hit"] != "none":
+            self.done = True
+            self.results.append((data["hit"], round(number(data, "pos_x"), 1), round(number(data, "pos_z"), 1)))
+            return [["reset", {}]]
+        return [steer(self.steering - 0.6 * number(data, "cte_pid") - number(data, "angl") / 25, 0.8)]
+
+
+def test_roads_are_laid_driven_to_their_end_and_set_back():
+    tests = RoadTests([0.0, 0.0, 3.0])
+    with Program(tests) as program:
+        assert join("roads", program, "--width", "8", "--land", "forest") == 0
+    (end, x, z), (end_too, x_too, z_too), (none, *_) = tests.results
+    assert (end, end_too, none) == ("end of the road", "end of the road", "none")
+    assert (x, z) == (pytest.approx(40, abs=0.6), pytest.approx(3, abs=0.6))
+    assert (x_too, z_too) == (pytest.approx(128, abs=0.6), pytest.approx(45, abs=0.6))
+    begun = next(data for data in program.data if data["track"] == ROADS[1])
+    place = [number(begun, key) for key in ("pos_x", "pos_z")]
+    assert place == pytest.approx([125, 5], abs=0.01)
+    assert number(begun, "pos_y") == pytest.approx(1.9, abs=0.1)  # y is up
+    assert number(begun, "speed") < 0.01
+    assert number(begun, "angle6") == pytest.approx(357.9, abs=0.1)  # degrees from north to the right
+    speeds = [number(data, "speed") for data in program.data]
+    assert 5 < max(speeds) <= 13.5  # m/s: 30 mph
+
+
+def test_the_same_program_gets_the_same_drive_again():
+    seen = []
+    for _ in range(2):
+        with Program(RoadTests([0.0])) as program:
+            join("roads", program)
+        seen.append([data for data in program.data if data["track"]])
+    assert seen[0] == seen[1]
+
+
+def test_a_text_that_is_no_road_ends_the_drive_with_its_reason(capsys):
+    with Program(lambda data, n: [["track", {"track_string": "0,0,0@1,x,0"}]]) as program:
+        assert join("roads", program) == 2
+    assert "simulator: point 2: '1,x,0' is not x,y,z" in capsys.readouterr().err
+
+
+def test_a_road_that_crosses_itself_is_laid_all_the_same():
+    eight = "@".join(f"{60 * np.cos(a)},1.9,{40 * np.sin(2 * a)}" for a in np.linspace(0.2, 6.2, 80))
+    dialect = Roads(LAKE)
+    assert dialect.handle("track", {"track_string": eight})
+    assert json.loads(dialect.telemetry()[2:])[1]["track"] == eight
+
+
+def test_a_lost_answer_stops_nothing(monkeypatch):
+    monkeypatch.setattr("simulator.join.ASK_AGAIN", 0.2)
+    with Program(lambda data, n: [] if n % 7 == 3 else [steer(0, 1)] if n < 30 else None) as program:
+        assert join("measures", program) == 0
+    times = [data["sim_time"] for data in program.data]
+    assert times[4] == times[3] != times[5]
+
+
+def test_a_missing_server_is_reported(capsys):
+    assert main(["join", "--dialect", "roads", "--wait", "0.2", "--port", str(unused_port())]) == 2
+    assert "no server at 127.0.0.1:" in capsys.readouterr().err
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Episodes, on the Socket.IO server of today
+
+
+class EpisodeProgram:
+    """A test program of the dialect of episodes: `plan` yields what to send in answer to a telemetry."""
+
+    def __init__(self, plan):
+        self.sio = socketio.Server(async_mode="threading", transports=["websocket"])
+        self.heard: list[tuple[str, Any]] = []
+        self.plan = plan(self)
+        for event in ("episode_metrics", "episode_events", "episode_event", "sim_paused", "sim_resumed"):
+            self.sio.on(event, lambda sid, data, event=event: self.heard.append((event, data)))
+        self.sio.on("connect", self.connect)
+        self.sio.on("car_telemetry", self.telemetry)
+        self.data = None
+        self.server = make_server("127.0.0.1", 0, socketio.WSGIApp(self.sio), threaded=True)
+        self.port = self.server.server_port
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+
+    def start(self, track, weather="sunny", daytime="day"):
+        self.sio.emit("end_episode")
+        self.sio.emit("start_episode", {"track_name": track, "weather_name": weather, "daytime_name": daytime})
+
+    def connect(self, sid, environ, auth=None):
+        time.sleep(0.3)  # the program is not ready yet
+        if next(self.plan, "over"):
+            raise ConnectionRefusedError("the program is over")
+
+    def telemetry(self, sid, data):
+        self.data = data
+        try:
+            next(self.plan)
+        except StopIteration:
+            self.sio.disconnect(sid)
+
+    def act(self, steering=0.0, throttle=1.0):
+        self.sio.emit("action", {"steering_angle": str(steering), "throttle": str(throttle)})
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.server.shutdown()
+        self.server.server_close()
+
+
+def test_episodes_have_weather_pauses_metrics_and_segments():
+    seen = {}
+
+    def plan(program):
+        program.start("lake")
+        yield
+        for _ in range(20):
+            program.act()
+            program.sio.emit("resume_sim")
+            yield
+        seen["sunny"] = program.data
+        program.act()
+        program.sio.emit("pause_sim")
+        yield
+        for _ in range(3):
+            seen.setdefault("paused", []).append(program.data["pos_x"])
+            program.act()
+            program.sio.emit("pause_sim")
+            yield
+        while not any(event == "episode_event" for event, _ in program.heard):
+            program.act(1.0)
+            program.sio.emit("resume_sim")
+            yield
+        program.act()
+        program.start("lake", "foggy", "daynight")
+        yield
+        while number(program.data, "speed") > 0.01:  # of the episode before
+            program.act()
+            yield
+        seen["foggy"] = program.data
+
+    with EpisodeProgram(plan) as program:
+        assert join("episodes", program) == 0
+    data = seen["sunny"]
+    assert {"lap", "sector", "next_cte", "cte", "pos_x", "pos_y", "pos_z", "speed", "steering_angle"} <= set(data)
+    assert number(data, "speed") > 3
+    frame = decode(base64.b64decode(data["image"]))
+    fog = decode(base64.b64decode(seen["foggy"]["image"]))
+    assert np.ptp(frame[2].astype(int), axis=-1).mean() > 40, "a blue sky"
+    assert np.ptp(fog[2].astype(int), axis=-1).mean() < 15, "a grey one"
+    png = np.frombuffer(base64.b64decode(data["semantic_segmentation"]), np.uint8)
+    segments = cv2.cvtColor(np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
+    assert segments.shape == frame.shape
+    assert tuple(segments[110, 160]) == ROAD
+    assert tuple(segments[5, 5]) in (SKY, GROUND)
+    assert tuple(segments[158, 160]) == CAR
+    assert len(set(map(tuple, segments.reshape(-1, 3)))) <= 6
+    assert len(set(seen["paused"][1:])) == 1
+    heard = [event for event, _ in program.heard]
+    assert "sim_paused" in heard
+    assert "sim_resumed" in heard
+    metrics = dict(program.heard)["episode_metrics"]
+    assert (metrics["track"], metrics["out_of_bounds"]) == ("lake", "1")
+    assert dict(program.heard)["episode_events"][0]["event"] == "out_of_bounds"
+
+
+def test_unknown_names_are_refused_and_known_ones_all_start():
+    dialect = Episodes(LAKE)
+    for names, reason in (
+        (("moon", "sunny", "day"), "no such track"),
+        (("lake", "hail", "day"), "no such weather; there are sunny, rainy, snowy, foggy"),
+        (("lake", "sunny", "night"), "no such daytime"),
+    ):
+        with pytest.raises(TrackError, match=reason):
+            dialect.start(*names)
+    images = []
+    for names in (("mountain", "rainy", "day"), ("jungle", "snowy", "daynight")):
+        dialect.start(*names)
+        images.append(json.loads(dialect.telemetry()[2:])[1]["image"])
+    assert dialect.ready
+    assert images[0] != images[1]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Started by a program; many episodes
+
+
+def test_a_launcher_is_taken_for_the_simulator_and_writes_its_log(tmp_path):
+    launcher = tmp_path / "sim.x86_64"
+    assert main(["join", "--dialect", "roads", "--launcher", str(launcher), "--wait", "0.3", "--marking", "kerb"]) == 0
+    with Program(RoadTests([0.0])) as program:
+        options = ["-batchmode", "--port", str(program.port), "-logFile", "unitylog.txt"]
+        process = subprocess.run([launcher, *options], cwd=tmp_path, capture_output=True, timeout=60)
+    assert (process.returncode, process.stdout, process.stderr) == (0, b"", b"")
+    assert "1 episode, " in (tmp_path / "unitylog.txt").read_text()
+
+
+def test_a_program_may_end_the_simulator_by_a_signal(tmp_path):
+    launcher = tmp_path / "sim.x86_64"
+    assert main(["join", "--dialect", "measures", "--launcher", str(launcher)]) == 0
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        process = subprocess.Popen([launcher, "--port", str(listener.getsockname()[1])])
+        listener.accept()[0].close()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == -signal.SIGTERM
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
+def test_many_episodes_take_no_more_memory():
+    dialect = Roads(LAKE)
+    sizes = []
+    for i in range(14):
+        assert dialect.handle("track", {"track_string": f"0,1.9,0@{40 + i},1.9,0@80,1.9,9"})
+        dialect.telemetry()
+        for _ in range(3):
+            dialect.handle("steer", {"steering_angle": "0", "throttle": "1"})
+            dialect.step()
+            dialect.handle("reset", {})
+        sizes.append(int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 2**20)
+    print([round(size, 1) for size in sizes])
+    assert sizes[-1] - sizes[5] < 4, "MiB"
