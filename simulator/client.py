@@ -39,7 +39,7 @@ DriveEnd = Literal["laps", "stood_still", "failed"]
 def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
     """Return the telemetry packet for the present state; steering and throttle: as last commanded, -1..1."""
     frame = cameras.frames(run.car.node.get_transform())[0]
-    return telemetry_packet(steering, throttle, run.speed_mph, jpeg(frame))
+    return telemetry_packet(steering, throttle, run.speed_mph, jpeg(frame), run.place)
 
 
 class Driven:

@@ -44,7 +44,7 @@ def test_follows_the_transcript(realtime):
     assert server.messages[-2:] == ["41", "1"]
     assert server.closed
     data = contents(server.messages[1])
-    assert set(data) == {"steering_angle", "throttle", "speed", "image"}
+    assert set(data) == {"steering_angle", "throttle", "speed", "image", "stand_in"}
     assert [data[key] for key in ("steering_angle", "throttle")] == ["0.0000", "0.0000"]
     assert re.fullmatch(r"0\.0\d{3}", data["speed"])
     frame = decode(base64.b64decode(data["image"]))
@@ -198,7 +198,7 @@ def connect(sid, environ, auth=None):
     server.emit("steer", {"steering_angle": "0", "throttle": "1"}, room=sid)
 @server.on("telemetry")
 def telemetry(sid, data):
-    assert set(data) == {"steering_angle", "throttle", "speed", "image"}
+    assert set(data) == {"steering_angle", "throttle", "speed", "image", "stand_in"}
     server.emit("steer", {"steering_angle": "0", "throttle": "1"}, room=sid)
 listener = eventlet.listen(("127.0.0.1", 0))
 print(importlib.metadata.version("python-socketio"), listener.getsockname()[1], flush=True)
