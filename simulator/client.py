@@ -174,7 +174,7 @@ class RemoteDriver(Driven):
     def __init__(self, host: str, port: int, cameras: Cameras):
         self.address, self.cameras = (host, port), cameras
         self.connection: Connection | None = None
-        self.state, self.next_try = "not connected", 0.0
+        self.state, self.next_try = "waiting for drive.py", 0.0
         self._connecting: threading.Thread | None = None
         self._connected: queue.SimpleQueue[Connection | ConnectionLost] = queue.SimpleQueue()  # by the thread
 
@@ -197,7 +197,7 @@ class RemoteDriver(Driven):
                     MANUAL_TELEMETRY if by_hand else current_telemetry(run, self.cameras, self.steering, self.throttle)
                 )
         except ConnectionLost as error:
-            self.connection, self.state = None, str(error)
+            self.connection, self.state = None, f"waiting for drive.py: {error}"
             self.steering = self.throttle = 0.0
             self.next_try = time.monotonic() + RECONNECT_INTERVAL
 
@@ -214,7 +214,7 @@ class RemoteDriver(Driven):
         self._connecting, made = None, self._connected.get()
         if isinstance(made, ConnectionLost):
             raise made
-        self.connection, self.state = made, "drives"
+        self.connection, self.state = made, "drive.py drives"
         for _ in range(OPENS):
             made.send(current_telemetry(run, self.cameras, 0.0, 0.0))
         return made

@@ -152,7 +152,7 @@ def test_the_window_sends_null_while_a_person_steers_and_is_never_held_up():
 def test_the_window_looks_for_a_server_without_waiting():
     remote = RemoteDriver("127.0.0.1", unused_port(), Blank())
     run, until = Run(Track("lake"), "autonomous"), time.monotonic() + 10
-    while remote.state == "not connected":
+    while remote.state == "waiting for drive.py":
         remote.poll(False, run)
         assert time.monotonic() < until
     assert "no server" in remote.state

@@ -195,7 +195,7 @@ class Pages:
                     event = self._event(last)
                     shown, state, last, quiet = self.session, self.state, self.until, 0
                     yield event
-                self.pause(UPDATE_INTERVAL)
+                self.pause(UPDATE_INTERVAL - time.monotonic() % UPDATE_INTERVAL)  # so that no interval is missed
         finally:
             self.open -= 1
 
