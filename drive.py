@@ -35,6 +35,7 @@ from cloning.server.speed import SpeedController
 from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
 from cloning.wire.protocol import PORT
 
+KERAS = (".h5", ".hdf5", ".keras")  # endings of files that other projects' drive.py takes
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
 FRAMES_IN_FLIGHT = 3  # that a simulator sends at its start, before it has used an answer
 PATIENCE = 5.0  # s until a simulator that sends nothing more is told of
@@ -243,6 +244,10 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
     """
     if argument is None:
         return DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
+    if argument.suffix in KERAS:
+        raise UserError(
+            f"{argument}: a model of Keras, which PyTorch can't read; `python model.py` trains one that drives"
+        )
     if folder is None and not argument.is_file() and argument.suffix != ".pt":
         raise UserError(
             f"{argument}: not a model file; name the model first and the folder for the frames second: "

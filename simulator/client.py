@@ -9,6 +9,7 @@ from typing import Literal
 from tqdm import tqdm
 
 from cloning.base.errors import SimulatorError
+from cloning.base.progress import progress_bar
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
 from cloning.wire.client import (
@@ -89,7 +90,7 @@ class Client(Driven, ClientSession):
         """Drive this number of laps. Raises SimulatorError."""
         goal = laps * self.run.track.length
         drive = self._drive_in_real_time if self.realtime else self._drive_in_lockstep
-        with tqdm(total=round(goal), unit="m", unit_scale=True, disable=None) as bar:
+        with progress_bar(round(goal), "m", unit_scale=True) as bar:
             while True:
                 self.connect()
                 try:
