@@ -18,6 +18,7 @@ import statistics
 import sys
 import time
 from collections import Counter
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +31,11 @@ from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.server import page, terminal
+from cloning.server.speed import SpeedController
 from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
 from cloning.wire.protocol import PORT
 
+KERAS = (".h5", ".hdf5", ".keras")  # endings of files that other projects' drive.py takes
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
 FRAMES_IN_FLIGHT = 3  # that a simulator sends at its start, before it has used an answer
 PATIENCE = 5.0  # s until a simulator that sends nothing more is told of
@@ -41,27 +44,6 @@ log = logging.getLogger("drive")
 
 # ----------------------------------------------------------------------------------------------------------------------
 # One simulator
-
-
-class SpeedController:
-    """The PI controller of Udacity's drive.py: throttle = 0.1 e + 0.002 Σe, where e = set speed - speed in mph.
-
-    The sum is not changed while the throttle is at its limit, so that it does not wind up on a hill.
-    """
-
-    PROPORTIONAL, INTEGRAL = 0.1, 0.002
-
-    def __init__(self, set_speed: float):
-        """set_speed: mph."""
-        self.set_speed, self.error_sum = set_speed, 0.0
-
-    def throttle(self, speed: float) -> float:
-        """Return the throttle, -1..1, at this speed in mph; call it once per frame."""
-        error = self.set_speed - speed
-        throttle = self.PROPORTIONAL * error + self.INTEGRAL * (self.error_sum + error)
-        if abs(throttle) <= 1:
-            self.error_sum += error
-        return min(1.0, max(-1.0, throttle))
 
 
 class Session(page.Session):
@@ -98,12 +80,14 @@ class Session(page.Session):
         else:
             self.frame = telemetry.image
             self.driven += 1
-            if self.server.saver:
+            self.place = place = telemetry.place
+            if self.server.saver and self.server.recording:
                 self.folder = self.folder or self.server.saver.start_session()
-                self.folder.save(telemetry.jpeg)
+                self.folder.save(telemetry.jpeg, place.time if place else None)
+            where = (place.offset, place.x, place.y) if place else (telemetry.cte, None, None)
             latency = (time.perf_counter() - arrived) * 1000
-            figures = (time.monotonic(), float(self.steering), telemetry.speed, throttle, latency, telemetry.cte)
-            self.history.append(page.DrivenFrame(*figures))
+            figures = (time.monotonic(), float(self.steering), telemetry.speed, throttle, latency)
+            self.history.append(page.DrivenFrame(*figures, *where))
         return {
             "steering_angle": format_number(self.steering, self.separator),
             "throttle": format_number(throttle, self.separator),
@@ -126,8 +110,9 @@ class DriveServer:
         """set_speed: mph; model: the network's name on the page."""
         from cloning.server import server  # here, because it needs the socket libraries
 
-        self.network, self.set_speed, self.model = network, set_speed, model
+        self.network, self.model, self.set_speed = network, model, set_speed
         self.saver: saved_frames.FrameSaver | None = None  # saves the frames
+        self.recording = False  # whether it does so now
         self.sessions: dict[str, Session] = {}
         self.last_ended: Session | None = None
         self.socket = server.Server()
@@ -183,15 +168,24 @@ class DriveServer:
         return max(heard, key=lambda session: (session.driven > 0, session.started), default=self.last_ended)
 
     def change_set_speed(self, set_speed: float) -> None:
-        """Drive all simulators at another set speed, in mph, from the next frame on."""
+        """Drive all simulators at another set speed, in mph, from the next frame on; 0 stops them."""
         self.set_speed = set_speed
         for session in self.sessions.values():
             session.controller.set_speed = set_speed  # its sum stays: it is what holds the speed on this slope
 
+    def record(self, on: bool) -> None:
+        """Save the frames from now on, each session's in a new folder, or no longer. Raises FolderError."""
+        if on and not self.recording:
+            self.saver = self.saver or saved_frames.FrameSaver(Path(f"run-{datetime.now():%Y%m%d-%H%M%S}"))
+            for session in self.sessions.values():
+                session.folder = None
+        self.recording = on
+
     def tell_of_silence(self) -> None:
         """Log that a simulator may expect other answers, if it looks like that."""
         for session in self.sessions.values():
-            sends_cte = 0 < session.driven <= FRAMES_IN_FLIGHT and session.history[-1].cte is not None
+            first = 0 < session.driven <= FRAMES_IN_FLIGHT and not session.place
+            sends_cte = first and session.history[-1].cte is not None
             if sends_cte and time.monotonic() > session.heard + PATIENCE and not session.puzzled:
                 session.puzzled = True
                 log.warning(
@@ -250,6 +244,10 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
     """
     if argument is None:
         return DEFAULT_MODEL if DEFAULT_MODEL.is_file() else SHIPPED_MODEL
+    if argument.suffix in KERAS:
+        raise UserError(
+            f"{argument}: a model of Keras, which PyTorch can't read; `python model.py` trains one that drives"
+        )
     if folder is None and not argument.is_file() and argument.suffix != ".pt":
         raise UserError(
             f"{argument}: not a model file; name the model first and the folder for the frames second: "
@@ -268,7 +266,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add = parser.add_argument
     add("model", nargs="?", type=Path, help="model file (default: model.pt if it exists, else the project's own)")
     add("folder", nargs="?", type=Path, help="save the frames here; frames saved here earlier are deleted")
-    speed = f"set speed in mph; the car does at most {TOP_SPEED_MPH} (default %(default)g)"
+    speed = f"set speed in mph, 0 to {TOP_SPEED_MPH}, which is the car's most (default %(default)g)"
     add("--speed", type=page.speed_argument, default=SET_SPEED_MPH, help=speed)
     host = "address to listen on (default %(default)s: this machine only; 0.0.0.0: any machine may connect)"
     add("--host", type=address, default="127.0.0.1", help=host)
@@ -288,7 +286,6 @@ def main() -> int:
     stderr = terminal.log_to_stderr("drive.py")
     log.setLevel(logging.INFO)
     torch.set_num_threads(1)  # a second thread would make single frames slower and their latency less regular
-    saver = None
     try:
         from cloning.server import connections  # here, because it needs the socket libraries
 
@@ -300,14 +297,15 @@ def main() -> int:
         server = DriveServer(network, arguments.speed, origin or str(model))
         listener = connections.claim_port(arguments.host, arguments.port)
         if arguments.folder:
-            server.saver = saver = saved_frames.FrameSaver(arguments.folder)  # last, because it empties the folder
+            server.saver, server.recording = saved_frames.FrameSaver(arguments.folder), True  # last: it empties it
     except (UserError, OSError) as error:
         return program.failed("drive.py", error)
     stopped, port = connections.noted_signals(), listener.getsockname()[1]
     watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(arguments.host, arguments.host)
     print(
         f"Driving with {model}{origin and f' ({origin})'}.\n"
-        f"Listening on {arguments.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE.\n"
+        f"Listening on {arguments.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE,\n"
+        f"or in a second terminal its stand-in: `python -m simulator drive{f' --port {port}' * (port != PORT)}`.\n"
         f"Watch at http://{f'[{watched}]' if ':' in watched else watched}:{port}/ . Ctrl-C ends.",
         file=sys.stderr,
         flush=True,
@@ -319,9 +317,9 @@ def main() -> int:
         connections.serve(listener, server.app, stopped, server.tell_of_silence, StatusLine(server, stderr).update)
     finally:
         server.close()
-        if saver:
+        if server.saver:
             try:
-                saver.close()
+                server.saver.close()
             except UserError as error:
                 print(f"drive.py: {error}", file=sys.stderr)
                 status = program.INCOMPLETE

@@ -14,6 +14,7 @@ in diagnostic_images/. From a program: `train(replace(REPORT, flip=0.0), ["data"
 """
 
 from cloning.base import program
+from cloning.base.progress import progress_bar
 
 if __name__ == "__main__":
     program.end_on_interrupt("model.py")  # also while the libraries below are loaded
@@ -32,7 +33,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.random import default_rng
 from torch import channels_last, manual_seed, nn
-from tqdm import tqdm
 
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
@@ -346,8 +346,8 @@ class TrainingRun:
         started = time.monotonic() - progress.seconds
         if ranks.first:
             print(f"Epoch {len(progress.history) + 1}/{recipe.epochs}", flush=True)
-        total, hidden = recipe.samples_per_epoch, not ranks.first or None  # None: shown on a terminal only
-        with tqdm(total=total, initial=progress.images, unit="image", leave=False, disable=hidden) as bar:
+        total = recipe.samples_per_epoch
+        with progress_bar(total, "image", not ranks.first, initial=progress.images, leave=False) as bar:
             while progress.images < total:
                 self.write_pictures()
                 batch = self.generator.next_batch()
@@ -362,7 +362,7 @@ class TrainingRun:
                 progress.add(batch.total, error)
                 progress.seconds = time.monotonic() - started
                 bar.update(batch.total)
-                bar.set_postfix_str(self.pace.after_batch(batch.total, progress))
+                bar.set_postfix_str(self.pace.after_batch(batch.total, progress), refresh=False)
                 if stopped:
                     self.save()
                     raise Interrupted(self.stop.received or SIGNALS[-1])
@@ -439,7 +439,10 @@ def run(command: Command, ranks: Ranks) -> None:
         with training_run.stop:
             training_run.train()
         if ranks.first:
-            print(f"{training_run.summary()}\n\nnext: python drive.py {training_run.files.last}")
+            better = (
+                "" if training_run.recipe.name == ROBUST.name else "\nmodel.py --robust trains one that drives better"
+            )
+            print(f"{training_run.summary()}\n\nnext: python drive.py {training_run.files.last}{better}")
     finally:
         training_run.pool.shutdown(cancel_futures=True)
 

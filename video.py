@@ -8,6 +8,7 @@ Exit status: 0 if the film shows every frame, 1 if unreadable ones were left out
 """
 
 from cloning.base import program
+from cloning.base.progress import progress_bar
 
 if __name__ == "__main__":
     program.end_on_interrupt("video.py", "stopped; no film was written")  # also while the libraries below are loaded
@@ -20,7 +21,6 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from cloning.base.arguments import number, ratio
 from cloning.base.errors import UserError
@@ -83,14 +83,16 @@ def make_film(folder: Path, fps: Fraction | None = None, draw: Overlay | None = 
     reason: ValueError | None = None  # of the first unreadable frame
     writer = FilmWriter(path, fps)
     try:
-        for _, frame_path in tqdm(frames, unit="frame", disable=None):
-            try:
-                frame = decode(read_jpeg(frame_path))
-            except ValueError as error:
-                unreadable.append(frame_path.name)
-                reason = reason or error
-                continue
-            writer.add(draw(frame) if draw else frame)
+        with progress_bar(len(frames), "frame") as bar:
+            for _, frame_path in frames:
+                bar.update()
+                try:
+                    frame = decode(read_jpeg(frame_path))
+                except ValueError as error:
+                    unreadable.append(frame_path.name)
+                    reason = reason or error
+                    continue
+                writer.add(draw(frame) if draw else frame)
         writer.close()
     finally:
         writer.discard()

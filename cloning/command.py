@@ -31,7 +31,7 @@ def start(module: str) -> int | None:
             main = importlib.import_module(module).main
         return main()
     except ModuleNotFoundError as error:  # of an extra of pyproject.toml
-        print(f"behavioral-cloning: {error}; `pip install {str(error.name).split('.')[0]}`", file=sys.stderr)
+        print(f"behavioral-cloning: {program.missing_library(error)}", file=sys.stderr)
         return program.FAILED
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 from tqdm import tqdm
 
 from cloning.base.errors import SimulatorError
+from cloning.base.progress import progress_bar
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
 from cloning.wire.client import (
@@ -39,7 +40,7 @@ DriveEnd = Literal["laps", "stood_still", "failed"]
 def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
     """Return the telemetry packet for the present state; steering and throttle: as last commanded, -1..1."""
     frame = cameras.frames(run.car.node.get_transform())[0]
-    return telemetry_packet(steering, throttle, run.speed_mph, jpeg(frame))
+    return telemetry_packet(steering, throttle, run.speed_mph, jpeg(frame), run.place)
 
 
 class Driven:
@@ -89,7 +90,7 @@ class Client(Driven, ClientSession):
         """Drive this number of laps. Raises SimulatorError."""
         goal = laps * self.run.track.length
         drive = self._drive_in_real_time if self.realtime else self._drive_in_lockstep
-        with tqdm(total=round(goal), unit="m", unit_scale=True, disable=None) as bar:
+        with progress_bar(round(goal), "m", unit_scale=True) as bar:
             while True:
                 self.connect()
                 try:
@@ -174,7 +175,7 @@ class RemoteDriver(Driven):
     def __init__(self, host: str, port: int, cameras: Cameras):
         self.address, self.cameras = (host, port), cameras
         self.connection: Connection | None = None
-        self.state, self.next_try = "not connected", 0.0
+        self.state, self.next_try = "waiting for drive.py", 0.0
         self._connecting: threading.Thread | None = None
         self._connected: queue.SimpleQueue[Connection | ConnectionLost] = queue.SimpleQueue()  # by the thread
 
@@ -197,7 +198,7 @@ class RemoteDriver(Driven):
                     MANUAL_TELEMETRY if by_hand else current_telemetry(run, self.cameras, self.steering, self.throttle)
                 )
         except ConnectionLost as error:
-            self.connection, self.state = None, str(error)
+            self.connection, self.state = None, f"waiting for drive.py: {error}"
             self.steering = self.throttle = 0.0
             self.next_try = time.monotonic() + RECONNECT_INTERVAL
 
@@ -214,7 +215,7 @@ class RemoteDriver(Driven):
         self._connecting, made = None, self._connected.get()
         if isinstance(made, ConnectionLost):
             raise made
-        self.connection, self.state = made, "drives"
+        self.connection, self.state = made, "drive.py drives"
         for _ in range(OPENS):
             made.send(current_telemetry(run, self.cameras, 0.0, 0.0))
         return made

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from panda3d.core import TransformState
-from tqdm import tqdm
 
 from cloning.base import program
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError
+from cloning.base.progress import progress_bar
 from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
 from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH, TOP_SPEED_MPH
@@ -116,7 +116,7 @@ def record(
             pool = stack.enter_context(ProcessPoolExecutor(renderers, _renderers_context(), _start_renderer))
             for _ in range(renderers):  # each starts a process
                 pool.submit(_prepare, track.source, look)
-        bar = stack.enter_context(tqdm(total=round(laps * track.length), unit="m", unit_scale=True, disable=None))
+        bar = stack.enter_context(progress_bar(round(laps * track.length), "m", unit_scale=True))
 
         def write() -> None:
             images, row = pending.popleft()

@@ -7,6 +7,7 @@ import numpy as np
 from cloning.road.autonomy import autonomy
 from cloning.road.motion import MPH, wrap_angle
 from cloning.road.track import Track
+from cloning.wire.protocol import Place
 from simulator.car import STEP, WHEELS, Car
 from simulator.world import build_physics
 
@@ -95,6 +96,12 @@ class Run:
     def lane(self) -> tuple[float, float]:
         """Lateral offset, m, and heading error, radians, both positive to the right, as recordings have them."""
         return self.offset, wrap_angle(self.track.at(self.s).heading - self.car.heading)  # headings grow to the left
+
+    @property
+    def place(self) -> Place:
+        """Where the car is, for the page of drive.py."""
+        position = self.car.node.get_pos()
+        return Place(self.track.name, position.x, position.y, self.offset, len(self.departures), self.time)
 
     @property
     def laps(self) -> int:

@@ -1,9 +1,13 @@
 """The window: a person drives and records, or watches drive.py drive and takes over from it."""
 
+import math
 import time
 from datetime import datetime
 from pathlib import Path
 
+import cv2
+import numpy as np
+from direct.gui.OnscreenImage import OnscreenImage
 from direct.gui.OnscreenText import OnscreenText
 from direct.showbase.ShowBase import ShowBase
 from direct.task.Task import Task
@@ -22,11 +26,17 @@ from simulator.controls import ACTIONS, HELD, HELP, Controls, Sticks, balance
 from simulator.film import place_chase_camera
 from simulator.record import write_row
 from simulator.run import Run
-from simulator.world import INSIDE, OUTSIDE, Scene, configure_engine
+from simulator.world import INSIDE, OUTSIDE, Scene, configure_engine, make_texture
 
 SIZE = 960, 540
 FIELD_OF_VIEW = 80  # degrees, horizontal
 MAX_DELAY = 0.2  # s of physics that are caught up after a slow frame; the rest is skipped
+SLOW_FRAMES = 3  # one after another, of which the window tells
+STRAIGHT = 40.0  # m of the straight on which a person starts
+TOLD_TIME = 4.0  # s for which the window tells of a departure, or of time that was skipped
+CHASE_TIME = 0.3  # s: time constant with which the camera follows the car's turns
+LETTERS, MARGIN = 0.06, 0.05  # height of a line, and distance from the window's edge; its height is 2
+BAR = 0.5  # half the width of the bar that shows the steering
 
 BUTTONS = {
     "a": core.GamepadButton.face_a(),
@@ -80,6 +90,9 @@ class Window(ShowBase):
         self.win.request_properties(properties)
         self.disable_mouse()
         self.simulation = Run(track, "autonomous" if server else "training")
+        if not server and track.closed:
+            self.simulation.s = track.straight(STRAIGHT)
+            self.simulation.set_back()
         self.scene = Scene(scenery.build(track.source, look))
         self.scene.root.reparent_to(self.render)
         self.cameras = Cameras(self.scene)
@@ -96,16 +109,57 @@ class Window(ShowBase):
         self.chase = True
         self.camLens.set_near_far(NEAR_PLANE, FAR_PLANE)
         self.camLens.set_fov(FIELD_OF_VIEW)
-        style = {"scale": 0.06, "fg": (1, 1, 1, 1), "align": core.TextNode.A_left}
-        self.text = OnscreenText("", pos=(-1.7, 0.9), bg=(0, 0, 0, 0.5), mayChange=True, **style)
-        font = self.loader.load_font("cmtt12")
-        self.help = OnscreenText(HELP, pos=(-1.1, 0.55), bg=(0, 0, 0, 0.7), font=font, **style)
-        self.help.hide()
+        self.looks: core.Vec3 | None = None  # the chase camera's direction
+        self.told, self.told_until = "", 0.0  # what the middle of the window tells, until this time.monotonic()
+        self.departures = self.slow = 0  # departures that it has told of; slow frames one after another
+        self.add_texts()
+        self.accept("aspectRatioChanged", self.fit)
+        self.fit()
         for key in ACTIONS:
             if not key.startswith("pad "):
                 self.accept(key, self.controls.press, [key])
         self.simulated_until = time.monotonic()
         self.task_mgr.add(self.tick, "tick")
+
+    def add_texts(self) -> None:
+        """Add the status, the help, the message in the middle, the mark of a recording and the steering's bar."""
+        style = {"scale": LETTERS, "fg": (1, 1, 1, 1), "mayChange": True}
+        left, corner = core.TextNode.A_left, (MARGIN, -MARGIN - LETTERS)
+        self.text = OnscreenText("", parent=self.a2dTopLeft, pos=corner, align=left, bg=(0, 0, 0, 0.5), **style)
+        self.message = OnscreenText("", pos=(0, 0.35), bg=(0.6, 0.05, 0, 0.8), **style)
+        font = self.loader.load_font("cmtt12")
+        self.help = OnscreenText(HELP, pos=(-1.1, 0.55), align=left, bg=(0, 0, 0, 0.8), font=font, **style)
+        self.help.hide()
+        disc = np.zeros((64, 64, 4), np.uint8)
+        cv2.circle(disc, (32, 32), 28, (255, 255, 255, 255), -1, cv2.LINE_AA)
+        disc = make_texture(disc, repeat=False, mipmaps=False)
+        place = (-MARGIN - LETTERS, 0, -MARGIN - LETTERS)
+        self.dot = OnscreenImage(disc, parent=self.a2dTopRight, pos=place, scale=LETTERS * 0.8, color=(1, 0, 0, 1))
+        self.dot.set_transparency(core.TransparencyAttrib.M_alpha)
+        bar = core.LineSegs("steering")
+        bar.set_thickness(2)
+        for x, height in ((-BAR, 0.03), (0, 0.03), (BAR, 0.03)):
+            bar.move_to(x, 0, -height)
+            bar.draw_to(x, 0, height)
+        bar.move_to(-BAR, 0, 0)
+        bar.draw_to(BAR, 0, 0)
+        holder = self.a2dBottomCenter.attach_new_node(bar.create())
+        holder.set_z(2 * MARGIN)
+        self.knob = OnscreenImage(disc, parent=holder, scale=0.03, color=(1, 0.8, 0.25, 1))
+        self.knob.set_transparency(core.TransparencyAttrib.M_alpha)
+        self.device = OnscreenText("", parent=holder, pos=(BAR + MARGIN, -LETTERS / 4), align=left, **style)
+
+    def fit(self) -> None:
+        """Let the texts fit the window's shape."""
+        width = 2 * self.get_aspect_ratio() if self.get_aspect_ratio() > 1 else 2.0
+        self.text.setWordwrap((width - 2 * MARGIN - 3 * LETTERS) / LETTERS)
+        size = min(LETTERS, (width - 4 * MARGIN) / 34)  # the help's lines have at most 60 letters of half its height
+        self.help.setScale(size)
+        self.help.setPos(-17 * size, 0.55 * size / LETTERS)
+
+    def tell(self, words: str) -> None:
+        """Show words in the middle of the window for TOLD_TIME."""
+        self.told, self.told_until = words, time.monotonic() + TOLD_TIME
 
     def held(self) -> set[str]:
         """Return the driving keys that are down."""
@@ -137,9 +191,12 @@ class Window(ShowBase):
             self.begin_drive()
         self.by_hand = by_hand
         driver: Controls | RemoteDriver = self.remote if self.remote and not by_hand else self.controls
+        self.slow = self.slow + 1 if now - self.simulated_until > MAX_DELAY else 0
+        if self.slow == SLOW_FRAMES:
+            self.tell("This computer is too slow for the picture: time passes more slowly. Make the window smaller.")
         while now - self.simulated_until >= STEP:
             self.simulated_until = max(self.simulated_until + STEP, now - MAX_DELAY)
-            self.controls.step(held, mouse, pad)
+            self.controls.step(held, mouse, pad, self.simulation.speed_mph)
             self.simulation.car.speed_limit = self.controls.set_speed * MPH
             if self.simulation.at_end and self.recording_on:
                 self.begin_drive()
@@ -148,6 +205,12 @@ class Window(ShowBase):
                 write_row(self.recording, self.cameras, self.simulation)
         for action in self.controls.take_actions():
             getattr(self, f"do_{action}")()
+        for departure in self.simulation.departures[self.departures :]:
+            self.tell(
+                f"A wheel left the road on the {departure.side} at {departure.speed / MPH:.0f} mph.\n"
+                "The car is back on the road's centre, at rest."
+            )
+        self.departures = len(self.simulation.departures)
         self.show(by_hand)
         return int(task.cont)
 
@@ -197,15 +260,17 @@ class Window(ShowBase):
         run = self.simulation
         transform = run.car.node.get_transform()
         self.scene.move_car(transform)
+        self.scene.move_parts(run.steering, run.distance, run.throttle)
         self.cam.node().set_camera_mask(OUTSIDE if self.chase else INSIDE)
         if self.chase:
             self.camera.reparent_to(self.render)
-            place_chase_camera(self.camera, transform)
+            turn = 1 - math.exp(-core.ClockObject.get_global_clock().get_dt() / CHASE_TIME)
+            self.looks = place_chase_camera(self.camera, transform, self.looks, turn)
         else:
             self.camera.reparent_to(self.scene.car)
             self.camera.set_pos_hpr(*CAMERA_POSITIONS["center"], -CAMERA_YAW, -MOUNT_PITCH, 0)
         lines = [
-            f"{run.speed_mph:4.1f} mph   steering {run.steering:+.2f}",
+            f"{run.speed_mph:4.1f} mph",
             f"lap {run.laps + 1}   {run.time:.0f} s   departures {len(run.departures)}",
         ]
         if by_hand:  # drive.py has a set speed of its own
@@ -213,7 +278,8 @@ class Window(ShowBase):
         if not self.started:
             lines.append("W or the up arrow: drive")
         if self.remote:
-            lines.append(f"drive.py: {self.remote.state}" + ("   you drive" if by_hand else ""))
+            connected = self.remote.connection is not None
+            lines.append("you drive, until you let go of W and S" if by_hand and connected else self.remote.state)
         if self.recording:
             state = "recording stopped"
             if self.recording_on:
@@ -221,3 +287,7 @@ class Window(ShowBase):
             lines.append(f"{state}: {self.recording.rows} rows in {self.recording.folder}")
         lines.append("F1: help")
         self.text.setText("\n".join(lines))
+        self.message.setText(self.told if time.monotonic() < self.told_until else "")
+        (self.dot.show if self.recording and self.recording_on and by_hand else self.dot.hide)()
+        self.knob.set_x(BAR * run.steering)
+        self.device.setText(self.controls.device if by_hand else "drive.py")

@@ -1,12 +1,15 @@
 """A track in the engine: the ground that the car drives on and the scene that the cameras see."""
 
 import functools
+import math
 from dataclasses import replace
 
 import numpy as np
 from panda3d import bullet, core
 
+from cloning.road.motion import FULL_LOCK
 from cloning.road.track import LEFT, RIGHT, Track
+from simulator.scenery.body import RADIUS, WHEELS
 from simulator.scenery.parts import Haze, Scenery
 from simulator.scenery.shade import STRETCH, Shade, car_shadow
 from simulator.scenery.shapes import Mesh, merge
@@ -14,7 +17,8 @@ from simulator.scenery.shapes import Mesh, merge
 GRAVITY = 9.81  # m/s²
 GROUND_HALF_WIDTH = 8.0  # m of ground on each side of a road with climbs; the car is set back before it gets so far
 CELL = 120.0  # m: meshes are divided into square cells, so that the engine can skip those that are out of view
-UNDER_CAR = 0.5  # share of the light that the ground under the car lacks in a scene without shadows
+UNDER_CAR = 0.6  # share of the light that the ground under the car lacks, as seen from outside
+UNDER_CAR_SIZE = 1.45, 1.2  # times the width and length of the car's shadow, so that it is seen around the car
 # Cameras in the car, which see its bonnet; others, which see its body.
 INSIDE, OUTSIDE = core.BitMask32.bit(0), core.BitMask32.bit(1)
 HAZE_STEP, SHEEN_STEP = 25.0, 2.0  # m of camera movement after which haze and sheen are computed again
@@ -215,16 +219,40 @@ class Scene:
         self.car = self.root.attach_new_node("car")
         self.car.set_bin("fixed", len(self.groups))
         MeshGroup(scenery.bonnet, self.car).root.hide(OUTSIDE)
-        MeshGroup(scenery.body, self.car).root.hide(INSIDE)
-        self.car_shadow = (self.root if shade else self.car).attach_new_node("car's shadow")
-        darkness = float(1 - shade.factor.mean()) if shade else UNDER_CAR
-        MeshGroup(car_shadow(darkness), self.car_shadow).root.set_transparency(core.TransparencyAttrib.M_alpha)
-        self.car_shadow.set_bin("fixed", len(self.groups))
-        self.car_shadow.set_depth_write(False)
-        if not shade:  # the real simulator's lower qualities have none, but a car seen from outside seems to float
-            self.car_shadow.hide(INSIDE)
+        outside = self.car.attach_new_node("body")
+        outside.hide(INSIDE)
+        MeshGroup(scenery.body.body, outside)
+        self.brake_lights = MeshGroup(scenery.body.brake, outside).root
+        self.wheels = [MeshGroup(scenery.body.wheel, outside).root for _ in WHEELS]
+        for wheel, (x, y) in zip(self.wheels, WHEELS, strict=True):
+            wheel.set_pos(x, y, RADIUS)
+        # The real simulator's lower qualities have no shadow, but a car seen from outside seems to float without one.
+        under = self._add_shadow(self.car, UNDER_CAR)
+        under.set_scale(*UNDER_CAR_SIZE, 1)
+        under.hide(INSIDE)
+        if shade:
+            self.car_shadow = self._add_shadow(self.root, float(1 - shade.factor.mean()))
+        self.move_parts()
         # Step -> the grid point for which colours were computed last.
         self.viewpoints: dict[float, tuple[int, int]] = {}
+
+    def _add_shadow(self, parent: core.NodePath, darkness: float) -> core.NodePath:
+        """Return a shadow of the car; darkness: the share of the light that it takes, 0..1."""
+        shadow = parent.attach_new_node("car's shadow")
+        MeshGroup(car_shadow(darkness), shadow).root.set_transparency(core.TransparencyAttrib.M_alpha)
+        shadow.set_bin("fixed", len(self.groups))
+        shadow.set_depth_write(False)
+        return shadow
+
+    def move_parts(self, steering: float = 0.0, distance: float = 0.0, throttle: float = 0.0) -> None:
+        """Turn the wheels and switch the brake lights, as seen from outside.
+
+        steering, throttle: -1..1; distance: m that the car has driven.
+        """
+        for wheel, (_, y) in zip(self.wheels, WHEELS, strict=True):
+            turned = -FULL_LOCK * steering if y > 0 else 0.0
+            wheel.set_hpr(turned, -math.degrees(distance / RADIUS % math.tau), 0)
+        (self.brake_lights.show if throttle < 0 else self.brake_lights.hide)()
 
     def move_car(self, transform: core.TransformState) -> None:
         """Move the car, and update haze, sheen and sky for its position.

@@ -115,7 +115,7 @@ class Page:
     def press(self, key: str, shift: bool = False) -> None:
         """Press and release a key, by its name in JavaScript."""
         character = {"text": "\r" if key == "Enter" else key} if len(key) == 1 or key == "Enter" else {}
-        codes = {"Enter": 13, "Escape": 27, " ": 32, "Tab": 9}
+        codes = {"Enter": 13, "Escape": 27, " ": 32, "Tab": 9, "ArrowLeft": 37, "ArrowRight": 39}
         code = {"windowsVirtualKeyCode": codes[key]} if key in codes else {}
         both = {"key": key, "modifiers": 8 * shift, **code}
         self.send("Input.dispatchKeyEvent", type="keyDown", **both, **character)

@@ -140,7 +140,7 @@ class Seat(Window):
         self.remote = Remote("127.0.0.1", 1, Blank())
         self.by_hand, self.started, self.cameras, self.keys = False, True, Blank(), set()
         self.folder, self.recording, self.recording_on = folder, None, False
-        self.simulated_until = 0.0
+        self.simulated_until, self.departures, self.slow = 0.0, 0, 0
 
     def held(self):
         return self.keys

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import json
 import logging
 import os
 import time
@@ -24,6 +25,8 @@ from cloning.recordings import saved_frames as frames
 from cloning.recordings.images import decode
 from cloning.road.overlay import overlay
 from cloning.server.terminal import MAX_PER_MINUTE, Few, Unblocked
+from cloning.wire.client import telemetry_packet
+from cloning.wire.protocol import Place
 from tools.simulator_client import telemetry
 
 
@@ -91,6 +94,18 @@ def test_controller_settles_at_each_set_speed_and_is_not_wound_up_by_a_wait_or_a
         beyond = max(speeds[:600]) - set_speed if set_speed > before else set_speed - min(speeds[:600])
         assert beyond < 2, "mph over the set speed, or under a lower one"
         assert abs(car.speed - set_speed) < 0.5, "settled again after the hill"
+
+
+def test_a_set_speed_of_0_brakes_until_the_car_is_at_rest_and_never_drives_it_backwards():
+    controller = drive.SpeedController(9)
+    controller.throttle(9)
+    controller.set_speed = 0
+    assert [controller.throttle(speed) for speed in (9, 6, 4, 4, 4.4, 2, 1, 0.4)] == [-1] * 7 + [0]
+    assert controller.throttle(0.1) == controller.throttle(3) == 0, "a car that rolls may roll backwards"
+    controller.set_speed = 9
+    assert controller.throttle(1) == pytest.approx(0.8, abs=0.02)
+    controller.set_speed = 0
+    assert [controller.throttle(speed) for speed in (1.2, 1.1, 1.2)] == [-1, -1, 0], "where it stops on a slope"
 
 
 def test_a_change_of_the_set_speed_leaves_the_integral_as_it_is(network, jpeg):
@@ -184,6 +199,26 @@ def test_the_distance_from_the_centre_is_shown_or_ignored(session, jpeg, sent, c
     plain = drive.Session(session.server).answer(telemetry(jpeg))
     assert session.answer({**telemetry(jpeg), "cte": sent}) == plain
     assert session.history[-1].cte == cte and session.unusable == 0
+
+
+def test_the_place_that_the_stand_in_tells_is_shown_and_any_other_ignored(session, jpeg):
+    place: dict[str, Any] = {"track": "lake", "x": 1, "y": -2.5, "offset": 0.25, "departures": 3, "time": 7.5}
+    packet = telemetry_packet(0, 0, 5, b"", Place(**place))
+    assert json.loads(packet[2:])[1]["stand_in"] == place
+    plain = session.answer(telemetry(jpeg))
+    wrong: list[dict[str, Any]] = [
+        {"x": "1"},
+        {"y": None},
+        {"offset": True},
+        {"time": 1e300},
+        {"x": float("nan")},
+        {"departures": 10**999},
+    ]
+    for told in (*({**place, **one} for one in wrong), {**place, "z": 0}, {**place, "track": "x" * 99}, {}, [], "here"):
+        assert session.answer({**telemetry(jpeg), "stand_in": told})["steering_angle"] == plain["steering_angle"]
+        assert session.place is None and session.history[-1].cte is None and session.unusable == 0
+    session.answer({**telemetry(jpeg), "stand_in": place})
+    assert session.place == Place(**place) and session.history[-1][-3:] == (0.25, 1, -2.5)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_i
             simulator.drive(telemetry(jpegs[0], speed="8.5000"))
         for query in ("", "?attention"):
             live = shown(server, query)
-            time_stamp, _, speed, throttle, latency, _ = live["rows"][-1]
+            time_stamp, _, speed, throttle, latency, *_ = live["rows"][-1]
             assert abs(time_stamp - time.monotonic()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
             assert live["image"].startswith("/9j/")
         measured: Any = SimpleNamespace(port=server.port, latencies=[])
@@ -101,14 +101,15 @@ def test_no_other_site_changes_the_set_speed(server, headers, status):
 
 
 def test_what_is_no_set_speed_is_refused(server):
-    for text in ("", "fast", "0", "0.05", "-9", "1001", "nan", "inf", "1e999", "9,5", "0x10"):
+    for text in ("", "fast", "-0.1", "-9", "30.1", "1000", "nan", "inf", "1e999", "9,5", "0x10"):
         with pytest.raises(SystemExit):
             drive.parse_arguments([f"--speed={text}"])
         status, answer = change_set_speed(server, {"set_speed": text})
-        assert status == 400 and "of at least 0.1 and at most 1000" in json.loads(answer)["message"]
+        assert status == 400 and "of at least 0 and at most 30" in json.loads(answer)["message"]
     bodies: list[object] = [{}, [], "20", {"set_speed": 20}, {"set_speed": None}, {"set_speed": "20", "more": "1"}]
     for body in (*bodies, b"null", b"", b"{", b"[" * 180):
         assert change_set_speed(server, body)[0] == 400
+        assert ask(server.port, "/record", "POST", body)[0] == 400
     assert change_set_speed(server, b" " * 1000)[0] == 413
     assert ask(server.port, "/set-speed")[0] == 405
     assert shown(server)["set_speed"] == 9
@@ -154,7 +155,8 @@ def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monk
 
     monkeypatch.setattr(drive_page, "UPDATE_INTERVAL", 2**-10)
     events = drive_page.Pages(server, with_attention=False, pause=pause).events()
-    assert json.loads(next(events)[6:]) == {"state": "waiting", "set_speed": 9.0, "saving": "", "saver": False}
+    quiet = {"state": "waiting", "set_speed": 9.0, "recording": False, "saving": "", "folder": ""}
+    assert json.loads(next(events)[6:]) == quiet
     next(events)
     assert len(naps) == 1 + drive_page.QUIET_INTERVALS
     session = server.sessions["sid"] = drive.Session(server)
@@ -204,6 +206,8 @@ def page(tmp_path_factory):
         yield page
 
 
+STARTS = ("drive --realtime --track jungle", "window --autonomous")  # the stand-in simulator, of which the page tells
+PLACE = {"track": "jungle", "x": 3.0, "y": 4.5, "offset": 0.5, "departures": 2, "time": 12.0}
 PLOTS = "[...document.querySelectorAll('#plots figure')].filter(each => !each.hidden).length"
 
 
@@ -216,11 +220,13 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
 
     with serving(model_file, "run1", cwd=tmp_path) as server:
         own = f"http://127.0.0.1:{server.port}/"
-        page.look(800, 800)  # where the image is as wide as its pixels
+        page.look(687, 800)  # where the image is as wide as its pixels
         page.open(own)
         page.shows("#state", "Waiting for a simulator")
         assert page.run("document.title") == "Waiting for a simulator"
-        assert page.run("document.querySelector('#image').hidden")
+        assert page.run("document.querySelector('#camera').hidden && document.querySelector('#plots').hidden")
+        commands = page.run("[...document.querySelectorAll('#start code')].map(each => each.innerText)")
+        assert [f"python -m simulator {words} --port {server.port}" for words in STARTS] == commands[1:]
         assert str(model_file) in page.text() and "begins with the first frame" in page.text()
         usual = telemetry(jpegs[0], speed="9.0000")
         with feeding(server.port, usual) as feeder:
@@ -230,19 +236,37 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             page.until(shows_the_sky)
             assert page.run(PLOTS) == 4, "no distance from the centre"
             assert page.text("#unusable") == "0"
-            for key in ("Tab", *"21", "Enter"):  # the first control is the set speed; Tab selects what is in it
-                page.press(key)
-            page.shows("#answer", "drives at 21 mph")
-            page.shows("#plots", "set speed 21 mph")
-            for key in (*"9999", "Enter"):
-                page.press(key)
-            assert page.run("document.querySelector('#speed').matches(':invalid')")
-            for key in ("Tab", "Tab", " "):
+            for keys, answer in (
+                (("Tab", " "), "stops the car"),  # the first control
+                ((" ",), "drives at 9 mph"),
+                (("Tab", "ArrowRight"), "drives at 9.5 mph"),
+                (("Tab", " "), "recording has ended"),
+            ):
+                for key in keys:
+                    page.press(key)
+                page.shows("#answer", answer)
+                page.shows("#stop", "Go" if "stops" in answer else "Stop")
+                page.shows("#state", "Stopping" if "stops" in answer else "Driving")
+            page.shows("#plots", "set speed 9.5 mph")
+            page.shows("#record", "Record")
+            page.press(" ")
+            page.shows("#saving", "frames saved in run1-2")
+            page.shows("#film", "python video.py run1-2")
+            for key in ("Tab", " "):
                 page.press(key)
             page.wait("document.querySelector('#attention').checked")
             feeder.message = {**usual, "cte": "-0.7500"}
             page.shows("#plots", "-0.75 m")
-            assert page.run(PLOTS) == 5
+            assert page.run(PLOTS) == 5 and "0.75 m from the lane's centre" in page.text("#now")
+            feeder.message = {**usual, "stand_in": {**PLACE, "offset": 1.2}}
+            page.shows("#now-distance", "1.20 m right of the lane's centre")
+            page.shows("#now-departures", "2 departures")
+            assert page.run("document.querySelector('#now-distance').className") == "off"
+            page.wait("document.querySelector('#map .road').getAttribute('d')?.length > 1000")
+            feeder.message = {**usual, "stand_in": {**PLACE, "offset": -2.6, "track": "nowhere"}}
+            page.shows("#now-distance", "2.60 m left of")
+            page.wait("document.querySelector('#map .road').getAttribute('d') == ''")
+            assert page.run("document.querySelector('#now-distance').className") == "far"
             feeder.message = {**usual, "speed": "fast"}
             page.shows("#state", "No frame can be used")
             page.shows("#unusable", "speed is not a number")
@@ -251,10 +275,16 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             feeder.going = False
             page.shows("#state", "The simulator is silent")
         page.shows("#state", "The simulator has gone")
-        assert not page.run("document.querySelector('#image').hidden")
+        assert not page.run("document.querySelector('#camera').hidden")
         assert page.complaints() == []
         assert all(address.startswith((own, "data:", "about:")) for address in page.addresses()), "no outside host"
     page.shows("#state", "drive.py does not answer")
+    page.click("#stop")
+    page.shows("#answer", "drive.py does not answer")
+    with serving(model_file, "--speed", "12", port=server.port, cwd=tmp_path):
+        page.shows("#state", "Waiting for a simulator")
+        page.wait("document.querySelector('#speed').value == 12")
+        assert page.text("#answer") == ""
 
 
 @needs_chromium
@@ -267,7 +297,7 @@ def test_a_spike_does_not_squash_the_rest(server, jpegs, page):
         page.shows("#plots", "beyond the scale: 300.0 mph")
         # All but the spike take up most of the height: the curve's pixels, by row, from the plot's own canvas.
         lines = page.run("""(() => {
-          const canvas = document.querySelectorAll('#plots figure')[1].querySelector('canvas');
+          const canvas = document.querySelectorAll('#plots figure')[2].querySelector('canvas');
           const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
           const blue = [];
           for (let at = 0; at < data.length; at += 4) {
@@ -287,3 +317,5 @@ def test_the_page_fits_every_screen_and_bars_nobody(server, jpegs, page, width, 
         page.shows("#state", "Driving")
         page.wait(f"{PLOTS} == 5")
         assert page.fits() and page.has_colours(dark) and page.barriers() == []
+        right = "[...document.querySelectorAll('#plots figure')].map(each => each.getBoundingClientRect().right)"
+        assert page.run(f"Math.max(...{right}) / innerWidth") > 0.93, "the whole width is used"

@@ -8,6 +8,7 @@ import torch
 from commands import SHORT, run_here, same, weights
 
 import model
+from cloning.network import tensors
 from cloning.training.distributed import Ranks
 from cloning.training.options import parse
 from model import REPORT, ROBUST
@@ -27,6 +28,15 @@ def test_a_run_begins_with_the_weights_of_the_file_and_nothing_else_of_it(sample
     assert same(run.network.state_dict(), weights(base))
     assert run.progress.number == 0 and not run.progress.history and not run.optimizer.state
     assert not run.checkpoint.resumed
+
+
+@pytest.mark.parametrize("recipe", [REPORT, ROBUST])
+def test_a_run_keeps_the_recipe_of_the_network_that_it_begins_with(base, recipe):
+    saved = torch.load(base, weights_only=True)
+    saved["arguments"]["recipe"]["name"] = recipe.name
+    tensors.save(base, {name: saved[name] for name in saved if name != "digest"})
+    for option, wanted in ((), recipe), (("--robust",), ROBUST), (("--no-robust",), REPORT):
+        assert parse(["--from", str(base), *option], REPORT, ROBUST).run.recipe.name == wanted.name
 
 
 def test_it_is_resumed_exactly_without_the_file(sample_recording, base, tmp_path):

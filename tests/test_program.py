@@ -1,13 +1,16 @@
 """Ctrl-C ends every command with a message and without a traceback, also while its libraries are loaded."""
 
 import os
+import re
 import subprocess
 import sys
+import time
 
 import pytest
 import warm
 from commands import HERE, ROOT
 
+from cloning.base import progress
 from cloning.base.program import FAILED
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there SIGINT goes to a whole console")
@@ -20,6 +23,8 @@ try:
 except BaseException:
     raise ImportError("initialization failed")
 """
+
+INSTALLED = ("-c", "import cloning.command as c; c.main()")  # the command of an installed project
 
 # Those that a user calls; the other modules in tools/ are parts of them.
 TOOLS = [
@@ -37,7 +42,7 @@ TOOLS = [
         ("simulator", "panda3d", ["-m", "simulator", "drive"]),
         ("simulator", "torch", ["-m", "simulator", "replay", "RECORDING", "--model", "model.pt"]),
         ("export", "onnx", ["-m", "cloning.network.export", "cloning/network/shipped.pt", "none.onnx"]),
-        ("behavioral-cloning browse", "flask", ["-c", "import cloning.command as c; c.main()", "browse"]),
+        ("behavioral-cloning browse", "flask", [*INSTALLED, "browse"]),
         *((tool, "numpy", ["-m", f"tools.{tool}"]) for tool in TOOLS),
     ],
 )
@@ -48,6 +53,46 @@ def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, sample_recording, progr
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 130
     assert done.stderr.startswith(f"{program}: stopped") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("program", "library", "command", "remedy"),
+    [
+        ("model.py", "torch", ["model.py"], "pip install torch"),
+        ("drive.py", "torch", ["drive.py"], "pip install torch"),
+        ("video.py", "cv2", ["video.py", "run1"], "pip install opencv-python-headless"),
+        ("simulator", "direct", ["-m", "simulator", "window"], "pip install panda3d"),
+        ("behavioral-cloning browse", "flask", [*INSTALLED, "browse"], "pip install flask"),
+    ],
+)
+def test_a_missing_library_is_told_in_one_sentence(tmp_path, program, library, command, remedy):
+    """As where the environment was forgotten."""
+    missing = f"raise ModuleNotFoundError({library!r}, name={library!r})"
+    (tmp_path / f"{library}.py").write_text(missing, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (FAILED, 1), done.stderr
+    assert f"{library} is missing: activate the environment" in done.stderr and remedy in done.stderr
+    assert done.stderr.startswith(f"{program.split()[0]}")
+
+
+def test_an_old_python_is_told_in_one_sentence():
+    old = "import runpy, sys; sys.version_info = (3, 10, 4); runpy.run_path('model.py', run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", old], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == FAILED and done.stderr.count("\n") == 1
+    assert "needs Python 3.11 or later, and" in done.stderr and "is Python 3.10.4" in done.stderr
+
+
+def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.05)
+    with progress.progress_bar(100, "image", desc="training") as bar:
+        for n in range(100):
+            bar.update()
+            bar.set_postfix_str(f"loss {n}", refresh=False)
+            time.sleep(0.003)
+    lines = capsys.readouterr().err.splitlines()
+    assert 3 <= len(lines) <= 20, "not every update"
+    assert re.fullmatch(r"training +\d+ %, \d+/100 image, 00:00 since the start, 00:00 left, loss \d+", lines[0])
 
 
 @pytest.mark.parametrize(

@@ -53,3 +53,15 @@ def test_a_folder_that_disappears_while_driving_is_made_again_or_its_frames_are_
         assert written.wait(20) and session.lost == lost
     with pytest.raises(frames.FolderError, match="1 of 2 frames were not saved"):
         saver.close()
+
+
+def test_frames_are_named_by_the_simulators_own_time_where_it_tells_it(tmp_path):
+    """A simulator that waits for its answers, and begins anew after its third frame."""
+    saver = frames.FrameSaver(tmp_path / "run1")
+    session = saver.start_session()
+    for time in (100.0, 100.5, 101.0, 0.0, 0.25):
+        session.save(b"frame", time)
+    saver.close()
+    times = [frames.taken_at(path.name) for path in sorted((tmp_path / "run1").iterdir())]
+    seconds = [(time - times[0]).total_seconds() for time in times if time and times[0]]
+    assert seconds == pytest.approx([0, 0.5, 1, 1, 1.25], abs=0.0021)

@@ -1,5 +1,6 @@
 """The driver's controls against the original's, with a fake gamepad, and the window with real key presses."""
 
+import math
 import os
 import shutil
 import subprocess
@@ -9,13 +10,17 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from commands import ROOT
 from panda3d.core import GamepadButton, InputDevice
 
+from cloning.road.motion import FULL_LOCK, MPH, WHEELBASE
+from cloning.road.track import Track
 from simulator.controls import Controls, Sticks
-from simulator.window import Gamepad
+from simulator.run import Run
+from simulator.window import STRAIGHT, Gamepad
 
 
-def test_keys_steer_a_twentieth_a_step_and_let_go_as_fast():
+def test_at_rest_keys_steer_a_twentieth_a_step_and_let_go_as_fast():
     controls = Controls()
     for n in range(1, 6):
         controls.step({"d"})
@@ -26,6 +31,41 @@ def test_keys_steer_a_twentieth_a_step_and_let_go_as_fast():
     for _ in range(20):
         controls.step(set())
     assert controls.steering == pytest.approx(0)
+
+
+REACTION, LOOK = 17, 8  # steps of 0.02 s: 0.34 s until a key follows what is seen, and a look six times a second
+
+
+def test_a_person_with_keys_alone_drives_three_laps_at_20_mph():
+    """A scripted person of moderate reaction, who looks 0.9 s ahead and presses left, right or nothing."""
+    run, controls, held, pressed = Run(Track("lake")), Controls(), {"w"}, [{"w"}] * REACTION
+    run.s = run.track.straight(STRAIGHT)
+    run.set_back()
+    run.car.speed_limit = 20 * MPH
+    for step in range(25_000):
+        if step % LOOK == 0:
+            position, ahead = run.car.node.get_pos(), 2 + 0.9 * run.car.speed
+            goal = run.track.at((run.s + ahead) % run.track.length)
+            bearing = run.car.heading - math.atan2(goal.y - position.y, goal.x - position.x)
+            wanted = math.degrees(math.atan(2 * WHEELBASE * math.sin(bearing) / ahead)) / FULL_LOCK
+            back = abs(wanted) < abs(run.steering) and wanted * run.steering >= 0
+            more = wanted - run.steering
+            held = {"w"} if back or abs(more) < 0.06 else {"w", "d" if more > 0 else "a"}
+        pressed.append(held)
+        controls.step(pressed.pop(0), speed=run.speed_mph)
+        run.step(controls.steering, controls.throttle)
+        if run.laps == 3:
+            break
+    assert run.laps == 3 and not run.departures
+
+
+def test_a_person_starts_on_a_straight():
+    for name in ("lake", "jungle", "road-1"):
+        run = Run(Track(name))
+        run.s = run.track.straight(STRAIGHT)
+        run.set_back()
+        while run.travelled < STRAIGHT:
+            assert run.advance(0.0, 0.4), "W alone leaves the road"
 
 
 def test_keys_throttle_and_brake_and_cruise_holds_the_throttle_until_the_brake():
@@ -129,6 +169,46 @@ def screen():
     finally:
         server.kill()
         server.wait()
+
+
+LOOK_AT_WINDOW = """
+from panda3d import core
+from cloning.road.track import Track
+from simulator.window import Window
+window = Window(Track("lake"), "recorded")
+window.finish()
+for size in ((960, 540), (960, 600), (500, 620)):
+    properties = core.WindowProperties.size(*size)
+    window.win.request_properties(properties)
+    for _ in range(3):
+        window.task_mgr.step()
+    window.do_help()
+    width = max(1, window.get_aspect_ratio())
+    for text in (window.text, window.help):
+        low, high = text.get_tight_bounds(window.aspect2d)
+        assert -width <= low.x < high.x <= width, (size, low, high)
+    window.do_help()
+assert window.win.get_x_size() == 500
+window.started = True
+window.simulation.set_back(4.5)
+window.task_mgr.step()
+window.simulation.step(0, 0)
+window.task_mgr.step()
+assert "left the road on the right" in window.message.getText()
+assert window.dot.is_hidden()
+window.do_record()
+window.task_mgr.step()
+assert not window.dot.is_hidden()
+window.finish()
+"""
+
+
+def test_the_window_tells_of_a_departure_and_of_recording_and_fits_every_shape(screen, tmp_path):
+    environment = {**screen, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", LOOK_AT_WINDOW]
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "No definition" not in done.stderr, "the font has every letter of the help"
 
 
 @pytest.mark.parametrize("drives", [True, False])

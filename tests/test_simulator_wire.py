@@ -44,7 +44,7 @@ def test_follows_the_transcript(realtime):
     assert server.messages[-2:] == ["41", "1"]
     assert server.closed
     data = contents(server.messages[1])
-    assert set(data) == {"steering_angle", "throttle", "speed", "image"}
+    assert set(data) == {"steering_angle", "throttle", "speed", "image", "stand_in"}
     assert [data[key] for key in ("steering_angle", "throttle")] == ["0.0000", "0.0000"]
     assert re.fullmatch(r"0\.0\d{3}", data["speed"])
     frame = decode(base64.b64decode(data["image"]))
@@ -152,7 +152,7 @@ def test_the_window_sends_null_while_a_person_steers_and_is_never_held_up():
 def test_the_window_looks_for_a_server_without_waiting():
     remote = RemoteDriver("127.0.0.1", unused_port(), Blank())
     run, until = Run(Track("lake"), "autonomous"), time.monotonic() + 10
-    while remote.state == "not connected":
+    while remote.state == "waiting for drive.py":
         remote.poll(False, run)
         assert time.monotonic() < until
     assert "no server" in remote.state
@@ -198,7 +198,7 @@ def connect(sid, environ, auth=None):
     server.emit("steer", {"steering_angle": "0", "throttle": "1"}, room=sid)
 @server.on("telemetry")
 def telemetry(sid, data):
-    assert set(data) == {"steering_angle", "throttle", "speed", "image"}
+    assert set(data) == {"steering_angle", "throttle", "speed", "image", "stand_in"}
     server.emit("steer", {"steering_angle": "0", "throttle": "1"}, room=sid)
 listener = eventlet.listen(("127.0.0.1", 0))
 print(importlib.metadata.version("python-socketio"), listener.getsockname()[1], flush=True)

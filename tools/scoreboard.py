@@ -111,6 +111,18 @@ def drive_laps(ports: SimpleQueue[int], mph: int, laps: float, on: tuple[str, st
     return driven(report, mph, look, laps, finished=status != program.FAILED)
 
 
+def in_words(limit: str, result: Replayed) -> str:
+    """Return the result of a replay at a limit in m, for people."""
+    autonomy, times, metres = result["autonomy_percent"], result["interventions"], result["distance_mean_m"]
+    return f"{autonomy:.1f} % autonomy at {limit} m ({times} interventions), {metres:.2f} m from the centre on average"
+
+
+def lap_in_words(drive: Driven) -> str:
+    """Return the result of a drive in the stand-in simulator, for people."""
+    road = f"{drive['track']} {drive['direction']}, look {drive['look']}, {drive['speed_mph']} mph"
+    return f"{road}: {drive['distance_km']:.2f} km, departures: {drive['departures']}"
+
+
 def parse_look(text: str) -> tuple[bool, int]:
     """Parse an item of --looks: return whether the road's number is to be added, and a look."""
     match = re.fullmatch(r"(own)(?:\+(\d+))?|(\d+)", text)
@@ -181,8 +193,8 @@ def measure(options: argparse.Namespace) -> None:
     board = read_board(file)
     network = network_of(board, options)
 
-    def save(result: object) -> None:
-        print(result, flush=True)
+    def save(line: str) -> None:
+        print(line, flush=True)
         network["drives"].sort(key=lambda drive: [natural(str(part)) for part in course(drive)])
         write_json(file, board)
         write_output(options.table, table(board).encode())
@@ -191,14 +203,14 @@ def measure(options: argparse.Namespace) -> None:
         replays = pool.map(partial(replay, options.model), folders)
         for folder, (recording, results) in zip(folders, replays, strict=True):
             board["recordings"][folder.name], network["replays"][folder.name] = recording, results
-            save(f"{folder.name}: {results}")
+            save(f"{folder.name}: {'; '.join(in_words(limit, result) for limit, result in results.items())}")
     for mph in options.speeds if courses else ():
         at_once = min(threads(), len(courses))
         with serving(options.model, mph, at_once) as ports, ThreadPoolExecutor(at_once) as pool:
             for result in pool.map(partial(drive_laps, ports, mph, options.laps), courses):
                 others = [drive for drive in network["drives"] if course(drive) != course(result)]
                 network["drives"] = [*others, result]
-                save(result)
+                save(lap_in_words(result))
 
 
 def main(argv: list[str] | None = None) -> int:

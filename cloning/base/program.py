@@ -4,6 +4,8 @@ A command calls `end_on_interrupt` before it imports large libraries, and `run` 
 is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C).
 """
 
+from __future__ import annotations  # so that an old Python comes as far as the sentence about it
+
 import atexit
 import functools
 import io
@@ -18,6 +20,9 @@ from typing import NoReturn
 
 from cloning.base.errors import UserError, message_of
 
+OLDEST_PYTHON = (3, 11)
+OWN_PACKAGES = ("cloning", "simulator", "tools")
+PACKAGES = {"cv2": "opencv-python-headless", "PIL": "pillow", "direct": "panda3d", "socketio": "python-socketio"}
 DONE = 0
 INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film, a car that left the road
 FAILED = 2  # not done: argparse's status for wrong arguments, and that of every other error the user can correct
@@ -41,10 +46,16 @@ def warn_once(message: str) -> None:
 def end_on_interrupt(program: str, message: str = "stopped") -> None:
     """Name the command, and make Ctrl-C print this message and end the process at once, with status 130.
 
-    An exception would not do: libraries that are interrupted while they load turn it into errors of their own.
+    An exception would not do: libraries that are interrupted while they load turn it into errors of their own. Also
+    end it, with a sentence instead of a traceback, if Python is too old or a library is missing.
     """
     global name, end_at_once
     name = program
+    if sys.version_info < OLDEST_PYTHON:
+        version = ".".join(map(str, sys.version_info[:3]))
+        print(f"{program}: needs Python 3.11 or later, and {sys.executable} is Python {version}", file=sys.stderr)
+        os._exit(FAILED)
+    sys.excepthook = functools.partial(_tell, sys.excepthook)
 
     def stop(signal_number: int, _: FrameType | None) -> None:
         print(f"{program}: {message}", file=sys.stderr, flush=True)
@@ -54,6 +65,25 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         end_at_once = stop
         signal.signal(signal.SIGINT, stop)
+
+
+def missing_library(error: ModuleNotFoundError) -> str:
+    """Return in a sentence which library is missing, and what to do."""
+    library = str(error.name).partition(".")[0]
+    activate = r".venv\Scripts\activate" if sys.platform == "win32" else "source .venv/bin/activate"
+    return (
+        f"the library {library} is missing: activate the environment, in the project's folder (`{activate}`); "
+        f"where that does not help, `pip install {PACKAGES.get(library, library)}`"
+    )
+
+
+def _tell(otherwise: Callable[..., object], kind: type[BaseException], error: BaseException, trace: object) -> None:
+    """Print an error that ends the process: a missing library in one sentence, others by the hook `otherwise`."""
+    if not isinstance(error, ModuleNotFoundError) or str(error.name).partition(".")[0] in OWN_PACKAGES:
+        otherwise(kind, error, trace)
+        return
+    print(f"{name}: {missing_library(error)}", file=sys.stderr, flush=True)
+    os._exit(FAILED)
 
 
 @contextmanager

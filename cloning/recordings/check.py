@@ -9,10 +9,10 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from cloning.base.errors import RecordingError
 from cloning.base.files import written_whole
+from cloning.base.progress import progress_bar
 from cloning.recordings.columns import Finding, Rejected
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
 from cloning.recordings.frames import FrameCache
@@ -52,10 +52,10 @@ def check_images(
         except ValueError as error:
             reasons[image] = f"{error}; {COPY_OR_DELETE}"
 
-    title, is_hidden = f"checking images of {recording.folder.name}", None if show_progress and len(todo) else True
+    title, hidden = f"checking images of {recording.folder.name}", not show_progress or not len(todo)
     with (
         ThreadPoolExecutor(threads) as pool,
-        tqdm(total=len(todo), desc=title, unit="image", leave=False, disable=is_hidden) as bar,
+        progress_bar(len(todo), "image", hidden, desc=title, leave=False) as bar,
     ):
         remaining = iter(todo.tolist())
         while part := list(islice(remaining, 4096)):  # a future takes memory, and there may be millions of images

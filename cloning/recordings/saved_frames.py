@@ -70,8 +70,8 @@ class FrameSaver:
         """Empty the folder and start the thread. Raises FolderError."""
         empty_folder(path)
         self._path = path
-        resolved = path.resolve()  # "." has no name
-        numbered = (resolved.with_name(f"{resolved.name}-{session}") for session in itertools.count(2))
+        named = path if path.name not in ("", "..") else path.resolve()  # "." has no name
+        numbered = (named.with_name(f"{named.name}-{session}") for session in itertools.count(2))
         # os.path, because Path.exists raises an error where it may not look; saving then counts what it loses.
         self._folders = itertools.chain([path], (folder for folder in numbered if not os.path.exists(folder)))
         self._sessions: list[SessionFolder] = []
@@ -104,7 +104,10 @@ class FrameSaver:
 
 
 class SessionFolder:
-    """The folder of one session; each frame is named by the UTC time of its arrival, and no two have the same name.
+    """The folder of one session; each frame is named by its UTC time, and no two have the same name.
+
+    It is the time of its arrival, or, if the simulator tells its own time, that since the session's first frame: so a
+    film of a simulator that waits for its answers plays as fast as the car drove.
 
     saved, lost   frames that the thread has written, and could not write
     error         why it lost the last one
@@ -115,10 +118,19 @@ class SessionFolder:
         self.path, self._queue = path, jobs
         self.saved, self.lost, self.error = 0, 0, ""
         self._last = datetime.min.replace(tzinfo=UTC)  # time in the last frame's name
+        self._zero: datetime | None = None  # of the simulator's clock
+        self._simulated = 0.0  # s, of the last frame
 
-    def save(self, jpeg: bytes) -> None:
-        """Queue a frame for writing; wait only while the queue is full."""
+    def save(self, jpeg: bytes, simulated: float | None = None) -> None:
+        """Queue a frame for writing; wait only while the queue is full.
+
+        simulated: seconds by the simulator's own clock, 0 to 1e6, if it tells them.
+        """
         now = datetime.now(UTC)
+        if simulated is not None:
+            if self._zero is None or simulated < self._simulated:  # its first frame, or it has begun anew
+                self._zero = max(now, self._last) - timedelta(seconds=simulated)
+            self._simulated, now = simulated, self._zero + timedelta(seconds=simulated)
         now -= timedelta(microseconds=now.microsecond % 1000)
         self._last = max(now, self._last + timedelta(milliseconds=1))
         self._queue.put(partial(self._write, self.path / f"{time_stamp(self._last)}.jpg", jpeg))

@@ -206,6 +206,12 @@ class Track:
         """Return by how many radians the heading grows over a lap."""
         return 2 * np.pi * round((self.heading[-1] - self.heading[0]) / (2 * np.pi))
 
+    def straight(self, length: float) -> float:
+        """Return s at which the straightest stretch of this length, m, begins."""
+        n = min(round(length / self.step), len(self.points))
+        bend = np.abs(np.r_[self.curvature, self.curvature[: n - 1]])
+        return float(np.lib.stride_tricks.sliding_window_view(bend, n).max(axis=1).argmin() * self.step)
+
     def _indices(self, start: float, end: float) -> np.ndarray:
         """Return the indices of the points from `start` to `end` metres along the file's direction."""
         return np.arange(round(start / self.step), round(end / self.step) + 1) % len(self.points)

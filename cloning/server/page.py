@@ -2,6 +2,7 @@
 
 import argparse
 import base64
+import functools
 import itertools
 import json
 import math
@@ -14,26 +15,29 @@ import flask
 import numpy as np
 
 from cloning.base.arguments import number
+from cloning.base.errors import TrackError, UserError
 from cloning.network.attention import visual_backprop
 from cloning.network.network import Network
 from cloning.recordings.images import encode
-from cloning.recordings.saved_frames import FrameSaver, SessionFolder
+from cloning.recordings.saved_frames import SessionFolder
+from cloning.road.autonomy import LIMITS
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.overlay import overlay
+from cloning.road.track import find_road
 from cloning.server import site
+from cloning.wire.protocol import PORT, Place
 
 SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
 SHOWN_FRAMES = 1200  # at most, in one event: as many as a graph has pixels; a new page gets the whole minute
-UPDATE_INTERVAL = 0.1  # s between two pictures
-QUIET_INTERVALS = 10  # without driving, after which a page gets an event nevertheless
+UPDATE_INTERVAL = 0.05  # s between two pictures
+QUIET_INTERVALS = 20  # without driving, after which a page gets an event nevertheless
 RATE_SECONDS = 2  # over which frames/s are counted
 SILENCE = 2.0  # s without a telemetry, or without a usable one, after which the page says so
 MAX_PAGES = 64  # open at once
 MAX_BODY = 200  # bytes of a request; more could be JSON that is nested too deeply to read
 JPEG_QUALITY = 80  # of the pictures
-LEAST_SPEED, LARGEST_SPEED = 0.1, 1000  # mph: the range of the set speed
-speed_argument = number(float, LEAST_SPEED, LARGEST_SPEED)
+speed_argument = number(float, 0, TOP_SPEED_MPH)  # mph: a set speed; 0 stops the car
 Pause = Callable[[float], None]  # waits for so many seconds, while others work
 
 
@@ -45,7 +49,9 @@ class DrivenFrame(NamedTuple):
     speed: float  # mph
     throttle: float  # -1..1
     latency: float  # ms in drive.py, from reading the telemetry's first fragment to its finished answer
-    cte: float | None = None  # m from the lane's centre, if the simulator tells; the sign is the simulator's own
+    cte: float | None = None  # m from the lane's centre, if the simulator tells; the stand-in's sign is right positive
+    x: float | None = None  # m to the east, and to the north, if the simulator tells
+    y: float | None = None
 
 
 class Session:
@@ -60,6 +66,7 @@ class Session:
         self.driven = self.unusable = 0  # frames
         self.reason = ""  # why the last unusable one was
         self.folder: SessionFolder | None = None  # of its saved frames
+        self.place: Place | None = None  # at the last driven frame, if the simulator tells
 
 
 class Server(Protocol):
@@ -68,7 +75,7 @@ class Server(Protocol):
     network: Network
     model: str  # the network's name, for people
     set_speed: float  # mph
-    saver: FrameSaver | None
+    recording: bool  # whether frames are saved
 
     def watched_session(self) -> Session | None:
         """Return the session to show, or None."""
@@ -76,12 +83,17 @@ class Server(Protocol):
     def change_set_speed(self, set_speed: float) -> None:
         """Drive at another set speed, in mph, from now on."""
 
+    def record(self, on: bool) -> None:
+        """Save the frames from now on, or no longer. Raises UserError."""
+
 
 def create_app(server: Server, pause: Pause) -> flask.Flask:
     """Return the web application; pause: the server's.
 
-    `/` is the page, `/live` its figures and pictures as server-sent events. POST to `/set-speed` changes the set speed:
-    {"set_speed": text, mph}; the answer is {"set_speed": number}, or {"message"} with 400.
+    `/` is the page, `/live` its figures and pictures as server-sent events, `/road` the centre line of the road that
+    the stand-in simulator names: [[x, y], …] in m. POST to `/set-speed` changes the set speed: {"set_speed": text,
+    mph}; the answer is {"set_speed": number}. POST to `/record` saves frames or does no longer: {"recording": true or
+    false}; the answer is the same. Both answer {"message"} with 400 to what can't be done.
     """
     app = flask.Flask(__name__, static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
@@ -90,8 +102,10 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
 
     @app.get("/")
     def index() -> str:
-        speeds = {"top_speed": TOP_SPEED_MPH, "speeds": (LEAST_SPEED, LARGEST_SPEED)}
-        return flask.render_template("drive.html", model=server.model, seconds=SHOWN_SECONDS, **speeds)
+        constants = {"seconds": SHOWN_SECONDS, "top_speed": TOP_SPEED_MPH, "limits": LIMITS}
+        port = flask.request.host.rpartition(":")[2]
+        option = "" if port == str(PORT) or not port.isdecimal() else f" --port {port}"
+        return flask.render_template("drive.html", model=server.model, option=option, **constants)
 
     @app.get("/live")
     def live() -> flask.Response:
@@ -100,19 +114,48 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
         events = pages["attention" in flask.request.args].events()
         return flask.Response(events, mimetype="text/event-stream", headers={"Cache-Control": "no-store"})
 
+    @app.get("/road")
+    def road() -> list[list[float]]:
+        session = server.watched_session()
+        return centre_line(session.place.track) if session and session.place else []
+
     @app.post("/set-speed")
     def change_set_speed() -> tuple[dict[str, Any], int]:
-        # JSON, which a browser does not send to another site without asking, whatever else keeps other sites out.
-        body = flask.request.get_json()
-        if not isinstance(body, dict) or set(body) != {"set_speed"} or type(body["set_speed"]) is not str:
-            flask.abort(400, "A set speed is a JSON object with the text set_speed.")
         try:
-            server.change_set_speed(speed_argument(body["set_speed"]))
+            server.change_set_speed(speed_argument(posted("set_speed", str)))
         except argparse.ArgumentTypeError as error:
             return {"message": f"{error} (mph)"}, 400
         return {"set_speed": server.set_speed}, 200
 
+    @app.post("/record")
+    def record() -> tuple[dict[str, Any], int]:
+        try:
+            server.record(posted("recording", bool))
+        except UserError as error:
+            return {"message": str(error)}, 400
+        return {"recording": server.recording}, 200
+
     return app
+
+
+def posted(name: str, kind: type) -> Any:
+    """Return the one value, of this type and name, in the request's JSON; else end the request with status 400.
+
+    A browser does not send JSON to another site without asking, whatever else keeps other sites out.
+    """
+    body = flask.request.get_json()
+    if not isinstance(body, dict) or set(body) != {name} or type(body[name]) is not kind:
+        flask.abort(400, f"This takes a JSON object with {name} alone.")
+    return body[name]
+
+
+@functools.lru_cache(maxsize=4)
+def centre_line(track: str) -> list[list[float]]:
+    """Return the points of a road's centre line, m to the east and the north; none for an unknown name."""
+    try:
+        return [[round(x, 1), round(y, 1)] for x, y in find_road(track)[1][:, :2].tolist()]
+    except TrackError:
+        return []
 
 
 class Pages:
@@ -138,7 +181,7 @@ class Pages:
         """Yield server-sent events: when frames have been driven, when the state changes, and else once a second.
 
         Writing one fails once the page is closed, which ends this loop. Their JSON is that of `figures`, and with new
-        frames also {"rows": [[time, steering, speed, throttle, latency, cte], …], "image": JPEG in base64}.
+        frames also {"rows": [each a DrivenFrame], "image": JPEG in base64}.
         """
         self.open += 1
         try:
@@ -152,7 +195,7 @@ class Pages:
                     event = self._event(last)
                     shown, state, last, quiet = self.session, self.state, self.until, 0
                     yield event
-                self.pause(UPDATE_INTERVAL)
+                self.pause(UPDATE_INTERVAL - time.monotonic() % UPDATE_INTERVAL)  # so that no interval is missed
         finally:
             self.open -= 1
 
@@ -198,12 +241,15 @@ def state_of(session: Session | None, now: float) -> str:
 def figures(server: Server, session: Session | None, now: float) -> dict[str, Any]:
     """Return what the page tells besides the state and the graphs, for JSON; now: time.monotonic()."""
     folder = session.folder if session else None
-    shown = {"set_speed": server.set_speed, "saving": folder.progress() if folder else "", "saver": bool(server.saver)}
+    shown: dict[str, Any] = {"set_speed": server.set_speed, "recording": server.recording}
+    shown |= {"saving": folder.progress() if folder else "", "folder": str(folder.path) if folder else ""}
     if session:
         recent = frames_since(session.history, now - RATE_SECONDS)
         rate = (len(recent) - 1) / max(now - recent[0].time, 1e-3) if recent else 0.0
         shown |= {"session": session.started, "now": now, "rate": rate, "frames": session.driven}
         shown |= {"unusable": session.unusable, "reason": session.reason}
+        if session.place:
+            shown |= {"track": session.place.track, "departures": session.place.departures}
     return shown
 
 

@@ -4,11 +4,12 @@ import base64
 import math
 import re
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from cloning.recordings.images import decode
+from cloning.wire.protocol import STAND_IN, Place
 
 MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
 UNREADABLE = object()  # what the server gives for a telemetry that is too long or not JSON
@@ -25,7 +26,8 @@ NUMBER = re.compile(
     r" ?(?P<after>[-)\u2212]?)"
 )
 SIGNS = {"": 1, "+": 1, "-": -1, "()": -1}  # by the characters before and after a number
-MAX_LENGTH = 40  # characters of a number
+MAX_LENGTH = 40  # characters of a number, or of a road's name
+LARGEST = 1e6  # m or s in a place: no road and no drive is longer
 
 
 class UnusableTelemetry(ValueError):
@@ -40,12 +42,14 @@ class Telemetry:
     image  the image decoded: uint8 (160, 320, 3), RGB
     speed  mph
     cte    m from the lane's centre, which some simulators tell, in their own sign; None without a usable number
+    place  that only the stand-in simulator tells, else None
     """
 
     jpeg: bytes
     image: np.ndarray
     speed: float
     cte: float | None
+    place: Place | None
 
 
 def parse_telemetry(message: object) -> Telemetry:
@@ -73,9 +77,20 @@ def parse_telemetry(message: object) -> Telemetry:
     except (TypeError, ValueError) as error:
         raise UnusableTelemetry("the image is not base64") from error
     try:
-        return Telemetry(jpeg, decode(jpeg), speed, cte)
+        return Telemetry(jpeg, decode(jpeg), speed, cte, parse_place(message.get(STAND_IN)))
     except ValueError as error:
         raise UnusableTelemetry(f"the image is unusable: {error}") from error
+
+
+def parse_place(told: object) -> Place | None:
+    """Return what the stand-in simulator tells of its car's place; None if it is not exactly that."""
+    if not isinstance(told, dict) or set(told) != {each.name for each in fields(Place)}:
+        return None
+    place = Place(**told)
+    numbers = (place.x, place.y, place.offset, place.departures, place.time)
+    # A comparison with nan is false.
+    usable = all(type(number) in (int, float) and abs(number) <= LARGEST for number in numbers)
+    return place if usable and type(place.track) is str and len(place.track) <= MAX_LENGTH else None
 
 
 def parse_number(written: object) -> tuple[float, str]:

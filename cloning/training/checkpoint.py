@@ -279,7 +279,7 @@ class Checkpoint:
             self._write_progress(progress)  # a killed run may not have come so far
             print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
         elif self.run.from_model:
-            print(f"begins with the weights of {self.run.from_model}")
+            print(f"begins with the weights of {self.run.from_model}, by the recipe {self.run.recipe.name}")
 
     def save(self, progress: Progress, *models: Path) -> None:
         """Write the network to these files, then model-resume.pt with all that --resume needs, then how far it is.

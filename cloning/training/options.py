@@ -2,12 +2,15 @@
 
 import argparse
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloning.base.arguments import number
+from cloning.base.errors import ModelError
 from cloning.network.compute import DEVICES, is_available
+from cloning.network.network import load_checkpoint
 from cloning.recordings.format import DRIVING_LOG, PROBLEM_AREAS
 from cloning.training.recipe import Recipe, option_name
 
@@ -97,7 +100,8 @@ def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
     parser = build_parser(report, robust)
     values = vars(parser.parse_intermixed_args(argv))  # recordings may follow options
     given = frozenset(values)
-    recipe = robust if values.pop("robust", False) else report
+    goes_on = values.get("from_model") and recipe_name(values["from_model"]) == robust.name
+    recipe = robust if values.pop("robust", goes_on) else report
     for name in REPORT_ONLY:
         if recipe is robust and name in given:
             parser.error(f"{option_name(name)} has no effect with --robust; leave it out")
@@ -110,6 +114,15 @@ def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
     if not is_available(process.device):
         parser.error(f"--device {process.device}: torch finds no such GPU on this machine; leave the option out")
     return Command(Run(recipe, **values), process, given, {report.name: report, robust.name: robust})
+
+
+def recipe_name(model: str) -> str | None:
+    """Return the name of the recipe that trained a model file; None if the file does not tell, or can't be read."""
+    with suppress(ModelError):  # `read_first_weights` tells of it later
+        arguments = load_checkpoint(model).get("arguments")
+        recipe = arguments.get("recipe") if isinstance(arguments, dict) else None
+        return recipe.get("name") if isinstance(recipe, dict) else None
+    return None
 
 
 def build_parser(report: Recipe, robust: Recipe) -> argparse.ArgumentParser:
@@ -133,13 +146,13 @@ def build_parser(report: Recipe, robust: Recipe) -> argparse.ArgumentParser:
         "other lateral offsets and headings; uses "
         f"{', '.join(f'{option_name(name)} {getattr(robust, name):g}' for name in differ)} unless these are given"
     )
-    add("--robust", action="store_true", help=text)
+    add("--robust", action=argparse.BooleanOptionalAction, help=text)
     for name, (parse_value, text) in FIGURES.items():
         add(option_name(name), type=parse_value, help=f"{text} (default: {getattr(report, name)})")
     add = parser.add_argument_group("run").add_argument
     text = "on the same machine, the same seed repeats the same run (default: 0)"
     add("--seed", type=number(int, 0, MAX_SEED), help=text)
-    text = "begin with the weights of this model file (default: random weights)"
+    text = "begin with the weights of this model file, and with --robust if it was trained so (default: random weights)"
     add("--from", dest="from_model", metavar="MODEL", help=text)
     text = "continue the run of this --output with its original arguments; begin a new run if there is none"
     add("--resume", action="store_true", help=text)

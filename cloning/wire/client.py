@@ -22,7 +22,7 @@ from wsproto.events import CloseConnection, Event, Ping, RejectConnection, Reque
 from wsproto.utilities import ProtocolError
 
 from cloning.road.motion import FULL_LOCK
-from cloning.wire.protocol import FRAGMENT, PING_INTERVAL, PONG_TIMEOUT
+from cloning.wire.protocol import FRAGMENT, PING_INTERVAL, PONG_TIMEOUT, STAND_IN, Place
 
 PATH = "/socket.io/?EIO=4&transport=websocket"
 # Engine.IO's packet types, with which each packet begins; a message (4) goes on with Socket.IO's type.
@@ -98,17 +98,20 @@ def event_packet(name: str, data: Any) -> str:
     return EVENT + json.dumps([name, data], separators=(",", ":"))
 
 
-def telemetry_packet(steering: float, throttle: float, speed: float, jpeg: bytes) -> str:
+def telemetry_packet(steering: float, throttle: float, speed: float, jpeg: bytes, place: Place | None = None) -> str:
     """Return the telemetry packet for a frame.
 
-    steering, throttle: as last commanded, -1..1 (the packet has the steering in degrees); speed: mph.
+    steering, throttle: as last commanded, -1..1 (the packet has the steering in degrees); speed: mph; place: of the
+    stand-in's car, for the page of drive.py; other servers ignore a field that they do not know.
     """
-    values = {
+    values: dict[str, object] = {
         "steering_angle": f"{FULL_LOCK * steering:.4f}",
         "throttle": f"{throttle:.4f}",
         "speed": f"{speed:.4f}",
         "image": base64.b64encode(jpeg).decode(),
     }
+    if place:
+        values[STAND_IN] = {name: round(v, 3) if isinstance(v, float) else v for name, v in vars(place).items()}
     return event_packet("telemetry", values)
 
 

@@ -1,5 +1,27 @@
 """Properties of the simulator's client that both ends of the wire rely on."""
 
+from dataclasses import dataclass
+
 PORT = 4567  # on which the simulator expects the server
 FRAGMENT = 1016  # bytes: the client splits longer messages
 PING_INTERVAL, PONG_TIMEOUT = 25, 60  # s: the client pings this often, and gives up without an answer in this time
+STAND_IN = "stand_in"  # the field with a `Place` that the stand-in simulator adds to each telemetry
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the stand-in simulator's car is, and how it got there.
+
+    track       name of the road
+    x, y        m to the east and to the north
+    offset      m to the right of the road's centre line
+    departures  how often it has left the road
+    time        simulated seconds
+    """
+
+    track: str
+    x: float
+    y: float
+    offset: float
+    departures: int
+    time: float

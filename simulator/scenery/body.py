@@ -1,11 +1,14 @@
 """The car as seen from outside, for films and the window; the cameras in the car see only its bonnet."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from simulator.scenery import textures
 from simulator.scenery.shapes import Colour, Light, Mesh, box, illuminate, merge, sheet
 
-GLASS, TYRE, RIM, RED, WHITE = (0.07, 0.08, 0.10), (0.05, 0.05, 0.05), (0.45, 0.46, 0.48), (0.7, 0.06, 0.05), (0.9,) * 3
+GLASS, TYRE, RIM, RED, WHITE = (0.07, 0.08, 0.10), (0.05, 0.05, 0.05), (0.45, 0.46, 0.48), (0.5, 0.04, 0.04), (0.9,) * 3
+SHINING = (1.0, 0.12, 0.08)  # brake lights
 # m, from the rear to the front: y, half the width, height of the upper edge.
 SHELL = [
     (-2.30, 0.70, 0.66),
@@ -29,14 +32,27 @@ WHEELS = [(x, y) for x in (-0.80, 0.80) for y in (1.27, -1.40)]  # m: the middle
 RADIUS, TREAD, SPOKES = 0.34, 0.24, 24
 
 
-def body(colour: Colour, light: Light) -> Mesh:
-    """Return the car's body, in the coordinates of the bonnet: x right, y forward, z up, in metres."""
-    parts = [shell(colour), cabin(colour), *(wheel(x, y) for x, y in WHEELS)]
+class Body(NamedTuple):
+    """The car's body in the coordinates of the bonnet: x right, y forward, z up, in metres.
+
+    wheel  one of the four, about the middle of its axle, which is the origin
+    brake  the brake lights as they shine
+    """
+
+    body: Mesh
+    wheel: Mesh
+    brake: Mesh
+
+
+def body(colour: Colour, light: Light) -> Body:
+    """Return the car's body."""
+    parts = [shell(colour), cabin(colour)]
     lamps = [(-2.27, RED, 0.62), (2.00, WHITE, 0.44)]  # behind and in front: y, colour, height
     for y, lamp, height in lamps:
         parts += [box((x, y, height), (0.30, 0.12, 0.10), 0.0, lamp, textures.plain()) for x in (-0.55, 0.55)]
     parts.append(box((0, -2.28, 0.40), (0.50, 0.10, 0.12), 0.0, WHITE, textures.plain()))  # number plate
-    return illuminate(merge(parts), light)
+    shining = [box((x, -2.29, 0.61), (0.34, 0.14, 0.14), 0.0, SHINING, textures.plain()) for x in (-0.55, 0.55)]
+    return Body(illuminate(merge(parts), light), illuminate(wheel(), light), merge(shining))
 
 
 def loft(sections: np.ndarray, colours: np.ndarray) -> Mesh:
@@ -74,25 +90,22 @@ def cabin(colour: Colour) -> Mesh:
     return loft(np.array(sections), np.array(colours, float))
 
 
-def wheel(x: float, y: float) -> Mesh:
-    """Return a wheel; x, y: the middle of its axle."""
+def wheel() -> Mesh:
+    """Return a wheel about the middle of its axle."""
     angle = np.linspace(0, 2 * np.pi, SPOKES + 1)
     # From the left hub over the tread to the right hub: x from the wheel's middle, and radius.
     profile = [(-0.40, 0.62), (-0.48, 0.66), (-0.50, 1.0), (0.50, 1.0), (0.48, 0.66), (0.40, 0.62)]
     colours = np.array([RIM, TYRE, TYRE, TYRE, TYRE, RIM])
-    sections = [
-        [(x + TREAD * side, y - RADIUS * r * np.cos(a), RADIUS + RADIUS * r * np.sin(a)) for side, r in profile]
-        for a in angle
-    ]
+    sections = [[(TREAD * side, -RADIUS * r * np.cos(a), RADIUS * r * np.sin(a)) for side, r in profile] for a in angle]
     tread = sheet(np.array(sections), colours, (0, 0), textures.plain())
-    return merge([tread, *(hub(x + TREAD * side, y, side > 0) for side in (-0.40, 0.40))])
+    return merge([tread, *(hub(TREAD * side, side > 0) for side in (-0.40, 0.40))])
 
 
-def hub(x: float, y: float, outwards_right: bool) -> Mesh:
+def hub(x: float, outwards_right: bool) -> Mesh:
     """Return the disc in a wheel."""
     angle = np.linspace(0, 2 * np.pi, SPOKES + 1)[:-1]
-    rim = np.stack([np.full(SPOKES, x), y - 0.62 * RADIUS * np.cos(angle), RADIUS * (1 + 0.62 * np.sin(angle))], axis=1)
-    points = np.vstack([[(x, y, RADIUS)], rim])
+    rim = np.stack([np.full(SPOKES, x), -0.62 * RADIUS * np.cos(angle), 0.62 * RADIUS * np.sin(angle)], axis=1)
+    points = np.vstack([[(x, 0, 0)], rim])
     here = np.arange(SPOKES) + 1
     faces = np.stack([np.zeros(SPOKES, int), here, here % SPOKES + 1], axis=1)
     colours = np.tile(np.array(RIM), (len(points), 1))

@@ -6,7 +6,7 @@ import numpy as np
 
 from cloning.road.camera import height_at_rows
 from simulator.scenery import textures
-from simulator.scenery.body import body
+from simulator.scenery.body import Body, body
 from simulator.scenery.looks import Look
 from simulator.scenery.shade import Shade
 from simulator.scenery.shapes import Colour, Light, Mesh, illuminate, sheet
@@ -35,7 +35,7 @@ class Scenery:
     meshes: list[Mesh]
     sky: Mesh
     bonnet: Mesh
-    body: Mesh
+    body: Body
     light: Light
     haze: Haze | None = None
     tone: np.ndarray | None = None

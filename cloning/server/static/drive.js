@@ -1,31 +1,36 @@
 // The page of drive.py: what it does in words, its figures, and curves of the last minute.
 import {element, make, rounded} from "./site.js";
 
-const SECONDS = Number(element("plots").dataset.seconds), TOP_SPEED = Number(element("plots").dataset.topSpeed);
-const AGAIN = 2000; // ms until a page that was turned away asks again
+const {seconds, topSpeed, limits} = element("plots").dataset;
+const SECONDS = Number(seconds), TOP_SPEED = Number(topSpeed), LIMITS = JSON.parse(limits); // s, mph, m
+const AGAIN = 1000; // ms until a page that lost drive.py asks again
+const STILL = 0.5; // mph: a car that is slower stands
 const GAP = 1; // s without a frame that interrupt a curve
-const HEIGHT = 118, LEFT = 64, RIGHT = 16; // px of a plot; drive.css has its margins for the captions
+const WIDE = 1800, HEIGHT = 97, WIDE_HEIGHT = 210, LEFT = 64, RIGHT = 16; // px of a plot; drive.css has its margins for the captions
 const SPIKES = 3; // frames at least that a scale may leave out
 const LIMIT = 1e6; // beyond which nothing is drawn to scale
 const WORDS = {
-  waiting: ["Waiting for a simulator", "Start it, choose a track and AUTONOMOUS MODE."],
+  waiting: ["Waiting for a simulator", ""],
   driving: ["Driving", ""],
+  stopping: ["Stopping", "Go drives on."],
+  stopped: ["Stopped", "Go drives on. On a slope the car may roll: the simulator has no brake below 5 mph."],
   manual: ["A person drives", "drive.py drives again when W and S are released in the simulator."],
   silent: ["The simulator is silent", "It is connected but sends nothing. Is it paused?"],
   unusable: ["No frame can be used", "The car is told to steer as before, without throttle."],
-  gone: ["The simulator has gone", "What it sent last is shown. drive.py waits for the next one."],
+  gone: ["The simulator has gone", "What it sent last is shown. drive.py waits for the next one: see below."],
   lost: ["drive.py does not answer", "It has ended, or too many pages are open. This page tries again by itself."],
 };
-// The columns of a row after its time. least: the scale reaches at least so far; both: as far below 0 as above;
+const STEERING = 1, SPEED = 2, THROTTLE = 3, LATENCY = 4, DISTANCE = 5, X = 6, Y = 7; // columns of a row, after its time
+// least: the scale reaches at least so far; both: as far below 0 as above;
 // isSpeed: the set speed is shown with it.
 const GRAPHS = [
-  {title: "Steering, right positive", unit: "", digits: 2, least: 0.1, both: true},
-  {title: "Speed", unit: " mph", digits: 1, least: 1, isSpeed: true},
-  {title: "Throttle", unit: "", digits: 2, least: 0.1},
-  {title: "Time in drive.py", unit: " ms", digits: 1, least: 10},
-  {title: "Distance from the centre, sign as sent", unit: " m", digits: 2, least: 0.5, both: true},
+  {column: DISTANCE, title: "Distance from the centre", unit: " m", digits: 2, least: 1.2, both: true, isDistance: true},
+  {column: STEERING, title: "Steering, right positive", unit: "", digits: 2, least: 0.1, both: true},
+  {column: SPEED, title: "Speed", unit: " mph", digits: 1, least: 1, isSpeed: true},
+  {column: THROTTLE, title: "Throttle", unit: "", digits: 2, least: 0.1},
+  {column: LATENCY, title: "Time in drive.py", unit: " ms", digits: 1, least: 10},
 ];
-let live = {}, rows = [], events, again;
+let live = {}, rows = [], road = "", heard = false, events, again;
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Words and figures
@@ -38,12 +43,65 @@ function say(state) {
   element("advice").textContent = advice;
 }
 
-function showFigures({rate, frames, unusable, reason, saving, saver, state}) {
+// The figures of the headline: speed, distance from the lane's centre, departures.
+function showNow() {
+  const last = live.state == "waiting" ? undefined : rows.at(-1), distance = last?.[DISTANCE];
+  element("now-speed").textContent = last ? `${rounded(last[SPEED], 1)} mph` : "";
+  const side = live.track ? distance < 0 ? " left of" : " right of" : " from";
+  element("now-distance").textContent = distance == null ? "" : `${Math.abs(distance).toFixed(2)} m${side} the lane's centre`;
+  element("now-distance").className = ["", "off", "far"][LIMITS.filter(limit => Math.abs(distance) > limit).length];
+  const departures = live.departures;
+  element("now-departures").textContent = departures == null ? "" : departures == 1 ? "1 departure" : `${departures || "no"} departures`;
+  element("now-departures").className = departures ? "far" : "";
+}
+
+function showFigures({rate, frames, unusable, reason, saving, recording, folder, set_speed, state}) {
   element("rate").textContent = state == "driving" ? rate.toFixed(1) : "–";
   element("frames").textContent = frames ?? "–";
   element("unusable").textContent = unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–";
   element("unusable").className = unusable ? "bad" : "";
-  element("saving").textContent = saving || (saver ? "begins with the first frame" : "no; name a folder after the model to save the frames");
+  element("saving").textContent = saving || (recording ? "begins with the first frame" : "no");
+  element("record").setAttribute("aria-pressed", recording);
+  element("record").textContent = recording ? "Stop recording" : "Record";
+  for (const each of document.querySelectorAll(".saved")) each.hidden = !folder;
+  if (element("film").textContent != `python video.py ${folder}`) element("film").textContent = `python video.py ${folder}`;
+  element("plots").hidden = !rows.length;
+  element("start").hidden = !["waiting", "gone"].includes(state);
+  const stopped = set_speed == 0;
+  element("stop").textContent = stopped ? "Go" : "Stop";
+  element("stop").className = stopped ? "go" : "";
+  if (!stopped) element("speed").value = set_speed;
+  element("set-speed").textContent = stopped ? `${element("speed").value} mph, stopped` : `${set_speed} mph`;
+}
+
+// The road from above, where it is known, with the last minute's path.
+async function showMap() {
+  const here = rows.at(-1);
+  element("map").hidden = !live.track || here?.[X] == null;
+  if (element("map").hidden) return;
+  const svg = element("map").querySelector("svg"), [lane, path] = svg.querySelectorAll("path"), car = svg.querySelector("circle");
+  if (road != live.track) {
+    road = live.track;
+    element("track").textContent = `${road}, north is up; the car in red, its last minute in blue`;
+    lane.setAttribute("d", "");
+    const points = await (await fetch("/road")).json();
+    const across = [0, 1].map(axis => points.map(point => point[axis] * (axis ? -1 : 1)));
+    if (!points.length) return;
+    const least = across.map(values => Math.min(...values) - 15), most = across.map(values => Math.max(...values) + 15);
+    svg.setAttribute("viewBox", [...least, most[0] - least[0], most[1] - least[1]].join(" "));
+    lane.setAttribute("d", smooth(across[0].map((x, at) => [x, across[1][at]])));
+  }
+  const driven = rows.filter((_, at) => at % 5 == 0).concat([here]).filter(row => row[X] != null);
+  path.setAttribute("d", "M" + driven.map(row => `${row[X]} ${-row[Y]}`).join("L"));
+  car.setAttribute("cx", here[X]);
+  car.setAttribute("cy", -here[Y]);
+}
+
+// A closed path through points: a Catmull-Rom spline in Bézier's form.
+function smooth(points) {
+  const at = index => points.at(index % points.length), near = (index, to, from) => at(index).map((value, axis) => value + (at(to)[axis] - at(from)[axis]) / 6);
+  const pieces = points.map((_, i) => `C${near(i, i + 1, i - 1)} ${near(i + 1, i, i + 2)} ${at(i + 1)}`);
+  return `M${points[0]}${pieces.join("")}`;
 }
 
 // Draws a picture; as the source of an image element, the browser would keep every one.
@@ -52,19 +110,23 @@ async function show(base64) {
   const picture = await createImageBitmap(jpeg), canvas = element("image");
   canvas.getContext("2d").drawImage(picture, 0, 0, canvas.width, canvas.height);
   picture.close();
-  canvas.hidden = false;
+  element("camera").hidden = false;
 }
 
 function hear(event) {
   const before = live;
   live = JSON.parse(event.data);
   if (live.session != before.session) rows = [];
-  if (live.set_speed != before.set_speed && document.activeElement != element("speed")) element("speed").value = live.set_speed;
+  if (!heard) answer("");
+  heard = true;
   const last = rows.at(-1)?.[0] ?? 0; // after a reconnection the server sends the last minute again
   rows = rows.concat((live.rows ?? []).filter(row => row[0] > last)).filter(row => row[0] > live.now - SECONDS);
   if (live.image) show(live.image);
-  say(live.state);
+  const stops = live.state == "driving" && live.set_speed == 0;
+  say(stops ? rows.at(-1)?.[SPEED] > STILL ? "stopping" : "stopped" : live.state);
+  showNow();
   showFigures(live);
+  showMap();
   draw();
 }
 
@@ -92,14 +154,14 @@ function scale({least, both, isSpeed}, values) {
     const bound = reach(known.map(Math.abs), least);
     return [-bound, bound];
   }
-  const target = isSpeed ? Math.min(live.set_speed ?? 0, TOP_SPEED) : 0;
+  const target = isSpeed ? Math.min(1.1 * (live.set_speed ?? 0), TOP_SPEED) : 0;
   const below = known.filter(value => value < 0).map(Math.abs);
   return [below.length ? -reach(below, least) : 0, reach(known, Math.max(least, target))];
 }
 
 class Graph {
-  constructor(graph, column) {
-    Object.assign(this, graph, {column, range: [0, 1]});
+  constructor(graph) {
+    Object.assign(this, graph, {range: [0, 1]});
     this.value = make("b");
     this.note = make("span", "", {class: "quiet"});
     this.holder = make("div", "", {role: "img", "aria-label": `${this.title} over the last minute`});
@@ -118,30 +180,40 @@ class Graph {
       ...this.size(), legend: {show: false}, cursor: {show: false}, padding: [6, RIGHT, 0, 0],
       scales: {x: {time: false, range: [-SECONDS, 0]}, y: {range: () => this.range}},
       axes: [
-        {...axis, size: 22, space: 60, incrs: [5, 10, 15, 30, 60], values: (_, times) => times.map(time => `${time} s`)},
+        {...axis, size: 24, gap: 8, space: 64, incrs: [5, 10, 15, 30, 60], values: (_, times) => times.map(time => `${time} s`)},
         {...axis, size: LEFT, space: 20, values: (_, values) => values.map(value => `${value}${this.unit}`)},
       ],
-      series: [{}, {...curve, stroke: colour("--line")}, {...curve, stroke: colour("--mark"), dash: [6, 4]}],
-    }, [[], [], []], this.holder);
+      series: [{}, {...curve, stroke: colour("--line")}, ...this.marks().map(([name]) => ({...curve, stroke: colour(name), dash: [6, 4]}))],
+    }, [[], [], ...this.marks().map(() => [])], this.holder);
+  }
+
+  // The dashed lines: colour and value of each.
+  marks() {
+    if (this.isSpeed) return [["--mark", live.set_speed || null]];
+    if (!this.isDistance) return [];
+    return LIMITS.flatMap((limit, at) => [1, -1].map(side => [at ? "--cut" : "--mark", side * limit]));
   }
 
   size() {
-    return {width: Math.max(200, element("plots").clientWidth), height: HEIGHT};
+    return {width: Math.max(200, this.figure.clientWidth), height: innerWidth < WIDE ? HEIGHT : WIDE_HEIGHT};
   }
 
   // times: of the rows, seconds before now; at: index of the row at each time, undefined in a gap.
   draw(times, at) {
     const values = rows.map(row => row[this.column]), last = values.at(-1);
-    this.figure.hidden = this.column == GRAPHS.length && !values.some(value => value != null);
+    const hidden = this.figure.hidden;
+    this.figure.hidden = this.isDistance && !values.some(value => value != null);
     if (this.figure.hidden) return;
+    if (hidden) this.plot.setSize(this.size());
     this.range = scale(this, values);
     const [low, high] = this.range, clip = value => value == null ? null : Math.min(high, Math.max(low, value));
-    const target = this.isSpeed && live.set_speed ? Math.min(live.set_speed, high) : null;
-    this.plot.setData([times, at.map(row => clip(values[row])), times.map(() => target)]);
+    const lines = this.marks().map(([, value]) => times.map(() => value == null || value < low || value > high ? null : value));
+    this.plot.setData([times, at.map(row => clip(values[row])), ...lines]);
     const largest = values.reduce((most, value) => Math.abs(value) > Math.abs(most) ? value : most, 0);
     this.value.textContent = last == null ? "–" : rounded(last, this.digits) + this.unit;
     this.note.textContent = [
-      target != null ? `dashed: set speed ${live.set_speed} mph` : "",
+      this.isSpeed && live.set_speed ? `dashed: set speed ${live.set_speed} mph` : "",
+      this.isDistance ? `${live.track ? "right positive" : "sign as sent"}; dashed: ${LIMITS.filter(limit => limit <= high).join(" and ")} m` : "",
       clip(largest) != largest ? `beyond the scale: ${rounded(largest, this.digits)}${this.unit}` : "",
     ].filter(Boolean).join("; ");
   }
@@ -160,8 +232,9 @@ function draw() {
   for (const graph of graphs) graph.draw(times, at);
 }
 
-const graphs = GRAPHS.map((graph, index) => new Graph(graph, index + 1));
+const graphs = GRAPHS.map(graph => new Graph(graph));
 new ResizeObserver(() => graphs.forEach(graph => graph.plot.setSize(graph.size()))).observe(element("plots"));
+element("attention").addEventListener("change", () => element("magenta").hidden = !element("attention").checked);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   graphs.forEach(graph => graph.build());
   draw();
@@ -174,9 +247,11 @@ function open() {
   close();
   events = new EventSource(element("attention").checked ? "/live?attention" : "/live");
   events.onmessage = hear;
-  events.onerror = () => {
+  events.onerror = () => { // the browser itself would ask again later and later
+    heard = false;
     say("lost");
-    if (events.readyState == EventSource.CLOSED) again = setTimeout(open, AGAIN);
+    close();
+    again = setTimeout(open, AGAIN);
   };
 }
 
@@ -188,18 +263,36 @@ function close() {
 element("attention").onchange = open;
 // A page that nobody sees asks for nothing.
 document.addEventListener("visibilitychange", () => document.hidden ? close() : open());
-element("set-speed").onsubmit = async event => {
-  event.preventDefault();
-  const body = JSON.stringify({set_speed: element("speed").value});
-  let said;
+function answer(words, bad = false) {
+  element("answer").textContent = words;
+  element("answer").className = bad ? "bad" : "";
+}
+
+// Posts a change; the next event shows it.
+async function post(path, body, words) {
   try {
-    const answer = await fetch("/set-speed", {method: "POST", headers: {"Content-Type": "application/json"}, body});
-    said = await answer.json();
+    const sent = await fetch(path, {method: "POST", headers: {"Content-Type": "application/json"}, body: JSON.stringify(body)});
+    const said = await sent.json();
+    answer(said.message ?? words, "message" in said);
   } catch (error) {
-    said = {message: "drive.py does not answer"};
+    answer("drive.py does not answer", true);
   }
-  element("answer").textContent = said.message ?? `drives at ${said.set_speed} mph`;
-  element("answer").className = said.message ? "bad" : "";
-};
+}
+
+const setSpeed = speed => post("/set-speed", {set_speed: String(speed)}, speed ? `drives at ${speed} mph` : "stops the car");
+element("speed").onchange = () => setSpeed(Number(element("speed").value));
+element("speed").oninput = () => element("set-speed").textContent = `${element("speed").value} mph`;
+element("stop").onclick = () => setSpeed(live.set_speed == 0 ? Number(element("speed").value) : 0);
+element("record").onclick = () => post("/record", {recording: !live.recording}, live.recording ? "recording has ended" : "recording");
+element("controls").onsubmit = event => event.preventDefault();
+for (const code of document.querySelectorAll("#start code, #film")) {
+  const copy = make("button", "Copy", {type: "button"});
+  copy.onclick = async () => {
+    await navigator.clipboard.writeText(code.textContent);
+    copy.textContent = "Copied";
+    setTimeout(() => copy.textContent = "Copy", 2000);
+  };
+  if (navigator.clipboard) code.after(" ", copy); // only on this machine, or with https
+}
 draw();
 open();

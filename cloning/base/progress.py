@@ -1,0 +1,26 @@
+"""How far a long job is: a bar on a terminal, and elsewhere, as in a log file, a line now and then."""
+
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+LINE_SECONDS = 30.0  # between two lines
+LINE = "{desc}{percentage:3.0f} %, {n_fmt}/{total_fmt} {unit}, {elapsed} since the start, {remaining} left{postfix}"
+
+
+class Lines(tqdm):
+    """A progress bar that is printed as a line every LINE_SECONDS."""
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """Print the line, or `msg` if it is not empty; pos: unused."""
+        if msg != "":  # that clears a bar
+            print((msg or str(self)).strip(), file=sys.stderr, flush=True)
+
+
+def progress_bar(total: int, unit: str, hidden: bool = False, **options: Any) -> tqdm:
+    """Return a progress bar of tqdm on stderr; options: more of tqdm's."""
+    if sys.stderr.isatty() or hidden:
+        return tqdm(total=total, unit=unit, disable=hidden, **options)
+    every: dict[str, Any] = {"delay": LINE_SECONDS, "mininterval": LINE_SECONDS, "maxinterval": LINE_SECONDS}
+    return Lines(total=total, unit=unit, bar_format=LINE, **{**options, **every, "leave": False})
