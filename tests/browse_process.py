@@ -83,7 +83,8 @@ def placed(folder: Path, offset: np.ndarray) -> None:
     track = Track("lake")
     x, y = track.points[100 : 100 + len(offset), :2].T
     road = {"name": "lake", "direction": "ccw", "outline": track.points[:, :2].tolist()}
-    written(folder, LANE, {"offset": offset, "x": x, "y": y, "road": np.zeros(len(offset))}, roads=[road])
+    label = -offset / 10
+    written(folder, LANE, {"offset": offset, "label": label, "x": x, "y": y, "road": 0 * label}, roads=[road])
 
 
 def steered(folder: Path, model: Path) -> None:

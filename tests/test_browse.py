@@ -69,7 +69,7 @@ def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
         found = track.locate(float(x[row]), float(y[row]))
         assert found == pytest.approx((at, 1.5), abs=0.02)
     assert np.isnan(x[:10]).all() and np.isnan(y[50:]).all()
-    road = summary.road_of(result, recording.images[:, 0])
+    road = summary.road_of(result, recording.images[:, 0], np.zeros(60, bool))
     assert road["roads"] == [["lake", "cw"]] and len(road["path"]) == 1 and len(road["path"][0]) == 40
     assert road["path"][0][0] == pytest.approx([x[10], y[10]], abs=0.06)
 

@@ -56,7 +56,7 @@ def test_the_server_tells_what_the_reader_tells(served, sample_recording):
 def test_replays_and_runs_over_the_socket(served, sample_recording):
     here = served.recordings()["lake sample"]
     shown = served.get(f"{here}/details?limit=1")["replays"][0]
-    assert shown["where"] == [[30, 1.2]] and shown["autonomy_percent"] == 90
+    assert shown["where"] == [[29, 1.2]] and shown["autonomy_percent"] == 90
     status, data, _ = served.ask(f"{here}/columns/replay-0-1")
     assert status == 200 and np.frombuffer(data, "<f4")[-1] == 0.5
     status, data, headers = served.ask(f"{here}/rows/59/replay-0-1.jpg")
@@ -82,10 +82,11 @@ FOREIGN = {"Origin": "http://evil.example"}, {"Host": "localhost.evil.example:80
 def test_no_page_of_another_site_is_answered(served, sample_recording, headers):
     here = served.recordings()["lake sample"]
     cut = {"first": center(sample_recording, 1), "last": center(sample_recording, 2), "reason": ""}
-    for path in ("/recordings", f"{here}/rows/0/left.jpg", "/runs"):
+    for path in ("/recordings", f"{here}/rows/0/left.jpg", f"{here}/film.mp4?rows=0-9", "/runs"):
         assert served.ask(path, **headers)[0] == 403
-    for path in (f"{here}/cuts", f"{here}/columns/offset", f"{here}/replays/2.5"):
-        assert served.ask(path, "POST", cut, **headers)[0] == 403
+    for path in ("cuts", "columns/offset", "replays/2.5", "compared", "export"):
+        assert served.ask(f"{here}/{path}", "POST", [cut], **headers)[0] == 403
+    assert served.ask("/analyses", "DELETE", **headers)[0] == 403
     assert not (sample_recording / "excluded.csv").exists()
 
 
@@ -137,29 +138,31 @@ def test_cuts_over_the_socket(linked):
 
         one = {"first": names[3], "last": names[5], "reason": "off"}
         two = {"first": names[10], "last": names[10], "reason": "crash, hard"}
-        assert server.ask(f"{here}/cuts", "POST", one)[0] == 200
-        status, data, _ = server.ask(f"{here}/cuts", "POST", two)
+        assert server.ask(f"{here}/cuts", "POST", [one])[0] == 200
+        status, data, _ = server.ask(f"{here}/cuts", "POST", [two])
         details = json.loads(data)
-        assert status == 200 and details["cut_frames"] == 4 and details["changed"] == two | {"line": 0}
+        assert status == 200 and details["cut_frames"] == 4 and details["changed"] == [two | {"line": 0}]
         assert [(cut["reason"], cut["frames"], cut["stretches"]) for cut in details["cuts"]] == [
             ("off", 3, [[3, 6]]),
             ("crash, hard", 1, [[10, 11]]),
         ]
         assert len(read_recording(linked)) == 56
-        assert server.ask(f"{here}/cuts", "DELETE", one)[0] == 200
-        refused("not there any more", "cuts", "DELETE", one)
-        wrongs: tuple[object, ...] = ([], {"first": 1, "last": "b", "reason": ""}, one | {"more": ""})
+        refused("is not there any more", "cuts", "DELETE", [two, one | {"reason": "other"}])
+        assert server.get(f"{here}/details")["cut_frames"] == 4, "none of them is deleted then"
+        assert server.ask(f"{here}/cuts", "DELETE", [one])[0] == 200
+        refused("not there any more", "cuts", "DELETE", [one])
+        wrongs: tuple[object, ...] = ([], one, [1], [{"first": 1, "last": "b", "reason": ""}], [one | {"more": ""}])
         for wrong in wrongs:
             assert server.ask(f"{here}/cuts", "POST", wrong)[0] == 400
-        for wrong in (b"[" * 100_000, json.dumps(one | {"reason": "\ud800"}).encode()):
+        for wrong in (b"[" * 100_000, json.dumps([one | {"reason": "\ud800"}]).encode()):
             status, data, _ = server.ask(f"{here}/cuts", "POST", wrong)
-            assert status == 400 and b"A cut is a JSON object with the texts" in data
-        refused("is not the centre image", "cuts", "POST", one | {"first": "../x"})
-        refused("comes before", "cuts", "POST", one | {"last": names[2]})
+            assert status == 400 and b"Cuts are a list of JSON objects" in data
+        refused("is not the centre image", "cuts", "POST", [two, one | {"first": "../x"}])
+        refused("comes before", "cuts", "POST", [one | {"last": names[2]}])
         text = f'first image,last image,reason\n{names[10]},{names[10]},"crash, hard"\n'
         assert cuts.read_text(encoding="utf-8") == text
         cuts.write_text(text + "spoilt\n", encoding="utf-8")
-        refused("excluded.csv: line 3: 1 fields where 3", "cuts", "POST", one)
+        refused("excluded.csv: line 3: 1 fields where 3", "cuts", "POST", [one])
         assert cuts.read_text(encoding="utf-8") == text + "spoilt\n"
         cuts.write_text(text, encoding="utf-8")
         assert (linked / "driving_log.csv").read_bytes() == log
@@ -170,7 +173,7 @@ def test_cuts_over_the_socket(linked):
         gone = "driving_log.csv: No such file"
         refused(gone, "details")
         refused(gone, "rows/0")
-        refused(gone, "cuts", "POST", one)
+        refused(gone, "cuts", "POST", [one])
         refused(gone, "columns/offset", "POST")
         assert gone in server.get(f"{here}/overview")["message"]
         assert (linked.with_name("elsewhere") / "excluded.csv").read_text(encoding="utf-8") == text
