@@ -21,7 +21,7 @@ from cloning.browse.analyses import Analysis, stamp, write_result
 from cloning.browse.attention import Attention
 from cloning.browse.replays import NotReplayedError
 from cloning.network.attention import visual_backprop
-from cloning.network.network import load_model, steer
+from cloning.network.network import load_checkpoint, load_model, steer
 from cloning.recordings.excluded import Cut, add_cuts
 from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording
@@ -152,6 +152,8 @@ def test_a_run_is_running_while_its_folder_is_claimed_and_then_stopped(tmp_path)
     assert found["left"] == 2.5 * 12.5
     assert [row["loss"] for row in found["history"]] == [0.5], "the other rows are an earlier run's"
     assert found["pictures"] == [0, 1200], "those from 6,400 observations on are an earlier run's"
+    assert found["trail"] == [[0.25, 0.5], [0.5, 0.49], [0.75, 0.48], [1.0, 0.47], [1.25, 0.46], [1.5, 0.45]]
+    assert found["best"] == {"epoch": 1, "by": "val_loss", "value": 0.5}
     holder.kill()
     holder.communicate()
     found = runs.overview(files)
@@ -161,6 +163,10 @@ def test_a_run_is_running_while_its_folder_is_claimed_and_then_stopped(tmp_path)
 def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
     found = runs.overview(RunFiles(str(finished[1] / "model.pt")))
     assert (found["state"], found["epochs"], len(found["history"]), found["pictures"]) == ("finished", 2, 2, [0])
+    best = load_checkpoint(finished[1] / "model-best.pt")["history"]
+    assert found["best"] == {"epoch": len(best), "by": "val_loss", "value": best[-1]["val_loss"]}, (
+        "too few rows to drift"
+    )
     files = written_run(tmp_path / "old", finished=4, images=0, losses=(0.5, float("nan"), 0.3))
     files.progress.unlink()
     found = runs.overview(files)

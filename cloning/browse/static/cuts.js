@@ -96,7 +96,7 @@ async function change(method, cuts, what, from = "") {
     if (!from) now.undone = [];
     if (method == "POST") now.marks = {};
     notice();
-    say(`${what}: ${many(changed.length, "stretch", "stretches")}.${from ? "" : " Undo with Z."}`);
+    say(`${what}: ${many(changed.length, "stretch", "stretches")}.${from ? "" : " Undo takes it back."}`);
     await now.update(details);
     find();
   } catch (error) {

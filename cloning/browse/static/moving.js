@@ -3,6 +3,8 @@ import {clock, element} from "./common.js";
 import {marked} from "./cuts.js";
 import {page, remember, say} from "./state.js";
 
+const PAUSE = 0.07; // s that the last frame is shown before they are played again
+
 // The reasons to jump to a row: what such rows are, and why there are none.
 export const JUMPS = {
   offset: ["rows with the largest offset", "The lateral offset is not known yet."],
@@ -56,7 +58,7 @@ export function play() {
     before = time;
     let row = now.row;
     while (row < last && seconds[row + 1] <= at) row++;
-    if (row >= last && now.loop && row > first) at = seconds[row = first];
+    if (now.loop && at > seconds[last] + PAUSE) at = seconds[row = first];
     if (row != now.row) goTo(row, Math.max(1, Math.round(now.speed / 2)));
     if (row >= last && !now.loop) stop();
     else now.playing = requestAnimationFrame(tick);

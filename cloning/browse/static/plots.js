@@ -182,7 +182,7 @@ export class Plots {
   }
 
   setZoom(low, high) {
-    if (this.count < 3) return;
+    if (this.count < 3) return showWindow(this);
     const wide = Math.min(this.count - 1, Math.max(LEAST, high - low)), from = Math.min(Math.max(0, (low + high - wide) / 2), this.count - 1 - wide);
     this.zoom = wide < this.count - 1 ? [from, from + wide] : null;
     this.plots.forEach(plot => plot.setScale("x", {min: from, max: from + wide}));

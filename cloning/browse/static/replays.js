@@ -51,7 +51,7 @@ export async function showReplays() {
     button.setAttribute("aria-pressed", button.dataset.limit == now.limit);
   }
   renew(element("attention"), details.models.map(({name}) => name), () => details.models.map(({name}, index) => {
-    const button = make("button", name);
+    const button = make("button", name, {title: `Show in magenta what ${name} looks at (A)`});
     onClick(button, () => watch(page.open.attention == index ? null : index));
     return button;
   }));

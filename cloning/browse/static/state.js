@@ -12,8 +12,10 @@ export function say(text) {
 // Write what is shown into the address, soon: browsers allow few changes a second.
 export function remember() {
   const now = page.open;
-  clearTimeout(now.noting);
-  now.noting = setTimeout(() => now == page.open && note(), 300);
+  now.noting ??= setTimeout(() => {
+    now.noting = undefined;
+    if (now == page.open) note();
+  }, 300);
 }
 
 export function note() {
