@@ -4,6 +4,7 @@ import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import pytest
 from browse_process import browsing, opened, placed, replayed, written_run
@@ -11,8 +12,10 @@ from test_excluded import center
 
 from cloning.base.errors import RecordingError
 from cloning.browse import __main__ as browse
+from cloning.recordings.excluded import Cut, add_cuts
 from cloning.recordings.images import decode, read_frame
-from cloning.recordings.log import read_recording
+from cloning.recordings.log import read_recording, read_uncut
+from cloning.road.overlay import overlay
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -66,13 +69,45 @@ def test_replays_and_runs_over_the_socket(served, sample_recording):
     assert served.get(f"{here}/details?limit=2.5")["replays"][0]["state"] == "none"
     status, data, _ = served.ask(f"{here}/columns/offset", "POST")
     assert status == 200 and json.loads(data)["lane"] == {"state": "ready"}, "what is there stays"
-    [found] = served.get("/runs")
+    empty, found = served.get("/runs")
+    assert "no training run in this folder yet" in empty["message"]
     assert found["id"] == 1 and found["state"] == "finished" and "pictures" not in found
     assert served.get("/runs/1")["pictures"] == [0, 1200]
     status, data, headers = served.ask("/runs/1/training_generator_LRC_0.png")
     assert (status, data, headers["Content-Type"]) == (200, PNG, "image/png")
     status, data, headers = served.ask("/runs/1/training_generator_LRC_5.png")
     assert status == 409 and "not a PNG" in json.loads(data)["message"] and headers["Cache-Control"] == "no-store"
+
+
+def test_a_film_and_a_new_recording_of_a_selection(linked, tmp_path):
+    placed(linked, np.zeros(60))
+    add_cuts(linked, Cut(center(linked, 0), center(linked, 4), "off"))
+    with browsing(linked) as server:
+        here = server.recordings()["lake"]
+        version = server.get(f"{here}/details")["version"]
+        status, data, headers = server.ask(f"{here}/film.mp4?rows=0-10,20-25&version={version}")
+        assert status == 200 and headers["Content-Type"] == "video/mp4"
+        (tmp_path / "film.mp4").write_bytes(data)
+        film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
+        frames = []
+        while (read := film.read())[0]:
+            frames.append(read[1])
+        assert len(frames) == 10 and frames[0].shape == (320, 640, 3), "without the five that are cut"
+        recording = read_uncut(linked)
+        wanted = overlay(read_frame(recording.path(20)), float(recording.steering[20]))[..., ::-1]
+        assert np.abs(frames[5].astype(int) - wanted).mean() < 12
+        status, data, _ = server.ask(f"{here}/export?version={version}", "POST", {"rows": "0-10,50-60", "name": "part"})
+        made = json.loads(data)
+        assert status == 200 and len(read_recording(made["folder"])) == 15
+        assert server.get(f"/recordings/{made['id']}/overview")["frames"] == 15, "the list has it"
+        for name, words in (("part", "exists already"), ("../part", "not the name of a folder"), (".", "not the name")):
+            status, data, _ = server.ask(f"{here}/export?version={version}", "POST", {"rows": "0-9", "name": name})
+            assert status == 409 and words in json.loads(data)["message"]
+        assert server.ask(f"{here}/film.mp4?rows=0-5&version={version}")[0] == 409, "all of it is cut"
+        assert server.ask(f"{here}/export", "POST", {"rows": "0-9", "name": "other"})[0] == 409, "of no version"
+        for rows in ("", "1", "a-b", "1-" + "9" * 10):
+            assert server.ask(f"{here}/film.mp4?rows={rows}&version={version}")[0] == 400
+        assert sorted(path.name for path in linked.parent.iterdir()) == ["lake", "part"]
 
 
 FOREIGN = {"Origin": "http://evil.example"}, {"Host": "localhost.evil.example:80"}, {"Sec_Fetch_Site": "same-site"}

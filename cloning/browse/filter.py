@@ -14,8 +14,7 @@ OPERATORS: dict[type, Callable] = {
     **{ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: np.divide},
     **{ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge},
     **{ast.Eq: operator.eq, ast.NotEq: operator.ne},
-    **{ast.And: np.logical_and, ast.Or: np.logical_or},
-    **{ast.USub: operator.neg, ast.UAdd: operator.pos, ast.Not: np.logical_not},
+    **{ast.USub: operator.neg, ast.UAdd: operator.pos},
 }
 
 
@@ -44,13 +43,13 @@ def matching(condition: str, column: Callable[[str], np.ndarray], names: list[st
                 raise ConditionError(f"condition: there is no {name[:40]} here; there are {', '.join(names)}")
             case ast.BinOp(left, op, right) if type(op) in OPERATORS:
                 return OPERATORS[type(op)](value(left), value(right))
+            case ast.UnaryOp(ast.Not(), operand):
+                return ~truth(value(operand))
             case ast.UnaryOp(op, operand) if type(op) in OPERATORS:
                 return OPERATORS[type(op)](value(operand))
             case ast.BoolOp(op, values):
-                first, *others = map(value, values)
-                for other in others:
-                    first = OPERATORS[type(op)](first, other)
-                return first
+                all_or_any = np.logical_and if isinstance(op, ast.And) else np.logical_or
+                return all_or_any.reduce([truth(value(each)) for each in values])
             case ast.Compare(left, ops, comparators) if all(type(op) in OPERATORS for op in ops):
                 sides = [value(left), *map(value, comparators)]
                 pairs = zip(ops, sides, sides[1:], strict=False)
@@ -63,12 +62,18 @@ def matching(condition: str, column: Callable[[str], np.ndarray], names: list[st
         raise ConditionError(f"condition: longer than {MAX_LENGTH} characters; use fewer")
     try:
         with np.errstate(all="ignore"):
-            found = np.asarray(value(ast.parse(condition.strip(), mode="eval").body))
-    except (SyntaxError, ValueError, RecursionError, MemoryError, OverflowError):
+            found = truth(value(ast.parse(condition.strip(), mode="eval").body))
+    except (SyntaxError, TypeError, ValueError, RecursionError, MemoryError, OverflowError):
         raise ConditionError("condition: not complete; for example abs(steering) > 0.8 and speed < 5") from None
+    return found & ~unknown
+
+
+def truth(found: np.ndarray | float) -> np.ndarray:
+    """Return the outcome of comparisons: bool (n,). Raises ConditionError if it is none."""
+    found = np.asarray(found)
     if found.dtype != bool or not found.ndim:
         raise ConditionError("condition: compares no column with a number; for example speed < 5")
-    return found & ~unknown
+    return found
 
 
 def stretches_of(rows: np.ndarray) -> list[list[int]]:

@@ -50,7 +50,7 @@ function table(found, limit) {
 
 function row({id, name, message, seconds, roads, offset, models}, columns, limit) {
   const link = make("a", name, {href: `#/${id}?limit=${limit}`}), heading = make("th", "", {scope: "row"}, link);
-  if (message) return make("tr", "", {}, heading, make("td", message, {colspan: 3 + columns, class: "bad"}));
+  if (message) return make("tr", "", {}, heading, make("td", "", {colspan: 3 + columns, class: "bad"}, make("p", message)));
   const figures = models.map(({error, steering, replay}) => [
     steering.state == "ready" && error != null ? error : waits(steering),
     replay.state == "ready" ? replay.autonomy_percent : waits(replay),

@@ -122,7 +122,9 @@ async function fill(id, card, now) {
 // What is worth telling besides the figures: what was repaired, refused or cut.
 function words(overview) {
   const counted = (count, word, what) => count ? [`${many(count, word)} ${what}`] : [];
-  return [...counted(repaired(overview), "row", "repaired"), ...counted(refused(overview), "row", "refused"), ...counted(overview.cut_frames, "frame", "cut")];
+  const [first] = [...overview.first_rejected ?? [], ...overview.first_unusable ?? []];
+  return [...counted(repaired(overview), "row", "repaired"), ...counted(overview.cut_frames, "frame", "cut"),
+    ...counted(refused(overview), "row", `refused, as line ${first?.[0]}: ${first?.[1]}`)];
 }
 
 function draw(overview, card) {
@@ -151,11 +153,12 @@ function draw(overview, card) {
   histograms.set(card, bars(overview.histogram, histogram));
 }
 
-function road({lane, roads}) {
+function road({lane, roads, unusable, frames}) {
   if (lane.state == "waiting") return "road not known yet: waits for its turn";
   if (lane.state == "paused") return "road not known yet: paused";
   if (lane.state == "running") return `road not known yet: ${(100 * lane.progress).toFixed(0)} % analysed`;
   if (lane.state == "failed") return `road not known, the analysis failed: ${lane.message}`;
+  if (unusable == frames) return "road not known: no image can be used";
   if (!roads.length) return "another road";
   return roads.map(([name, direction]) => `${name}, ${DIRECTIONS[direction]}`).join("; ");
 }

@@ -47,12 +47,12 @@ export class Plots {
     const replays = this.replays.map((replay, index) => replay && ({...models[index], values: replay.offset,
       marks: replay.where.map(([row]) => row)})).filter(Boolean);
     const drivers = this.replays.map((replay, index) => replay &&
-      ({...models[index], name: `${models[index].name} driving`, values: replay.driver, dash: [4, 3]})).filter(Boolean);
+      ({...models[index], name: `${models[index].name} driving`, values: replay.driver})).filter(Boolean);
     const human = {name: "human", values: steering, colour: colours.getPropertyValue("--line")};
     const taught = label ? [{name: "label", values: label, colour: colours.getPropertyValue("--label")}] : [];
-    this.steerings = {human, taught, models, drivers};
+    this.steerings = {human, taught, models};
     const graphs = [
-      {title: "Steering", unit: "", digits: 3, tall: 96, curves: [human, ...taught, ...models, ...drivers],
+      {title: "Steering", unit: "", digits: 3, tall: 96, curves: [human, ...taught, ...drivers.length ? drivers : models],
         range: (_, low, high) => balanced(Math.max(0.1, -low * 1.05, high * 1.05), 1)},
       {title: "Throttle", unit: "", digits: 2, tall: 54, range: [Math.min(0, least(throttle)), 1], curves: [{name: "", values: throttle}]},
       {title: "Speed", unit: " mph", digits: 1, tall: 60, range: [0, Math.max(31, -least(speed.map(value => -value)))],
@@ -90,7 +90,7 @@ export class Plots {
           values: (_, rows) => rows.map(row => isLast ? this.time(row) : "")},
         {...axis, size: LEFT, space: 22, ...limits.length && {splits: () => [0, ...limits], values: (_, at) => at.map(metres => metres ? `${metres} m` : "0")}},
       ],
-      series: [{}, ...curves.map(curve => ({stroke: curve.colour, width: 1, dash: curve.dash, spanGaps: false,
+      series: [{}, ...curves.map(curve => ({stroke: curve.colour, width: 1, spanGaps: false,
         points: {show: this.count == 1, fill: curve.colour}}))],
       hooks: {
         ready: [plot => this.listen(plot, here)],

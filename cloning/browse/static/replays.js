@@ -13,12 +13,13 @@ export function cameras() {
   element("cameras").className = isReplayed ? "replaying" : "";
   document.querySelectorAll("#cameras .replayed").forEach(figure => figure.remove());
   const recorded = (canvas, caption, looks = []) => ({canvas, caption: () => caption, path: canvas, looks, paths: []});
-  const centre = {...recorded("center", isReplayed ? "Centre, driven by the human" : "Centre", attention == null ? [] : [attention]),
+  const centre = {...recorded("center", isReplayed ? "Human" : "Centre", attention == null ? [] : [attention]),
     paths: drawn(isReplayed ? [human, ...taught] : [...models, ...taught, human])};
+  element("cameras").dataset.views = replays.filter(Boolean).length;
   if (!isReplayed) return [recorded("left", "Left"), centre, recorded("right", "Right")];
   const views = replays.map((replay, index) => replay && {
     canvas: `view-${index}`,
-    caption: row => `${details.models[index].name} at ${replay.limit} m: ${metres(replay.offset[row])}`,
+    caption: row => `${details.models[index].name}: ${metres(replay.offset[row]).replace("to the ", "")}`,
     has: row => !Number.isNaN(replay.offset[row]),
     path: `replay-${index}-${replay.limit}`,
     looks: attention == index ? [index] : [],
