@@ -83,7 +83,8 @@ def placed(folder: Path, offset: np.ndarray) -> None:
     track = Track("lake")
     x, y = track.points[100 : 100 + len(offset), :2].T
     road = {"name": "lake", "direction": "ccw", "outline": track.points[:, :2].tolist()}
-    written(folder, LANE, {"offset": offset, "x": x, "y": y, "road": np.zeros(len(offset))}, roads=[road])
+    label = -offset / 10
+    written(folder, LANE, {"offset": offset, "label": label, "x": x, "y": y, "road": 0 * label}, roads=[road])
 
 
 def steered(folder: Path, model: Path) -> None:
@@ -101,16 +102,19 @@ def replayed(folder: Path, model: Path, limit: float, offset: np.ndarray, where:
     written(folder, Analysis("replay", str(model), limit), columns, **about)
 
 
-def written_run(folder, finished: int, images: int, epochs: int = 4, losses=(0.5, 0.4, 0.3, 0.2)) -> RunFiles:
-    """A run of epochs of 1000 images at 100 images/s, as model.py writes it."""
+def written_run(folder, finished: int, images: int, epochs=4, losses=(0.5, 0.4, 0.3, 0.2), drifts=()) -> RunFiles:
+    """A run of epochs of 1000 images at 100 images/s, as model.py writes it; drifts: none as an earlier version."""
     files = RunFiles(str(folder / "model.pt"))
     files.pictures.mkdir(parents=True)
     options = {"epochs": epochs, "samples_per_epoch": 1000, "batch_size": 10, "robust": True, "recordings": ["lake"]}
     files.arguments.write_text(json.dumps(options), encoding="utf-8")
-    rows = [f"{n + 1},1000,12.5,{loss},{loss}" for n, loss in enumerate(losses)]
-    files.log.write_text("\n".join(["epoch,images,seconds,loss,val_loss", *rows]) + "\n", encoding="utf-8")
+    drift = [f",{metres}" for metres in drifts] or [""] * len(losses)
+    rows = [f"{n + 1},1000,12.5,{loss},{loss}{drift[n]}" for n, loss in enumerate(losses)]
+    header = "epoch,images,seconds,loss,val_loss" + ",val_drift" * bool(drifts)
+    files.log.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     progress = {"run": "a", "finished": finished, "batches": finished * 100 + images // 10, "images": images}
     progress |= {"seconds": images / 100, "loss": 0.25 if images else None}
+    progress |= {"trail_every": 25, "trail": [0.5 - 0.01 * n for n in range((finished * 1000 + images) // 250)]}
     files.progress.write_text(json.dumps(progress), encoding="utf-8")
     for observations in (0, 1200, 6400):
         for name in ("LRC_", "augmented-"):

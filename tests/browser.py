@@ -121,6 +121,26 @@ class Page:
         self.send("Input.dispatchKeyEvent", type="keyDown", **both, **character)
         self.send("Input.dispatchKeyEvent", type="keyUp", **both)
 
+    def drag(self, selector: str, begin: float, end: float, height: float = 0.5) -> None:
+        """Drag the mouse over an element; begin, end, height: shares of its width and height."""
+        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
+        left, top, width, tall = self.run(f"(({{x, y, width, height}}) => [x, y, width, height])({box})")
+        moves = [
+            ("mousePressed", begin),
+            ("mouseMoved", (begin + end) / 2),
+            ("mouseMoved", end),
+            ("mouseReleased", end),
+        ]
+        for kind, share in moves:
+            place = {"x": left + share * width, "y": top + height * tall}
+            self.send("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **place)
+
+    def wheel(self, selector: str, pixels: float) -> None:
+        """Turn the mouse's wheel over the middle of an element."""
+        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
+        x, y = self.run(f"(({{x, y, width, height}}) => [x + width / 2, y + height / 2])({box})")
+        self.send("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=pixels)
+
     def look(self, width: int, height: int, dark: bool = False) -> None:
         """Choose the window's size in px and the system's colours."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}

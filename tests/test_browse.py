@@ -16,11 +16,14 @@ from drive_process import awaited
 from cloning.base.errors import RecordingError, message_of
 from cloning.browse import analyse, analyses, library, summary
 from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
+from cloning.browse.filter import ConditionError, matching
 from cloning.browse.library import UnknownError
 from cloning.lane.localise import Localisation
 from cloning.network.network import load_model, steer
+from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_recording, read_uncut
+from cloning.recordings.part import write_part
 from cloning.road.track import Track
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -69,9 +72,83 @@ def test_the_road_and_the_path_on_the_map(sample_recording, monkeypatch):
         found = track.locate(float(x[row]), float(y[row]))
         assert found == pytest.approx((at, 1.5), abs=0.02)
     assert np.isnan(x[:10]).all() and np.isnan(y[50:]).all()
-    road = summary.road_of(result, recording.images[:, 0])
+    road = summary.road_of(result, recording.images[:, 0], np.zeros(60, bool))
     assert road["roads"] == [["lake", "cw"]] and len(road["path"]) == 1 and len(road["path"][0]) == 40
     assert road["path"][0][0] == pytest.approx([x[10], y[10]], abs=0.06)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Finding rows
+
+STEERING = np.array([-0.9, -0.5, 0.0, 0.5, 0.9], np.float32)
+OFFSET = np.array([np.nan, -2.0, 0.0, 2.0, np.nan], np.float32)
+NUMBERS = {"steering": STEERING, "offset": OFFSET, "speed": np.arange(5, dtype=np.float32)}
+
+
+@pytest.mark.parametrize(
+    "condition, rows",
+    [
+        ("abs(steering) > 0.8 and speed < 3", [0]),
+        ("-0.6 <= steering <= 0.6", [1, 2, 3]),
+        ("not speed > 1 or steering == 0.5", [0, 1, 3]),
+        ("abs(offset - steering) > 1", [1, 3]),
+        ("not abs(offset) > 1", [2]),  # what is not known is not smaller either
+        ("max(speed, 2) / 2 * (steering + 1) >= +2.2", [3, 4]),
+        ("speed > 1 / 0", []),
+    ],
+)
+def test_rows_are_found_by_a_condition(condition, rows):
+    found = matching(condition, NUMBERS.__getitem__, list(NUMBERS))
+    assert found.dtype == bool and np.flatnonzero(found).tolist() == rows
+
+
+@pytest.mark.parametrize(
+    "condition, words",
+    [
+        ("steering >", "not complete"),
+        ("", "not complete"),
+        ("wheel > 1", "there is no wheel here; there are steering, offset, speed"),
+        ("speed", "compares no column"),
+        ("1 < 2", "compares no column"),
+        ("speed > 1 and speed + 1", "compares no column"),
+        ("-(speed > 1)", "not complete"),
+        ("__import__('os')", "has no meaning"),
+        ("speed.max() > 1", "has no meaning"),
+        ("[speed][0] > 1", "has no meaning"),
+        ("speed ** 99 > 1", "has no meaning"),
+        ("abs(speed, 1) > 1", "has no meaning"),
+        ("'a' < speed", "has no meaning"),
+        ("speed in steering", "has no meaning"),
+        ("(" * 200 + "speed" + ")" * 200, "longer than"),
+        ("-" * 290 + "speed", "not complete|compares no"),
+    ],
+)
+def test_a_condition_without_meaning_is_refused(condition, words):
+    with pytest.raises(ConditionError, match=words):
+        matching(condition, NUMBERS.__getitem__, list(NUMBERS))
+
+
+def test_a_part_of_a_recording_is_a_recording_with_the_same_images(linked, tmp_path):
+    """Numbers to the last bit, hard links, its lane.csv; nothing is left of one that could not be written."""
+    recording = read_recording(linked)
+    lane = ["center image,lateral offset (m),heading error (radians)"]
+    lane += [f"{recording.name(row)},{row / 100},0" for row in range(60)]
+    (linked / "lane.csv").write_text("\n".join(lane) + "\n", encoding="utf-8")
+    chosen = recording.take(np.arange(60) % 3 == 1)
+    write_part(chosen, tmp_path / "part")
+    written = read_recording(tmp_path / "part")
+    for name in ("steering", "throttle", "brake", "speed", "time"):
+        assert (getattr(written, name) == getattr(chosen, name)).all(), name
+    assert not written.repairs and not written.rejected
+    assert len(list((tmp_path / "part/IMG").iterdir())) == 60 and written.path(7, 2).samefile(chosen.path(7, 2))
+    known = (tmp_path / "part/lane.csv").read_text(encoding="utf-8").splitlines()
+    assert known == [lane[0], *lane[2::3]]
+    with pytest.raises(RecordingError, match="part: exists already"):
+        write_part(chosen, tmp_path / "part")
+    recording.path(10).unlink()
+    with pytest.raises(RecordingError, match=f"{recording.name(10)}: No such file"):
+        write_part(chosen, tmp_path / "other")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "part"]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -169,6 +246,29 @@ def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", "import sys; sys.exit('started')"))
     recording.retry("offset")
     assert ended(recording.analyses, linked)[-1] == {"state": "failed", "message": "started"}
+
+
+def test_analyses_pause_and_go_on(recording, linked, monkeypatch):
+    code = "import time; print('progress 0.5', flush=True); time.sleep(600)"
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
+    queue = recording.analyses
+    awaited(lambda: queue.state(linked, LANE) == {"state": "running", "progress": 0.5})
+    process = queue.process
+    queue.pause()
+    awaited(lambda: queue.state(linked, LANE) == {"state": "paused"})
+    assert process and process.poll() is not None, "it takes no more time"
+    queue.resume()
+    awaited(lambda: queue.state(linked, LANE) == {"state": "running", "progress": 0.5})
+
+
+def test_a_recording_without_an_image_has_no_lane(linked):
+    shutil.rmtree(linked / "IMG")
+    (linked / "IMG").mkdir()
+    checked = check_images(read_uncut(linked), show_progress=False)
+    result = analyse.lane(checked)
+    assert result.about["unusable"] == 60 and not len(result.images)
+    road = summary.road_of(result, read_uncut(linked).images[:, 0], np.zeros(60, bool))
+    assert road["roads"] == [] and road["offset"] is None and road["first_unusable"][0][0] == 1
 
 
 def test_without_file_handles_no_file_is_blamed():

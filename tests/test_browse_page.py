@@ -1,13 +1,16 @@
 """The page of recordings in a real Chromium, with the keyboard alone and on every screen."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
 from browse_process import browsing, placed, replayed, steered, written_run
-from browser import LOOKS, chromium, needs_chromium
+from browser import LOOKS, chromium, decoded, needs_chromium
 from test_excluded import center
 
 from cloning.recordings.log import read_recording
+from cloning.road.overlay import draw_path
 
 pytestmark = needs_chromium
 
@@ -50,14 +53,15 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
     placed(linked, np.where(np.arange(60) == 44, -2.5, 0))
     with browsing(linked) as server:
         page.open(server.base)
-        page.wait("document.querySelector('article dl')")
-        for words in ("60, 0.1 minutes", "lake, counter-clockwise", "30.2 mph", "1 recording, 60 frames"):
+        page.wait("document.querySelector('article .road')")
+        for words in ("0.1 minutes, 60 frames", "lake, counter-clockwise", "30.2 mph", "1 recording, 60 frames"):
             assert words in page.text()
         assert page.run("document.querySelectorAll('article svg .path').length") == 1
         page.press("Tab")
         page.wait("document.activeElement.id == 'home'")
-        for key in ("Tab", "Tab", "Enter"):
-            page.press(key)
+        while not page.run("document.activeElement.matches('article h2 a')"):
+            page.press("Tab")
+        page.press("Enter")
         page.wait("document.querySelectorAll('#plots .uplot').length == 4")
         at(page, 0)
         assert page.run("getComputedStyle(document.querySelector('#replaying')).display") == "none", "without a model"
@@ -80,7 +84,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         page.shows("#cuts", "3 frames: off")
         header, cuts = "first image,last image,reason\n", linked / "excluded.csv"
         assert cuts.read_text(encoding="utf-8") == f"{header}{center(linked, 42)},{center(linked, 44)},off\n"
-        assert page.run("document.querySelector('#strip i').style.left") == "70%"
+        assert page.run("document.querySelector('#stretches i').style.left") == "70%"
         page.press("z")
         page.shows("#cuts", "None")
         assert cuts.read_text(encoding="utf-8") == header
@@ -105,21 +109,21 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     page.wait("document.querySelectorAll('#replay-list .where').length == 2")
     for words in ("one.pt at 1 m", "two.pt at 1 m", "90.0 %", "mean 0.25 m", "1.20 m to the right"):
         assert words in page.text()
-    for key, row in (("n", 30), ("n", 40), ("n", 50), ("N", 40)):
+    for key, row in (("n", 29), ("n", 39), ("n", 49), ("N", 39)):
         page.press(key, key == "N")
         at(page, row)
     page.run("document.querySelectorAll('#replay-list .where button')[1].click()")
-    at(page, 50)
+    at(page, 49)
     page.shows("#said", "one.pt was 1.10 m to the left")
     page.press("N", shift=True)
     captions = "[...document.querySelectorAll('.replayed figcaption')].map(each => each.textContent).join()"
-    page.wait(f"{captions} == 'one.pt at 1 m: 0.18 m to the right,two.pt at 1 m: 0.18 m to the left'")
-    seen = served.ask(f"{here}/rows/40/replay-0-1.jpg")[1]
+    page.wait(f"{captions} == 'one.pt: 0.16 m right,two.pt: 0.16 m left'")
+    seen = served.ask(f"{here}/rows/39/replay-0-1.jpg")[1]
     page.until(lambda: page.difference("view-0", seen) < 3)
-    centre = read_recording(sample_recording).path(40).read_bytes()
+    centre = read_recording(sample_recording).path(39).read_bytes()
     page.until(lambda: page.difference("center", centre) < 3)
     page.press("a")
-    assert page.run(f"fetch('{here}/rows/40/center/0.png').then(answer => answer.status)") == 200
+    assert page.run(f"fetch('{here}/rows/39/center/0.png').then(answer => answer.status)") == 200
     page.until(lambda: page.difference("center", centre) > 6)
     page.press("a")
     page.press("a")
@@ -131,16 +135,196 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     assert page.complaints() == []
 
 
+def now(page, code: str):
+    """Evaluate JavaScript about what a recording's page shows."""
+    return page.run(f"import('/static/state.js').then(({{page: {{open}}}}) => open.{code})")
+
+
+CONTROLS = "[...document.querySelectorAll('#recording :is(button, select, input)')].filter(each => each.offsetHeight)"
+
+
+def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
+    """The answer to a key, all curves with their scales, and a tooltip on every control; targets for thumbs."""
+    page.look(1366, 768)
+    page.open(f"{served.base}{served.hash('lake sample')}/20?limit=1&paths=0")
+    page.wait("document.querySelectorAll('.replayed').length == 2")
+    needed = "[...document.querySelectorAll('#said, #where, #scrub, #condition, #plots, #cameras')]"
+    assert max(page.run(f"{needed}.map(each => each.getBoundingClientRect().bottom)")) <= 768
+    bare = f"{CONTROLS}.filter(each => !each.title && each.id != 'scrub' && !each.closest('#replays, #notes')).length"
+    assert page.run(bare) == 0, "tooltips"
+    assert now(page, "plots.plots[3].axes[1]._splits") == [0, -1, 1, -2.5, 2.5], "metres from the lane's centre"
+    assert -0.6 < now(page, "plots.plots[0].scales.y.min") < -0.2, "the steering's own scale"
+    assert "one.pt driving 0." in page.text("#plots"), "how the replayed car is steered"
+    recording = read_recording(sample_recording)
+    frame = recording.path(20).read_bytes()
+    page.until(lambda: page.difference("center", frame) < 0.1)
+    page.press("p")
+    drawn, seen = decoded(frame), "document.querySelector('#center').getContext('2d').getImageData(0, 0, 320, 160).data"
+    draw_path(drawn, float(recording.steering[20]), (204, 102, 0))  # BGR of the human's curve
+    path = np.abs(drawn.astype(int) - decoded(frame)).max(axis=2) > 60
+
+    def off() -> float:
+        shown = np.array(page.run(f"[...{seen}].join()").split(","), np.uint8).reshape(160, 320, 4)[..., 2::-1]
+        return np.abs(shown.astype(int) - drawn)[path].mean()
+
+    page.until(lambda: off() < 40)
+    page.look(390, 844)
+    page.wait("innerWidth == 390")
+    assert page.run(f"{CONTROLS}.filter(each => each.offsetHeight < 44).length") == 0
+    assert page.run("document.querySelector('#where').getBoundingClientRect().bottom") <= 844
+    page.look(1280, 900)
+    assert page.complaints() == []
+
+
+def test_frames_are_found_cut_together_and_exported(linked, page):
+    """By a condition and on the histogram; undoing outlives the page, whose address has all that it shows."""
+    placed(linked, np.where(np.arange(60) > 40, 1.5, 0.0))
+    recording, cuts = read_recording(linked), linked / "excluded.csv"
+    with browsing(linked) as server:
+        page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4")
+        page.shows("#matches", "19 frames in 1 stretch")
+        page.press("g")
+        at(page, 41)
+        page.press("/")
+        page.run("document.execCommand('selectAll')")
+        page.send("Input.insertText", text="abs(steering) > ")
+        page.shows("#matches", "not complete")
+        page.send("Input.insertText", text="0.2")
+        wanted = int((np.abs(recording.steering) > 0.2).sum())
+        page.shows("#matches", f"{wanted} frames in ")
+        page.run("document.activeElement.blur()")
+        page.drag("#histogram .u-over", 0.8, 0.99)
+        page.shows("#matches", "frame")
+        low, high = (float(part) for part in now(page, "condition").split(" and ")[1].split(" <= steering <= "))
+        found = (np.abs(recording.steering) > 0.2) & (recording.steering >= low) & (recording.steering <= high)
+        page.shows("#matches", f"{found.sum()} frames in ")
+        page.click("#cut-matches")
+        page.wait("document.querySelector('#reason[open]')")
+        page.press("Enter")
+        page.shows("#said", "Undo takes it back")
+        assert len(read_recording(linked)) == 60 - found.sum()
+        page.shows("#matches", "no frame")
+        page.click("#home")
+        page.wait("document.querySelector('article h2 a')")
+        page.click("article h2 a")
+        at(page, 0)
+        page.press("z")
+        page.shows("#cuts", "None")
+        assert len(read_recording(linked)) == 60
+        page.press("y")
+        page.wait("document.querySelectorAll('#cuts button').length")
+        page.press("z")
+        page.shows("#cuts", "None")
+        assert len(cuts.read_text(encoding="utf-8").splitlines()) == 1
+        page.press("End")
+        for key in ("i", *["ArrowLeft"] * 9, "o", ">", "b", " "):
+            page.press(key)
+        page.wait("['mark=50-59', 'speed=2', 'loop=1'].every(part => location.hash.includes(part))")
+        page.shows("#play", "Pause")
+        rows: set[int] = set()
+        page.until(lambda: rows.add(now(page, "row")) or {50, 59} <= rows)  # type: ignore[func-returns-value]
+        assert min(rows) == 50, "it plays the marked stretch again and again"
+        page.press("e")
+        page.shows("#selection", "the marked stretch: 10 frames")
+        page.run("document.querySelector('#export-name').value = 'end'")
+        page.click("#export button[value=recording]")
+        page.shows("#said", "Written")
+        written = read_recording(linked.with_name("end"))
+        assert len(written) == 10 and (written.steering == recording.steering[50:]).all()
+        assert written.path(0).samefile(recording.path(50))
+        assert [entry for entry in page.complaints() if "condition=" not in entry] == []
+
+
+def test_curves_are_zoomed_with_wheel_and_window(served, page):
+    page.open(f"{served.base}{served.hash('lake sample')}/30")
+    at(page, 30)
+    assert page.run("document.querySelector('#window').hidden && document.querySelector('#whole').hidden")
+    page.drag("#plots .u-over", 0.25, 0.75)
+    page.wait("!document.querySelector('#window').hidden")
+    low, high = now(page, "plots.zoom")
+    assert (low, high) == (pytest.approx(14.75, abs=1), pytest.approx(44.25, abs=1))
+    page.shows("#zoomed", "The curves show 0:01.0 to 0:02.9")
+    page.wheel("#plots .u-over", -200)
+    page.until(lambda: now(page, "plots.zoom[1]") < high - 3)
+    first = now(page, "plots.zoom[0]")
+    page.drag("#window", 0.5, 0.8)
+    page.until(lambda: now(page, "plots.zoom[0]") > first + 3)
+    page.wait("location.hash.includes('zoom=')")
+    page.open(page.run("location.href"))
+    at(page, 30)
+    assert not page.run("document.querySelector('#window').hidden"), "it is in the address"
+    page.press("0")
+    page.wait("document.querySelector('#window').hidden")
+    assert page.complaints() == []
+
+
+def test_recordings_are_searched_sorted_and_compared(served, page, linked, models, sample_recording, tmp_path):
+    """A recording of one frame, one without images and one that cannot be read beside a whole one."""
+    placed(linked, np.linspace(0, 1.5, 60))
+    for name in ("gone", "one", "spoilt"):
+        (tmp_path / "data" / name / "IMG").mkdir(parents=True)
+    log = (linked / "driving_log.csv").read_text(encoding="utf-8")
+    (tmp_path / "data/gone/driving_log.csv").write_text(log, encoding="utf-8")
+    (tmp_path / "data/one/driving_log.csv").write_text(log.splitlines()[0] + "\n", encoding="utf-8")
+    for image in (linked / "IMG").iterdir():
+        if image.name in log.splitlines()[0]:
+            shutil.copy(image, tmp_path / "data/one/IMG")
+    (tmp_path / "data/spoilt/driving_log.csv").write_text("x" * 300, encoding="utf-8")
+    with browsing(linked.parent, "--run", tmp_path) as server:
+        page.look(390, 844)
+        page.open(server.base)
+        page.shows("#total", "4 recordings, 121 frames")
+        page.shows("#runs", "no training run in this folder yet")
+        page.wait("document.querySelector('article img').naturalWidth == 320")
+        page.until(lambda: "60 rows refused" in page.text("#cards") and "IndexError" not in page.text(), 90)
+        assert page.fits() and page.barriers() == [], "an error with a long word"
+        shown = "[...document.querySelectorAll('#cards article:not([hidden]) h2')].map(each => each.textContent).join()"
+        assert page.run(shown) == "gone,lake,one,spoilt"
+        assert " 0 rows" not in page.text("#cards").replace("\n", " "), "what is zero is not told"
+        searches = [("counter-clockwise", "name", "lake"), ("frames>50", "offset", "lake,gone")]
+        searches += [("", "findings", "spoilt,gone,lake,one"), ("refused>0", "name", "gone")]
+        for query, sort, names in searches:
+            page.run(f"document.querySelector('#sort').value = '{sort}'")
+            page.run(f"document.querySelector('#query').value = '{query}'; document.querySelector('#query').oninput()")
+            assert page.run(shown) == names
+        assert page.run("location.hash") == "#?find=refused%3E0"
+        page.run(f"location.hash = '{server.hash('one')}'")
+        page.shows("#where", "frame 1 of 1")
+        assert now(page, "plots.plots[3].axes[0]._splits.length") == 1, "no axis of a hundred NaN:NaN"
+        (tmp_path / "data/one/driving_log.csv").write_text((log.splitlines()[0] + "\n") * 2, encoding="utf-8")
+        page.shows("#notice", "press R to read it again")
+        page.press("r")
+        page.shows("#where", "frame 1 of 2")
+        assert page.run("document.querySelector('#notice').hidden")
+    page.look(1280, 900)
+    page.open(f"{served.base}#/compare?limit=1")
+    page.wait("document.querySelectorAll('#table td').length > 5")
+    difference = 0.1 - read_recording(sample_recording).steering
+    for words in ("one.pt", "two.pt", "90.0 %", "0.25 m", f"{np.sqrt(np.mean(difference**2)):.3f}", "lake"):
+        assert words in page.text("#table")
+    assert page.barriers() == []
+
+
 def test_a_training_run_refreshes_itself(tmp_path, page):
-    files = written_run(tmp_path, finished=1, images=500)
+    files = written_run(tmp_path / "a", finished=1, images=500, drifts=(0.9, 0.8, 0.6, 0.7))
+    written_run(tmp_path / "b", finished=4, images=0, epochs=5)
+    (tmp_path / "none").mkdir()
     for path in files.pictures.iterdir():
         cv2.imwrite(str(path), np.zeros((1, 1), np.uint8))
-    with browsing("--run", tmp_path) as server:
+    with browsing("--run", *(tmp_path / name for name in ("a", "b", "none"))) as server:
+        page.open(f"{server.base}#/run/2")
+        page.shows("#notice", "none: no training run in this folder yet; `python model.py --output")
         page.open(server.base)
         page.shows("#runs", "stopped or killed in epoch 2 of 4")
         page.click("#runs a")
-        page.wait("document.querySelector('#losses .uplot')")
+        page.wait("document.querySelectorAll('#losses .uplot').length == 2")
         assert page.run("document.title").startswith("stopped: ")
+        assert "Drift" in page.text("#losses section") and "within the epoch" in page.text("#losses")
+        page.click("#run-others button")
+        page.shows("#losses", "b drift")
+        assert page.run("location.hash") == "#/run/0?with=1"
+        page.click("#run-options summary")
+        assert page.text("#run-table").split("\n") == ["option\ta\tb", "epochs\t4\t5"]
         page.shows("#run-which", "after 1,200 observations")
         page.press("ArrowLeft")
         page.shows("#run-which", "after 0 observations")
@@ -152,6 +336,8 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         progress = files.progress.read_text(encoding="utf-8")
         files.progress.write_text(progress.replace('"finished": 1', '"finished": 4'), encoding="utf-8")
         page.shows("#run-figures", "finished: 4 epochs")
+        page.shows("#run-figures", "epoch 4, in model-best.pt: it has the least validation loss, 0.2000")
+        page.shows("#run-figures", "the least drift, 0.60 m, is that of epoch 3")
         assert page.run("document.querySelector('#run-bar').value") == 1
         assert page.run("document.querySelector('#run-read').open"), "after it has refreshed itself"
         assert page.complaints() == []
@@ -162,7 +348,7 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
     page.look(width, 900, dark)
     page.open(served.base)
     for hash, key, condition in (
-        ("#", "", "document.querySelector('article dl')"),
+        ("#", "", "document.querySelector('article .road')"),
         ("#/run/0", "", "document.querySelector('#losses .uplot')"),
         (f"{served.hash('lake sample')}/5", "", "document.querySelector('#where').textContent.includes('frame 6 of')"),
         ("", "l", "document.querySelectorAll('.replayed').length == 2"),
@@ -178,7 +364,7 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
 
 def test_the_focus_stays_on_a_button_of_what_is_shown_anew(served, page):
     page.open(served.base)
-    page.wait("document.querySelector('article dl')")
+    page.wait("document.querySelector('article .road')")
     focused = """import('/static/common.js').then(({make, renew}) => {
       const holder = document.body.appendChild(document.createElement('div'));
       const show = name => renew(holder, name, () => [make('button', 'Go'), make('button', name)]);
@@ -200,7 +386,7 @@ def test_what_failed_is_tried_again(linked, page, tmp_path, models):
         assert "not known, the analysis failed: ImportError: no PyTorch today" in page.text()
         placed(linked, np.zeros(60))
         page.click("article button")
-        page.shows("article dl", "lake, counter-clockwise")
+        page.shows("article", "lake, counter-clockwise")
         page.run(f"location.hash = '{server.hash('lake')}'")
         page.shows("#findings", "one.pt failed: ImportError")
         steered(linked, models[0])
@@ -229,7 +415,7 @@ def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked,
         page.open(server.base)
         page.shows("article .bad", "excluded.csv: line 1")
         cuts.unlink()
-        page.wait("document.querySelector('article dl')")
+        page.wait("document.querySelector('article .road')")
         cuts.write_text("spoilt\n", encoding="utf-8")
         page.run(f"location.hash = '{server.hash('lake')}/7'")
         page.shows("#notice", "excluded.csv: line 1")

@@ -4,6 +4,7 @@ import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import pytest
 from browse_process import browsing, opened, placed, replayed, written_run
@@ -11,8 +12,10 @@ from test_excluded import center
 
 from cloning.base.errors import RecordingError
 from cloning.browse import __main__ as browse
+from cloning.recordings.excluded import Cut, add_cuts
 from cloning.recordings.images import decode, read_frame
-from cloning.recordings.log import read_recording
+from cloning.recordings.log import read_recording, read_uncut
+from cloning.road.overlay import overlay
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -56,7 +59,7 @@ def test_the_server_tells_what_the_reader_tells(served, sample_recording):
 def test_replays_and_runs_over_the_socket(served, sample_recording):
     here = served.recordings()["lake sample"]
     shown = served.get(f"{here}/details?limit=1")["replays"][0]
-    assert shown["where"] == [[30, 1.2]] and shown["autonomy_percent"] == 90
+    assert shown["where"] == [[29, 1.2]] and shown["autonomy_percent"] == 90
     status, data, _ = served.ask(f"{here}/columns/replay-0-1")
     assert status == 200 and np.frombuffer(data, "<f4")[-1] == 0.5
     status, data, headers = served.ask(f"{here}/rows/59/replay-0-1.jpg")
@@ -66,13 +69,45 @@ def test_replays_and_runs_over_the_socket(served, sample_recording):
     assert served.get(f"{here}/details?limit=2.5")["replays"][0]["state"] == "none"
     status, data, _ = served.ask(f"{here}/columns/offset", "POST")
     assert status == 200 and json.loads(data)["lane"] == {"state": "ready"}, "what is there stays"
-    [found] = served.get("/runs")
+    empty, found = served.get("/runs")
+    assert "no training run in this folder yet" in empty["message"]
     assert found["id"] == 1 and found["state"] == "finished" and "pictures" not in found
     assert served.get("/runs/1")["pictures"] == [0, 1200]
     status, data, headers = served.ask("/runs/1/training_generator_LRC_0.png")
     assert (status, data, headers["Content-Type"]) == (200, PNG, "image/png")
     status, data, headers = served.ask("/runs/1/training_generator_LRC_5.png")
     assert status == 409 and "not a PNG" in json.loads(data)["message"] and headers["Cache-Control"] == "no-store"
+
+
+def test_a_film_and_a_new_recording_of_a_selection(linked, tmp_path):
+    placed(linked, np.zeros(60))
+    add_cuts(linked, Cut(center(linked, 0), center(linked, 4), "off"))
+    with browsing(linked) as server:
+        here = server.recordings()["lake"]
+        version = server.get(f"{here}/details")["version"]
+        status, data, headers = server.ask(f"{here}/film.mp4?rows=0-10,20-25&version={version}")
+        assert status == 200 and headers["Content-Type"] == "video/mp4"
+        (tmp_path / "film.mp4").write_bytes(data)
+        film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
+        frames = []
+        while (read := film.read())[0]:
+            frames.append(read[1])
+        assert len(frames) == 10 and frames[0].shape == (320, 640, 3), "without the five that are cut"
+        recording = read_uncut(linked)
+        wanted = overlay(read_frame(recording.path(20)), float(recording.steering[20]))[..., ::-1]
+        assert np.abs(frames[5].astype(int) - wanted).mean() < 12
+        status, data, _ = server.ask(f"{here}/export?version={version}", "POST", {"rows": "0-10,50-60", "name": "part"})
+        made = json.loads(data)
+        assert status == 200 and len(read_recording(made["folder"])) == 15
+        assert server.get(f"/recordings/{made['id']}/overview")["frames"] == 15, "the list has it"
+        for name, words in (("part", "exists already"), ("../part", "not the name of a folder"), (".", "not the name")):
+            status, data, _ = server.ask(f"{here}/export?version={version}", "POST", {"rows": "0-9", "name": name})
+            assert status == 409 and words in json.loads(data)["message"]
+        assert server.ask(f"{here}/film.mp4?rows=0-5&version={version}")[0] == 409, "all of it is cut"
+        assert server.ask(f"{here}/export", "POST", {"rows": "0-9", "name": "other"})[0] == 409, "of no version"
+        for rows in ("", "1", "a-b", "1-" + "9" * 10):
+            assert server.ask(f"{here}/film.mp4?rows={rows}&version={version}")[0] == 400
+        assert sorted(path.name for path in linked.parent.iterdir()) == ["lake", "part"]
 
 
 FOREIGN = {"Origin": "http://evil.example"}, {"Host": "localhost.evil.example:80"}, {"Sec_Fetch_Site": "same-site"}
@@ -82,10 +117,11 @@ FOREIGN = {"Origin": "http://evil.example"}, {"Host": "localhost.evil.example:80
 def test_no_page_of_another_site_is_answered(served, sample_recording, headers):
     here = served.recordings()["lake sample"]
     cut = {"first": center(sample_recording, 1), "last": center(sample_recording, 2), "reason": ""}
-    for path in ("/recordings", f"{here}/rows/0/left.jpg", "/runs"):
+    for path in ("/recordings", f"{here}/rows/0/left.jpg", f"{here}/film.mp4?rows=0-9", "/runs"):
         assert served.ask(path, **headers)[0] == 403
-    for path in (f"{here}/cuts", f"{here}/columns/offset", f"{here}/replays/2.5"):
-        assert served.ask(path, "POST", cut, **headers)[0] == 403
+    for path in ("cuts", "columns/offset", "replays/2.5", "compared", "export"):
+        assert served.ask(f"{here}/{path}", "POST", [cut], **headers)[0] == 403
+    assert served.ask("/analyses", "DELETE", **headers)[0] == 403
     assert not (sample_recording / "excluded.csv").exists()
 
 
@@ -137,29 +173,31 @@ def test_cuts_over_the_socket(linked):
 
         one = {"first": names[3], "last": names[5], "reason": "off"}
         two = {"first": names[10], "last": names[10], "reason": "crash, hard"}
-        assert server.ask(f"{here}/cuts", "POST", one)[0] == 200
-        status, data, _ = server.ask(f"{here}/cuts", "POST", two)
+        assert server.ask(f"{here}/cuts", "POST", [one])[0] == 200
+        status, data, _ = server.ask(f"{here}/cuts", "POST", [two])
         details = json.loads(data)
-        assert status == 200 and details["cut_frames"] == 4 and details["changed"] == two | {"line": 0}
+        assert status == 200 and details["cut_frames"] == 4 and details["changed"] == [two | {"line": 0}]
         assert [(cut["reason"], cut["frames"], cut["stretches"]) for cut in details["cuts"]] == [
             ("off", 3, [[3, 6]]),
             ("crash, hard", 1, [[10, 11]]),
         ]
         assert len(read_recording(linked)) == 56
-        assert server.ask(f"{here}/cuts", "DELETE", one)[0] == 200
-        refused("not there any more", "cuts", "DELETE", one)
-        wrongs: tuple[object, ...] = ([], {"first": 1, "last": "b", "reason": ""}, one | {"more": ""})
+        refused("is not there any more", "cuts", "DELETE", [two, one | {"reason": "other"}])
+        assert server.get(f"{here}/details")["cut_frames"] == 4, "none of them is deleted then"
+        assert server.ask(f"{here}/cuts", "DELETE", [one])[0] == 200
+        refused("not there any more", "cuts", "DELETE", [one])
+        wrongs: tuple[object, ...] = ([], one, [1], [{"first": 1, "last": "b", "reason": ""}], [one | {"more": ""}])
         for wrong in wrongs:
             assert server.ask(f"{here}/cuts", "POST", wrong)[0] == 400
-        for wrong in (b"[" * 100_000, json.dumps(one | {"reason": "\ud800"}).encode()):
+        for wrong in (b"[" * 100_000, json.dumps([one | {"reason": "\ud800"}]).encode()):
             status, data, _ = server.ask(f"{here}/cuts", "POST", wrong)
-            assert status == 400 and b"A cut is a JSON object with the texts" in data
-        refused("is not the centre image", "cuts", "POST", one | {"first": "../x"})
-        refused("comes before", "cuts", "POST", one | {"last": names[2]})
+            assert status == 400 and b"Cuts are a list of JSON objects" in data
+        refused("is not the centre image", "cuts", "POST", [two, one | {"first": "../x"}])
+        refused("comes before", "cuts", "POST", [one | {"last": names[2]}])
         text = f'first image,last image,reason\n{names[10]},{names[10]},"crash, hard"\n'
         assert cuts.read_text(encoding="utf-8") == text
         cuts.write_text(text + "spoilt\n", encoding="utf-8")
-        refused("excluded.csv: line 3: 1 fields where 3", "cuts", "POST", one)
+        refused("excluded.csv: line 3: 1 fields where 3", "cuts", "POST", [one])
         assert cuts.read_text(encoding="utf-8") == text + "spoilt\n"
         cuts.write_text(text, encoding="utf-8")
         assert (linked / "driving_log.csv").read_bytes() == log
@@ -170,7 +208,7 @@ def test_cuts_over_the_socket(linked):
         gone = "driving_log.csv: No such file"
         refused(gone, "details")
         refused(gone, "rows/0")
-        refused(gone, "cuts", "POST", one)
+        refused(gone, "cuts", "POST", [one])
         refused(gone, "columns/offset", "POST")
         assert gone in server.get(f"{here}/overview")["message"]
         assert (linked.with_name("elsewhere") / "excluded.csv").read_text(encoding="utf-8") == text
@@ -194,8 +232,9 @@ def test_others_are_answered_while_a_long_log_is_read(linked):
 
 def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, monkeypatch, capsys):
     for arguments, words in (
-        ([tmp_path], f"{tmp_path}: no driving_log.csv in or below it"),
+        ([tmp_path], f"{tmp_path}: no driving_log.csv in or below it. Record some in the simulator (training mode,"),
         ([sample_recording, "--model", tmp_path / "m.pt"], f"{tmp_path / 'm.pt'}: no such model file"),
     ):
         monkeypatch.setattr(sys, "argv", ["browse", *map(str, arguments), "--port", "0"])
-        assert browse.main() == 2 and capsys.readouterr().err.startswith(f"browse: {words}")
+        assert browse.main() == 2 and (said := capsys.readouterr().err).startswith(f"browse: {words}")
+        assert "python -m simulator record data/lake" in said or "model" in words

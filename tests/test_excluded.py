@@ -11,7 +11,7 @@ import warm
 from commands import ROOT, SHORT, run_here
 
 from cloning.base.errors import RecordingError
-from cloning.recordings.excluded import MAX_REASON, Cut, add_cut, delete_cut, one_line, read_cuts
+from cloning.recordings.excluded import MAX_REASON, Cut, add_cuts, delete_cuts, one_line, read_cuts
 from cloning.recordings.log import print_findings, read_recording, read_uncut
 from cloning.replay.replay import load_recording
 
@@ -100,7 +100,7 @@ def test_a_wrong_line_is_named_with_the_remedy(linked, text, words):
     before = (linked / "excluded.csv").read_bytes()
     if "fields" in words or "end of data" in words:
         with pytest.raises(RecordingError):
-            add_cut(linked, Cut(names["a"], names["b"], "more"))
+            add_cuts(linked, Cut(names["a"], names["b"], "more"))
     assert (linked / "excluded.csv").read_bytes() == before
 
 
@@ -125,7 +125,7 @@ def test_a_named_pipe_is_refused_and_not_waited_for(linked, name):
     with pytest.raises(RecordingError, match=f"{name}: not a regular file; "):
         read_recording(linked)
     with pytest.raises(RecordingError, match=r"excluded.csv: "):
-        delete_cut(linked, Cut("a.jpg", "b.jpg", ""))
+        delete_cuts(linked, Cut("a.jpg", "b.jpg", ""))
 
 
 @pytest.mark.parametrize(
@@ -141,8 +141,8 @@ def test_hand_written_forms_are_understood(linked, form):
     (linked / "excluded.csv").write_bytes(form.format(a=a, b=b).encode())
     assert [cut.row() for cut in read_cuts(linked)] == [(a, b, "off")]
     assert len(read_recording(linked)) == 55
-    add_cut(linked, Cut(b, b, "more"))
-    delete_cut(linked, Cut(b, b, "more"))
+    add_cuts(linked, Cut(b, b, "more"))
+    delete_cuts(linked, Cut(b, b, "more"))
     assert (linked / "excluded.csv").read_bytes().rstrip() == form.format(a=a, b=b).encode().rstrip(), "as it was"
 
 
@@ -150,22 +150,22 @@ def test_adding_and_deleting_keep_all_other_lines(linked):
     log = (linked / "driving_log.csv").read_bytes()
     cuts = [Cut(center(linked, n), center(linked, n + 1), reason) for n, reason in ((1, 'a "b", c'), (5, ""), (9, "ü"))]
     for cut in cuts:
-        add_cut(linked, cut)
-        add_cut(linked, cut)  # a second time it changes nothing
+        add_cuts(linked, cut)
+        add_cuts(linked, cut)  # a second time it changes nothing
     assert [cut.row() for cut in read_cuts(linked)] == [cut.row() for cut in cuts]
-    delete_cut(linked, cuts[1])
+    delete_cuts(linked, cuts[1])
     assert [cut.row() for cut in read_cuts(linked)] == [cuts[0].row(), cuts[2].row()]
     with pytest.raises(RecordingError, match="is not there any more; it was deleted elsewhere"):
-        delete_cut(linked, cuts[1])
+        delete_cuts(linked, cuts[1])
     assert (linked / "driving_log.csv").read_bytes() == log
 
 
 ADD = """
 import sys
 from pathlib import Path
-from cloning.recordings.excluded import Cut, add_cut
+from cloning.recordings.excluded import Cut, add_cuts
 for n in range(20):
-    add_cut(Path(sys.argv[1]), Cut("a.jpg", "b.jpg", f"{sys.argv[2]} {n}"))
+    add_cuts(Path(sys.argv[1]), Cut("a.jpg", "b.jpg", f"{sys.argv[2]} {n}"))
 """
 
 

@@ -22,7 +22,7 @@ from steer_server import STEER, Server
 
 from cloning.base.errors import RecordingError
 from cloning.recordings.check import check_images
-from cloning.recordings.excluded import Cut, add_cut, read_cuts
+from cloning.recordings.excluded import Cut, add_cuts, read_cuts
 from cloning.recordings.log import read_recording
 from tools.simulator_client import Simulator, telemetry
 
@@ -256,7 +256,7 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
     shutil.copy(lake / "driving_log.csv", recorded)
     center = [images[0].decode() for images, _ in names]
     earlier, new = Cut(center[1], center[2], "off"), Cut(center[5], center[9], "off")
-    add_cut(recorded, earlier)
+    add_cuts(recorded, earlier)
     command, answers = ["-m", "cloning.browse", "lake", "--port", 0], []
     trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin")
 

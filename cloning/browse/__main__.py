@@ -64,7 +64,7 @@ def main() -> int:
         return program.failed("browse", error)
     stopped = connections.noted_signals()
     stderr = terminal.log_to_stderr("browse")
-    library, runs = Library(folders, arguments.model), Runs(arguments.run or [Path()])
+    library, runs = Library(folders, arguments.model), Runs(arguments.run or [])
     print(
         f"{len(folders)} recording{'s' * (len(folders) != 1)}. "
         f"Open http://{HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.",

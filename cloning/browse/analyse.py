@@ -25,6 +25,7 @@ from cloning.browse.analyses import PROGRESS, Analysis, Result, stamp, write_res
 from cloning.lane.known import known_position
 from cloning.lane.localise import localise_recording, shipped_networks
 from cloning.lane.reader import LaneNetwork, detect_centres, read_strips
+from cloning.lane.recovery import LaneAhead
 from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
 from cloning.recordings.check import check_images
@@ -37,6 +38,8 @@ from cloning.replay.score import driving_metrics
 from cloning.road.motion import stretches
 
 PART_ROWS = 256  # that are analysed at once: with their strips, 12 MB
+LANE_COLUMNS = ("offset", "label", "x", "y", "road")  # of an analysis of the lane
+NOTHING = np.empty(0, np.float32)
 SHOWN_REJECTED = 5  # rows with unusable images that the page lists
 
 
@@ -65,11 +68,14 @@ def main() -> int:
 
 
 def lane(recording: Recording) -> Result:
-    """Return the columns offset (m, right positive), x and y (m, where the track is known), road, and the tracks.
+    """Return the columns offset (m, right positive), label, x and y (m, on a known track), road, and the tracks.
 
-    road is an index into about["roads"], -1 where the track is not known; offset is nan where it is not trusted. A
+    label is the steering of `model.py --robust`, -1..1, as it learns it for the recorded images; road is an index into
+    about["roads"], -1 where the track is not known; offset is nan where it is not trusted, label where there is none. A
     `lane.csv` has the offset, but not the track.
     """
+    if not len(recording):
+        return Result(recording.images[:, 0], dict.fromkeys(LANE_COLUMNS, NOTHING), {"roads": []} | rejected(recording))
     known = known_position(recording)  # first, since the rest takes long
 
     def detect(network: LaneNetwork) -> np.ndarray:
@@ -77,7 +83,8 @@ def lane(recording: Recording) -> Result:
         return np.concatenate(of_parts or [np.empty((0, 3, 5), np.float32)])
 
     strips = partial(read_strips, recording)
-    position, localised = localise_recording(recording, stretches(recording), detect, strips, shipped_networks())
+    driven = stretches(recording)
+    position, localised = localise_recording(recording, driven, detect, strips, shipped_networks())
     position = known or position
     x, y = np.full((2, len(recording)), np.nan, np.float32)
     road, roads = np.full(len(recording), -1, np.float32), []
@@ -90,7 +97,12 @@ def lane(recording: Recording) -> Result:
         poses = [track.at(s, right) for s, right, _ in localisation.states.tolist()]
         x[rows], y[rows] = np.array([(pose.x, pose.y) for pose in poses]).T
     offset = np.where(position.trusted, position.lateral_offset, np.nan).astype(np.float32)
-    columns = {"offset": offset, "x": x, "y": y, "road": road}
+    label = np.full(len(recording), np.nan, np.float32)
+    for stretch in driven:
+        rows = stretch.rows
+        ahead = LaneAhead.of_stretch(stretch, position.lateral_offset[rows], position.trusted[rows])
+        label[rows] = np.where(ahead.known, ahead.steering(ahead.offset, ahead.yaw), np.nan)
+    columns = dict(zip(LANE_COLUMNS, (offset, label, x, y, road), strict=True))
     return Result(recording.images[:, 0], columns, {"roads": roads} | rejected(recording))
 
 

@@ -23,7 +23,7 @@ from cloning.recordings.check import cache_file
 from cloning.recordings.excluded import read_cuts
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE
 
-RULES = 3  # of what a result contains: counted up when they change
+RULES = 4  # of what a result contains: counted up when they change
 COMMAND = (sys.executable, "-m", "cloning.browse.analyse")
 PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
 
@@ -133,6 +133,7 @@ class Analyses:
         self.failed: dict[tuple[Job, str], str] = {}  # job, stamp -> message
         self.ready: set[tuple[Job, str]] = set()  # job, stamp
         self.running: Job | None = None
+        self.paused = False  # whether none is begun, until `resume`
         self.progress = 0.0
         self.process: subprocess.Popen[str] | None = None
         self.changed = threading.Condition()
@@ -144,7 +145,8 @@ class Analyses:
     def state(self, folder: Path, analysis: Analysis, begin: bool = True) -> dict[str, Any]:
         """Return how far an analysis is, for the page: {"state", "progress" or "message"}.
 
-        The states are ready, running, waiting, failed and, if it is not to begin now and nobody asked for it, none.
+        The states are ready, running, waiting, paused, failed and, if it is not to begin now and nobody asked for it,
+        none.
         Raises RecordingError as `stamp` does.
         """
         job = folder, analysis
@@ -162,7 +164,21 @@ class Analyses:
                     return {"state": "none"}
                 self.waiting[job] = file_stamp(folder / DRIVING_LOG)[0]
                 self.changed.notify()
-        return {"state": "waiting"}
+            return {"state": "paused" if self.paused else "waiting"}
+
+    def pause(self) -> None:
+        """End the analysis that runs, to be done again, and begin no other until `resume`."""
+        with self.changed:
+            self.paused = True
+            if self.running:
+                self.waiting[self.running] = 0
+                self._end()
+
+    def resume(self) -> None:
+        """Begin analyses again."""
+        with self.changed:
+            self.paused = False
+            self.changed.notify()
 
     def retry(self, folder: Path, analysis: Analysis) -> None:
         """Begin an analysis again that has failed. Raises RecordingError as `stamp` does."""
@@ -212,7 +228,7 @@ class Analyses:
     def _next(self) -> Job | None:
         """Wait for an analysis to do, and return it as the running one; None at the end."""
         with self.changed:
-            self.changed.wait_for(lambda: self.waiting or self.closed)
+            self.changed.wait_for(lambda: (self.waiting and not self.paused) or self.closed)
             if self.closed:
                 return None
             self.running, self.progress, self.ended = min(self.waiting, key=self._order), 0.0, False

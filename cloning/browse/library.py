@@ -3,25 +3,32 @@
 import functools
 import hashlib
 import os
+import tempfile
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cloning.base.errors import RecordingError, UserError, message_of
+from cloning.base.errors import OutputError, RecordingError, UserError, message_of
+from cloning.base.film import FilmWriter, frame_rate
 from cloning.base.frame import FRAME
 from cloning.browse import replays, summary
 from cloning.browse.analyses import LANE, Analyses, Analysis, Result, file_stamp, read_result, stamp
 from cloning.browse.attention import Attention
-from cloning.recordings.excluded import Cut, add_cut, cut_rows, delete_cut, one_line, read_cuts
-from cloning.recordings.format import CAMERAS, DRIVING_LOG
-from cloning.recordings.images import jpeg_size, read_jpeg
+from cloning.browse.filter import matching, stretches_of
+from cloning.recordings.excluded import Cut, add_cuts, cut_rows, delete_cuts, one_line, read_cuts
+from cloning.recordings.format import CAMERAS, DRIVING_LOG, SAMPLE_RATE
+from cloning.recordings.images import jpeg_size, read_frame, read_jpeg
 from cloning.recordings.log import Recording, read_uncut
+from cloning.recordings.part import write_part
 from cloning.road.autonomy import LIMITS
+from cloning.road.overlay import overlay
 
 OPEN = 2  # recordings that are kept in memory: 100,000 rows take 20 MB
-COLUMNS = ("steering", "throttle", "speed", "seconds")  # of the log; the analyses add to them
+COLUMNS = ("steering", "throttle", "brake", "speed", "seconds")  # of the log; the analyses add to them
+MAX_FILM = 300 * SAMPLE_RATE  # rows: five minutes, which take half a minute to encode
 
 _wanted: dict[Path, threading.Lock] = {}
 _reading = threading.Lock()
@@ -38,9 +45,15 @@ class Library:
         """folders: recordings; models: whose steering is shown."""
         self.models = [str(model) for model in models]
         self.analyses, self.attention = Analyses(), Attention()
-        self.recordings = {
-            hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=6).hexdigest(): folder for folder in folders
-        }
+        self.recordings: dict[str, Path] = {}
+        for folder in folders:
+            self.add(folder)
+
+    def add(self, folder: Path) -> str:
+        """Add a recording, and return its identifier."""
+        identifier = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=6).hexdigest()
+        self.recordings[identifier] = folder
+        return identifier
 
     def close(self) -> None:
         """End the processes that were started for the page."""
@@ -63,17 +76,21 @@ class Library:
 class ShownRecording:
     """What the page shows of a recording, and changes in it.
 
-    Besides COLUMNS it has the columns of analyses: offset, m, right positive; model-0 and so on, the models' steering,
-    -1..1; replay-0-2.5 and so on, the lateral offset with model 0 as the driver, at a limit of 2.5 m.
+    Besides COLUMNS it has the columns of analyses: offset, m, right positive; label, the steering that `model.py
+    --robust` learns there; model-0 and so on, the models' steering, -1..1; replay-0-2.5 and so on, the lateral offset
+    with model 0 as the driver, at a limit of 2.5 m; driver-0-2.5 and so on, its steering then.
     """
 
     def __init__(self, identifier: str, folder: Path, models: list[str], analyses: Analyses):
         """models: their files, in the order of the page."""
         self.identifier, self.folder, self.models, self.analyses = identifier, folder, models, analyses
-        self.analysed = {"offset": LANE}
+        self.analysed = {"offset": (LANE, "offset"), "label": (LANE, "label")}  # column -> analysis, its name there
         for index, model in enumerate(models):
-            self.analysed[f"model-{index}"] = Analysis("steering", model)
-            self.analysed |= {f"replay-{index}-{limit:g}": Analysis("replay", model, limit) for limit in LIMITS}
+            self.analysed[f"model-{index}"] = Analysis("steering", model), "steering"
+            for limit in LIMITS:
+                replay = Analysis("replay", model, limit)
+                self.analysed[f"replay-{index}-{limit:g}"] = replay, "offset"
+                self.analysed[f"driver-{index}-{limit:g}"] = replay, "steering"
 
     def version(self) -> str:
         """Return what changes when the log does. Raises RecordingError if it is gone."""
@@ -94,10 +111,11 @@ class ShownRecording:
         """Return what the list shows of a recording; {"message"} instead of figures if it can't be read."""
         shown: dict[str, Any] = {"id": self.identifier, "name": self.folder.resolve().name, "folder": str(self.folder)}
         try:
-            shown |= _figures(self.folder, self.version(), tuple(read_cuts(self.folder)))
+            cuts = tuple(read_cuts(self.folder))
+            shown |= _figures(self.folder, self.version(), cuts)
             shown["lane"] = self._state("offset")
             if shown["lane"]["state"] == "ready":
-                shown |= _road(self.folder, self.version(), stamp(self.folder, LANE))
+                shown |= _road(self.folder, self.version(), cuts, stamp(self.folder, LANE))
         except (UserError, OSError) as error:
             shown["message"] = message_of(error)
         return shown
@@ -116,7 +134,7 @@ class ShownRecording:
             {
                 **cut.__dict__,
                 "frames": int(rows.sum()),
-                "stretches": np.flatnonzero(np.diff(rows, prepend=False, append=False)).reshape(-1, 2).tolist(),
+                "stretches": stretches_of(rows),
             }
             for cut, rows in zip(cuts, rows_cut, strict=True)
         ]
@@ -133,8 +151,8 @@ class ShownRecording:
         """Return the columns of the replays at a limit, one a model."""
         return [f"replay-{index}-{limit}" for index in range(len(self.models))]
 
-    def _replay(self, recording: Recording, column: str) -> dict[str, Any]:
-        shown = self._state(column, begin=False)
+    def _replay(self, recording: Recording, column: str, begin: bool = False) -> dict[str, Any]:
+        shown = self._state(column, begin)
         if shown["state"] == "ready":
             result, now = self._result(column)
             shown |= {**replays.figures(result, recording.images[:, 0]), "stamp": now}
@@ -142,6 +160,8 @@ class ShownRecording:
 
     def replay(self, limit: str, begin: bool) -> None:
         """Begin the replays at a limit, or end those that are not done. Raises UnknownError."""
+        if begin:
+            self.analyses.resume()  # whoever asks for one wants it
         for column in self._replays(limit):
             (self.analyses.state if begin else self.analyses.stop)(self.folder, self._analysis(column))
 
@@ -152,7 +172,7 @@ class ShownRecording:
     def _analysis(self, column: str) -> Analysis:
         if column not in self.analysed:
             raise UnknownError(f"no column {column[:40]}")
-        return self.analysed[column]
+        return self.analysed[column][0]
 
     def _state(self, column: str, begin: bool = True) -> dict[str, Any]:
         return self.analyses.state(self.folder, self._analysis(column), begin)
@@ -169,8 +189,50 @@ class ShownRecording:
             return summary.driven_seconds(recording.time).astype(np.float32)
         if name in COLUMNS:
             return getattr(recording, name)
-        part = "steering" if self._analysis(name).kind == "steering" else "offset"
-        return self._result(name)[0].column(part, recording.images[:, 0])
+        result, _ = self._result(name)
+        return result.column(self.analysed[name][1], recording.images[:, 0])
+
+    def matches(self, condition: str, limit: str | None, version: str | None = None) -> dict[str, Any]:
+        """Return the rows that meet a condition: their number, and the stretches of them that are not cut.
+
+        A stretch is [first row, row after the last, the names of the first's and the last's centre image]. Columns are
+        called as on the page: model1, driver1 and replay1 belong to the first model, the last two at a replay's limit.
+        Raises ConditionError, UnknownError, RecordingError.
+        """
+        recording, cuts = self.read(version), tuple(read_cuts(self.folder))
+        names = {"offset": "offset", "label": "label"} | {name: name for name in COLUMNS}
+        for index in range(len(self.models)):
+            names[f"model{index + 1}"] = f"model-{index}"
+            if limit:
+                names |= {f"{kind}{index + 1}": f"{kind}-{index}-{limit}" for kind in ("replay", "driver")}
+        rows = matching(condition, lambda name: self.column(names[name], version), list(names))
+        rows &= ~np.logical_or.reduce(_rows_cut(self.folder, cuts, recording))
+        found = stretches_of(rows)
+        ends = [[first, end, recording.name(first), recording.name(end - 1)] for first, end in found]
+        return {"rows": int(rows.sum()), "stretches": ends}
+
+    def compared(self, limit: str, begin: bool) -> dict[str, Any]:
+        """Return the overview with each model's figures: how it steers, and how it drives at a limit.
+
+        begin: begin the analyses that are missing. Raises UnknownError, RecordingError.
+        """
+        shown, models = self.overview(), list[dict[str, Any]]()
+        if "message" in shown:
+            return shown
+        recording, cuts = self.read(), tuple(read_cuts(self.folder))
+        kept = ~np.logical_or.reduce(_rows_cut(self.folder, cuts, recording))
+        if begin:
+            self.analyses.resume()
+        for at, column in enumerate(self._replays(limit)):
+            steering = self._state(f"model-{at}", begin)
+            error = None
+            if steering["state"] == "ready":
+                difference = (self.column(f"model-{at}") - recording.steering)[kept]
+                known = difference[~np.isnan(difference)]
+                error = float(np.sqrt(np.mean(known**2))) if len(known) else None
+            replay = self._replay(recording, column, begin)
+            models.append({"name": Path(self.models[at]).name, "steering": steering, "error": error, "replay": replay})
+        return shown | {"models": models}
 
     def row(self, row: int, version: str | None = None) -> dict[str, Any]:
         """Return a row's line in the log and the names of its images. Raises UnknownError, RecordingError."""
@@ -178,19 +240,18 @@ class ShownRecording:
         names = [recording.name(row, camera) for camera in range(len(CAMERAS))]
         return {"line": int(recording.lines[row]), "images": names}
 
-    def jpeg(self, row: int, picture: str, version: str | None = None, with_path: bool = False) -> bytes:
+    def jpeg(self, row: int, picture: str, version: str | None = None) -> bytes:
         """Return the JPEG of a frame; picture: one of CAMERAS, or a replay's column: what its car sees there.
 
-        with_path: draw the path ahead at the model's steering on what a replayed car sees. Raises UnknownError,
-        NotReplayedError, and RecordingError if a frame is unusable.
+        Raises UnknownError, NotReplayedError, and RecordingError if a frame is unusable.
         """
         recording = self._with_row(row, version)
-        replay = self.analysed.get(picture)
-        if replay and replay.kind == "replay":
+        replay, name = self.analysed.get(picture, (LANE, ""))
+        if replay.kind == "replay" and name == "offset":
             result, now = self._result(picture)
             index = replays.index_of(result, int(recording.images[row, 0]))
             line = int(result.columns["line"][index])
-            return _line_views(self.folder, self.version(), replay, now, line).jpeg(index, with_path)
+            return _line_views(self.folder, self.version(), replay, now, line).jpeg(index)
         if picture not in CAMERAS:
             raise UnknownError(f"no picture {picture[:40]}")
         path = recording.path(row, CAMERAS.index(picture))
@@ -208,21 +269,53 @@ class ShownRecording:
             raise UnknownError(f"no row {row}: the recording has {len(recording)}")
         return recording
 
-    def cut(self, first: str, last: str, reason: str) -> Cut:
-        """Cut a stretch, and return the cut as it is written; first, last: file names of centre images.
+    def cut(self, cuts: Iterable[Cut]) -> list[Cut]:
+        """Cut stretches, and return the cuts as they are written. Raises RecordingError, OSError."""
+        cuts = [Cut(cut.first, cut.last, one_line(cut.reason)) for cut in cuts]
+        _rows_cut(self.folder, tuple(cuts), self.read())  # refuses what is no stretch
+        add_cuts(self.folder, *cuts)
+        return cuts
 
-        Raises RecordingError, OSError.
-        """
-        cut = Cut(first, last, one_line(reason))
-        _rows_cut(self.folder, (cut,), self.read())  # refuses what is no stretch
-        add_cut(self.folder, cut)
-        return cut
+    def restore(self, cuts: Iterable[Cut]) -> list[Cut]:
+        """Undo cuts, and return them. Raises RecordingError, OSError."""
+        cuts = list(cuts)
+        delete_cuts(self.folder, *cuts)
+        return cuts
 
-    def restore(self, first: str, last: str, reason: str) -> Cut:
-        """Undo a cut, and return it. Raises RecordingError, OSError."""
-        cut = Cut(first, last, reason)
-        delete_cut(self.folder, cut)
-        return cut
+    def _selected(self, stretches: list[list[int]], version: str) -> Recording:
+        """Return the rows of stretches, [first, row after the last], without those that are cut. Raises UserError."""
+        recording = self.read(version)
+        chosen = np.zeros(len(recording), bool)
+        for first, end in stretches:
+            chosen[first:end] = True
+        chosen &= ~np.logical_or.reduce(_rows_cut(self.folder, tuple(read_cuts(self.folder)), recording))
+        if not chosen.any():
+            raise RecordingError(f"{self.folder}: all of the selection is cut; select other frames")
+        return recording.take(chosen)
+
+    def export(self, stretches: list[list[int]], version: str, name: str) -> Path:
+        """Write stretches as a recording of its own beside this one, and return its folder. Raises UserError."""
+        if not name.strip(". ") or any(c in r'/\:*?"<>|' or not c.isprintable() for c in name) or len(name) > 100:
+            raise OutputError(f"{name[:60]!r}: not the name of a folder; use letters and digits, for example bends")
+        selected, folder = self._selected(stretches, version), self.folder.resolve().with_name(name)
+        write_part(selected, folder)
+        return folder
+
+    def film(self, stretches: list[list[int]], version: str) -> bytes:
+        """Return an mp4 film of stretches, with the path ahead at the human driver's steering. Raises UserError."""
+        selected = self._selected(stretches, version)
+        if len(selected) > MAX_FILM:
+            raise OutputError(f"film: {len(selected)} frames; mark a stretch of at most {MAX_FILM}")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "film.mp4"
+            writer = FilmWriter(path, frame_rate(selected.time.tolist(), SAMPLE_RATE), quality=24)
+            try:
+                for row in range(len(selected)):
+                    writer.add(overlay(read_frame(selected.path(row)), float(selected.steering[row])))
+                writer.close()
+            finally:
+                writer.discard()
+            return path.read_bytes()
 
 
 def _rows_cut(folder: Path, cuts: tuple[Cut, ...], recording: Recording) -> np.ndarray:
@@ -262,5 +355,7 @@ def _figures(folder: Path, version: str, cuts: tuple[Cut, ...]) -> dict[str, Any
 
 
 @functools.lru_cache(maxsize=1000)
-def _road(folder: Path, version: str, now: str) -> dict[str, Any]:
-    return summary.road_of(_result(folder, LANE, now), _read(folder, version).images[:, 0])
+def _road(folder: Path, version: str, cuts: tuple[Cut, ...], now: str) -> dict[str, Any]:
+    recording = _read(folder, version)
+    is_cut = np.logical_or.reduce(_rows_cut(folder, cuts, recording))
+    return summary.road_of(_result(folder, LANE, now), recording.images[:, 0], is_cut)

@@ -1,5 +1,7 @@
 """The page's server: figures as JSON, columns of numbers as bytes, frames as the JPEGs that they are."""
 
+import math
+import re
 from typing import Any
 
 import flask
@@ -9,10 +11,13 @@ from cloning.base.errors import UserError, message_of
 from cloning.browse.library import Library, ShownRecording, UnknownError
 from cloning.browse.replays import NotReplayedError
 from cloning.browse.runs import Runs
-from cloning.recordings.excluded import BYTES
+from cloning.recordings.excluded import BYTES, Cut
 from cloning.road.autonomy import LIMITS
+from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
+from cloning.road.motion import FULL_LOCK, WHEELBASE
 from cloning.server import site
 
+SPEEDS = ("0.25", "0.5", "1", "2", "4", "8")  # of playing
 KEPT = 600  # s for which a browser does not ask again for a frame
 
 
@@ -22,10 +27,13 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     `/` is the page; `/recordings` lists identifiers. Below `/recordings/ID`: `overview` and `details`, JSON;
     `columns/NAME`, little-endian float32 (n,), and POST tries its analysis again, which failed; `rows/N`, JSON,
     `rows/N/PICTURE.jpg`, and what a model looks at on it, `rows/N/PICTURE/MODEL.png`; `cuts`, to which POST adds and
-    DELETE deletes one, {"first", "last", "reason"}; they answer with the details, and with the cut as "changed".
-    `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are. What
-    depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/runs` and `/runs/N` tell
-    of training runs, and `/runs/N/NAME` is a picture of one. An error is {"message"}.
+    DELETE deletes some, [{"first", "last", "reason"}, …]; they answer with the details, and with the cuts as "changed".
+    `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are.
+    `matches?condition=` has the stretches that meet a condition, `compared?limit=` the models' figures, and POST begins
+    what they need. `export` writes a recording, {"rows", "name"}; `film.mp4?rows=` is one: rows are "first-end,…".
+    What depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/analyses`: DELETE
+    pauses them, POST goes on. `/runs` and `/runs/N` tell of training runs, and `/runs/N/NAME` is a picture of one. An
+    error is {"message"}.
     """
     from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
 
@@ -50,7 +58,11 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/")
     def index() -> str:
-        return flask.render_template("browse.html", limits=[f"{limit:g}" for limit in LIMITS])
+        camera = {"matrix": CAMERA_MATRIX.tolist(), "height": CAMERA_HEIGHT}
+        camera |= {"lock": math.radians(FULL_LOCK), "wheelbase": WHEELBASE}
+        return flask.render_template(
+            "browse.html", limits=[f"{each:g}" for each in LIMITS], speeds=SPEEDS, camera=camera
+        )
 
     @app.get("/recordings")
     def recordings() -> list[dict[str, str]]:
@@ -85,7 +97,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>.jpg")
     def frame(identifier: str, row: int, picture: str) -> flask.Response:
-        return kept(shown(identifier).jpeg(row, picture, version(), with_path=True), "image/jpeg")
+        return kept(shown(identifier).jpeg(row, picture, version()), "image/jpeg")
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/<int:model>.png")
     def attention(identifier: str, row: int, picture: str, model: int) -> flask.Response:
@@ -96,8 +108,33 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     @app.route("/recordings/<identifier>/cuts", methods=["POST", "DELETE"])
     def cut(identifier: str) -> dict[str, Any]:
         change = shown(identifier).cut if flask.request.method == "POST" else shown(identifier).restore
-        changed = change(**stretch())
+        changed = change(cuts())
         return shown(identifier).details(limit()) | {"changed": changed}
+
+    @app.get("/recordings/<identifier>/matches")
+    def matches(identifier: str) -> dict[str, Any]:
+        return shown(identifier).matches(flask.request.args.get("condition", ""), limit(), version())
+
+    @app.route("/recordings/<identifier>/compared", methods=["GET", "POST"])
+    def compared(identifier: str) -> dict[str, Any]:
+        return shown(identifier).compared(limit() or f"{LIMITS[0]:g}", begin=flask.request.method == "POST")
+
+    @app.post("/recordings/<identifier>/export")
+    def export(identifier: str) -> dict[str, Any]:
+        body = flask.request.get_json()
+        name, rows = (str(body.get(key, "")) if isinstance(body, dict) else "" for key in ("name", "rows"))
+        folder = shown(identifier).export(stretches(rows), version() or "", name)
+        return {"id": library.add(folder), "folder": str(folder)}
+
+    @app.get("/recordings/<identifier>/film.mp4")
+    def film(identifier: str) -> flask.Response:
+        mp4 = shown(identifier).film(stretches(flask.request.args.get("rows", "")), version() or "")
+        return flask.Response(mp4, mimetype="video/mp4", headers={"Content-Disposition": "attachment"})
+
+    @app.route("/analyses", methods=["POST", "DELETE"])
+    def analyses() -> dict[str, Any]:
+        (library.analyses.resume if flask.request.method == "POST" else library.analyses.pause)()
+        return {}
 
     @app.get("/runs")
     def found() -> list[dict[str, Any]]:
@@ -133,13 +170,21 @@ def limit() -> str | None:
     return flask.request.args.get("limit")
 
 
-def stretch() -> dict[str, str]:
-    """Return the request's cut: {"first", "last", "reason"}. Ends the request with 400 if it has none."""
+def cuts() -> list[Cut]:
+    """Return the request's cuts: [{"first", "last", "reason"}, …]. Ends the request with 400 if it has none."""
     try:
         body = flask.request.get_json()
-        if not isinstance(body, dict) or set(body) != {"first", "last", "reason"}:
+        if not isinstance(body, list) or not body or any(set(each) != {"first", "last", "reason"} for each in body):
             raise TypeError
-        "".join(body.values()).encode(**BYTES)
-    except (RecursionError, TypeError, UnicodeEncodeError):  # nested too deeply; no texts; half of a character
-        flask.abort(400, "A cut is a JSON object with the texts first, last and reason.")
-    return body
+        for each in body:
+            "".join(each.values()).encode(**BYTES)
+    except (AttributeError, RecursionError, TypeError, UnicodeEncodeError):  # nested too deeply; no texts; half of one
+        flask.abort(400, "Cuts are a list of JSON objects with the texts first, last and reason.")
+    return [Cut(**each) for each in body]
+
+
+def stretches(text: str) -> list[list[int]]:
+    """Return the stretches in a text such as "0-15,30-45". Ends the request with 400 if it has none."""
+    if not re.fullmatch(r"(\d{1,9}-\d{1,9},?)+", text):
+        flask.abort(400, "Rows are stretches such as 0-15,30-45.")
+    return [[int(row) for row in stretch.split("-")] for stretch in text.strip(",").split(",")]

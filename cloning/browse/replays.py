@@ -11,7 +11,6 @@ from cloning.recordings.log import Recording
 from cloning.replay.views import StretchViews
 from cloning.road.camera import VIEW_JPEG_QUALITY
 from cloning.road.motion import Stretch
-from cloning.road.overlay import draw_path
 
 
 class NotReplayedError(UserError):
@@ -29,9 +28,12 @@ def rows_driven(result: Result, centres: np.ndarray) -> np.ndarray:
 
 
 def figures(result: Result, centres: np.ndarray) -> dict[str, Any]:
-    """Return a replay's metrics, and its interventions as [row, offset in m]; centres: as in `rows_driven`."""
+    """Return a replay's metrics, and its interventions as [row, offset in m]; centres: as in `rows_driven`.
+
+    The row is the last one before the car is set back, which shows where it went; the first of a line has none.
+    """
     rows = rows_driven(result, centres)
-    where = [[int(rows[index]), metres] for index, metres in result.about["where"]]
+    where = [[int(rows[index - 1]), metres] for index, metres in result.about["where"]]
     return {**result.about, "where": where, "driven": len(rows)}
 
 
@@ -51,19 +53,14 @@ class LineViews:
         indices = np.flatnonzero(result.columns["line"] == line)
         part = recording.take(rows_driven(result, recording.images[:, 0])[indices])
         self.views = StretchViews(part, Stretch.of(part, slice(0, len(part))))
-        self.right, self.yaw, self.steering = (result.columns[name][indices] for name in ("right", "yaw", "steering"))
+        self.right, self.yaw = (result.columns[name][indices] for name in ("right", "yaw"))
         self.first = int(indices[0])
 
-    def jpeg(self, index: int, with_path: bool) -> bytes:
+    def jpeg(self, index: int) -> bytes:
         """Return the view at an index of the result's columns; at the human driver's pose, the recorded file itself.
 
-        with_path: draw the path ahead at the model's steering. Raises RecordingError if an image became unusable.
+        Raises RecordingError if an image became unusable.
         """
         at = index - self.first
         pose = float(self.right[at]), float(self.yaw[at])
-        if not (any(pose) or with_path):
-            return self.views.jpeg(at)
-        view = self.views.view_from(at, *pose) if any(pose) else self.views.frame(at, 0).copy()
-        if with_path:
-            draw_path(view, float(self.steering[at]))
-        return encode(view, VIEW_JPEG_QUALITY)
+        return encode(self.views.view_from(at, *pose), VIEW_JPEG_QUALITY) if any(pose) else self.views.jpeg(at)

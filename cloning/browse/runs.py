@@ -28,17 +28,23 @@ class Runs:
     """The runs in the given folders, each by its index."""
 
     def __init__(self, folders: list[Path]):
-        """folders: into which model.py writes, or may later."""
+        """folders: into which model.py writes, or may later; none: perhaps into the current one."""
+        self.asked = bool(folders)
+        folders = folders or [Path()]
         self.files = [RunFiles(str(folder / "model.pt")) for folder in folders]
 
     def found(self) -> list[dict[str, Any]]:
-        """Return what the list shows of each run that has begun; {"message"} instead of figures if it can't be read."""
+        """Return what the list shows of each run; {"message"} instead of figures if it can't be read or has not begun.
+
+        The current folder is left out if nobody asked for it and there is no run.
+        """
         shown = []
         for index, files in enumerate(self.files):
-            if files.arguments.exists():
+            if files.arguments.exists() or self.asked:
                 name: dict[str, Any] = {"id": index, "folder": str(files.last.parent.resolve())}
                 try:
-                    shown.append(name | {key: value for key, value in overview(files).items() if key != "pictures"})
+                    known = overview(files)
+                    shown.append(name | {key: known[key] for key in known.keys() - {"pictures", "trail", "options"}})
                 except (UserError, OSError) as error:
                     shown.append(name | {"message": message_of(error)})
         return shown
@@ -70,9 +76,14 @@ def overview(files: RunFiles) -> dict[str, Any]:
 
     run: its identifier, or None; state: running, finished or stopped; history: a dict of METRICS and val_drift for each
     finished epoch; epochs, samples_per_epoch; images and loss so far in this epoch, with their age in s; rate in
-    images/s, and left, s of training from there on, None if unknown; pictures: numbers of observations, ascending.
+    images/s, and left, s of training from there on, None if unknown; pictures: numbers of observations, ascending;
+    trail: [epochs done, loss] within the epochs; best: the epoch whose model is model-best.pt, and by which metric;
+    options: what the run was given, by name.
     Raises RunError, OSError.
     """
+    if not files.arguments.exists():
+        command = f"`python model.py --output {files.last}`"
+        raise RunError(f"{files.last.parent}: no training run in this folder yet; {command} begins one")
     options, progress = _json(files.arguments, OPTIONS, 1, "recipe"), {}
     history = _history(files.log)
     if files.progress.exists():
@@ -105,7 +116,39 @@ def overview(files: RunFiles) -> dict[str, Any]:
         "age": age,
         "rate": rate,
         "left": left,
+        "trail": _trail(progress, finished + min(1.0, images / samples)),
+        "best": _best(history, options),
+        "options": _flat(options),
         "pictures": _pictures(files, progress["batches"] * options["batch_size"] if progress else math.inf),
+    }
+
+
+def _trail(progress: dict[str, Any], done: float) -> list[list[float]]:
+    """Return the losses within the epochs, as [epochs done, loss]; done: epochs until now."""
+    every, losses, batches = progress.get("trail_every"), progress.get("trail"), progress.get("batches", 0)
+    if not (isinstance(every, int) and isinstance(losses, list) and batches):  # of an earlier version
+        return []
+    known = [(n, loss) for n, loss in enumerate(losses, 1) if isinstance(loss, float) and n * every <= batches]
+    return [[round(n * every / batches * done, 4), loss] for n, loss in known]
+
+
+def _best(history: list[dict[str, float]], options: dict[str, Any]) -> dict[str, Any] | None:
+    """Return {"epoch", "by", "value"} of the best epoch as `training.checkpoint.best_epoch` chooses it, or None."""
+    robust = options.get("robust") is True or options.get("name") == "robust"
+    by = options.get("best_by") or ("val_loss" if robust else "val_drift")
+    if by not in ("val_loss", "val_drift") or not history or math.isnan(history[-1]["val_drift"]):
+        by = "val_loss"
+    known = [row for row in history if not math.isnan(row[by])]
+    best = min(known, key=lambda row: row[by], default=None)
+    return best and {"epoch": best["epoch"], "by": by, "value": best[by]}
+
+
+def _flat(options: dict[str, Any]) -> dict[str, str]:
+    """Return the options of a run as texts, those of its recipe and of its libraries among them."""
+    return {
+        str(name)[:60]: json.dumps(value)[:300].strip('"')
+        for name, value in options.items()
+        if not isinstance(value, dict) and name not in ("output", "resume")
     }
 
 

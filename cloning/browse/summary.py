@@ -65,7 +65,10 @@ def jumps(
 
 
 def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
-    """Return the figures of the log alone; is_cut: bool (n,). Steering and speed are those of the rows not cut."""
+    """Return the figures of the log alone; is_cut: bool (n,). Steering and speed are those of the rows not cut.
+
+    picture is the row that shows the recording in the list: the middle one of those that are not cut.
+    """
     kept = ~is_cut
     steering, speed = recording.steering[kept], recording.speed[kept]
     counts, _ = np.histogram(steering, np.linspace(-1, 1, BINS + 1))
@@ -74,6 +77,7 @@ def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
         "frames": len(recording),
         "seconds": float(seconds[-1]),
         "cut_frames": int(is_cut.sum()),
+        "picture": int(np.flatnonzero(kept)[kept.sum() // 2]) if kept.any() else 0,
         "histogram": counts.tolist(),
         "zeros": float((steering == 0).mean()) if len(steering) else None,
         "speed": [float(function(speed)) for function in (np.min, np.mean, np.max)] if len(speed) else None,
@@ -84,13 +88,16 @@ def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
     }
 
 
-def road_of(result: Result, centres: np.ndarray) -> dict[str, Any]:
+def road_of(result: Result, centres: np.ndarray, is_cut: np.ndarray) -> dict[str, Any]:
     """Return on which roads and in which directions a recording was driven, and its path on the most driven one.
 
-    result: of the analysis of the lane; centres: int32 (n,), the rows' centre images. The path is a list of strokes,
-    lists of [x, y] in m, east and north.
+    result: of the analysis of the lane; centres: int32 (n,), the rows' centre images; is_cut: bool (n,). The path is a
+    list of strokes, lists of [x, y] in m, east and north. offset is [mean, largest], m from the lane's centre in the
+    rows that are not cut, None if it is not known.
     """
     about = result.about
+    offset = np.abs(result.column("offset", centres)[~is_cut])
+    offset = offset[~np.isnan(offset)]
     road, x, y = (result.column(name, centres) for name in ("road", "x", "y"))
     rows = [int((road == index).sum()) for index in range(len(about["roads"]))]
     order = sorted(range(len(rows)), key=lambda index: -rows[index])
@@ -108,6 +115,7 @@ def road_of(result: Result, centres: np.ndarray) -> dict[str, Any]:
         "roads": [[found["name"], found["direction"]] for found in roads],
         "outline": roads[0]["outline"] if roads else [],
         "path": strokes,
+        "offset": [round(float(function(offset)), 2) for function in (np.mean, np.max)] if len(offset) else None,
         "unusable": about["unusable"],
         "first_unusable": about["first_unusable"],
     }

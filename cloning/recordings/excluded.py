@@ -88,35 +88,39 @@ def _rows_with(where: str, name: str, names: np.ndarray, centres: np.ndarray) ->
     return rows
 
 
-def add_cut(folder: Path, cut: Cut) -> None:
-    """Append a cut to a recording's `excluded.csv`, unless the same one is there; the other lines stay as they are.
+def add_cuts(folder: Path, *cuts: Cut) -> None:
+    """Append cuts to a recording's `excluded.csv`, unless the same ones are there; the other lines stay as they are.
 
     Raises RecordingError if the file is not readable as such, and OSError if it cannot be written; then it stays.
     """
 
-    def append(lines: list[str], cuts: list[Cut]) -> list[str]:
-        if cut.row() in [each.row() for each in cuts]:
+    def append(lines: list[str], there: list[Cut]) -> list[str]:
+        present = {each.row() for each in there}
+        added = [_line(row) for row in dict.fromkeys(cut.row() for cut in cuts) if row not in present]
+        if not added:
             return lines
         ended = [line if line.endswith(("\n", "\r")) else f"{line}\n" for line in lines]
-        return [*(ended or [_line(HEADER)]), _line(cut.row())]
+        return [*(ended or [_line(HEADER)]), *added]
 
     _change(folder, append)
 
 
-def delete_cut(folder: Path, cut: Cut) -> None:
-    """Delete a cut's line from a recording's `excluded.csv`; the other lines stay as they are.
+def delete_cuts(folder: Path, *cuts: Cut) -> None:
+    """Delete the lines of cuts from a recording's `excluded.csv`; the other lines stay as they are.
 
-    Raises RecordingError if it is not there, and the errors of `add_cut`.
+    Raises RecordingError if one of them is not there, and the errors of `add_cuts`; then none is deleted.
     """
 
-    def delete(lines: list[str], cuts: list[Cut]) -> list[str]:
-        at = [each.line for each in cuts if each.row() == cut.row()]
-        if not at:
-            raise RecordingError(
-                f"{folder / EXCLUDED}: the cut from {cut.first} to {cut.last} is not there any more; it was deleted "
-                "elsewhere"
-            )
-        return lines[: at[-1] - 1] + lines[at[-1] :]
+    def delete(lines: list[str], there: list[Cut]) -> list[str]:
+        at = {each.row(): each.line for each in there}
+        for cut in cuts:
+            if cut.row() not in at:
+                raise RecordingError(
+                    f"{folder / EXCLUDED}: the cut from {cut.first} to {cut.last} is not there any more; it was "
+                    "deleted elsewhere"
+                )
+        deleted = {at[cut.row()] for cut in cuts}
+        return [line for number, line in enumerate(lines, 1) if number not in deleted]
 
     _change(folder, delete)
 

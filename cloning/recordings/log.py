@@ -123,6 +123,7 @@ def logs_below(path: Path) -> Iterator[Path]:
             continue
         visited.add(real)
         if DRIVING_LOG in files:
+            below[:] = [name for name in below if name != IMAGE_FOLDER]  # which takes long to list
             yield Path(folder) / DRIVING_LOG
 
 

@@ -4,6 +4,7 @@ A random polygon gets round corners and is smoothed; polygons that give too shar
 are refused. The random numbers depend on the road's number alone, so a number always gives the same road.
 """
 
+import functools
 import itertools
 import re
 from dataclasses import dataclass
@@ -126,6 +127,7 @@ def road_number(name: str) -> int | None:
     return int(match[2]) if match else None
 
 
+@functools.lru_cache(maxsize=16)
 def generate(name: str) -> PointRoad | None:
     """Return the generated road of this name: counter-clockwise, with points about 2 m apart; None if there is none.
 

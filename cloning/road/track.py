@@ -106,6 +106,15 @@ def find_points(source: str | PointRoad) -> PointRoad | None:
     return road
 
 
+def centre_line(source: str | PointRoad) -> np.ndarray:
+    """Return the points of a road's centre line as they are listed: float64 (n, 2) or (n, 3), m.
+
+    source: see `find_points`, whose errors are raised.
+    """
+    road = find_points(source)
+    return road.points if road else np.loadtxt(FOLDER / f"{source}.csv", delimiter=",", skiprows=1)
+
+
 class Track:
     """A track driven in one direction, as points about 1 m apart; s is the distance from the first point in metres.
 
@@ -128,11 +137,10 @@ class Track:
 
         An open road's `forward` is "ccw", whatever its shape. Raises TrackError if there is no such track.
         """
-        self.source, of_points = source, find_points(source)
+        self.source, of_points, listed = source, find_points(source), centre_line(source)
         if of_points is None:
-            road, listed = ROADS[str(source)], np.loadtxt(FOLDER / f"{source}.csv", delimiter=",", skiprows=1)
+            road = ROADS[str(source)]
         else:
-            listed = of_points.points
             x, y = listed[:, :2].T
             clockwise = of_points.closed and (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0
             road = Road(forward="cw" if clockwise else "ccw", edge=of_points.width / 2)

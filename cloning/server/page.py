@@ -23,7 +23,7 @@ from cloning.recordings.saved_frames import SessionFolder
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.overlay import overlay
-from cloning.road.track import find_road
+from cloning.road.track import centre_line
 from cloning.server import site
 from cloning.wire.protocol import PORT, Place
 
@@ -117,7 +117,7 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     @app.get("/road")
     def road() -> list[list[float]]:
         session = server.watched_session()
-        return centre_line(session.place.track) if session and session.place else []
+        return road_on_map(session.place.track) if session and session.place else []
 
     @app.post("/set-speed")
     def change_set_speed() -> tuple[dict[str, Any], int]:
@@ -150,10 +150,10 @@ def posted(name: str, kind: type) -> Any:
 
 
 @functools.lru_cache(maxsize=4)
-def centre_line(track: str) -> list[list[float]]:
+def road_on_map(track: str) -> list[list[float]]:
     """Return the points of a road's centre line, m to the east and the north; none for an unknown name."""
     try:
-        return [[round(x, 1), round(y, 1)] for x, y in find_road(track)[1][:, :2].tolist()]
+        return [[round(x, 1), round(y, 1)] for x, y in centre_line(track)[:, :2].tolist()]
     except TrackError:
         return []
 

@@ -44,7 +44,8 @@ from cloning.training.run_files import RunFiles
 
 EpochMetrics = dict[str, float]  # a row of training_log.csv: METRICS
 NEW_RUN = "start a new run without --resume"
-POSITION = ("number", "images", "loss", "seconds")  # of Progress
+POSITION = ("number", "images", "loss", "seconds", "smooth")  # of Progress
+TRAIL_EVERY, SMOOTHED = 25, 0.96  # batches; the weight of the loss until then beside a batch's
 METRICS = ("epoch", "images", "seconds", "loss", "val_loss", "val_drift")  # of EpochMetrics
 COUNTS = {"number", "images", "epoch"}
 MAY_CHANGE = {"recordings", "epochs"}  # with --resume; a fingerprint checks the recordings' contents
@@ -57,6 +58,8 @@ class Progress:
 
     number                 of the next batch, from 0, counted over all epochs
     images, loss, seconds  so far in this epoch; loss is the sum of squared errors
+    smooth                 mean loss of the last batches: an exponential moving average over some 25
+    trail                  smooth after each TRAIL_EVERY batches, of all epochs: the losses within them
     history                the metrics of each finished epoch
     run                    a random identifier, by which a run recognises its own files; None from an earlier version
     """
@@ -65,13 +68,15 @@ class Progress:
     images: int = 0
     loss: float = 0.0
     seconds: float = 0.0
+    smooth: float = 0.0
+    trail: list[float] = field(default_factory=list)
     history: list[EpochMetrics] = field(default_factory=list)
     run: str | None = field(default_factory=lambda: uuid.uuid4().hex)
 
     def as_json(self) -> dict[str, Any]:
         """Return the contents of training_progress.json: the run, finished epochs, and the position in the next one.
 
-        loss is the mean squared error so far in this epoch, None before its first batch.
+        loss is the mean squared error so far in this epoch, None before its first batch; trail as in `Progress`.
         """
         return {
             "run": self.run,
@@ -80,11 +85,16 @@ class Progress:
             "images": self.images,
             "seconds": round(self.seconds, 3),
             "loss": self.loss / self.images if self.images else None,
+            "trail_every": TRAIL_EVERY,
+            "trail": [float(f"{loss:.4g}") for loss in self.trail],
         }
 
     def add(self, images: int, loss: float) -> None:
         """Count a batch; loss: its sum of squared errors."""
+        self.smooth = SMOOTHED * self.smooth + (1 - SMOOTHED) * loss / images if self.number else loss / images
         self.number += 1
+        if self.number % TRAIL_EVERY == 0:
+            self.trail.append(self.smooth)
         self.images += images
         self.loss += loss
 
@@ -233,17 +243,21 @@ def _progress(saved: dict[str, Any]) -> Progress:
     state, history, run = saved["training"], saved.get("history"), saved.get("run")
     if not isinstance(state, dict) or not isinstance(history, list) or type(run) not in (str, type(None)):
         raise ValueError("it has no state, history or identifier of its run")
-    values: list[tuple[str, Any]] = [(name, state.get(name)) for name in POSITION]
+    values: list[tuple[str, Any]] = [(name, state.get(name)) for name in POSITION[:-1]]
+    values += [("smooth", state.get("smooth", 0.0))]  # an earlier version had none
+    trail = state.get("trail", [])
+    if not isinstance(trail, list):
+        raise ValueError(f"its trail is {shown(trail)}")
     for row in history:
         if isinstance(row, dict) and tuple(row) == METRICS[:-1]:
             row["val_drift"] = math.nan  # an earlier version did not measure it
         if not isinstance(row, dict) or tuple(row) != METRICS:
             raise ValueError(f"its history has {shown(row)}, not {', '.join(METRICS)}")
         values += row.items()
-    for name, value in values:
+    for name, value in [*values, *(("trail", loss) for loss in trail)]:
         if not (type(value) is int and 0 <= value <= 10**12 if name in COUNTS else type(value) is float):
             raise ValueError(f"its {name} is {shown(value)}")
-    return Progress(**dict(values[: len(POSITION)]), history=history, run=run)
+    return Progress(**dict(values[: len(POSITION)]), trail=trail, history=history, run=run)
 
 
 def _unusable(path: Path, error: ValueError) -> ModelError:
@@ -288,6 +302,7 @@ class Checkpoint:
         """
         more = {"arguments": self.run.saved(), "history": progress.history, "run": progress.run}
         position = {name: getattr(progress, name) for name in POSITION}
+        position["trail"] = progress.trail
         training = {"optimizer": {"state": self.optimizer.state}, **position, "fingerprint": self.fingerprint}
         if models and len(progress.history) == 1:
             for path in (self.files.last, self.files.best):

@@ -1,16 +1,18 @@
 // The page: which view is shown, messages, and the keys' help.
 import {element, make, notice} from "./common.js";
+import {showComparison, leaveComparison} from "./compare.js";
 import {showList, leaveList} from "./list.js";
 import {showRun, leaveRun, pressedInRun} from "./run.js";
 import {showRecording, leaveRecording, pressed, KEYS} from "./recording.js";
 
-const VIEWS = ["list", "recording", "run"], AGAIN = 5000; // ms until a view that could not be shown is tried again
+const VIEWS = ["list", "comparison", "recording", "run"], AGAIN = 5000; // ms until a view that could not be shown is tried again
 let routed = 0, again; // number of the last view, what an earlier one says is dropped; timer of the next try
 
 async function route(isAgain) {
-  const [, id, row] = location.hash.split("/"), number = ++routed;
+  const [path, query = ""] = location.hash.split("?"), [, id, row] = path.split("/"), shown = new URLSearchParams(query), number = ++routed;
   clearTimeout(again);
   leaveList();
+  leaveComparison();
   leaveRecording();
   leaveRun();
   VIEWS.forEach(view => element(view).hidden = true);
@@ -18,7 +20,7 @@ async function route(isAgain) {
   element("title").textContent = "";
   document.title = "Recordings";
   try {
-    await (id == "run" ? showRun(row) : id ? showRecording(id, Number(row) || 0) : showList());
+    await (id == "run" ? showRun(row, shown) : id == "compare" ? showComparison(shown) : id ? showRecording(id, Number(row) || 0, shown) : showList(shown));
     if (isAgain && number == routed) notice();
   } catch (error) {
     if (number != routed) return;
@@ -40,6 +42,10 @@ element("help-button").onclick = help;
 addEventListener("hashchange", () => route());
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || document.querySelector("dialog[open]")) return;
+  if (event.target.matches("input:not([type=range]), select")) {
+    if (event.key == "Escape") event.target.blur();
+    return;
+  }
   if (event.key == "?") help();
   else if (event.key == "Escape" && !element("notice").hidden) notice();
   else if (event.key == "Escape") location.hash = "";

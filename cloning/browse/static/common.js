@@ -25,7 +25,7 @@ export function notice(message = "") {
 }
 
 export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;
-export const many = (count, word) => `${count.toLocaleString("en")} ${word}${count == 1 ? "" : "s"}`;
+export const many = (count, word, several = `${word}s`) => `${count.toLocaleString("en")} ${count == 1 ? word : several}`;
 
 // Have a button do something; after a click with the mouse, Space is again for playing.
 export function onClick(button, action) {

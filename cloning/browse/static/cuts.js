@@ -1,84 +1,131 @@
-// Cutting stretches from a recording, and undoing it.
+// Marking stretches, cutting them from a recording, and undoing it; what can be undone survives leaving the page.
 import {ask, clock, element, make, many, notice, renew} from "./common.js";
+import {find} from "./filter.js";
 import {seek, stop} from "./moving.js";
-import {page, say} from "./state.js";
+import {page, remember, say} from "./state.js";
+
+const OPPOSITE = {POST: "DELETE", DELETE: "POST"};
+let asked; // the cuts that the dialog asks a reason for, without it: [first, row after the last] or names of images
 
 export function showCuts() {
-  const now = page.open, {details, marks, count} = now, stretches = [];
-  for (const cut of details.cuts) for (const [first, end] of cut.stretches) stretches.push([first, end, "--cut"]);
-  const {first, last} = marks, from = first?.row ?? last?.row, to = last?.row ?? first?.row;
-  if (from != undefined) stretches.push([Math.min(from, to), Math.max(from, to) + 1, "--mark"]);
-  now.plots.setStretches(stretches);
-  element("strip").replaceChildren(...stretches.map(([first, end, colour]) => make("i", "", {
-    class: colour == "--mark" ? "mark" : "",
-    style: `left: ${100 * first / count}%; width: ${100 * (end - first) / count}%`,
-  })));
-  renew(element("cuts"), [now.id, details.version, details.cuts], () => details.cuts.length ? details.cuts.map(cut => {
-    const begin = cut.stretches[0]?.[0] ?? 0, row = make("li", "", {});
-    const go = make("button", clock(now.columns.seconds[begin])), remove = make("button", "Delete");
+  const now = page.open, {details} = now;
+  showStretches();
+  const cuts = details.cuts.map(cut => ({...cut, begin: cut.stretches[0]?.[0] ?? 0})).sort((a, b) => a.begin - b.begin);
+  renew(element("cuts"), [now.id, details.version, cuts], () => cuts.length ? cuts.map(({begin, frames, first, last, reason}) => {
+    const time = clock(now.columns.seconds[begin]), go = make("button", time, {"aria-label": `Go to the cut at ${time}`});
+    const remove = make("button", "Delete", {"aria-label": `Delete the cut at ${time}`});
     go.onclick = () => seek(begin);
-    go.setAttribute("aria-label", `Go to the cut at ${clock(now.columns.seconds[begin])}`);
-    remove.onclick = () => change("DELETE", cut, "deleted the cut");
-    row.append(go, ` ${many(cut.frames, "frame")}: ${cut.reason || "no reason given"} `, remove);
-    return row;
-  }) : [make("li", "None. Mark a stretch with I and O, then press X.", {class: "quiet"})]);
+    remove.onclick = () => change("DELETE", [{first, last, reason}], "Deleted the cut");
+    return make("li", "", {}, go, ` ${many(frames, "frame")}: ${reason || "no reason given"} `, remove);
+  }) : [make("li", "None. Mark a stretch, then cut it.", {class: "quiet"})]);
 }
 
-export async function mark(name) {
-  const now = page.open, {row} = now;
-  const {images} = await ask(`/${now.id}/rows/${row}?version=${now.details.version}`);
-  if (page.open != now) return;
-  now.marks[name] = {row, image: images[0]};
-  const {first, last} = now.marks;
-  if (first && last && first.row > last.row) { // marked in the other order
-    [now.marks.first, now.marks.last] = [last, first];
-  }
-  say(first && last ? `Marked ${many(Math.abs(last.row - first.row) + 1, "frame")}: X cuts them.`
-    : `Marked the ${name} frame; now the other with ${name == "first" ? "O" : "I"}.`);
-  now.update(now.details);
-}
-
-export function askForReason() {
+// The marked stretch: [first row, row after the last], or undefined.
+export function marked() {
   const {first, last} = page.open.marks;
-  if (!(first && last)) return say("Mark a stretch first: I at its first frame, O at its last.");
+  return first == undefined || last == undefined ? undefined : [first, last + 1];
+}
+
+// What is cut, found and marked, behind the curves and on the strip.
+export function showStretches() {
+  const now = page.open, {first, last} = now.marks, from = first ?? last, stretches = now.details.cuts
+    .flatMap(cut => cut.stretches).map(([first, end]) => [first, end, "--cut"]);
+  for (const [first, end] of now.matches?.stretches ?? []) stretches.push([first, end, "--match"]);
+  if (from != undefined) stretches.push([from, (last ?? first) + 1, "--mark"]);
+  now.plots.setStretches(stretches);
+  element("stretches").replaceChildren(...stretches.map(([first, end, colour]) => make("i", "", {
+    class: colour.slice(2),
+    style: `left: ${100 * first / now.count}%; width: ${100 * (end - first) / now.count}%`,
+  }, ...colour == "--mark" ? [make("b"), make("b")] : [])));
+  element("cut").disabled = !marked();
+  element("undo").disabled = from == undefined && !now.done.length;
+  element("redo").disabled = !now.undone.length;
+}
+
+export function mark(name, row = page.open.row) {
+  const now = page.open;
+  now.marks[name] = row;
+  const {first, last} = now.marks;
+  if (first > last) [now.marks.first, now.marks.last] = [last, first]; // marked in the other order
+  say(marked() ? `Marked ${many(Math.abs(last - first) + 1, "frame")}: cut or export them.`
+    : `Marked the ${name} frame; now mark the ${name == "first" ? "last" : "first"}.`);
+  showStretches();
+  remember();
+}
+
+export function cutMarked() {
+  const stretch = marked();
+  if (!stretch) return say("Mark a stretch first: its first frame, then its last.");
+  askForReason([stretch]);
+}
+
+// Ask for the reason and cut; cuts: stretches as above, or {first, last} as the server has them.
+export function askForReason(cuts, reason = element("reason-text").value) {
+  asked = cuts;
   stop();
-  element("stretch").textContent = many(last.row - first.row + 1, "frame");
+  element("stretch").textContent = cuts.length == 1 && Array.isArray(cuts[0]) ? many(cuts[0][1] - cuts[0][0], "frame") : many(cuts.length, "stretch", "stretches");
   element("reason").returnValue = "";
+  element("reason-text").value = reason;
   element("reason").showModal();
   element("reason-text").select();
 }
 
-element("reason").onclose = () => {
-  if (element("reason").returnValue != "cut" || !page.open) return;
-  const {first, last} = page.open.marks;
-  change("POST", {first: first.image, last: last.image, reason: element("reason-text").value}, "cut");
-};
-
-// Add or delete a cut; what: for the message; undoing: whether this is itself an undo.
-async function change(method, {first, last, reason}, what, undoing = false) {
-  const now = page.open;
+element("reason").onclose = async () => {
+  const now = page.open, reason = element("reason-text").value;
+  if (element("reason").returnValue != "cut" || !now) return;
+  const name = async row => (await ask(`/${now.id}/rows/${row}?version=${now.details.version}`)).images[0];
   try {
-    const details = await ask(`/${now.id}/cuts${now.query()}`, {
-      method, headers: {"Content-Type": "application/json"}, body: JSON.stringify({first, last, reason}),
-    });
-    if (page.open != now) return;
-    if (!undoing) now.done.push([method == "POST" ? "DELETE" : "POST", details.changed]);
-    if (method == "POST") now.marks = {};
-    notice();
-    say(`${what[0].toUpperCase()}${what.slice(1)}. ${undoing ? "" : "Z undoes it."}`);
-    await now.update(details);
+    const cuts = await Promise.all(asked.map(async cut => Array.isArray(cut)
+      ? {first: await name(cut[0]), last: await name(cut[1] - 1), reason} : {...cut, reason}));
+    if (page.open == now) await change("POST", cuts, "Cut");
   } catch (error) {
     notice(error.message);
   }
+};
+
+// Add or delete cuts; what: for the message; from: the list that it was taken from, if it is undone or done again.
+async function change(method, cuts, what, from = "") {
+  const now = page.open;
+  try {
+    const details = await ask(`/${now.id}/cuts${now.query()}`, {
+      method, headers: {"Content-Type": "application/json"}, body: JSON.stringify(cuts),
+    });
+    if (page.open != now) return;
+    const changed = details.changed.map(({first, last, reason}) => ({first, last, reason}));
+    now[from == "done" ? "undone" : "done"].push({method: OPPOSITE[method], cuts: changed});
+    if (!from) now.undone = [];
+    if (method == "POST") now.marks = {};
+    notice();
+    say(`${what}: ${many(changed.length, "stretch", "stretches")}.${from ? "" : " Undo takes it back."}`);
+    await now.update(details);
+    find();
+  } catch (error) {
+    notice(error.message);
+  } finally {
+    localStorage.setItem(`cuts-${now.id}`, JSON.stringify({done: now.done, undone: now.undone}));
+  }
+}
+
+// What was changed on this page earlier, to be undone: {done, undone}.
+export function changes(id) {
+  return JSON.parse(localStorage.getItem(`cuts-${id}`)) ?? {done: [], undone: []};
 }
 
 export function undo() {
-  const now = page.open;
-  if (now.marks.first || now.marks.last) {
+  const now = page.open, {first, last} = now.marks;
+  if (first != undefined || last != undefined) {
     now.marks = {};
     say("The marks are gone.");
-    now.update(now.details);
+    showStretches();
+    remember();
   } else if (now.done.length) {
-    change(...now.done.pop(), "undone", true);
-  } else say("Nothing to undo on this page; a cut in the list has a button that deletes it.");
+    const {method, cuts} = now.done.pop();
+    change(method, cuts, "Undone", "done");
+  } else say("Nothing to undo; a cut in the list has a button that deletes it.");
+}
+
+export function redo() {
+  const now = page.open, next = now.undone.pop();
+  if (next) change(next.method, next.cuts, "Done again", "undone");
+  else say("Nothing to do again.");
 }

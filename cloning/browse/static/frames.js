@@ -4,10 +4,27 @@ import {element} from "./common.js";
 const KEPT = 60; // rows whose pictures stay decoded: 200 kB for each layer of each picture
 const AHEAD = 4; // rows that are loaded ahead while playing
 const AT_ONCE = 3; // rows that are loaded at the same time; of those asked for meanwhile, only the last one is
+const FORGOTTEN = 1000; // ms after which what is not shown any more is freed
 const PATIENCE = 100; // ms that a row's frames wait for what the models look at
 
+const {matrix, height, lock, wheelbase} = JSON.parse(element("recording").dataset.camera); // of road/camera.py and motion.py
+
+// Draw the path ahead at a steering, -1..1, on a frame, as cloning/road/overlay.py does.
+function drawPath(context, steering, colour) {
+  const bend = Math.tan(lock * steering) / wheelbase; // 1/m, right positive
+  context.beginPath();
+  for (let ahead = 2.5; ahead <= 25; ahead += 0.5) { // m; the bonnet hides the nearer part
+    const point = [bend * ahead ** 2 / 2, height, ahead]; // right, down, forward
+    const [x, y, z] = matrix.map(line => line.reduce((sum, factor, axis) => sum + factor * point[axis], 0));
+    context.lineTo(x / z + 0.5, y / z + 0.5);
+  }
+  Object.assign(context, {strokeStyle: colour, lineWidth: 2});
+  context.stroke();
+}
+
 export class Frames {
-  // pictures: {canvas, caption(row), path, looks, has?(row)}; looks: numbers of the models whose attention lies over it
+  // pictures: {canvas, caption(row), path, looks, has?(row), paths}; looks: numbers of the models whose attention lies
+  // over it; paths: {values, colour} of the steerings drawn on it
   constructor(id, version, count, pictures) {
     Object.assign(this, {id, version, count, pictures, closed: false, row: 0});
     this.wanted = undefined; // the row to load next
@@ -27,12 +44,20 @@ export class Frames {
 
   setPictures(pictures) {
     this.pictures = pictures;
-    this.loaded.clear();
+    [...this.loaded.keys()].forEach(row => this.forget(row));
     this.show(this.row);
+  }
+
+  // Decoded pictures are freed at once: they take more memory than the browser knows of.
+  forget(row) {
+    const {whole} = this.loaded.get(row);
+    this.loaded.delete(row);
+    setTimeout(() => whole.then(all => all.forEach(({layers}) => layers.forEach(layer => layer.close()))), FORGOTTEN);
   }
 
   close() {
     this.closed = true;
+    [...this.loaded.keys()].forEach(row => this.forget(row));
   }
 
   async draw() {
@@ -44,7 +69,7 @@ export class Frames {
       const loaded = await Promise.race([whole, frames.then(pause)]);
       if (this.closed || number < this.drawn || pictures != this.pictures) continue;
       this.drawn = number;
-      pictures.forEach((picture, at) => paint(picture, row, loaded[at]));
+      pictures.forEach((picture, at) => paint(picture, row, loaded[at], picture.looks.length && loaded[at].layers.length == 1));
       whole.then(all => { // the attention may take long: it is laid over the frames when it comes
         if (all.some(({message}) => message)) this.loaded.delete(row); // it is asked for again the next time
         if (all == loaded || this.closed || number != this.drawn || pictures != this.pictures) return;
@@ -56,7 +81,11 @@ export class Frames {
 
   // Promises of a row's pictures, {layers, message?} each: the frames alone, and with what the models look at.
   load(row) {
-    if (!this.loaded.has(row)) {
+    const known = this.loaded.get(row);
+    if (known) { // it becomes the newest
+      this.loaded.delete(row);
+      this.loaded.set(row, known);
+    } else {
       const parts = this.pictures.map(({path, looks, has}) => has && !has(row)
         ? [Promise.resolve({message: "not replayed here"})]
         : [`${path}.jpg`, ...looks.map(model => `${path}/${model}.png`)].map(path => this.layer(row, path)));
@@ -64,14 +93,15 @@ export class Frames {
         frames: Promise.all(parts.map(async ([frame]) => together([await frame]))),
         whole: Promise.all(parts.map(async layers => together(await Promise.all(layers)))),
       });
-      if (this.loaded.size > KEPT) this.loaded.delete(this.loaded.keys().next().value);
+      if (this.loaded.size > KEPT) this.forget(this.loaded.keys().next().value);
     }
     return this.loaded.get(row);
   }
 
   async layer(row, path) {
     try {
-      const answer = await fetch(`/recordings/${this.id}/rows/${row}/${path}?version=${this.version}`);
+      const cache = path.endsWith(".jpg") ? "no-store" : "default"; // what a browser caches stays in its memory, too
+      const answer = await fetch(`/recordings/${this.id}/rows/${row}/${path}?version=${this.version}`, {cache});
       if (!answer.ok) return {message: (await answer.json()).message};
       return {layer: await createImageBitmap(await answer.blob())};
     } catch (error) {
@@ -87,10 +117,11 @@ const together = parts => ({
   message: parts.find(({message}) => message)?.message,
 });
 
-function paint({canvas, caption}, row, {layers, message}) {
+function paint({canvas, caption, paths}, row, {layers, message}, isWaiting) {
   const picture = element(canvas), context = picture.getContext("2d"), below = picture.parentNode.lastElementChild;
   context.clearRect(0, 0, picture.width, picture.height);
   for (const layer of layers) context.drawImage(layer, 0, 0);
-  below.textContent = message?.split(/[\\/]IMG[\\/]/).at(-1) ?? caption(row); // no folder
+  if (layers.length) for (const {values, colour} of paths) if (!Number.isNaN(values[row])) drawPath(context, values[row], colour);
+  below.textContent = message?.split(/[\\/]IMG[\\/]/).at(-1) ?? caption(row) + (isWaiting ? " – computing what it looks at …" : ""); // no folder
   below.className = message ? "bad" : "";
 }

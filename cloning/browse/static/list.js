@@ -15,15 +15,76 @@ export function leaveList() {
   known.clear();
 }
 
-export async function showList() {
+export async function showList(state) {
   const now = shown, recordings = await ask("");
   if (now != shown) return;
   element("list").hidden = false;
+  element("query").value = state.get("find") ?? "";
+  element("sort").value = state.get("sort") ?? "name";
   showRuns(now);
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);
+  element("finding").hidden = !cards.length;
   await Promise.all(recordings.map((recording, at) => fill(recording.id, cards[at], now)));
 }
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Which recordings, in which order
+
+const repaired = ({repairs = []}) => repairs.reduce((sum, [, rows]) => sum + rows, 0);
+const refused = ({rejected = 0, unusable = 0}) => rejected + unusable;
+const FIGURES = { // of an overview, by which the list is searched and sorted
+  minutes: each => (each.seconds ?? 0) / 60,
+  frames: each => each.frames ?? 0,
+  offset: each => each.offset?.[1] ?? 0,
+  speed: each => each.speed?.[1] ?? 0,
+  cut: each => each.cut_frames ?? 0,
+  refused,
+  repaired,
+  findings: each => (each.message ? 1e9 : 0) + refused(each) + repaired(each) + (each.cut_frames ?? 0),
+};
+const HOLDS = {">": (a, b) => a > b, "<": (a, b) => a < b, ">=": (a, b) => a >= b, "<=": (a, b) => a <= b, "=": (a, b) => a == b};
+
+// Whether a recording has all words of a search: conditions such as minutes>1, and texts.
+function meets(overview, query) {
+  const text = [overview.name, overview.folder, overview.message, overview.lane && road(overview), ...words(overview)].join(" ").toLowerCase();
+  return query.toLowerCase().split(/\s+/).filter(Boolean).every(word => {
+    const [, figure, sign, number] = word.match(/^(\w+)([<>]=?|=)(-?[\d.]+)$/) ?? [];
+    return FIGURES[figure] ? HOLDS[sign](FIGURES[figure](overview), Number(number)) : text.includes(word);
+  });
+}
+
+function arrange() {
+  const query = element("query").value, by = element("sort").value, figure = FIGURES[by];
+  const key = ([, each]) => by == "road" ? (each.lane ? road(each) : "~") : each.name ?? "";
+  const order = [...known].sort((a, b) => (figure ? figure(b[1]) - figure(a[1]) : 0) || key(a).localeCompare(key(b)));
+  order.forEach(([card, overview], at) => {
+    card.hidden = !meets(overview, query);
+    if (element("cards").children[at] != card) element("cards").insertBefore(card, element("cards").children[at]);
+  });
+  const all = order.filter(([card]) => !card.hidden).map(([, overview]) => overview), sum = name => all.reduce((total, each) => total + (each[name] ?? 0), 0);
+  element("total").textContent = `${all.length < known.size ? `${all.length} of ` : ""}${many(known.size, "recording")}, ${many(sum("frames"), "frame")}, ` +
+    `${(sum("seconds") / 60).toFixed(1)} minutes` + (sum("cut_frames") ? `, ${many(sum("cut_frames"), "frame")} cut` : "");
+  element("compare").disabled = !all.length;
+  const state = new URLSearchParams({...query && {find: query}, ...by != "name" && {sort: by}});
+  history.replaceState(null, "", state.size ? `#?${state}` : "#");
+  const states = [...known.values()].map(({lane}) => lane?.state), left = states.filter(state => ["waiting", "running", "paused"].includes(state)).length;
+  renew(element("analysing"), [left, states.includes("paused")], () => {
+    const button = make("button", states.includes("paused") ? "Go on" : "Pause", {title: "Pause the analyses of all recordings, or go on with them"});
+    onClick(button, () => request("/analyses", {method: states.includes("paused") ? "POST" : "DELETE"})
+      .then(() => Promise.all([...known].map(([card, {id}]) => fill(id, card, shown)))).catch(error => notice(error.message)));
+    return left ? [`Where the car is: ${many(left, "recording")} to analyse. `, button] : [];
+  });
+}
+
+element("query").oninput = element("sort").onchange = arrange;
+element("compare").onclick = () => {
+  const all = [...known].filter(([card]) => !card.hidden);
+  location.hash = all.length == known.size ? "#/compare" : `#/compare?ids=${all.map(([, {id}]) => id)}`;
+};
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Training runs and cards
 
 async function showRuns(now) {
   try {
@@ -48,60 +109,63 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => know
 async function fill(id, card, now) {
   const overview = await ask(`/${id}/overview`);
   if (now != shown) return;
+  const isSame = JSON.stringify(known.get(card)) == JSON.stringify(overview);
   known.set(card, overview);
-  const all = [...known.values()], sum = name => all.reduce((total, each) => total + (each[name] ?? 0), 0);
-  element("total").textContent = `${many(all.length, "recording")}, ${many(sum("frames"), "frame")}, ` +
-    `${(sum("seconds") / 60).toFixed(1)} minutes, ${many(sum("cut_frames"), "frame")} cut`;
-  draw(overview, card);
-  if (overview.message || ["waiting", "running"].includes(overview.lane?.state)) {
-    setTimeout(() => now == shown && fill(id, card, now).catch(error => notice(error.message)), AGAIN);
+  if (!isSame) draw(overview, card);
+  arrange();
+  if (overview.message || ["waiting", "running", "paused"].includes(overview.lane?.state)) {
+    clearTimeout(card.again);
+    card.again = setTimeout(() => now == shown && fill(id, card, now).catch(error => notice(error.message)), AGAIN);
   }
 }
 
+// What is worth telling besides the figures: what was repaired, refused or cut.
+function words(overview) {
+  const counted = (count, word, what) => count ? [`${many(count, word)} ${what}`] : [];
+  const [first] = [...overview.first_rejected ?? [], ...overview.first_unusable ?? []];
+  return [...counted(repaired(overview), "row", "repaired"), ...counted(overview.cut_frames, "frame", "cut"),
+    ...counted(refused(overview), "row", `refused, as line ${first?.[0]}: ${first?.[1]}`)];
+}
+
 function draw(overview, card) {
-  const heading = make("h2", "", {}, make("a", overview.name, {href: `#/${overview.id}`}));
-  if (overview.message) {
-    card.replaceChildren(heading, make("p", overview.message, {class: "bad"}));
+  const {id, name, message, lane} = overview, heading = make("h2", "", {}, make("a", name, {href: `#/${id}`}));
+  if (message) {
+    card.replaceChildren(heading, make("p", message, {class: "bad"}));
     return;
   }
-  const histogram = make("div", "", {class: "histogram"});
-  const lines = Object.entries({
-    frames: `${overview.frames.toLocaleString("en")}, ${(overview.seconds / 60).toFixed(1)} minutes`,
-    road: road(overview),
-    speed: overview.speed ? `${overview.speed[1].toFixed(1)} mph, at most ${overview.speed[2].toFixed(1)}` : "–",
-    "steering 0": overview.zeros == null ? "–" : `${(100 * overview.zeros).toFixed(0)} % of the frames`,
-    repaired: many(overview.repairs.reduce((sum, [, rows]) => sum + rows, 0), "row"),
-    refused: many(overview.rejected, "row") + (overview.unusable ? `, ${many(overview.unusable, "row")} for an image` : ""),
-    cut: many(overview.cut_frames, "frame") +
-      (overview.cut_frames ? `, ${(100 * overview.cut_frames / overview.frames).toFixed(1)} %` : ""),
-    folder: overview.folder,
-  });
-  card.replaceChildren(
-    heading,
-    make("div", "", {class: "pictures"}, map(overview), histogram),
-    make("dl", "", {}, ...lines.flatMap(([name, value]) => [make("dt", name), make("dd", value)])),
-  );
-  if (overview.lane.state == "failed") {
+  const picture = make("img", "", {src: `/recordings/${id}/rows/${overview.picture}/center.jpg`, alt: "", width: 320, height: 160, loading: "lazy"});
+  picture.onerror = () => picture.replaceWith(make("div", "", {class: "none"}));
+  const histogram = make("div", "", {class: "histogram"}), [, mean, most] = overview.speed ?? [];
+  const lines = [
+    `${(overview.seconds / 60).toFixed(1)} minutes, ${many(overview.frames, "frame")}; ${road(overview)}`,
+    mean == undefined ? "all of it is cut" : `${mean.toFixed(1)} mph, at most ${most.toFixed(1)}; steering 0 in ${(100 * overview.zeros).toFixed(0)} %` +
+      (overview.offset ? `; ${overview.offset[0].toFixed(2)} m from the lane's centre, at most ${overview.offset[1].toFixed(2)} m` : ""),
+  ];
+  card.replaceChildren(heading, make("div", "", {class: "road"}, picture, ...map(overview)), histogram, ...lines.map(line => make("p", line)),
+    ...words(overview).length ? [make("p", words(overview).join(", "), {class: "found"})] : [],
+    make("p", overview.folder, {class: "quiet"}));
+  if (lane.state == "failed") {
     const retry = make("button", "Look for the road again"), now = shown;
-    onClick(retry, () => ask(`/${overview.id}/columns/offset`, {method: "POST"}).then(() => fill(overview.id, card, now))
-      .catch(error => notice(error.message)));
+    onClick(retry, () => ask(`/${id}/columns/offset`, {method: "POST"}).then(() => fill(id, card, now)).catch(error => notice(error.message)));
     card.append(retry);
   }
   histograms.get(card)?.destroy();
   histograms.set(card, bars(overview.histogram, histogram));
 }
 
-function road({lane, roads}) {
-  if (lane.state == "waiting") return "not known yet: waits for its turn";
-  if (lane.state == "running") return `not known yet: ${(100 * lane.progress).toFixed(0)} % of the frames analysed`;
-  if (lane.state == "failed") return `not known, the analysis failed: ${lane.message}`;
-  if (!roads.length) return "other";
+function road({lane, roads, unusable, frames}) {
+  if (lane.state == "waiting") return "road not known yet: waits for its turn";
+  if (lane.state == "paused") return "road not known yet: paused";
+  if (lane.state == "running") return `road not known yet: ${(100 * lane.progress).toFixed(0)} % analysed`;
+  if (lane.state == "failed") return `road not known, the analysis failed: ${lane.message}`;
+  if (unusable == frames) return "road not known: no image can be used";
+  if (!roads.length) return "another road";
   return roads.map(([name, direction]) => `${name}, ${DIRECTIONS[direction]}`).join("; ");
 }
 
 // The track from above, east to the right, with the path driven.
 function map({outline, path}) {
-  if (!outline?.length) return make("div", "no map", {class: "none quiet"});
+  if (!outline?.length) return [];
   const xs = outline.map(point => point[0]), ys = outline.map(point => -point[1]);
   const [left, top] = [Math.min(...xs), Math.min(...ys)];
   const size = Math.max(Math.max(...xs) - left, Math.max(...ys) - top);
@@ -115,7 +179,7 @@ function map({outline, path}) {
     line.setAttribute("points", points.map(([x, y]) => `${x},${-y}`).join(" "));
     svg.append(line);
   }
-  return svg;
+  return [svg];
 }
 
 function bars(counts, holder) {
@@ -125,10 +189,10 @@ function bars(counts, holder) {
   holder.setAttribute("aria-label", "Histogram of steering, on a square-root scale");
   holder.title = "How many frames have which steering, on a square-root scale";
   return new uPlot({
-    width, height: 100, legend: {show: false}, cursor: {show: false}, padding: [4, 8, 0, 8],
+    width, height: 64, legend: {show: false}, cursor: {show: false}, padding: [4, 8, 0, 8],
     scales: {x: {time: false, range: [-1, 1]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
       range: (plot, low, high) => [0, Math.max(1, high)]}},
-    axes: [{stroke: colours.getPropertyValue("--quiet"), size: 24, grid: {show: false}, ticks: {show: false},
+    axes: [{stroke: colours.getPropertyValue("--quiet"), size: 18, gap: 2, grid: {show: false}, ticks: {show: false},
       splits: () => [-1, -0.5, 0, 0.5, 1], font: "12px system-ui, sans-serif"}, {show: false}],
     series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, paths: uPlot.paths.bars({size: [0.9, 100]}),
       points: {show: false}}],

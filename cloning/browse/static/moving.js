@@ -1,13 +1,17 @@
 // Moving through a recording: to a row, by playing, and to the rows worth watching.
 import {clock, element} from "./common.js";
-import {page, say} from "./state.js";
+import {marked} from "./cuts.js";
+import {page, remember, say} from "./state.js";
+
+const PAUSE = 0.07; // s that the last frame is shown before they are played again
 
 // The reasons to jump to a row: what such rows are, and why there are none.
 export const JUMPS = {
   offset: ["rows with the largest offset", "The lateral offset is not known yet."],
-  stop: ["rows with the steering at its stop", "The steering is nowhere at its stop."],
+  stop: ["rows with the wheels at full lock", "The wheels are nowhere at full lock."],
   difference: ["rows where a model differs most", "No model's steering is there: start with --model, or wait for it."],
   intervention: ["interventions", "No intervention: there is no replay, or the car stayed within its limit."],
+  match: ["stretches that match", "Nothing matches: write a condition first, such as abs(steering) > 0.8."],
 };
 
 export function goTo(row, step = 0) {
@@ -20,8 +24,7 @@ export function goTo(row, step = 0) {
   element("scrub").setAttribute("aria-valuetext", time);
   element("where").textContent =
     `${time} of ${clock(now.columns.seconds.at(-1))}, frame ${now.row + 1} of ${now.count}`;
-  clearTimeout(now.noting);
-  now.noting = setTimeout(() => now == page.open && history.replaceState(null, "", `#/${now.id}/${now.row}`), 300);
+  remember();
 }
 
 export function seek(row) {
@@ -35,23 +38,55 @@ export function stop() {
   element("play").textContent = "Play";
 }
 
+// The rows that are played again and again: [first, last].
+function looped() {
+  const {count, plots: {zoom}} = page.open, [first, end] = marked() ?? [Math.ceil(zoom?.[0] ?? 0), Math.floor(zoom?.[1] ?? count - 1) + 1];
+  return [first, end - 1];
+}
+
 export function play() {
   const now = page.open, {seconds} = now.columns;
   if (now.playing) return stop();
-  if (now.row == now.count - 1) goTo(0);
-  const begun = performance.now(), from = seconds[now.row];
+  const [first, last] = now.loop ? looped() : [0, now.count - 1];
+  if (now.row < first || now.row >= last) goTo(first);
+  let before = performance.now(), at = seconds[now.row]; // s of the recording
   element("play").textContent = "Pause";
   const tick = () => {
     if (page.open != now || !now.playing) return;
-    const until = from + (performance.now() - begun) / 1000;
+    const [first, last] = now.loop ? looped() : [0, now.count - 1], time = performance.now();
+    at += (time - before) / 1000 * now.speed;
+    before = time;
     let row = now.row;
-    while (row < now.count - 1 && seconds[row + 1] <= until) row++;
-    if (row != now.row) goTo(row, 1);
-    if (row == now.count - 1) stop();
+    while (row < last && seconds[row + 1] <= at) row++;
+    if (now.loop && at > seconds[last] + PAUSE) at = seconds[row = first];
+    if (row != now.row) goTo(row, Math.max(1, Math.round(now.speed / 2)));
+    if (row >= last && !now.loop) stop();
     else now.playing = requestAnimationFrame(tick);
   };
   now.playing = requestAnimationFrame(tick);
 }
+
+export function setSpeed(speed) {
+  const select = element("speed"), now = page.open;
+  select.value = speed;
+  if (!select.value) select.value = 1;
+  now.speed = Number(select.value);
+  remember();
+}
+
+export function changeSpeed(by) {
+  const select = element("speed");
+  setSpeed(select.options[Math.min(select.options.length - 1, Math.max(0, select.selectedIndex + by))].value);
+  say(`Playing at ${select.value} times the recording's rate.`);
+}
+
+export function setLoop(loop) {
+  page.open.loop = loop;
+  element("loop").setAttribute("aria-pressed", loop);
+  remember();
+}
+
+element("speed").onchange = () => setSpeed(element("speed").value);
 
 export function jump(reason, back) {
   const now = page.open, rows = now.jumps[reason] ?? [], [name, none] = JUMPS[reason];

@@ -1,10 +1,14 @@
 // The curves of a recording, one above the other, over its rows; drawn by uPlot.
 import {element, make} from "./common.js";
 import {rounded} from "/site/site.js";
+import {showWindow, zoomable} from "./zoom.js";
 
 export const MODEL_COLOURS = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]; // told apart by the colour-blind too
+const LEAST = 15; // rows that a zoom shows
 const LEFT = 56, RIGHT = 12; // px; browse.css has them for the bar
-const HEIGHT = 84, TIMES = 20; // px of a plot, and of the times below the last one
+const TIMES = 20; // px of the times below the last plot
+const ROOM = 310, PLOTS = 440, MOST = 1.8; // px of a window's height for all else, and of the plots; how far they grow
+const LIMITS = [1, 2.5], OFF = 6; // m: where a human would take over, and the edge line of the lake; the offset's axis
 const STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 1800, 3600], TIME_SPACE = 70; // s between two times; px
 
 export class Plots {
@@ -13,8 +17,7 @@ export class Plots {
     Object.assign(this, {columns, models, seek, stretches: [], replays: [], row: 0, zoom: null});
     this.count = columns.seconds.length;
     this.rows = Array.from({length: this.count}, (_, row) => row);
-    this.resizing = new ResizeObserver(() =>
-      this.plots.forEach((plot, at) => plot.setSize(this.size(at == this.plots.length - 1))));
+    this.resizing = new ResizeObserver(() => this.plots.forEach(plot => plot.setSize(this.size(plot))));
     this.resizing.observe(element("plots"));
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.redo = () => this.build();
@@ -22,8 +25,9 @@ export class Plots {
     this.build();
   }
 
-  size(isLast) {
-    return {width: Math.max(200, element("plots").clientWidth), height: HEIGHT + (isLast ? TIMES : 0)};
+  size({tall, isLast}) {
+    const grown = Math.min(MOST, Math.max(1, (innerHeight - ROOM) / PLOTS));
+    return {width: Math.max(200, element("plots").clientWidth), height: Math.round(tall * grown) + (isLast ? TIMES : 0)};
   }
 
   close() {
@@ -37,27 +41,33 @@ export class Plots {
   build() {
     this.plots?.forEach(plot => plot.destroy());
     element("plots").replaceChildren();
-    const {steering, throttle, speed, offset} = this.columns;
+    const {steering, throttle, speed, offset, label} = this.columns, colours = getComputedStyle(document.body);
     const models = this.models.map((name, index) =>
       ({name, values: this.columns[`model-${index}`], colour: MODEL_COLOURS[index % MODEL_COLOURS.length]}));
     const replays = this.replays.map((replay, index) => replay && ({...models[index], values: replay.offset,
       marks: replay.where.map(([row]) => row)})).filter(Boolean);
+    const drivers = this.replays.map((replay, index) => replay &&
+      ({...models[index], name: `${models[index].name} driving`, values: replay.driver})).filter(Boolean);
+    const human = {name: "human", values: steering, colour: colours.getPropertyValue("--line")};
+    const taught = label ? [{name: "label", values: label, colour: colours.getPropertyValue("--label")}] : [];
+    this.steerings = {human, taught, models};
     const graphs = [
-      {title: "Steering", unit: "", digits: 3, range: [-1, 1],
-        curves: [{name: models.length ? "human" : "", values: steering}, ...models]},
-      {title: "Throttle", unit: "", digits: 2, range: [Math.min(0, least(throttle)), 1], curves: [{name: "", values: throttle}]},
-      {title: "Speed", unit: " mph", digits: 1, range: [0, Math.max(31, -least(speed.map(value => -value)))],
+      {title: "Steering", unit: "", digits: 3, tall: 96, curves: [human, ...taught, ...drivers.length ? drivers : models],
+        range: (_, low, high) => balanced(Math.max(0.1, -low * 1.05, high * 1.05), 1)},
+      {title: "Throttle", unit: "", digits: 2, tall: 54, range: [Math.min(0, least(throttle)), 1], curves: [{name: "", values: throttle}]},
+      {title: "Speed", unit: " mph", digits: 1, tall: 60, range: [0, Math.max(31, -least(speed.map(value => -value)))],
         curves: [{name: "", values: speed}]},
-      {title: "Lateral offset, right positive", unit: " m", digits: 2,
+      {title: "Metres right of the lane's centre", unit: " m", digits: 2, tall: 120, lines: LIMITS,
+        range: (_, low, high) => balanced(Math.max(2.75, -low * 1.05, high * 1.05), OFF),
         curves: [{name: replays.length ? "human" : "", values: offset}, ...replays]},
     ];
     this.shown = [];
-    this.plots = graphs.map((graph, at) => this.plot(graph, at == graphs.length - 1));
+    this.plots = graphs.map((graph, at) => this.plot({...graph, isLast: at == graphs.length - 1}));
     if (this.zoom) this.setZoom(...this.zoom);
     this.goTo(this.row);
   }
 
-  plot({title, unit, digits, range, curves}, isLast) {
+  plot({title, unit, digits, range, curves, lines = [], tall, isLast}) {
     const colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
     const figure = make("figure"), caption = make("figcaption", "", {}, make("span", title)), holder = make("div");
     for (const curve of curves) {
@@ -70,20 +80,21 @@ export class Plots {
     element("plots").append(figure);
     const here = make("div", "", {class: "here"}), axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
       grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
-    const bound = Math.max(1, ...curves.filter(({values}) => values && !range).map(({values}) => largest(values)));
+    const limits = lines.flatMap(metres => [-metres, metres]);
     const plot = new uPlot({
-      ...this.size(isLast), legend: {show: false}, padding: [6, RIGHT, isLast ? 0 : 6, 0],
+      ...this.size({tall, isLast}), legend: {show: false}, padding: [6, RIGHT, isLast ? 0 : 6, 0],
       cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
-      scales: {x: {time: false, range: (_, low, high) => [low, high]}, y: {range: range ?? [-bound, bound]}},
+      scales: {x: {time: false, range: (_, low, high) => this.count > 1 ? [low, high] : [-0.5, 0.5]}, y: {range}},
       axes: [
         {...axis, size: isLast ? TIMES : 0, splits: (plot, _, low, high) => this.times(plot.width, low, high),
           values: (_, rows) => rows.map(row => isLast ? this.time(row) : "")},
-        {...axis, size: LEFT, space: 22},
+        {...axis, size: LEFT, space: 22, ...limits.length && {splits: () => [0, ...limits], values: (_, at) => at.map(metres => metres ? `${metres} m` : "0")}},
       ],
-      series: [{}, ...curves.map(curve => ({stroke: curve.colour, width: 1, points: {show: false}, spanGaps: false}))],
+      series: [{}, ...curves.map(curve => ({stroke: curve.colour, width: 1, spanGaps: false,
+        points: {show: this.count == 1, fill: curve.colour}}))],
       hooks: {
         ready: [plot => this.listen(plot, here)],
-        drawClear: [plot => this.shade(plot, curves)],
+        drawClear: [plot => this.shade(plot, curves, limits)],
         draw: [plot => this.move(plot, here)],
         setSelect: [plot => {
           const from = plot.posToVal(plot.select.left, "x"), width = plot.select.width;
@@ -92,15 +103,16 @@ export class Plots {
         }],
       },
     }, [this.rows, ...curves.map(({values}) => values ? gaps(values) : this.rows.map(() => null))], holder);
-    plot.here = here;
-    return plot;
+    return Object.assign(plot, {here, tall, isLast});
   }
 
   // The rows at round times, at most one for each TIME_SPACE px.
   times(width, low, high) {
-    const {seconds} = this.columns, from = seconds[Math.ceil(low)], to = seconds[Math.floor(high)], rows = [];
+    const {seconds} = this.columns, rows = [];
+    [low, high] = [Math.max(0, Math.ceil(low)), Math.min(this.count - 1, Math.floor(high))];
+    const from = seconds[low], to = seconds[high];
     const step = STEPS.find(step => (to - from) / step < width / TIME_SPACE) ?? STEPS.at(-1);
-    for (let row = Math.ceil(low), next = Math.ceil(from / step) * step; row <= high; row++) {
+    for (let row = low, next = Math.ceil(from / step) * step; row <= high; row++) {
       if (seconds[row] < next) continue;
       rows.push(row);
       next = (Math.floor(seconds[row] / step) + 1) * step;
@@ -121,11 +133,13 @@ export class Plots {
       if (Math.abs(event.clientX - from) < 4) this.seek(Math.round(plot.posToVal(event.offsetX, "x")));
     });
     plot.over.addEventListener("dblclick", () => this.setZoom(0, this.count - 1));
+    zoomable(plot, this);
   }
 
   // The stretches behind the curves: [first row, row after the last, custom property of the colour].
   // The interventions of the curves are ticks in their colours, which leave the curves to be seen where there are many.
-  shade(plot, curves) {
+  // Lines at the limits, dashed: where a human would take over, and where the road ends.
+  shade(plot, curves, limits) {
     const {ctx, bbox} = plot, colours = getComputedStyle(document.body);
     ctx.save();
     ctx.globalAlpha = 0.25;
@@ -136,6 +150,16 @@ export class Plots {
       if (right > left) ctx.fillRect(left, bbox.top, Math.max(1, right - left), bbox.height);
     }
     ctx.globalAlpha = 0.7;
+    for (const metres of limits) {
+      const at = Math.round(plot.valToPos(metres, "y", true)) + 0.5;
+      if (at < bbox.top || at > bbox.top + bbox.height) continue;
+      Object.assign(ctx, {strokeStyle: colours.getPropertyValue(Math.abs(metres) == limits.at(-1) ? "--cut" : "--mark"), lineWidth: 1});
+      ctx.setLineDash([5, 4]);
+      ctx.beginPath();
+      ctx.moveTo(bbox.left, at);
+      ctx.lineTo(bbox.left + bbox.width, at);
+      ctx.stroke();
+    }
     for (const {marks = [], colour} of curves) {
       ctx.fillStyle = colour;
       for (const row of marks) {
@@ -146,7 +170,7 @@ export class Plots {
     ctx.restore();
   }
 
-  // Replays by the index of their model: {offset, where}, or undefined.
+  // Replays by the index of their model: {offset, driver, where}, or undefined.
   setReplays(replays) {
     this.replays = replays;
     this.build();
@@ -158,26 +182,24 @@ export class Plots {
   }
 
   setZoom(low, high) {
-    low = Math.max(0, low);
-    high = Math.min(this.count - 1, high);
-    if (high - low < 2) return;
-    this.zoom = [low, high];
-    this.plots.forEach(plot => plot.setScale("x", {min: low, max: high}));
+    if (this.count < 3) return showWindow(this);
+    const wide = Math.min(this.count - 1, Math.max(LEAST, high - low)), from = Math.min(Math.max(0, (low + high - wide) / 2), this.count - 1 - wide);
+    this.zoom = wide < this.count - 1 ? [from, from + wide] : null;
+    this.plots.forEach(plot => plot.setScale("x", {min: from, max: from + wide}));
+    showWindow(this);
   }
 
-  // Show so many times as many rows as now, around the current one.
-  scale(factor) {
-    const [low, high] = this.zoom ?? [0, this.count - 1], wide = Math.min(this.count - 1, Math.max(30, (high - low) * factor));
-    const from = Math.min(Math.max(0, this.row - wide / 2), this.count - 1 - wide);
-    this.setZoom(from, from + wide);
+  // Show so many times as many rows as now; row: stays where it is on the screen.
+  scale(factor, row = this.row) {
+    const [low, high] = this.zoom ?? [0, this.count - 1];
+    this.setZoom(row - (row - low) * factor, row + (high - row) * factor);
   }
 
   goTo(row) {
     this.row = row;
     const [low, high] = this.zoom ?? [0, this.count - 1];
     if (row < low || row > high) { // turn the page
-      const wide = high - low, from = Math.min(Math.max(0, row - wide / 10), this.count - 1 - wide);
-      this.setZoom(from, from + wide);
+      this.setZoom(row - (high - low) / 10, row + (high - low) * 0.9);
     }
     for (const {value, unit, digits, values} of this.shown) {
       const here = values?.[row];
@@ -191,7 +213,7 @@ export class Plots {
   }
 }
 
+const balanced = (bound, most) => [-Math.min(bound, most), Math.min(bound, most)];
 const least = values => values.reduce((low, value) => Math.min(low, value), Infinity);
-const largest = values => values.reduce((high, value) => Math.max(high, Math.abs(value) || 0), 0);
 // uPlot leaves gaps at nulls, which typed arrays do not have.
 const gaps = values => values.some(Number.isNaN) ? Array.from(values, value => Number.isNaN(value) ? null : value) : values;

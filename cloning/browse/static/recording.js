@@ -1,25 +1,32 @@
 // One recording: its frames and curves, news of it from the server, and the keys.
 import {ask, element, make, many, notice, onClick, renew} from "./common.js";
-import {askForReason, mark, showCuts, undo} from "./cuts.js";
+import {changes, cutMarked, mark, redo, showCuts, undo} from "./cuts.js";
+import {askToExport, find, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
-import {goTo, jump, JUMPS, play, seek} from "./moving.js";
+import {changeSpeed, goTo, jump, JUMPS, play, seek, setLoop, setSpeed} from "./moving.js";
 import {Plots} from "./plots.js";
 import {cameras, nextAttention, nextLimit, showReplays} from "./replays.js";
-import {orderButton, page, say} from "./state.js";
+import {orderButton, note, page, remember, say} from "./state.js";
 
 const SECOND = 15; // rows, of the larger step
 const PENDING = 2000, IDLE = 5000; // ms between two questions for news, while something is being analysed and else
 export const KEYS = [
-  ["Space", "play and pause, at the recording's own rate"],
+  ["Space", "play and pause"],
+  ["< >", "play more slowly, faster"],
+  ["B", "play the marked stretch, or what the curves show, again and again"],
   ["← →", "one frame back, on; in a training run, earlier and later pictures"],
   ["Shift+← Shift+→", "one second back, on"],
   ["PageUp PageDown", "ten seconds back, on"],
   ["Home End", "to the beginning, the end"],
   ["I O", "mark the first, the last frame of a stretch"],
   ["X", "cut the marked stretch"],
-  ["Z", "undo: the marks, or this page's last cut or deleted cut"],
+  ["Z Y", "undo the marks, or the last cut or deleted cut; do it again"],
+  ["/", "find frames by a condition"],
+  ["G Shift+G", "next, previous stretch that meets the condition"],
+  ["E", "export the marked stretch, what was found, or what the curves show"],
+  ["P", "draw on the picture where each steering leads, or not"],
   ["F Shift+F", "next, previous of the rows with the largest lateral offset"],
-  ["S Shift+S", "next, previous row with the steering at its stop"],
+  ["S Shift+S", "next, previous row with the wheels at full lock"],
   ["D Shift+D", "next, previous of the rows where a model differs most from the human (with --model)"],
   ["L", "replay with each model as the driver, at the next limit; off after the last (with --model)"],
   ["N Shift+N", "next, previous intervention of a replay"],
@@ -29,6 +36,7 @@ export const KEYS = [
   ["Esc", "close a message; back to the list"],
   ["?", "these keys"],
 ];
+const CHANGED = "The recording's log has changed: press R to read it again. Your cuts are in its folder.";
 let latest = 0; // number of the last request for a recording: what comes for an earlier one is dropped
 
 export function leaveRecording() {
@@ -42,21 +50,21 @@ export function leaveRecording() {
   page.open = undefined;
 }
 
-export async function showRecording(id, row) {
-  const mine = ++latest, again = page.open?.id == id ? page.open : undefined;
-  const query = again?.query() ?? "";
-  const details = await ask(`/${id}/details${query}`);
+// shown: the rest of the state, as `remember` writes it.
+export async function showRecording(id, row, shown) {
+  const mine = ++latest, limits = shown.get("limit");
+  const details = await ask(`/${id}/details${limits ? `?limit=${limits}` : ""}`);
   const names = ["steering", "throttle", "speed", "seconds"], columns = {};
   const parts = await Promise.all(names.map(name => column(id, details.version, name)));
   if (mine != latest) return;
   names.forEach((name, at) => columns[name] = parts[at]);
   leaveRecording();
   element("recording").hidden = false;
-  // What this page has done stays undoable when it reads again, and it shows the same replays.
-  const count = columns.seconds.length, marks = again?.details.version == details.version ? again.marks : {};
+  const count = columns.seconds.length, [first, last] = (shown.get("mark") ?? "").split("-").map(at => at ? Math.min(Number(at), count - 1) : undefined);
   const now = page.open = {
-    id, details, columns, count, marks, done: again?.done ?? [], row: 0, playing: 0, jumps: {},
-    limit: again?.limit ?? null, attention: again?.attention ?? null, replays: [], update,
+    id, details, columns, count, marks: {first, last}, ...changes(id), row: 0, playing: 0, jumps: {...details.jumps},
+    limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
+    condition: shown.get("find") ?? "", paths: shown.get("paths") != "0",
     query: () => now.limit ? `?limit=${now.limit}` : "",
     column: name => column(id, details.version, name),
   };
@@ -66,8 +74,14 @@ export async function showRecording(id, row) {
   document.title = details.name;
   element("scrub").max = count - 1;
   say("");
-  await update(details);
-  goTo(Math.min(row, count - 1));
+  now.row = Math.min(row, count - 1);
+  now.plots.setZoom(...(shown.get("zoom") ?? `0-${count - 1}`).split("-").map(Number));
+  setSpeed(shown.get("speed") ?? 1);
+  setLoop(shown.get("loop") == "1");
+  setPaths(now.paths);
+  goTo(now.row);
+  await refresh(now, details);
+  await find();
 }
 
 async function column(id, version, name) {
@@ -82,15 +96,23 @@ async function update(details) {
   clearTimeout(now.timer);
   if (details.message) notice(details.message);
   if (details.version != now.details.version) {
-    notice("The recording's log has changed: press R to read it again. Your cuts are in its folder.");
-    return;
+    now.marks = {}; // of other rows
+    return notice(CHANGED);
   }
   now.details = details;
   const analyses = [["offset", details.lane], ...details.models.map((model, index) => [`model-${index}`, model])];
   const ready = analyses.filter(([name, analysis]) => analysis.state == "ready" && !now.columns[name]);
-  for (const [name] of ready) now.columns[name] = await now.column(name);
+  for (const [name] of ready) {
+    now.columns[name] = await now.column(name);
+    if (name == "offset") now.columns.label = await now.column("label");
+  }
   if (page.open != now) return;
-  if (ready.length) now.plots.build();
+  if (ready.length) {
+    now.plots.build();
+    now.frames.setPictures(cameras());
+  }
+  if (ready.length || !now.hasHistogram) showHistogram();
+  now.hasHistogram = true;
   await showReplays();
   if (page.open != now) return;
   showCuts();
@@ -102,9 +124,9 @@ async function update(details) {
   now.timer = setTimeout(() => refresh(now), pending ? PENDING : IDLE);
 }
 
-async function refresh(now) {
+async function refresh(now, known) {
   try {
-    const details = await ask(`/${now.id}/details${now.query()}`);
+    const details = known ?? await ask(`/${now.id}/details${now.query()}`);
     if (page.open != now) return;
     if (now.lost) {
       notice();
@@ -132,6 +154,7 @@ function showFindings() {
   const columns = ["offset", ...details.models.map((_, index) => `model-${index}`)];
   [{name: "lateral offset", ...details.lane}, ...details.models].forEach(({name, state, progress, message}, at) => {
     if (state == "waiting") found.push(`${name}: waits for its turn`);
+    if (state == "paused") found.push(`${name}: the analyses are paused; the list goes on with them`);
     if (state == "running") found.push(`${name}: ${(100 * progress).toFixed(0)} % analysed`);
     if (state == "failed") found.push([`${name} failed: ${message}. `, columns[at]]);
   });
@@ -143,12 +166,10 @@ function showFindings() {
 }
 
 function buttons() {
-  const {marks, details, done, replays} = page.open;
+  const {details, replays, jumps} = page.open;
   const interventions = replays.flatMap(replay => replay?.where.map(([row]) => row) ?? []);
-  page.open.jumps = {...details.jumps, intervention: [...new Set(interventions)].sort((a, b) => a - b)};
-  element("cut").disabled = !(marks.first && marks.last);
-  element("undo").disabled = !(marks.first || marks.last || done.length);
-  for (const reason of Object.keys(JUMPS)) element(`jump-${reason}`).disabled = !page.open.jumps[reason]?.length;
+  page.open.jumps = {...details.jumps, intervention: [...new Set(interventions)].sort((a, b) => a - b), match: jumps.match};
+  for (const reason of Object.keys(JUMPS).filter(reason => reason != "match")) element(`jump-${reason}`).disabled = !page.open.jumps[reason]?.length;
   for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
 }
 
@@ -168,10 +189,18 @@ export function pressed(key, shift) {
     PageDown: () => seek(now.row + 10 * SECOND),
     Home: () => seek(0),
     End: () => seek(now.count - 1),
-    i: () => mark("first").catch(error => notice(error.message)),
-    o: () => mark("last").catch(error => notice(error.message)),
-    x: askForReason,
+    "<": () => changeSpeed(-1),
+    ">": () => changeSpeed(1),
+    b: () => setLoop(!now.loop),
+    i: () => mark("first"),
+    o: () => mark("last"),
+    x: cutMarked,
     z: undo,
+    y: redo,
+    "/": () => element("condition").focus(),
+    g: () => jump("match", shift),
+    e: askToExport,
+    p: () => setPaths(!now.paths),
     f: () => jump("offset", shift),
     s: () => jump("stop", shift),
     d: () => jump("difference", shift),
@@ -182,14 +211,24 @@ export function pressed(key, shift) {
     "=": () => now.plots.scale(0.5),
     "-": () => now.plots.scale(2),
     "0": () => now.plots.setZoom(0, now.count - 1),
-    r: () => showRecording(now.id, now.row).catch(error => notice(error.message)),
+    r: () => {
+      note();
+      dispatchEvent(new HashChangeEvent("hashchange"));
+    },
   };
   const action = actions[key.length == 1 ? key.toLowerCase() : key];
   action?.();
   return Boolean(action);
 }
 
+function setPaths(paths) {
+  page.open.paths = paths;
+  element("paths").setAttribute("aria-pressed", paths);
+  page.open.frames.setPictures(cameras());
+  remember();
+}
+
 for (const button of document.querySelectorAll("[data-key]")) {
-  onClick(button, event => pressed(button.dataset.key, event.shiftKey));
+  onClick(button, event => pressed(button.dataset.key, event.shiftKey || button.dataset.key == "G"));
 }
 element("scrub").oninput = () => page.open && seek(Number(element("scrub").value));

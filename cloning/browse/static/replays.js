@@ -2,24 +2,28 @@
 import {clock, element, make, many, onClick, renew} from "./common.js";
 import {seek} from "./moving.js";
 import {MODEL_COLOURS} from "./plots.js";
-import {order, orderButton, page, say} from "./state.js";
+import {order, orderButton, page, remember, say} from "./state.js";
 
-const LIMITS = [...document.querySelectorAll("[data-limit]")].map(button => button.dataset.limit);
+export const LIMITS = [...document.querySelectorAll("[data-limit]")].map(button => button.dataset.limit);
 
 // The pictures to show: the cameras, or the centre camera beside what each replayed car sees.
 export function cameras() {
-  const {details, replays, attention} = page.open, isReplayed = replays.some(Boolean);
+  const {details, replays, attention, paths, plots: {steerings: {human, taught, models}}} = page.open;
+  const isReplayed = replays.some(Boolean), drawn = curves => paths ? curves.filter(({values}) => values) : [];
   element("cameras").className = isReplayed ? "replaying" : "";
   document.querySelectorAll("#cameras .replayed").forEach(figure => figure.remove());
-  const recorded = (canvas, caption, looks = []) => ({canvas, caption: () => caption, path: canvas, looks});
-  const centre = recorded("center", isReplayed ? "Centre, driven by the human" : "Centre", attention == null ? [] : [attention]);
+  const recorded = (canvas, caption, looks = []) => ({canvas, caption: () => caption, path: canvas, looks, paths: []});
+  const centre = {...recorded("center", isReplayed ? "Human" : "Centre", attention == null ? [] : [attention]),
+    paths: drawn(isReplayed ? [human, ...taught] : [...models, ...taught, human])};
+  element("cameras").dataset.views = replays.filter(Boolean).length;
   if (!isReplayed) return [recorded("left", "Left"), centre, recorded("right", "Right")];
   const views = replays.map((replay, index) => replay && {
     canvas: `view-${index}`,
-    caption: row => `${details.models[index].name} at ${replay.limit} m: ${metres(replay.offset[row])}`,
+    caption: row => `${details.models[index].name}: ${metres(replay.offset[row]).replace("to the ", "")}`,
     has: row => !Number.isNaN(replay.offset[row]),
     path: `replay-${index}-${replay.limit}`,
     looks: attention == index ? [index] : [],
+    paths: drawn([{values: replay.driver, colour: models[index].colour}]),
   }).filter(Boolean);
   for (const {canvas} of views) {
     element("cameras").append(make("figure", "", {class: "replayed"},
@@ -48,7 +52,7 @@ export async function showReplays() {
     button.setAttribute("aria-pressed", button.dataset.limit == now.limit);
   }
   renew(element("attention"), details.models.map(({name}) => name), () => details.models.map(({name}, index) => {
-    const button = make("button", name);
+    const button = make("button", name, {title: `Show in magenta what ${name} looks at (A)`});
     onClick(button, () => watch(page.open.attention == index ? null : index));
     return button;
   }));
@@ -64,7 +68,8 @@ async function load(now, replay, index) {
   if (replay.state != "ready") return undefined;
   const limit = now.details.limit, before = now.replays[index];
   if (before?.limit == limit && before.stamp == replay.stamp) return before;
-  return {...replay, limit, offset: await now.column(`replay-${index}-${limit}`)};
+  const [offset, driver] = await Promise.all(["replay", "driver"].map(kind => now.column(`${kind}-${index}-${limit}`)));
+  return {...replay, limit, offset, driver};
 }
 
 function section(replay, index) {
@@ -74,6 +79,7 @@ function section(replay, index) {
   const waiting = {
     none: ["Not replayed with these files and cuts. ", button("Replay", "POST")],
     waiting: ["Waits for its turn. ", button("Stop", "DELETE")],
+    paused: ["The analyses are paused. ", button("Go on", "POST")],
     running: [`Replaying: ${(100 * replay.progress).toFixed(0)} % driven. `, button("Stop", "DELETE")],
     failed: [`Failed: ${replay.message}. `, orderButton("Try again", "POST", `columns/replay-${index}-${limit}`)],
   }[replay.state];
@@ -110,6 +116,7 @@ const metres = offset => `${Math.abs(offset).toFixed(2)} m to the ${offset > 0 ?
 async function choose(limit) {
   const now = page.open;
   now.limit = limit;
+  remember();
   say(limit ? `Replays at a limit of ${limit} m.` : "No replays.");
   if (limit) return order("POST", `replays/${limit}`);
   now.replays = [];
@@ -126,6 +133,7 @@ export function nextLimit() {
 function watch(index) {
   const now = page.open;
   now.attention = index;
+  remember();
   say(index == null ? "" : `In magenta, what ${now.details.models[index].name} looks at.`);
   now.frames.setPictures(cameras());
   showReplays();

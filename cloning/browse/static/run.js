@@ -1,26 +1,48 @@
-// A training run: how far it is, its losses, and the pictures of what it trains on; it refreshes itself.
-import {element, make, many, notice, renew, request} from "./common.js";
+// A training run: how far it is, its drift and losses beside other runs', and the pictures of what it trains on; it
+// refreshes itself.
+import {element, make, many, notice, onClick, renew, request} from "./common.js";
+import {MODEL_COLOURS} from "./plots.js";
 
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
 const PICTURES = ["LRC_", "augmented-"]; // of pictures, in the order of the page
-const HEIGHT = 260; // px of the losses
-let open; // {id, run, at, plot, timer}; at: observations of the picture that was chosen, undefined for the latest
+const HEIGHT = 260; // px of a plot
+const LOSSES = 0.98; // share of the losses within the epochs that the plot shows: the first ones are far higher
+let open; // {id, run, runs, others, at, plots, timer}; at: observations of the picture that was chosen, undefined for the latest
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
 export function leaveRun() {
   if (!open) return;
   clearTimeout(open.timer);
-  open.plot?.destroy();
+  open.plots.forEach(plot => plot.destroy());
   open = undefined;
 }
 
-export async function showRun(id) {
-  const now = open = {id, at: undefined};
-  const run = await request(`/runs/${id}`);
+// shown: `with`, the other runs that are laid over this one.
+export async function showRun(id, shown) {
+  const others = (shown.get("with") ?? "").split(",").filter(Boolean), now = open = {id, others, plots: [], runs: []};
+  const runs = await load(now);
   if (open != now) return;
   element("run").hidden = false;
-  update(run);
+  update(runs);
 }
+
+// This run, and those laid over it; the others that there are.
+async function load({id, others}) {
+  const [all, ...runs] = await Promise.all([request("/runs"), ...[id, ...others].map(each => request(`/runs/${each}`))]);
+  return {all, runs};
+}
+
+const nameOf = ({folder}) => folder.split(/[\\/]/).at(-1);
+const UNITS = {val_loss: "validation loss", val_drift: "drift"};
+// Which epoch is the best, why, and whether its drift says the same.
+function best({best, history}) {
+  if (!best) return "none yet";
+  const steadiest = history.filter(row => row.val_drift != null).sort((a, b) => a.val_drift - b.val_drift)[0];
+  return `epoch ${best.epoch}, in model-best.pt: it has the least ${UNITS[best.by]}, ${best.by == "val_drift" ? metres(best.value) : loss(best.value)}` +
+    (steadiest && steadiest.epoch != best.epoch ? `; the least drift, ${metres(steadiest.val_drift)}, is that of epoch ${steadiest.epoch}` : "");
+}
+
+const metres = value => value == null ? "–" : `${value.toFixed(2)} m`;
 
 export const stateOf = ({state, history, epochs, samples_per_epoch: samples, images, left}) => {
   if (state == "finished") return `finished: ${many(epochs, "epoch")}`;
@@ -38,11 +60,11 @@ function duration(seconds) {
 
 async function refresh(now) {
   try {
-    const run = await request(`/runs/${now.id}`);
+    const found = await load(now);
     if (open != now) return;
     if (now.lost) notice();
     now.lost = false;
-    update(run);
+    update(found);
   } catch (error) {
     if (open != now) return;
     now.lost = true;
@@ -51,59 +73,80 @@ async function refresh(now) {
   }
 }
 
-function update(run) {
-  const now = open, before = now.run;
-  now.run = run;
-  const name = run.folder.split(/[\\/]/).at(-1), {history} = run, last = history.at(-1);
-  const best = history.filter(row => row.val_loss != null).sort((a, b) => a.val_loss - b.val_loss)[0];
+function update({all, runs}) {
+  const now = open, before = now.runs, [run] = runs, {history} = run, last = history.at(-1);
+  Object.assign(now, {run, runs});
+  const name = nameOf(run);
   element("title").textContent = `/ training run in ${name}`;
   document.title = `${run.state}: ${name}`;
   const share = run.state == "finished" ? 1 : (history.length + Math.min(1, run.images / run.samples_per_epoch)) / run.epochs;
   element("run-bar").value = Math.min(1, share);
   element("run-bar").setAttribute("aria-valuetext", stateOf(run));
   const lines = Object.entries({
-    state: stateOf(run),
-    "this epoch": run.images ? `${run.images.toLocaleString("en")} of ${run.samples_per_epoch.toLocaleString("en")} images` +
-      (run.state == "running" ? `, as of ${Math.round(run.age)} s ago` : "") : "–",
-    rate: run.rate ? `${Math.round(run.rate).toLocaleString("en")} images/s` : "–",
-    "last epoch": last ? `loss ${loss(last.loss)}, validation ${loss(last.val_loss)}` +
-      (last.val_drift == null ? "" : `, drift in two seconds of driving ${last.val_drift.toFixed(2)} m`) : "none finished yet",
-    "lowest loss": best ? `validation ${loss(best.val_loss)} in epoch ${best.epoch}` : "–",
-    trained: run.robust ? "with --robust" : "as in the report",
-    folder: run.folder,
+    state: stateOf(run) + (run.rate && run.state == "running" ? `; ${Math.round(run.rate).toLocaleString("en")} images/s, as of ${Math.round(run.age)} s ago` : ""),
+    best: best(run),
+    "last epoch": last ? `drift ${metres(last.val_drift)}, validation loss ${loss(last.val_loss)}, training loss ${loss(last.loss)}` : "none finished yet",
+    trained: `${run.robust ? "with --robust" : "as in the report"}, in ${run.folder}`,
   });
+  element("run-figures").replaceChildren(...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)]));
   element("run-read").hidden = !run.recordings.length;
   element("run-count").textContent = many(run.recordings.length, "recording");
   renew(element("run-recordings"), run.recordings, () => run.recordings.map(folder => make("li", folder)));
-  element("run-figures").replaceChildren(...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)]));
-  if (JSON.stringify([before?.history, before?.loss]) != JSON.stringify([history, run.loss])) draw();
+  const others = all.filter(each => each.id != now.id && !each.message);
+  renew(element("run-others"), [now.others, others.map(({id, folder}) => [id, folder])], () => others.length ? ["Lay over it", ...others.map(each => {
+    const isShown = now.others.includes(String(each.id)), button = make("button", nameOf(each), {"aria-pressed": isShown, title: each.folder});
+    const chosen = isShown ? now.others.filter(id => id != each.id) : [...now.others, each.id];
+    onClick(button, () => location.hash = `#/run/${now.id}${chosen.length ? `?with=${chosen}` : ""}`);
+    return button;
+  })] : []);
+  showOptions(runs);
+  const shown = all => JSON.stringify(all.map(({history, trail, loss}) => [history, trail, loss]));
+  if (shown(before) != shown(runs)) draw();
   showPictures();
   now.timer = setTimeout(() => refresh(now), AGAIN[run.state]);
 }
 
+// The options of one run, or those in which several differ.
+function showOptions(runs) {
+  const names = [...new Set(runs.flatMap(({options}) => Object.keys(options)))];
+  const shown = names.filter(name => runs.length == 1 || new Set(runs.map(({options}) => options[name])).size > 1);
+  element("run-options").firstElementChild.textContent = runs.length == 1 ? "Its options" : `Options in which they differ (${shown.length})`;
+  renew(element("run-table"), runs.map(({options, folder}) => [folder, options]), () => [
+    make("tr", "", {}, make("th", "option", {scope: "col"}), ...runs.map(run => make("th", nameOf(run), {scope: "col"}))),
+    ...shown.map(name => make("tr", "", {}, make("th", name, {scope: "row"}), ...runs.map(({options}) => make("td", options[name] ?? "–")))),
+  ]);
+}
+
 const loss = value => value == null ? "not a number" : value.toFixed(4);
 
-// The losses by epoch; that of the epoch which is not finished yet is a point as far into it.
+// Drift and losses by epoch, of all runs, and the losses within the epochs.
 function draw() {
-  const {run, plot} = open, holder = element("losses"), colours = getComputedStyle(document.body);
-  plot?.destroy();
-  holder.replaceChildren();
-  const {history} = run, done = history.length;
-  const now = run.loss == null ? [] : [done + Math.min(1, run.images / run.samples_per_epoch)];
-  const x = [...history.map(row => row.epoch), ...now], none = now.map(() => null);
-  const colour = name => colours.getPropertyValue(name), axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
-    grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
-  const curve = (name, paint) => ({label: name, stroke: paint, width: 2, spanGaps: false, points: {show: true, size: 6, fill: paint}});
-  open.plot = new uPlot({
-    width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
-    scales: {x: {time: false, range: [0, Math.max(1, run.epochs)]}, y: {range: (_, low, high) => [0, (high || 0.1) * 1.08]}},
-    axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font, incrs: [1, 2, 5, 10, 20, 50, 100]}, {...axis, size: 56}],
-    series: [{label: "epoch", value: (_, at) => at == null ? "–" : at.toFixed(Number.isInteger(at) ? 0 : 2)},
-      {...curve("training", colour("--line")), value: (_, value) => value?.toFixed(4) ?? "–"},
-      {...curve("validation", "#d55e00"), value: (_, value) => value?.toFixed(4) ?? "–"},
-      {...curve("this epoch so far", colour("--good")), value: (_, value) => value?.toFixed(4) ?? "–"}],
-  }, [x, [...history.map(row => row.loss), ...none], [...history.map(row => row.val_loss), ...none],
-    [...history.map(() => null), ...now.map(() => run.loss)]], holder);
+  const {runs, plots} = open, colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
+  plots.forEach(plot => plot.destroy());
+  const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif", grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
+  const [drift, losses] = [[], []]; // [epochs, values], and the curve's looks
+  runs.forEach((run, at) => {
+    const {history, trail} = run, paint = at ? MODEL_COLOURS[(at - 1) % MODEL_COLOURS.length] : colour("--line");
+    const of = runs.length > 1 ? `${nameOf(run)} ` : "", epochs = history.map(({epoch}) => epoch), values = key => history.map(row => row[key]);
+    const points = {show: true, size: 7, fill: paint}, chosen = run.best?.by == "val_drift" ? drift : losses;
+    drift.push([[epochs, values("val_drift")], {label: `${of}drift`, stroke: paint, width: 2, points}]);
+    losses.push([[epochs, values("val_loss")], {label: `${of}validation`, stroke: paint, width: 2, points}],
+      [[epochs, values("loss")], {label: `${of}training`, stroke: paint, width: 1, dash: [5, 3], points: {...points, fill: colour("--paper"), stroke: paint}}],
+      [[trail.map(([done]) => done), trail.map(([, loss]) => loss)], {label: `${of}within the epoch`, stroke: `color-mix(in srgb, ${paint} 55%, transparent)`, width: 1, points: {show: false}}]);
+    if (run.best) chosen.push([[[run.best.epoch], [run.best.value]], {label: `${of}best`, stroke: colour("--good"), width: 0, points: {show: true, size: 15, width: 3, fill: "transparent", stroke: colour("--good")}}]);
+  });
+  open.plots = [[drift, 2, " m"], [losses, 4, ""]].map(([curves, digits, unit], at) => {
+    const holder = element("losses").children[at].lastElementChild;
+    holder.replaceChildren();
+    const most = curves.flatMap(([[x, y], {label}]) => label.endsWith("within the epoch") ? y.toSorted((a, b) => a - b).slice(0, Math.ceil(LOSSES * y.length)).slice(-1) : y);
+    return new uPlot({
+      width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
+      scales: {x: {time: false, range: [0, Math.max(...runs.map(({epochs}) => epochs))]}, y: {range: [0, Math.max(...most, 0) * 1.08 || 0.1]}},
+      axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font, incrs: [1, 2, 5, 10, 20, 50, 100]}, {...axis, size: 56}],
+      series: [{label: "epoch", value: (_, at) => at == null ? "–" : at.toFixed(Number.isInteger(at) ? 0 : 2)},
+        ...curves.map(([, looks]) => ({...looks, spanGaps: true, value: (_, value) => value == null ? "–" : value.toFixed(digits) + unit}))],
+    }, uPlot.join(curves.map(([values]) => values), curves.map(() => [0, 1])), holder);
+  });
 }
 
 function showPictures() {
@@ -137,5 +180,5 @@ export function pressedInRun(key) {
 element("run-earlier").onclick = () => step(-1);
 element("run-later").onclick = () => step(1);
 dark.addEventListener("change", () => open?.run && draw());
-new ResizeObserver(() => open?.plot?.setSize({width: Math.max(200, element("losses").clientWidth), height: HEIGHT}))
-  .observe(element("losses"));
+new ResizeObserver(() => open?.plots.forEach(({root, setSize}) =>
+  setSize({width: Math.max(200, root.parentNode.clientWidth), height: HEIGHT}))).observe(element("losses"));

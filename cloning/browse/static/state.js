@@ -1,4 +1,4 @@
-// The recording that is shown, for the parts of its page.
+// The recording that is shown, for the parts of its page, and the address that shows the same again.
 import {ask, element, make, notice, onClick} from "./common.js";
 
 // Its details and columns, its frames and curves, marks, and the row; undefined while none is shown. recording.js
@@ -7,6 +7,25 @@ export const page = {open: undefined};
 
 export function say(text) {
   element("said").textContent = text;
+}
+
+// Write what is shown into the address, soon: browsers allow few changes a second.
+export function remember() {
+  const now = page.open;
+  now.noting ??= setTimeout(() => {
+    now.noting = undefined;
+    if (now == page.open) note();
+  }, 300);
+}
+
+export function note() {
+  const {id, row, limit, attention, condition, plots: {zoom}, marks: {first, last}, speed, loop, paths} = page.open;
+  const state = {
+    limit, look: attention, find: condition, speed: speed == 1 ? null : speed, loop: loop ? 1 : null, paths: paths ? null : 0,
+    zoom: zoom && zoom.map(Math.round).join("-"), mark: first == undefined && last == undefined ? null : `${first ?? ""}-${last ?? ""}`,
+  };
+  const shown = new URLSearchParams(Object.entries(state).filter(([, value]) => value != null && value !== ""));
+  history.replaceState(null, "", `#/${id}/${row}${shown.size ? `?${shown}` : ""}`);
 }
 
 // Make a request about the recording, and show the details that answer it.

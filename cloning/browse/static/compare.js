@@ -1,0 +1,68 @@
+// Several recordings and several models in one table: how they were driven, and how the models steer and drive there.
+import {ask, element, make, many, notice, onClick, renew} from "./common.js";
+import {LIMITS} from "./replays.js";
+
+const AGAIN = 2000; // ms until recordings whose analyses are not done are asked for again
+let open; // {limit, ids, found, timer}
+
+export function leaveComparison() {
+  clearTimeout(open?.timer);
+  open = undefined;
+}
+
+// shown: ids, separated by commas, all if there are none; limit of the replays.
+export async function showComparison(shown) {
+  const now = open = {limit: shown.get("limit") ?? LIMITS[0], ids: shown.get("ids")?.split(",")};
+  now.ids ??= (await ask("")).map(({id}) => id);
+  if (open != now) return;
+  element("title").textContent = "/ compared";
+  document.title = "Recordings compared";
+  element("comparison").hidden = false;
+  renew(element("comparing"), now.limit, () => ["Replays at a limit of", ...LIMITS.map(limit => {
+    const button = make("button", `${limit} m`, {"aria-pressed": limit == now.limit});
+    onClick(button, () => location.hash = `#/compare?${new URLSearchParams({...shown.get("ids") && {ids: shown.get("ids")}, limit})}`);
+    return button;
+  })]);
+  await refresh(now, "GET");
+}
+
+async function refresh(now, method) {
+  const found = await Promise.all(now.ids.map(id => ask(`/${id}/compared?limit=${now.limit}`, {method})));
+  if (open != now) return;
+  const states = found.flatMap(({models = []}) => models.flatMap(({steering, replay}) => [steering.state, replay.state]));
+  const count = state => states.filter(each => each == state).length, pending = count("running") + count("waiting");
+  element("compare-all").hidden = !(count("none") + count("paused"));
+  element("compared").textContent = pending ? `${many(pending, "analysis", "analyses")} to do` : "";
+  renew(element("table"), found, () => table(found, now.limit));
+  if (pending) now.timer = setTimeout(() => refresh(now, "GET").catch(error => notice(error.message)), AGAIN);
+}
+
+element("compare-all").onclick = () => refresh(open, "POST").catch(error => notice(error.message));
+
+function table(found, limit) {
+  const names = found.find(({models}) => models)?.models.map(({name}) => name) ?? [];
+  const each = ["steering error", "autonomy", "mean distance"];
+  const head = make("tr", "", {}, ...["recording", "minutes", "road", "human's distance"].map(text => make("th", text, {rowspan: 2, scope: "col"})),
+    ...names.map(name => make("th", name, {colspan: each.length, scope: "colgroup"})));
+  const below = make("tr", "", {}, ...names.flatMap(() => each.map(text => make("th", text, {scope: "col"}))));
+  return [make("thead", "", {}, head, below), make("tbody", "", {}, ...found.map(recording => row(recording, names.length * each.length, limit)))];
+}
+
+function row({id, name, message, seconds, roads, offset, models}, columns, limit) {
+  const link = make("a", name, {href: `#/${id}?limit=${limit}`}), heading = make("th", "", {scope: "row"}, link);
+  if (message) return make("tr", "", {}, heading, make("td", "", {colspan: 3 + columns, class: "bad"}, make("p", message)));
+  const figures = models.map(({error, steering, replay}) => [
+    steering.state == "ready" && error != null ? error : waits(steering),
+    replay.state == "ready" ? replay.autonomy_percent : waits(replay),
+    replay.state == "ready" ? replay.distance_mean_m : waits(replay),
+  ]);
+  const best = [Math.min, Math.max, Math.min].map((choose, at) => choose(...figures.map(each => each[at]).filter(Number.isFinite)));
+  const written = [value => value.toFixed(3), value => `${value.toFixed(1)} %`, value => `${value.toFixed(2)} m`];
+  return make("tr", "", {}, heading, make("td", (seconds / 60).toFixed(1)),
+    make("td", roads?.map(([name]) => name).filter((name, at, all) => all.indexOf(name) == at).join(", ") || "–"),
+    make("td", offset ? `${offset[0].toFixed(2)} m` : "–"),
+    ...figures.flatMap(values => values.map((value, at) => Number.isFinite(value)
+      ? make("td", written[at](value), {class: models.length > 1 && value == best[at] ? "best" : ""}) : make("td", value))));
+}
+
+const waits = ({state, progress}) => state == "running" ? `${(100 * progress).toFixed(0)} %` : {none: "–", waiting: "waits", paused: "paused", failed: "failed", ready: "–"}[state];

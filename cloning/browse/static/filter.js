@@ -1,0 +1,136 @@
+// Finding frames by a condition, written or brushed on a histogram, and what can be done with them: cut, export.
+import {ask, element, many, notice, request} from "./common.js";
+import {askForReason, marked, showStretches} from "./cuts.js";
+import {clock, make} from "./common.js";
+import {page, remember, say} from "./state.js";
+
+const SOON = 300, BINS = 60, HEIGHT = 52; // ms after the last letter; of the histogram, and its px
+let typing, plot;
+
+// Show the frames that meet the condition in the page's state.
+export async function find() {
+  const now = page.open, {condition} = now, shown = element("matches");
+  if (element("condition").value.trim() != condition) element("condition").value = condition;
+  shown.className = "";
+  if (condition) {
+    try {
+      const query = new URLSearchParams({condition, version: now.details.version, ...now.limit && {limit: now.limit}});
+      const found = await ask(`/${now.id}/matches?${query}`);
+      if (page.open != now || now.condition != condition) return;
+      now.matches = found;
+      shown.textContent = found.rows ? `${many(found.rows, "frame")} in ${many(found.stretches.length, "stretch", "stretches")}` : "no frame";
+    } catch (error) {
+      if (page.open != now || now.condition != condition) return;
+      now.matches = undefined;
+      shown.textContent = error.message.replace("condition: ", "");
+      shown.className = "bad";
+    }
+  } else {
+    now.matches = undefined;
+    shown.textContent = "";
+  }
+  now.jumps.match = (now.matches?.stretches ?? []).map(([first]) => first);
+  element("cut-matches").disabled = !now.jumps.match.length;
+  showStretches();
+  remember();
+}
+
+function set(condition) {
+  page.open.condition = condition;
+  return find();
+}
+
+element("condition").oninput = () => {
+  clearTimeout(typing);
+  typing = setTimeout(() => page.open && set(element("condition").value.trim()), SOON);
+};
+element("filter").onsubmit = event => event.preventDefault();
+element("cut-matches").onclick = () =>
+  askForReason(page.open.matches.stretches.map(([, , first, last]) => ({first, last})), page.open.condition);
+
+// ---------------------------------------------------------------------------------------------------------------------
+// The histogram
+
+// The columns by the names that conditions have for them.
+function columns() {
+  const {columns, details: {models}} = page.open;
+  const names = {steering: columns.steering, throttle: columns.throttle, speed: columns.speed, offset: columns.offset, label: columns.label};
+  models.forEach((_, index) => names[`model${index + 1}`] = columns[`model-${index}`]);
+  return Object.entries(names).filter(([, values]) => values);
+}
+
+export function showHistogram() {
+  const select = element("of"), known = columns(), chosen = select.value || "steering";
+  if (select.options.length != known.length) {
+    select.replaceChildren(...known.map(([name]) => make("option", name)));
+    select.value = known.some(([name]) => name == chosen) ? chosen : "steering";
+  }
+  const name = select.value, values = known.find(each => each[0] == name)[1];
+  const [low, high] = values.reduce(([low, high], value) => [Math.min(low, Number.isNaN(value) ? low : value), Math.max(high, Number.isNaN(value) ? high : value)], [Infinity, -Infinity]);
+  const [from, to] = low < high ? [low, high] : [low - 0.5, low + 0.5], wide = (to - from) / BINS, counts = new Array(BINS).fill(0);
+  for (const value of values) if (!Number.isNaN(value)) counts[Math.min(BINS - 1, Math.floor((value - from) / wide))] += 1;
+  const colours = getComputedStyle(document.body), holder = element("histogram");
+  plot?.destroy();
+  holder.setAttribute("aria-label", `Histogram of ${name}, on a square-root scale`);
+  plot = new uPlot({
+    width: Math.min(300, innerWidth - 24), height: HEIGHT, legend: {show: false}, padding: [2, 10, 0, 10],
+    cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
+    scales: {x: {time: false, range: [from, to]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value, range: (_, low, high) => [0, Math.max(1, high)]}},
+    axes: [{stroke: colours.getPropertyValue("--quiet"), size: 16, gap: 1, space: 40, grid: {show: false}, ticks: {show: false}, font: "11px system-ui, sans-serif"}, {show: false}],
+    series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, points: {show: false}, paths: uPlot.paths.bars({size: [0.9, 100]})}],
+    hooks: {setSelect: [plot => {
+      const {left, width} = plot.select, value = px => Number(plot.posToVal(px, "x").toPrecision(3));
+      if (width > 3) brush(name, value(left), value(left + width));
+      plot.setSelect({left: 0, width: 0, top: 0, height: 0}, false);
+    }]},
+  }, [counts.map((_, bin) => from + (bin + 0.5) * wide), counts], holder);
+}
+
+// The condition for a range of values, in place of an earlier one of the same column.
+function brush(name, low, high) {
+  const others = page.open.condition.split(" and ").filter(part => part && !part.includes(` <= ${name} <= `));
+  set([...others.map(part => part.includes(" or ") ? `(${part})` : part), `${low} <= ${name} <= ${high}`].join(" and "));
+}
+
+element("of").onchange = showHistogram;
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => page.open && showHistogram());
+
+// ---------------------------------------------------------------------------------------------------------------------
+// Export: of the marked stretch, or the matches, or what the curves show
+
+function selected() {
+  const {matches, plots: {zoom}, count} = page.open, stretch = marked();
+  if (stretch) return ["the marked stretch", [stretch]];
+  if (matches?.stretches.length) return ["what matches", matches.stretches];
+  return zoom ? ["what the curves show", [[Math.ceil(zoom[0]), Math.floor(zoom[1]) + 1]]] : ["the whole recording", [[0, count]]];
+}
+
+export function askToExport() {
+  const [what, stretches] = selected(), frames = stretches.reduce((sum, [first, end]) => sum + end - first, 0);
+  element("selection").textContent = `${what}: ${many(frames, "frame")}`;
+  element("export-name").value ||= `${page.open.details.name}-part`;
+  element("export").returnValue = "";
+  element("export").showModal();
+}
+
+element("export").onclose = async () => {
+  const now = page.open, kind = element("export").returnValue, name = element("export-name").value;
+  if (!kind || !now) return;
+  const rows = selected()[1].map(([first, end]) => `${first}-${end}`).join(), {version} = now.details;
+  try {
+    if (kind == "film") {
+      say("Making the film …");
+      const film = await request(`/recordings/${now.id}/film.mp4?${new URLSearchParams({rows, version})}`, {binary: true});
+      const address = URL.createObjectURL(new Blob([film], {type: "video/mp4"}));
+      make("a", "", {href: address, download: `${name}.mp4`}).click();
+      setTimeout(() => URL.revokeObjectURL(address), 60000);
+      return say(`The film is saved: ${name}.mp4.`);
+    }
+    const {folder} = await ask(`/${now.id}/export?version=${version}`, {
+      method: "POST", headers: {"Content-Type": "application/json"}, body: JSON.stringify({rows, name}),
+    });
+    say(`Written: ${folder}. The list has it.`);
+  } catch (error) {
+    notice(error.message);
+  }
+};
