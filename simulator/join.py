@@ -18,13 +18,18 @@ from simulator.dialects import Dialect
 ASK_AGAIN = 5.0  # s without an answer, after which the telemetry is sent again: programs drop some
 SETTLE = 0.2  # s without a word from the server, after which its greeting is over
 STILL = 1 / 15  # s of real time between two telemetries while simulated time stands still
+# A driver in another thread than the program's answers is waited for: s at most, until one is known to be there and
+# then; and for so many equal answers in a row, because commands may be constant.
+BRIEFLY, PATIENTLY, EQUAL_ANSWERS = 0.15, 2.0, 3
 MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 200,000
 
 
 class Joined(ClientSession):
     """Sends telemetry to a server and does what it says, until the server has gone for `wait` seconds.
 
-    In lock-step simulated time waits for the answer to each telemetry; otherwise it follows the wall clock.
+    In lock-step simulated time waits for the answer to each telemetry; otherwise it follows the wall clock. Where a
+    program answers at once, with what its driver has commanded last, an answer that equals the one before is of no use:
+    the same telemetry is sent again until the driver has seen it.
     """
 
     def __init__(self, dialect: Dialect, host: str, port: int, wait: float, pace: float, rate: float):
@@ -35,6 +40,7 @@ class Joined(ClientSession):
         super().__init__(host, port, wait, max_packet=MAX_PACKET)
         self.dialect, self.pace, self.period = dialect, pace, max(STEP, 1 / rate)
         self.frames, self.time, self.due = 0, 0.0, 0.0  # sent; simulated s in all; when the next is due
+        self._thinking, self._equal, self._apart = 0.02, 0, False  # s; equal answers; whether the driver is a thread
         self._origin = 0.0  # simulated s at time.perf_counter() 0, with a pace
 
     def run(self) -> None:
@@ -65,10 +71,35 @@ class Joined(ClientSession):
         while True:
             while not self.dialect.ready:
                 self._listen(ASK_AGAIN)
-            self.connection.send(self.dialect.telemetry())
-            self.frames += 1
-            if self._await_answer():
+            telemetry = self.dialect.telemetry()
+            if self._ask(telemetry):
+                if not self.pace:
+                    self._await_driver(telemetry)
                 self._drive()
+
+    def _ask(self, telemetry: str) -> bool:
+        """Send a telemetry; return whether it was answered."""
+        self.connection.send(telemetry)
+        self.frames += 1
+        return self._await_answer()
+
+    def _await_driver(self, telemetry: str) -> None:
+        """Send the telemetry again while the answer is the one before, until the driver must have seen it."""
+        begin, pause = time.monotonic(), self._thinking
+        until = begin + (PATIENTLY if self._apart else BRIEFLY)
+        waited = False
+        while self.dialect.stale and self._equal < EQUAL_ANSWERS and time.monotonic() < until:
+            waited = True
+            self._listen(pause)
+            self._ask(telemetry)
+            pause *= 1.5
+        if self.dialect.stale:
+            self._equal += 1
+        else:
+            self._equal = 0
+            if waited:
+                self._apart = True
+                self._thinking += 0.1 * (min(time.monotonic() - begin, 0.2) - self._thinking)
 
     def _listen(self, pause: float) -> bool:
         """Do what the server says until it is silent for `pause` seconds; return whether it answered a telemetry."""
