@@ -61,10 +61,11 @@ class Dialect:
     still  whether simulated time stands still until the program says something else
     ready  whether the program is to get telemetry
     more   s after an answer in which more may come that belongs to it
-    stale  whether the last answer is the one before, and so perhaps of a driver that has not seen the telemetry yet
+    apart  whether the program's driver may be in another thread than its answers
+    same   whether the last answer is the same as the one before
     """
 
-    more, stale = 0.0, False
+    more, apart, same = 0.0, False, False
 
     def __init__(self, stage: Stage):
         self.stage, self.still, self.ready, self.episodes = stage, False, True, 0
@@ -172,6 +173,8 @@ class Roads(Dialect):
     These programs answer at once, with what their driver, in another thread, has commanded last.
     """
 
+    apart = True
+
     def __init__(self, stage: Stage):
         super().__init__(stage)
         self.text = ""  # of the road that lies there
@@ -180,7 +183,7 @@ class Roads(Dialect):
 
     def handle(self, event: str, data: Any) -> bool:
         """Steer, lay a road, or set the car back at its start. Raises TrackError for a text that is no road."""
-        self.stale, self._last = event == "steer" and data == self._last, data
+        self.same, self._last = event == "steer" and data == self._last, data
         if event == "steer":
             self.still = self.run.at_end
             return self.apply(parse_commands(data))

@@ -159,7 +159,8 @@ def test_a_driver_in_another_thread_is_waited_for_however_slow_it_is():
                         continue
                     data = latest.pop("data")
                 time.sleep(pause)
-                latest["command"] = steer(-0.6 * number(data, "cte") - number(data, "angl") / 25, 0.8)
+                steering = -0.6 * number(data, "cte") - number(data, "angl") / 25
+                latest["command"] = steer(steering, 1 - (number(data, "speed") / 10) ** 2)
 
         def answer(data, n, tests=tests, lock=lock, latest=latest):
             answers = tests(data, n)
