@@ -72,6 +72,7 @@ class Cameras:
     def __init__(self, scene: Scene, names: tuple[str, ...] = CAMERAS):
         """Mount the named cameras on the scene's car."""
         self.scene = scene
+        self.last: np.ndarray | None = None  # what `frames` has returned last
         mounted = []
         for name in names:
             camera = scene.car.attach_new_node(core.Camera(name, lens()))
@@ -87,4 +88,5 @@ class Cameras:
         rows = self.buffer.render().reshape(-1, COLUMNS, 3)
         tall = cv2.addWeighted(rows[0::2], 0.5, rows[1::2], 0.5, 0)  # as cv2.resize by area, in a sixteenth of its time
         tone = self.scene.scenery.tone
-        return (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)
+        self.last = (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)
+        return self.last
