@@ -124,7 +124,9 @@ def add_drive(commands: "Subparsers") -> None:
     )
     parser.add_argument("--report", metavar="FILE", help="write the lap report as JSON")
     parser.add_argument("--picture", metavar="FILE.png", help="plot the track from above with the path driven")
-    parser.add_argument("--film", metavar="FILE.mp4", help="film the drive from behind the car")
+    parser.add_argument(
+        "--film", metavar="FILE.mp4", help="film the drive from behind the car, with what its camera sees"
+    )
 
 
 def add_correct(commands: "Subparsers") -> None:
@@ -307,7 +309,7 @@ def run_drive(arguments: argparse.Namespace) -> int:
 
     steps: list[Callable[[], object]] = [lambda: client.drive(arguments.laps), print_report]
     if arguments.film:
-        film = ChaseFilm(arguments.film, scene)
+        film = ChaseFilm(arguments.film, scene, client.cameras)
         client.watch = functools.partial(film.watch, run)
         steps.append(film.close)
     if arguments.report:

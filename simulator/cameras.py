@@ -71,6 +71,7 @@ class Cameras:
 
     def __init__(self, scene: Scene, names: tuple[str, ...] = CAMERAS):
         """Mount the named cameras on the scene's car."""
+        self.last: np.ndarray | None = None  # what `frames` has returned last
         self.mounted = [core.NodePath(core.Camera(name, lens())) for name in names]
         for name, camera in zip(names, self.mounted, strict=True):
             camera.node().set_camera_mask(INSIDE)
@@ -91,7 +92,8 @@ class Cameras:
         rows = self.buffer.render().reshape(-1, COLUMNS, 3)
         tall = cv2.addWeighted(rows[0::2], 0.5, rows[1::2], 0.5, 0)  # as cv2.resize by area, in a sixteenth of its time
         tone = self.scene.scenery.tone
-        return (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)
+        self.last = (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)
+        return self.last
 
     def segments(self, transform: core.TransformState) -> np.ndarray:
         """Render the first camera's frame without mixing neighbouring pixels: uint8 (160, 320, 3), RGB."""

@@ -7,13 +7,14 @@ from panda3d.core import Camera, NodePath, TransformState, Vec3
 from cloning.base.film import DriveFilm
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
-from simulator.cameras import Buffer, lens
+from simulator.cameras import Buffer, Cameras, lens
 from simulator.run import Run
 from simulator.world import OUTSIDE, Scene
 
 FILM_ROWS, FILM_COLUMNS = 360, 640
 # bits/s: 9 MB for a lake lap of 284 s, at 9 mph. Without a limit it takes 47 MB, most of them for the asphalt's grain.
 MAX_BITS = 250_000
+INSET, MARGIN = (100, 200), 8  # rows and columns of what the car's camera sees, and its distance from the corner
 DISTANCE_BEHIND, HEIGHT_ABOVE = 7.5, 2.9  # m from the car to the camera
 TARGET_AHEAD, TARGET_HEIGHT = 4.0, 1.0  # m from the car to the point that the camera looks at
 
@@ -60,15 +61,21 @@ class ChaseView:
 class ChaseFilm(DriveFilm):
     """A film of 15 frames per simulated second."""
 
-    def __init__(self, path: str, scene: Scene):
-        """Open the film. Raises OutputError."""
+    def __init__(self, path: str, scene: Scene, cameras: Cameras | None = None):
+        """Open the film; cameras: the first one's last frame is shown in a corner. Raises OutputError."""
         super().__init__(path, SAMPLE_RATE, quality=28, max_bits=MAX_BITS)
-        self.view, self.clock = ChaseView(scene), SampleClock()
+        self.view, self.clock, self.cameras = ChaseView(scene), SampleClock(), cameras
 
     def watch(self, run: Run) -> None:
         """Append a frame if one is due; call this after each physics step."""
         if not self.error and self.clock.due(run.time):
-            self.add(self.view.frame(run))
+            frame = self.view.frame(run)
+            if self.cameras and self.cameras.last is not None:
+                rows, columns = INSET
+                seen = cv2.resize(self.cameras.last[0], (columns, rows), interpolation=cv2.INTER_AREA)
+                seen = cv2.rectangle(seen, (0, 0), (columns - 1, rows - 1), (255, 255, 255), 1)
+                frame[MARGIN : MARGIN + rows, -MARGIN - columns : -MARGIN] = seen
+            self.add(frame)
 
 
 def caption(frame: np.ndarray, run: Run) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict
 import numpy as np
 
 from cloning.base.outputs import write_output
+from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import STEP
@@ -149,7 +150,8 @@ def report_text(report: LapReport) -> str:
 def write_picture(path: str | Path, run: Run) -> None:
     """Plot a drive as PNG: the track from above with the car's path, and the lateral offset along the way.
 
-    The path's colours reach as far as the car's largest distance from the centre line. Raises OutputError.
+    The path's colours reach to 1 m, as in the pictures of other drives, or as far as the car was from the centre line.
+    Raises OutputError.
     """
     from matplotlib import colors  # here, because loading matplotlib takes long and only this function needs it
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -173,7 +175,7 @@ def write_picture(path: str | Path, run: Run) -> None:
     offset = np.array(trajectory.offset)[::every]
     metres = np.cumsum(trajectory.speed)[::every] * STEP
     joined = np.linalg.norm(np.diff(path_driven, axis=0), axis=1) < JUMP
-    scale = max(0.1, math.ceil(10 * np.abs(offset).max(initial=0)) / 10)
+    scale = max(LIMITS[0], math.ceil(10 * np.abs(offset).max(initial=0)) / 10)
     segments = np.stack([path_driven[:-1], path_driven[1:]], axis=1)
     lines = LineCollection(list(segments[joined]), cmap="viridis", norm=colors.Normalize(0, scale), linewidth=2.5)
     lines.set_array(np.abs(offset)[:-1][joined])

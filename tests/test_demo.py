@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from browser import LOOKS, chromium, needs_chromium
 
 from cloning.base import program
 from cloning.base.errors import SimulatorError
@@ -102,3 +103,18 @@ def test_the_page_needs_nothing_but_the_files_beside_it(commands):
         "diagnostic_images/training_generator_augmented-0.png",
     }
     assert all(text in page for text in (demo.ACTIVATE, *(command for command, _ in demo.NEXT)))
+
+
+@needs_chromium
+def test_the_page_fits_every_screen_and_bars_nobody_and_its_films_start_by_themselves(commands, tmp_path):
+    demo.main([])
+    with chromium(tmp_path / "profile") as page:
+        for width, dark in LOOKS:
+            page.look(width, 900, dark)
+            page.open((demo.FOLDER / "index.html").resolve().as_uri())
+            page.wait("document.readyState == 'complete'")
+            assert page.fits() and page.has_colours(dark) and page.barriers() == []
+            assert page.run("[...document.querySelectorAll('video')].every(film => film.autoplay && film.muted)")
+            assert page.run(
+                "document.querySelector('dd').clientWidth > 0.8 * document.querySelector('main').clientWidth"
+            )

@@ -134,7 +134,8 @@ def in_words(report: LapReport) -> str:
 def page() -> str:
     """Return the page: one HTML file that needs nothing but the files beside it."""
     figures = [
-        f'<figure><video src="{lap.name}/lap.mp4" controls muted loop playsinline preload="metadata"></video>'
+        f'<figure><video src="{lap.name}/lap.mp4" controls autoplay muted loop playsinline '
+        f'aria-label="{html.escape(lap.title)}, from behind the car"></video>'
         f"<figcaption><b>{html.escape(lap.title)}</b> {html.escape(in_words(lap.report()))}.</figcaption></figure>"
         for lap in DRIVES
     ]

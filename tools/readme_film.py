@@ -3,8 +3,8 @@
 python -m tools.readme_film                     # the network that comes with the project
 python -m tools.readme_film model.pt film.webp  # another one, into another file
 
-Left the lake, right the jungle, each first without and then with shadows, as the stand-in simulator renders them. The
-film is an animated WebP, which web pages show like a picture.
+Left the car from behind, right what its camera sees: first on the lake, then in the jungle, without and with shadows,
+as the stand-in simulator renders them. The film is an animated WebP, which web pages show like a picture.
 """
 
 import io
@@ -31,25 +31,36 @@ from simulator.scenery.looks import SHADOWED
 from tools.command import ROOT, command_line, run_tool
 
 FILM = ROOT / "diagnostic_images" / "report" / "driving.webp"
-TRACKS = ("lake", "jungle")
-LOOKS = {0: "", SHADOWED: ", in shadow"}  # the looks, in their order, and what the label says of them
-STARTS, SECONDS = {"lake": 29, "jungle": 15}, 4  # s from the start of a lap to a bend with shadows; of each clip
+CLIPS = (("lake", 0), ("jungle", 0), ("jungle", SHADOWED))  # track and look of each, one after the other
+STARTS, SECONDS = {"lake": 29, "jungle": 15}, 3  # s from the start of a lap to a bend with shadows; of each clip
 EVERY = 2  # frames: 7.5 a second are enough
-QUALITY, EFFORT = 60, 4  # of 100; of 6: the film has 0.6 MB
-WHITE = (255, 255, 255)
+QUALITY, EFFORT = 35, 6  # of 100; of 6: the film has 0.6 MB
+ROWS, STRIP = 200, 26  # of the pictures, and of the captions above them
+WHITE, ABOVE = (255, 255, 255), 18  # of the captions: colour, and row of their letters' feet
+
+
+def panel(picture: np.ndarray, words: str) -> np.ndarray:
+    """Return a picture, uint8 (rows, columns, 3), RGB, with ROWS rows and its caption above it."""
+    columns = round(picture.shape[1] * ROWS / picture.shape[0])
+    fine = cv2.INTER_CUBIC if picture.shape[0] < ROWS else cv2.INTER_AREA
+    strip = np.zeros((STRIP, columns, 3), np.uint8)
+    cv2.putText(strip, words, (8, ABOVE), cv2.FONT_HERSHEY_SIMPLEX, 0.45, WHITE, 1, cv2.LINE_AA)
+    return np.concatenate([strip, cv2.resize(picture, (columns, ROWS), interpolation=fine)])
 
 
 def clip(network: Network, track: str, look: int) -> list[np.ndarray]:
-    """Drive at 15 mph and return the frames of a clip with the overlay: uint8 (160, 320, 3), RGB."""
-    env = gymnasium.make(environment.ID, track=track, look=look, speed=15)
+    """Drive at 15 mph and return the frames of a clip: uint8 (ROWS + STRIP, columns, 3), RGB."""
+    env = gymnasium.make(environment.ID, track=track, look=look, speed=15, render_mode="rgb_array")
     frames: list[np.ndarray] = []
     frame, _ = env.reset(seed=0)
+    road = f"the {track}{', in shadow' * (look == SHADOWED)}: a network steers"
     for step in range((STARTS[track] + SECONDS) * SAMPLE_RATE):
         steering, mask = visual_backprop(network, frame)
         if step >= STARTS[track] * SAMPLE_RATE and step % EVERY == 0:
-            picture = np.ascontiguousarray(overlay(frame, steering, mask)[::2, ::2])
-            cv2.putText(picture, track + LOOKS[look], (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, WHITE, 1, cv2.LINE_AA)
-            frames.append(picture)
+            sees = panel(
+                overlay(frame, steering, mask), "what it sees; green: where it steers; magenta: what it looks at"
+            )
+            frames.append(np.concatenate([panel(np.asarray(env.render()), road), sees], axis=1))
         frame, _, terminated, _, _ = env.step(np.array([steering, 1], np.float32))
         if terminated:
             raise UserError(f"the network leaves the road of the {track} in look {look}; film another one")
@@ -67,8 +78,8 @@ def main(argv: list[str] | None = None) -> int:
     torch.set_num_threads(1)
     check_folders(options.film)
     network = load_model(options.model)
-    clips = [np.concatenate([clip(network, track, look) for look in LOOKS]) for track in TRACKS]
-    first, *rest = [Image.fromarray(picture) for picture in np.concatenate(clips, axis=2)]
+    pictures = [picture for track, look in CLIPS for picture in clip(network, track, look)]
+    first, *rest = [Image.fromarray(picture) for picture in pictures]
     film, duration = io.BytesIO(), 1000 * EVERY // SAMPLE_RATE  # ms
     compression = {"quality": QUALITY, "method": EFFORT}
     first.save(film, "WEBP", save_all=True, append_images=rest, duration=duration, loop=0, **compression)
