@@ -60,7 +60,8 @@ export async function showRecording(id, row, shown) {
   names.forEach((name, at) => columns[name] = parts[at]);
   leaveRecording();
   element("recording").hidden = false;
-  const count = columns.seconds.length, [first, last] = (shown.get("mark") ?? "").split("-").map(at => at ? Math.min(Number(at), count - 1) : undefined);
+  const count = columns.seconds.length, marks = (shown.get("mark") ?? "").split("-");
+  const [first, last] = marks.map(at => at ? Math.min(Number(at), count - 1) : undefined);
   const now = page.open = {
     id, details, columns, count, marks: {first, last}, ...changes(id), row: 0, playing: 0, jumps: {...details.jumps},
     limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
@@ -160,16 +161,20 @@ function showFindings() {
   });
   if (!found.length) found.push("Every row could be read as it is.");
   renew(element("findings"), [page.open.id, found], () => found.map(each => {
-    const [text, column] = [each].flat(), button = column ? [orderButton("Try again", "POST", `columns/${column}`)] : [];
-    return make("li", text, {}, ...button);
+    const [text, column] = [each].flat();
+    return make("li", text, {}, ...column ? [orderButton("Try again", "POST", `columns/${column}`)] : []);
   }));
 }
 
 function buttons() {
   const {details, replays, jumps} = page.open;
   const interventions = replays.flatMap(replay => replay?.where.map(([row]) => row) ?? []);
-  page.open.jumps = {...details.jumps, intervention: [...new Set(interventions)].sort((a, b) => a - b), match: jumps.match};
-  for (const reason of Object.keys(JUMPS).filter(reason => reason != "match")) element(`jump-${reason}`).disabled = !page.open.jumps[reason]?.length;
+  const inOrder = [...new Set(interventions)].sort((a, b) => a - b);
+  page.open.jumps = {...details.jumps, intervention: inOrder, match: jumps.match};
+  for (const reason of Object.keys(JUMPS)) {
+    const button = element(`jump-${reason}`);
+    if (button) button.disabled = !page.open.jumps[reason]?.length;
+  }
   for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
 }
 
