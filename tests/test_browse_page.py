@@ -257,6 +257,11 @@ def test_curves_are_zoomed_with_wheel_and_window(served, page):
     assert not page.run("document.querySelector('#window').hidden"), "it is in the address"
     page.press("0")
     page.wait("document.querySelector('#window').hidden")
+    for key in ("i", "ArrowRight", "ArrowRight", "o"):
+        page.press(key)
+    page.drag("#stretches .mark b:last-child", 0.5, 20)
+    page.until(lambda: now(page, "marks.last") > 35)
+    assert now(page, "marks.first") == 30
     assert page.complaints() == []
 
 

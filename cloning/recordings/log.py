@@ -21,8 +21,8 @@ from cloning.recordings.images import read_frame
 from cloning.recordings.rows import RowReader, read_lines
 
 WHERE_TO_GET_RECORDINGS = (
-    "Record some in the simulator (training mode, button R), or without it with `python -m simulator record "
-    "data/lake`, or unpack the public sample data there: data/README.md says how. A recording is a folder with "
+    "Record some: in the simulator (training mode, button R), or by `python -m simulator record data/lake-ccw`; or "
+    "unpack the public sample data there: data/README.md says how. A recording is a folder with "
     f"{DRIVING_LOG} and {IMAGE_FOLDER}/."
 )
 SHOWN_REJECTED = 5  # rows of each finding that are printed, so that a damaged recording does not fill the screen
