@@ -180,6 +180,7 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
     """By a condition and on the histogram; undoing outlives the page, whose address has all that it shows."""
     placed(linked, np.where(np.arange(60) > 40, 1.5, 0.0))
     recording, cuts = read_recording(linked), linked / "excluded.csv"
+    page.look(1280, 900)
     with browsing(linked) as server:
         page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4")
         page.shows("#matches", "19 frames in 1 stretch")
@@ -236,6 +237,7 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
 
 
 def test_curves_are_zoomed_with_wheel_and_window(served, page):
+    page.look(1280, 900)
     page.open(f"{served.base}{served.hash('lake sample')}/30")
     at(page, 30)
     assert page.run("document.querySelector('#window').hidden && document.querySelector('#whole').hidden")
@@ -255,6 +257,11 @@ def test_curves_are_zoomed_with_wheel_and_window(served, page):
     assert not page.run("document.querySelector('#window').hidden"), "it is in the address"
     page.press("0")
     page.wait("document.querySelector('#window').hidden")
+    for key in ("i", "ArrowRight", "ArrowRight", "o"):
+        page.press(key)
+    page.drag("#stretches .mark b:last-child", 0.5, 20)
+    page.until(lambda: now(page, "marks.last") > 35)
+    assert now(page, "marks.first") == 30
     assert page.complaints() == []
 
 

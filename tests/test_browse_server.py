@@ -232,7 +232,7 @@ def test_others_are_answered_while_a_long_log_is_read(linked):
 
 def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, monkeypatch, capsys):
     for arguments, words in (
-        ([tmp_path], f"{tmp_path}: no driving_log.csv in or below it. Record some in the simulator (training mode,"),
+        ([tmp_path], f"{tmp_path}: no driving_log.csv in or below it. Record some: in the simulator (training mode"),
         ([sample_recording, "--model", tmp_path / "m.pt"], f"{tmp_path / 'm.pt'}: no such model file"),
     ):
         monkeypatch.setattr(sys, "argv", ["browse", *map(str, arguments), "--port", "0"])

@@ -267,7 +267,7 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
             connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
             connection.request("GET", "/recordings")
             here = json.loads(connection.getresponse().read())[0]["id"]
-            body = json.dumps({"first": new.first, "last": new.last, "reason": new.reason})
+            body = json.dumps([{"first": new.first, "last": new.last, "reason": new.reason}])
             connection.request("POST", f"/recordings/{here}/cuts", body, {"Content-Type": "application/json"})
             answers.append(connection.getresponse().read().decode())
             connection.close()

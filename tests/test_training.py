@@ -334,3 +334,13 @@ def test_a_rank_prints_the_error_that_it_alone_meets(tmp_path, capsys):
         ranks = Ranks(rank=1)
         status = status_of(Mock(side_effect=error), Process(str(tmp_path / "model.pt")), ranks)
         assert (status, capsys.readouterr().err) == (2, printed)
+
+
+def test_the_losses_within_the_epochs_stay_few_in_a_long_run():
+    progress = Progress()
+    for number in range(1, 25_001):
+        progress.add(8, 8 * 0.001 * number)
+        assert len(progress.trail) == number // progress.trail_every < 2000
+    assert progress.trail_every == 20
+    batches = np.arange(1, 1251) * 20
+    np.testing.assert_allclose(progress.trail[50:], 0.001 * (batches[50:] - 9), rtol=1e-3)  # 9 batches behind

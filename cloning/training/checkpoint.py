@@ -45,7 +45,8 @@ from cloning.training.run_files import RunFiles
 EpochMetrics = dict[str, float]  # a row of training_log.csv: METRICS
 NEW_RUN = "start a new run without --resume"
 POSITION = ("number", "images", "loss", "seconds", "smooth")  # of Progress
-TRAIL_EVERY, SMOOTHED = 25, 0.96  # batches; the weight of the loss until then beside a batch's
+TRAIL_EVERY, TRAIL_LENGTH = 5, 2000  # batches between two losses of `Progress.trail`, doubled when it has so many
+SMOOTHED = 0.9  # weight of the losses until then beside a batch's
 METRICS = ("epoch", "images", "seconds", "loss", "val_loss", "val_drift")  # of EpochMetrics
 COUNTS = {"number", "images", "epoch"}
 MAY_CHANGE = {"recordings", "epochs"}  # with --resume; a fingerprint checks the recordings' contents
@@ -58,8 +59,8 @@ class Progress:
 
     number                 of the next batch, from 0, counted over all epochs
     images, loss, seconds  so far in this epoch; loss is the sum of squared errors
-    smooth                 mean loss of the last batches: an exponential moving average over some 25
-    trail                  smooth after each TRAIL_EVERY batches, of all epochs: the losses within them
+    smooth                 mean loss of the last batches: an exponential moving average over some 10
+    trail                  smooth after every `trail_every` batches, of all epochs: the losses within them
     history                the metrics of each finished epoch
     run                    a random identifier, by which a run recognises its own files; None from an earlier version
     """
@@ -85,7 +86,7 @@ class Progress:
             "images": self.images,
             "seconds": round(self.seconds, 3),
             "loss": self.loss / self.images if self.images else None,
-            "trail_every": TRAIL_EVERY,
+            "trail_every": self.trail_every,
             "trail": [float(f"{loss:.4g}") for loss in self.trail],
         }
 
@@ -93,10 +94,20 @@ class Progress:
         """Count a batch; loss: its sum of squared errors."""
         self.smooth = SMOOTHED * self.smooth + (1 - SMOOTHED) * loss / images if self.number else loss / images
         self.number += 1
-        if self.number % TRAIL_EVERY == 0:
+        if self.number % self.trail_every == 0:
             self.trail.append(self.smooth)
+        if len(self.trail) == TRAIL_LENGTH:
+            del self.trail[::2]
         self.images += images
         self.loss += loss
+
+    @property
+    def trail_every(self) -> int:
+        """The number of batches between two losses of the trail."""
+        every = TRAIL_EVERY
+        while self.number >= TRAIL_LENGTH * every:
+            every *= 2
+        return every
 
     def done(self, recipe: Recipe) -> float:
         """Return the finished share of the run, 0..1 or, in the last batch, a little more."""

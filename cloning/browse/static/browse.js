@@ -5,11 +5,13 @@ import {showList, leaveList} from "./list.js";
 import {showRun, leaveRun, pressedInRun} from "./run.js";
 import {showRecording, leaveRecording, pressed, KEYS} from "./recording.js";
 
-const VIEWS = ["list", "comparison", "recording", "run"], AGAIN = 5000; // ms until a view that could not be shown is tried again
+const VIEWS = ["list", "comparison", "recording", "run"];
+const AGAIN = 5000; // ms until a view that could not be shown is tried again
 let routed = 0, again; // number of the last view, what an earlier one says is dropped; timer of the next try
 
 async function route(isAgain) {
-  const [path, query = ""] = location.hash.split("?"), [, id, row] = path.split("/"), shown = new URLSearchParams(query), number = ++routed;
+  const [path, query = ""] = location.hash.split("?"), [, id, row] = path.split("/");
+  const shown = new URLSearchParams(query), number = ++routed;
   clearTimeout(again);
   leaveList();
   leaveComparison();
@@ -20,7 +22,8 @@ async function route(isAgain) {
   element("title").textContent = "";
   document.title = "Recordings";
   try {
-    await (id == "run" ? showRun(row, shown) : id == "compare" ? showComparison(shown) : id ? showRecording(id, Number(row) || 0, shown) : showList(shown));
+    await (id == "run" ? showRun(row, shown) : id == "compare" ? showComparison(shown)
+      : id ? showRecording(id, Number(row) || 0, shown) : showList(shown));
     if (isAgain && number == routed) notice();
   } catch (error) {
     if (number != routed) return;

@@ -25,7 +25,8 @@ export function notice(message = "") {
 }
 
 export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;
-export const many = (count, word, several = `${word}s`) => `${count.toLocaleString("en")} ${count == 1 ? word : several}`;
+export const many = (count, word, several = `${word}s`) =>
+  `${count.toLocaleString("en")} ${count == 1 ? word : several}`;
 
 // Have a button do something; after a click with the mouse, Space is again for playing.
 export function onClick(button, action) {

@@ -20,7 +20,8 @@ export async function showComparison(shown) {
   element("comparison").hidden = false;
   renew(element("comparing"), now.limit, () => ["Replays at a limit of", ...LIMITS.map(limit => {
     const button = make("button", `${limit} m`, {"aria-pressed": limit == now.limit});
-    onClick(button, () => location.hash = `#/compare?${new URLSearchParams({...shown.get("ids") && {ids: shown.get("ids")}, limit})}`);
+    const ids = shown.get("ids"), state = new URLSearchParams({...ids && {ids}, limit});
+    onClick(button, () => location.hash = `#/compare?${state}`);
     return button;
   })]);
   await refresh(now, "GET");
@@ -29,7 +30,8 @@ export async function showComparison(shown) {
 async function refresh(now, method) {
   const found = await Promise.all(now.ids.map(id => ask(`/${id}/compared?limit=${now.limit}`, {method})));
   if (open != now) return;
-  const states = found.flatMap(({models = []}) => models.flatMap(({steering, replay}) => [steering.state, replay.state]));
+  const models = found.flatMap(({models = []}) => models);
+  const states = models.flatMap(({steering, replay}) => [steering.state, replay.state]);
   const count = state => states.filter(each => each == state).length, pending = count("running") + count("waiting");
   element("compare-all").hidden = !(count("none") + count("paused"));
   element("compared").textContent = pending ? `${many(pending, "analysis", "analyses")} to do` : "";
@@ -42,27 +44,32 @@ element("compare-all").onclick = () => refresh(open, "POST").catch(error => noti
 function table(found, limit) {
   const names = found.find(({models}) => models)?.models.map(({name}) => name) ?? [];
   const each = ["steering error", "autonomy", "mean distance"];
-  const head = make("tr", "", {}, ...["recording", "minutes", "road", "human's distance"].map(text => make("th", text, {rowspan: 2, scope: "col"})),
+  const head = make("tr", "", {},
+    ...["recording", "minutes", "road", "human's distance"].map(text => make("th", text, {rowspan: 2, scope: "col"})),
     ...names.map(name => make("th", name, {colspan: each.length, scope: "colgroup"})));
   const below = make("tr", "", {}, ...names.flatMap(() => each.map(text => make("th", text, {scope: "col"}))));
-  return [make("thead", "", {}, head, below), make("tbody", "", {}, ...found.map(recording => row(recording, names.length * each.length, limit)))];
+  const rows = found.map(recording => row(recording, names.length * each.length, limit));
+  return [make("thead", "", {}, head, below), make("tbody", "", {}, ...rows)];
 }
 
 function row({id, name, message, seconds, roads, offset, models}, columns, limit) {
   const link = make("a", name, {href: `#/${id}?limit=${limit}`}), heading = make("th", "", {scope: "row"}, link);
-  if (message) return make("tr", "", {}, heading, make("td", "", {colspan: 3 + columns, class: "bad"}, make("p", message)));
+  const error = () => make("td", "", {colspan: 3 + columns, class: "bad"}, make("p", message));
+  if (message) return make("tr", "", {}, heading, error());
   const figures = models.map(({error, steering, replay}) => [
     steering.state == "ready" && error != null ? error : waits(steering),
     replay.state == "ready" ? replay.autonomy_percent : waits(replay),
     replay.state == "ready" ? replay.distance_mean_m : waits(replay),
   ]);
-  const best = [Math.min, Math.max, Math.min].map((choose, at) => choose(...figures.map(each => each[at]).filter(Number.isFinite)));
+  const best = [Math.min, Math.max, Math.min].map((choose, at) =>
+    choose(...figures.map(each => each[at]).filter(Number.isFinite)));
   const written = [value => value.toFixed(3), value => `${value.toFixed(1)} %`, value => `${value.toFixed(2)} m`];
   return make("tr", "", {}, heading, make("td", (seconds / 60).toFixed(1)),
     make("td", roads?.map(([name]) => name).filter((name, at, all) => all.indexOf(name) == at).join(", ") || "–"),
     make("td", offset ? `${offset[0].toFixed(2)} m` : "–"),
-    ...figures.flatMap(values => values.map((value, at) => Number.isFinite(value)
-      ? make("td", written[at](value), {class: models.length > 1 && value == best[at] ? "best" : ""}) : make("td", value))));
+    ...figures.flatMap(values => values.map((value, at) => !Number.isFinite(value) ? make("td", value)
+      : make("td", written[at](value), {class: models.length > 1 && value == best[at] ? "best" : ""}))));
 }
 
-const waits = ({state, progress}) => state == "running" ? `${(100 * progress).toFixed(0)} %` : {none: "–", waiting: "waits", paused: "paused", failed: "failed", ready: "–"}[state];
+const waits = ({state, progress}) => state == "running" ? `${(100 * progress).toFixed(0)} %`
+  : {none: "–", ready: "–", waiting: "waits"}[state] ?? state;

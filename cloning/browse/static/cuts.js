@@ -11,13 +11,16 @@ export function showCuts() {
   const now = page.open, {details} = now;
   showStretches();
   const cuts = details.cuts.map(cut => ({...cut, begin: cut.stretches[0]?.[0] ?? 0})).sort((a, b) => a.begin - b.begin);
-  renew(element("cuts"), [now.id, details.version, cuts], () => cuts.length ? cuts.map(({begin, frames, first, last, reason}) => {
-    const time = clock(now.columns.seconds[begin]), go = make("button", time, {"aria-label": `Go to the cut at ${time}`});
+  const item = ({begin, frames, first, last, reason}) => {
+    const time = clock(now.columns.seconds[begin]);
+    const go = make("button", time, {"aria-label": `Go to the cut at ${time}`});
     const remove = make("button", "Delete", {"aria-label": `Delete the cut at ${time}`});
     go.onclick = () => seek(begin);
     remove.onclick = () => change("DELETE", [{first, last, reason}], "Deleted the cut");
     return make("li", "", {}, go, ` ${many(frames, "frame")}: ${reason || "no reason given"} `, remove);
-  }) : [make("li", "None. Mark a stretch, then cut it.", {class: "quiet"})]);
+  };
+  renew(element("cuts"), [now.id, details.version, cuts], () =>
+    cuts.length ? cuts.map(item) : [make("li", "None. Mark a stretch, then cut it.", {class: "quiet"})]);
 }
 
 // The marked stretch: [first row, row after the last], or undefined.
@@ -63,7 +66,8 @@ export function cutMarked() {
 export function askForReason(cuts, reason = element("reason-text").value) {
   asked = cuts;
   stop();
-  element("stretch").textContent = cuts.length == 1 && Array.isArray(cuts[0]) ? many(cuts[0][1] - cuts[0][0], "frame") : many(cuts.length, "stretch", "stretches");
+  const [[first, end]] = Array.isArray(cuts[0]) ? cuts : [[]];
+  element("stretch").textContent = end ? many(end - first, "frame") : many(cuts.length, "stretch", "stretches");
   element("reason").returnValue = "";
   element("reason-text").value = reason;
   element("reason").showModal();

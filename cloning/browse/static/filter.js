@@ -1,7 +1,6 @@
 // Finding frames by a condition, written or brushed on a histogram, and what can be done with them: cut, export.
-import {ask, element, many, notice, request} from "./common.js";
+import {ask, element, make, many, notice, request} from "./common.js";
 import {askForReason, marked, showStretches} from "./cuts.js";
-import {clock, make} from "./common.js";
 import {page, remember, say} from "./state.js";
 
 const SOON = 300, BINS = 60, HEIGHT = 52; // ms after the last letter; of the histogram, and its px
@@ -18,7 +17,8 @@ export async function find() {
       const found = await ask(`/${now.id}/matches?${query}`);
       if (page.open != now || now.condition != condition) return;
       now.matches = found;
-      shown.textContent = found.rows ? `${many(found.rows, "frame")} in ${many(found.stretches.length, "stretch", "stretches")}` : "no frame";
+      shown.textContent = !found.rows ? "no frame"
+        : `${many(found.rows, "frame")} in ${many(found.stretches.length, "stretch", "stretches")}`;
     } catch (error) {
       if (page.open != now || now.condition != condition) return;
       now.matches = undefined;
@@ -53,8 +53,8 @@ element("cut-matches").onclick = () =>
 
 // The columns by the names that conditions have for them.
 function columns() {
-  const {columns, details: {models}} = page.open;
-  const names = {steering: columns.steering, throttle: columns.throttle, speed: columns.speed, offset: columns.offset, label: columns.label};
+  const {columns: {steering, throttle, speed, offset, label, ...columns}, details: {models}} = page.open;
+  const names = {steering, throttle, speed, offset, label};
   models.forEach((_, index) => names[`model${index + 1}`] = columns[`model-${index}`]);
   return Object.entries(names).filter(([, values]) => values);
 }
@@ -66,18 +66,23 @@ export function showHistogram() {
     select.value = known.some(([name]) => name == chosen) ? chosen : "steering";
   }
   const name = select.value, values = known.find(each => each[0] == name)[1];
-  const [low, high] = values.reduce(([low, high], value) => [Math.min(low, Number.isNaN(value) ? low : value), Math.max(high, Number.isNaN(value) ? high : value)], [Infinity, -Infinity]);
-  const [from, to] = low < high ? [low, high] : [low - 0.5, low + 0.5], wide = (to - from) / BINS, counts = new Array(BINS).fill(0);
-  for (const value of values) if (!Number.isNaN(value)) counts[Math.min(BINS - 1, Math.floor((value - from) / wide))] += 1;
+  const there = values.filter(value => !Number.isNaN(value)), counts = new Array(BINS).fill(0);
+  const [low, high] = there.reduce(([low, high], value) => [Math.min(low, value), Math.max(high, value)],
+    [there[0] ?? 0, there[0] ?? 0]);
+  const [from, to] = low < high ? [low, high] : [low - 0.5, low + 0.5], wide = (to - from) / BINS;
+  for (const value of there) counts[Math.min(BINS - 1, Math.floor((value - from) / wide))] += 1;
   const colours = getComputedStyle(document.body), holder = element("histogram");
   plot?.destroy();
   holder.setAttribute("aria-label", `Histogram of ${name}, on a square-root scale`);
   plot = new uPlot({
     width: Math.min(300, innerWidth - 24), height: HEIGHT, legend: {show: false}, padding: [2, 10, 0, 10],
     cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
-    scales: {x: {time: false, range: [from, to]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value, range: (_, low, high) => [0, Math.max(1, high)]}},
-    axes: [{stroke: colours.getPropertyValue("--quiet"), size: 16, gap: 1, space: 40, grid: {show: false}, ticks: {show: false}, font: "11px system-ui, sans-serif"}, {show: false}],
-    series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, points: {show: false}, paths: uPlot.paths.bars({size: [0.9, 100]})}],
+    scales: {x: {time: false, range: [from, to]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
+      range: (_, low, high) => [0, Math.max(1, high)]}},
+    axes: [{stroke: colours.getPropertyValue("--quiet"), size: 16, gap: 1, space: 40, grid: {show: false},
+      ticks: {show: false}, font: "11px system-ui, sans-serif"}, {show: false}],
+    series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, points: {show: false},
+      paths: uPlot.paths.bars({size: [0.9, 100]})}],
     hooks: {setSelect: [plot => {
       const {left, width} = plot.select, value = px => Number(plot.posToVal(px, "x").toPrecision(3));
       if (width > 3) brush(name, value(left), value(left + width));
@@ -89,7 +94,8 @@ export function showHistogram() {
 // The condition for a range of values, in place of an earlier one of the same column.
 function brush(name, low, high) {
   const others = page.open.condition.split(" and ").filter(part => part && !part.includes(` <= ${name} <= `));
-  set([...others.map(part => part.includes(" or ") ? `(${part})` : part), `${low} <= ${name} <= ${high}`].join(" and "));
+  const kept = others.map(part => part.includes(" or ") && !part.startsWith("(") ? `(${part})` : part);
+  set([...kept, `${low} <= ${name} <= ${high}`].join(" and "));
 }
 
 element("of").onchange = showHistogram;
@@ -102,7 +108,8 @@ function selected() {
   const {matches, plots: {zoom}, count} = page.open, stretch = marked();
   if (stretch) return ["the marked stretch", [stretch]];
   if (matches?.stretches.length) return ["what matches", matches.stretches];
-  return zoom ? ["what the curves show", [[Math.ceil(zoom[0]), Math.floor(zoom[1]) + 1]]] : ["the whole recording", [[0, count]]];
+  if (zoom) return ["what the curves show", [[Math.ceil(zoom[0]), Math.floor(zoom[1]) + 1]]];
+  return ["the whole recording", [[0, count]]];
 }
 
 export function askToExport() {
@@ -120,7 +127,8 @@ element("export").onclose = async () => {
   try {
     if (kind == "film") {
       say("Making the film …");
-      const film = await request(`/recordings/${now.id}/film.mp4?${new URLSearchParams({rows, version})}`, {binary: true});
+      const query = new URLSearchParams({rows, version});
+      const film = await request(`/recordings/${now.id}/film.mp4?${query}`, {binary: true});
       const address = URL.createObjectURL(new Blob([film], {type: "video/mp4"}));
       make("a", "", {href: address, download: `${name}.mp4`}).click();
       setTimeout(() => URL.revokeObjectURL(address), 60000);

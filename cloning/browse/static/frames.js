@@ -7,7 +7,8 @@ const AT_ONCE = 3; // rows that are loaded at the same time; of those asked for 
 const FORGOTTEN = 1000; // ms after which what is not shown any more is freed
 const PATIENCE = 100; // ms that a row's frames wait for what the models look at
 
-const {matrix, height, lock, wheelbase} = JSON.parse(element("recording").dataset.camera); // of road/camera.py and motion.py
+// Of cloning/road/camera.py and motion.py.
+const {matrix, height, lock, wheelbase} = JSON.parse(element("recording").dataset.camera);
 
 // Draw the path ahead at a steering, -1..1, on a frame, as cloning/road/overlay.py does.
 function drawPath(context, steering, colour) {
@@ -69,7 +70,8 @@ export class Frames {
       const loaded = await Promise.race([whole, frames.then(pause)]);
       if (this.closed || number < this.drawn || pictures != this.pictures) continue;
       this.drawn = number;
-      pictures.forEach((picture, at) => paint(picture, row, loaded[at], picture.looks.length && loaded[at].layers.length == 1));
+      pictures.forEach((picture, at) =>
+        paint(picture, row, loaded[at], picture.looks.length && loaded[at].layers.length == 1));
       whole.then(all => { // the attention may take long: it is laid over the frames when it comes
         if (all.some(({message}) => message)) this.loaded.delete(row); // it is asked for again the next time
         if (all == loaded || this.closed || number != this.drawn || pictures != this.pictures) return;
@@ -121,7 +123,10 @@ function paint({canvas, caption, paths}, row, {layers, message}, isWaiting) {
   const picture = element(canvas), context = picture.getContext("2d"), below = picture.parentNode.lastElementChild;
   context.clearRect(0, 0, picture.width, picture.height);
   for (const layer of layers) context.drawImage(layer, 0, 0);
-  if (layers.length) for (const {values, colour} of paths) if (!Number.isNaN(values[row])) drawPath(context, values[row], colour);
-  below.textContent = message?.split(/[\\/]IMG[\\/]/).at(-1) ?? caption(row) + (isWaiting ? " – computing what it looks at …" : ""); // no folder
+  for (const {values, colour} of layers.length ? paths : []) {
+    if (!Number.isNaN(values[row])) drawPath(context, values[row], colour);
+  }
+  below.textContent = message?.split(/[\\/]IMG[\\/]/).at(-1) // without the folder
+    ?? caption(row) + (isWaiting ? " – computing what it looks at …" : "");
   below.className = message ? "bad" : "";
 }

@@ -3,6 +3,7 @@ import {ask, element, make, many, notice, onClick, renew, request} from "./commo
 import {stateOf} from "./run.js";
 
 const AGAIN = 3000; // ms until a recording that cannot be read, or whose lane is being analysed, is asked for again
+const PENDING = ["waiting", "running", "paused"];
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
 let shown = 0; // counted up when the list is left, so that answers that come later are dropped
 const known = new Map(); // card -> its recording's overview
@@ -43,11 +44,15 @@ const FIGURES = { // of an overview, by which the list is searched and sorted
   repaired,
   findings: each => (each.message ? 1e9 : 0) + refused(each) + repaired(each) + (each.cut_frames ?? 0),
 };
-const HOLDS = {">": (a, b) => a > b, "<": (a, b) => a < b, ">=": (a, b) => a >= b, "<=": (a, b) => a <= b, "=": (a, b) => a == b};
+const HOLDS = {
+  ">": (a, b) => a > b, "<": (a, b) => a < b, ">=": (a, b) => a >= b, "<=": (a, b) => a <= b, "=": (a, b) => a == b,
+};
 
 // Whether a recording has all words of a search: conditions such as minutes>1, and texts.
 function meets(overview, query) {
-  const text = [overview.name, overview.folder, overview.message, overview.lane && road(overview), ...words(overview)].join(" ").toLowerCase();
+  const {name, folder, message, lane} = overview;
+  const texts = [name, folder, message, lane && !message && road(overview), ...words(overview)];
+  const text = texts.join(" ").toLowerCase();
   return query.toLowerCase().split(/\s+/).filter(Boolean).every(word => {
     const [, figure, sign, number] = word.match(/^(\w+)([<>]=?|=)(-?[\d.]+)$/) ?? [];
     return FIGURES[figure] ? HOLDS[sign](FIGURES[figure](overview), Number(number)) : text.includes(word);
@@ -62,17 +67,22 @@ function arrange() {
     card.hidden = !meets(overview, query);
     if (element("cards").children[at] != card) element("cards").insertBefore(card, element("cards").children[at]);
   });
-  const all = order.filter(([card]) => !card.hidden).map(([, overview]) => overview), sum = name => all.reduce((total, each) => total + (each[name] ?? 0), 0);
-  element("total").textContent = `${all.length < known.size ? `${all.length} of ` : ""}${many(known.size, "recording")}, ${many(sum("frames"), "frame")}, ` +
-    `${(sum("seconds") / 60).toFixed(1)} minutes` + (sum("cut_frames") ? `, ${many(sum("cut_frames"), "frame")} cut` : "");
+  const all = order.filter(([card]) => !card.hidden).map(([, overview]) => overview);
+  const sum = name => all.reduce((total, each) => total + (each[name] ?? 0), 0), cut = sum("cut_frames");
+  element("total").textContent = (all.length < known.size ? `${all.length} of ` : "") + many(known.size, "recording") +
+    `, ${many(sum("frames"), "frame")}, ${(sum("seconds") / 60).toFixed(1)} minutes` +
+    (cut ? `, ${many(cut, "frame")} cut` : "");
   element("compare").disabled = !all.length;
   const state = new URLSearchParams({...query && {find: query}, ...by != "name" && {sort: by}});
   history.replaceState(null, "", state.size ? `#?${state}` : "#");
-  const states = [...known.values()].map(({lane}) => lane?.state), left = states.filter(state => ["waiting", "running", "paused"].includes(state)).length;
-  renew(element("analysing"), [left, states.includes("paused")], () => {
-    const button = make("button", states.includes("paused") ? "Go on" : "Pause", {title: "Pause the analyses of all recordings, or go on with them"});
-    onClick(button, () => request("/analyses", {method: states.includes("paused") ? "POST" : "DELETE"})
-      .then(() => Promise.all([...known].map(([card, {id}]) => fill(id, card, shown)))).catch(error => notice(error.message)));
+  const states = [...known.values()].map(({lane}) => lane?.state), isPaused = states.includes("paused");
+  const left = states.filter(state => PENDING.includes(state)).length;
+  renew(element("analysing"), [left, isPaused], () => {
+    const title = "Pause the analyses of all recordings, or go on with them";
+    const button = make("button", isPaused ? "Go on" : "Pause", {title});
+    onClick(button, () => request("/analyses", {method: isPaused ? "POST" : "DELETE"})
+      .then(() => Promise.all([...known].map(([card, {id}]) => fill(id, card, shown))))
+      .catch(error => notice(error.message)));
     return left ? [`Where the car is: ${many(left, "recording")} to analyse. `, button] : [];
   });
 }
@@ -90,8 +100,9 @@ async function showRuns(now) {
   try {
     const runs = await request("/runs");
     if (now != shown) return;
-    renew(element("runs"), runs.map(({id, folder}) => [id, folder]), () => runs.map(({id, folder}) => make("article", "", {},
-      make("h2", "", {}, make("a", `Training run in ${folder}`, {href: `#/run/${id}`})), make("p"))));
+    const card = ({id, folder}) => make("article", "", {},
+      make("h2", "", {}, make("a", `Training run in ${folder}`, {href: `#/run/${id}`})), make("p"));
+    renew(element("runs"), runs.map(({id, folder}) => [id, folder]), () => runs.map(card));
     runs.forEach((run, at) => {
       const state = element("runs").children[at].lastElementChild;
       state.textContent = run.message ?? stateOf(run);
@@ -113,7 +124,7 @@ async function fill(id, card, now) {
   known.set(card, overview);
   if (!isSame) draw(overview, card);
   arrange();
-  if (overview.message || ["waiting", "running", "paused"].includes(overview.lane?.state)) {
+  if (overview.message || PENDING.includes(overview.lane?.state)) {
     clearTimeout(card.again);
     card.again = setTimeout(() => now == shown && fill(id, card, now).catch(error => notice(error.message)), AGAIN);
   }
@@ -133,20 +144,27 @@ function draw(overview, card) {
     card.replaceChildren(heading, make("p", message, {class: "bad"}));
     return;
   }
-  const picture = make("img", "", {src: `/recordings/${id}/rows/${overview.picture}/center.jpg`, alt: "", width: 320, height: 160, loading: "lazy"});
+  const src = `/recordings/${id}/rows/${overview.picture}/center.jpg`;
+  const picture = make("img", "", {src, alt: "", width: 320, height: 160, loading: "lazy"});
   picture.onerror = () => picture.replaceWith(make("div", "", {class: "none"}));
   const histogram = make("div", "", {class: "histogram"}), [, mean, most] = overview.speed ?? [];
   const lines = [
     `${(overview.seconds / 60).toFixed(1)} minutes, ${many(overview.frames, "frame")}; ${road(overview)}`,
-    mean == undefined ? "all of it is cut" : `${mean.toFixed(1)} mph, at most ${most.toFixed(1)}; steering 0 in ${(100 * overview.zeros).toFixed(0)} %` +
-      (overview.offset ? `; ${overview.offset[0].toFixed(2)} m from the lane's centre, at most ${overview.offset[1].toFixed(2)} m` : ""),
+    mean == undefined ? "all of it is cut"
+      : `${mean.toFixed(1)} mph, at most ${most.toFixed(1)}; steering 0 in ${(100 * overview.zeros).toFixed(0)} %`,
   ];
-  card.replaceChildren(heading, make("div", "", {class: "road"}, picture, ...map(overview)), histogram, ...lines.map(line => make("p", line)),
+  if (overview.offset) {
+    const [mean, most] = overview.offset.map(metres => metres.toFixed(2));
+    lines.push(`${mean} m from the lane's centre, at most ${most} m`);
+  }
+  card.replaceChildren(heading, make("div", "", {class: "road"}, picture, ...map(overview)), histogram,
+    ...lines.map(line => make("p", line)),
     ...words(overview).length ? [make("p", words(overview).join(", "), {class: "found"})] : [],
     make("p", overview.folder, {class: "quiet"}));
   if (lane.state == "failed") {
     const retry = make("button", "Look for the road again"), now = shown;
-    onClick(retry, () => ask(`/${id}/columns/offset`, {method: "POST"}).then(() => fill(id, card, now)).catch(error => notice(error.message)));
+    onClick(retry, () => ask(`/${id}/columns/offset`, {method: "POST"})
+      .then(() => fill(id, card, now)).catch(error => notice(error.message)));
     card.append(retry);
   }
   histograms.get(card)?.destroy();

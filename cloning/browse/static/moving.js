@@ -40,7 +40,8 @@ export function stop() {
 
 // The rows that are played again and again: [first, last].
 function looped() {
-  const {count, plots: {zoom}} = page.open, [first, end] = marked() ?? [Math.ceil(zoom?.[0] ?? 0), Math.floor(zoom?.[1] ?? count - 1) + 1];
+  const {count, plots: {zoom}} = page.open, [low, high] = zoom ?? [0, count - 1];
+  const [first, end] = marked() ?? [Math.ceil(low), Math.floor(high) + 1];
   return [first, end - 1];
 }
 

@@ -3,7 +3,8 @@ import {element, make} from "./common.js";
 import {rounded} from "/site/site.js";
 import {showWindow, zoomable} from "./zoom.js";
 
-export const MODEL_COLOURS = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"]; // told apart by the colour-blind too
+// Told apart by the colour-blind, too.
+export const MODEL_COLOURS = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"];
 const LEAST = 15; // rows that a zoom shows
 const LEFT = 56, RIGHT = 12; // px; browse.css has them for the bar
 const TIMES = 20; // px of the times below the last plot
@@ -27,7 +28,8 @@ export class Plots {
 
   size({tall, isLast}) {
     const grown = Math.min(MOST, Math.max(1, (innerHeight - ROOM) / PLOTS));
-    return {width: Math.max(200, element("plots").clientWidth), height: Math.round(tall * grown) + (isLast ? TIMES : 0)};
+    const height = Math.round(tall * grown) + (isLast ? TIMES : 0);
+    return {width: Math.max(200, element("plots").clientWidth), height};
   }
 
   close() {
@@ -52,9 +54,11 @@ export class Plots {
     const taught = label ? [{name: "label", values: label, colour: colours.getPropertyValue("--label")}] : [];
     this.steerings = {human, taught, models};
     const graphs = [
-      {title: "Steering", unit: "", digits: 3, tall: 96, curves: [human, ...taught, ...drivers.length ? drivers : models],
+      {title: "Steering", unit: "", digits: 3, tall: 96,
+        curves: [human, ...taught, ...drivers.length ? drivers : models],
         range: (_, low, high) => balanced(Math.max(0.1, -low * 1.05, high * 1.05), 1)},
-      {title: "Throttle", unit: "", digits: 2, tall: 54, range: [Math.min(0, least(throttle)), 1], curves: [{name: "", values: throttle}]},
+      {title: "Throttle", unit: "", digits: 2, tall: 54, range: [Math.min(0, least(throttle)), 1],
+        curves: [{name: "", values: throttle}]},
       {title: "Speed", unit: " mph", digits: 1, tall: 60, range: [0, Math.max(31, -least(speed.map(value => -value)))],
         curves: [{name: "", values: speed}]},
       {title: "Metres right of the lane's centre", unit: " m", digits: 2, tall: 120, lines: LIMITS,
@@ -72,15 +76,17 @@ export class Plots {
     const figure = make("figure"), caption = make("figcaption", "", {}, make("span", title)), holder = make("div");
     for (const curve of curves) {
       curve.colour ??= colour("--line");
-      const named = curve.name ? [make("i", "", {style: `background: ${curve.colour}`}), `${curve.name} `] : [], value = make("b");
+      const named = curve.name ? [make("i", "", {style: `background: ${curve.colour}`}), `${curve.name} `] : [];
+      const value = make("b");
       caption.append(make("span", "", {}, ...named, value));
       this.shown.push({value, unit, digits, values: curve.values});
     }
     figure.append(caption, holder);
     element("plots").append(figure);
-    const here = make("div", "", {class: "here"}), axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
+    const here = make("div", "", {class: "here"}), limits = lines.flatMap(metres => [-metres, metres]);
+    const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
       grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
-    const limits = lines.flatMap(metres => [-metres, metres]);
+    const metres = {splits: () => [0, ...limits], values: (_, at) => at.map(each => each ? `${each} m` : "0")};
     const plot = new uPlot({
       ...this.size({tall, isLast}), legend: {show: false}, padding: [6, RIGHT, isLast ? 0 : 6, 0],
       cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
@@ -88,7 +94,7 @@ export class Plots {
       axes: [
         {...axis, size: isLast ? TIMES : 0, splits: (plot, _, low, high) => this.times(plot.width, low, high),
           values: (_, rows) => rows.map(row => isLast ? this.time(row) : "")},
-        {...axis, size: LEFT, space: 22, ...limits.length && {splits: () => [0, ...limits], values: (_, at) => at.map(metres => metres ? `${metres} m` : "0")}},
+        {...axis, size: LEFT, space: 22, ...limits.length && metres},
       ],
       series: [{}, ...curves.map(curve => ({stroke: curve.colour, width: 1, spanGaps: false,
         points: {show: this.count == 1, fill: curve.colour}}))],
@@ -153,7 +159,8 @@ export class Plots {
     for (const metres of limits) {
       const at = Math.round(plot.valToPos(metres, "y", true)) + 0.5;
       if (at < bbox.top || at > bbox.top + bbox.height) continue;
-      Object.assign(ctx, {strokeStyle: colours.getPropertyValue(Math.abs(metres) == limits.at(-1) ? "--cut" : "--mark"), lineWidth: 1});
+      ctx.strokeStyle = colours.getPropertyValue(Math.abs(metres) == limits.at(-1) ? "--cut" : "--mark");
+      ctx.lineWidth = 1;
       ctx.setLineDash([5, 4]);
       ctx.beginPath();
       ctx.moveTo(bbox.left, at);
@@ -164,7 +171,8 @@ export class Plots {
       ctx.fillStyle = colour;
       for (const row of marks) {
         const at = plot.valToPos(row, "x", true);
-        if (at >= bbox.left && at <= bbox.left + bbox.width) ctx.fillRect(at - 1, bbox.top + 0.7 * bbox.height, 2, 0.3 * bbox.height);
+        if (at < bbox.left || at > bbox.left + bbox.width) continue;
+        ctx.fillRect(at - 1, bbox.top + 0.7 * bbox.height, 2, 0.3 * bbox.height);
       }
     }
     ctx.restore();
@@ -183,8 +191,9 @@ export class Plots {
 
   setZoom(low, high) {
     if (this.count < 3) return showWindow(this);
-    const wide = Math.min(this.count - 1, Math.max(LEAST, high - low)), from = Math.min(Math.max(0, (low + high - wide) / 2), this.count - 1 - wide);
-    this.zoom = wide < this.count - 1 ? [from, from + wide] : null;
+    const all = this.count - 1, wide = Math.min(all, Math.max(LEAST, high - low));
+    const from = Math.min(Math.max(0, (low + high - wide) / 2), all - wide);
+    this.zoom = wide < all ? [from, from + wide] : null;
     this.plots.forEach(plot => plot.setScale("x", {min: from, max: from + wide}));
     showWindow(this);
   }
@@ -203,7 +212,7 @@ export class Plots {
     }
     for (const {value, unit, digits, values} of this.shown) {
       const here = values?.[row];
-      value.textContent = values == undefined ? "not known" : Number.isNaN(here) ? "not known here" : rounded(here, digits) + unit;
+      value.textContent = !values ? "not known" : Number.isNaN(here) ? "not known here" : rounded(here, digits) + unit;
     }
     this.plots.forEach(plot => this.move(plot, plot.here));
   }
@@ -216,4 +225,5 @@ export class Plots {
 const balanced = (bound, most) => [-Math.min(bound, most), Math.min(bound, most)];
 const least = values => values.reduce((low, value) => Math.min(low, value), Infinity);
 // uPlot leaves gaps at nulls, which typed arrays do not have.
-const gaps = values => values.some(Number.isNaN) ? Array.from(values, value => Number.isNaN(value) ? null : value) : values;
+const gaps = values =>
+  values.some(Number.isNaN) ? Array.from(values, value => Number.isNaN(value) ? null : value) : values;

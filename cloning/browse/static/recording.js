@@ -1,5 +1,5 @@
 // One recording: its frames and curves, news of it from the server, and the keys.
-import {ask, element, make, many, notice, onClick, renew} from "./common.js";
+import {ask, element, make, many, notice, onClick, renew, request} from "./common.js";
 import {changes, cutMarked, mark, redo, showCuts, undo} from "./cuts.js";
 import {askToExport, find, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
@@ -60,7 +60,8 @@ export async function showRecording(id, row, shown) {
   names.forEach((name, at) => columns[name] = parts[at]);
   leaveRecording();
   element("recording").hidden = false;
-  const count = columns.seconds.length, [first, last] = (shown.get("mark") ?? "").split("-").map(at => at ? Math.min(Number(at), count - 1) : undefined);
+  const count = columns.seconds.length, marks = (shown.get("mark") ?? "").split("-");
+  const [first, last] = marks.map(at => at ? Math.min(Number(at), count - 1) : undefined);
   const now = page.open = {
     id, details, columns, count, marks: {first, last}, ...changes(id), row: 0, playing: 0, jumps: {...details.jumps},
     limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
@@ -154,22 +155,34 @@ function showFindings() {
   const columns = ["offset", ...details.models.map((_, index) => `model-${index}`)];
   [{name: "lateral offset", ...details.lane}, ...details.models].forEach(({name, state, progress, message}, at) => {
     if (state == "waiting") found.push(`${name}: waits for its turn`);
-    if (state == "paused") found.push(`${name}: the analyses are paused; the list goes on with them`);
-    if (state == "running") found.push(`${name}: ${(100 * progress).toFixed(0)} % analysed`);
-    if (state == "failed") found.push([`${name} failed: ${message}. `, columns[at]]);
+    if (state == "paused") found.push([`${name}: paused. `, "Go on", "POST"]);
+    if (state == "running") found.push([`${name}: ${(100 * progress).toFixed(0)} % analysed. `, "Pause", "DELETE"]);
+    if (state == "failed") found.push([`${name} failed: ${message}. `, "Try again", "POST", columns[at]]);
   });
   if (!found.length) found.push("Every row could be read as it is.");
   renew(element("findings"), [page.open.id, found], () => found.map(each => {
-    const [text, column] = [each].flat(), button = column ? [orderButton("Try again", "POST", `columns/${column}`)] : [];
-    return make("li", text, {}, ...button);
+    const [text, what, method, column] = [each].flat();
+    if (!what) return make("li", text);
+    return make("li", text, {}, column ? orderButton(what, method, `columns/${column}`) : pauseButton(what, method));
   }));
+}
+
+// A button that ends the analyses until they are to go on, those of other recordings, too.
+function pauseButton(text, method) {
+  const button = make("button", text), now = page.open;
+  onClick(button, () => request("/analyses", {method}).then(() => refresh(now)).catch(error => notice(error.message)));
+  return button;
 }
 
 function buttons() {
   const {details, replays, jumps} = page.open;
   const interventions = replays.flatMap(replay => replay?.where.map(([row]) => row) ?? []);
-  page.open.jumps = {...details.jumps, intervention: [...new Set(interventions)].sort((a, b) => a - b), match: jumps.match};
-  for (const reason of Object.keys(JUMPS).filter(reason => reason != "match")) element(`jump-${reason}`).disabled = !page.open.jumps[reason]?.length;
+  const inOrder = [...new Set(interventions)].sort((a, b) => a - b);
+  page.open.jumps = {...details.jumps, intervention: inOrder, match: jumps.match};
+  for (const reason of Object.keys(JUMPS)) {
+    const button = element(`jump-${reason}`);
+    if (button) button.disabled = !page.open.jumps[reason]?.length;
+  }
   for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
 }
 

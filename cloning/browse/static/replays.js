@@ -27,7 +27,9 @@ export function cameras() {
   }).filter(Boolean);
   for (const {canvas} of views) {
     element("cameras").append(make("figure", "", {class: "replayed"},
-      make("canvas", "", {id: canvas, role: "img", width: 320, height: 160, "aria-label": "What the replayed car sees"}),
+      make("canvas", "", {
+        id: canvas, role: "img", width: 320, height: 160, "aria-label": "What the replayed car sees",
+      }),
       make("figcaption")));
   }
   return [centre, ...views];
@@ -56,10 +58,12 @@ export async function showReplays() {
     onClick(button, () => watch(page.open.attention == index ? null : index));
     return button;
   }));
-  [...element("attention").children].forEach((button, index) => button.setAttribute("aria-pressed", now.attention == index));
+  [...element("attention").children].forEach((button, index) =>
+    button.setAttribute("aria-pressed", now.attention == index));
   element("replays").hidden = !now.limit;
   if (now.limit && details.limit == now.limit) {
-    renew(element("replay-list"), [now.id, details.version, details.limit, details.replays], () => details.replays.map(section));
+    const content = [now.id, details.version, details.limit, details.replays];
+    renew(element("replay-list"), content, () => details.replays.map(section));
   }
 }
 
@@ -74,7 +78,8 @@ async function load(now, replay, index) {
 
 function section(replay, index) {
   const {details, limit} = page.open, {name} = details.models[index];
-  const heading = make("h3", `${name} at ${limit} m`, {style: `border-color: ${MODEL_COLOURS[index % MODEL_COLOURS.length]}`});
+  const style = `border-color: ${MODEL_COLOURS[index % MODEL_COLOURS.length]}`;
+  const heading = make("h3", `${name} at ${limit} m`, {style});
   const button = (text, method) => orderButton(text, method, `replays/${limit}`);
   const waiting = {
     none: ["Not replayed with these files and cuts. ", button("Replay", "POST")],
@@ -88,15 +93,16 @@ function section(replay, index) {
     autonomy: `${replay.autonomy_percent.toFixed(1)} %`,
     distance: `mean ${replay.distance_mean_m.toFixed(2)} m, 95 % below ${replay.distance_p95_m.toFixed(2)} m`,
     "human's distance": `mean ${replay.human_mean_m.toFixed(2)} m`,
-    driven: many(replay.driven, "frame") + (replay.by_lane < replay.driven
-      ? `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known` : ""),
+    driven: many(replay.driven, "frame") + (replay.by_lane == replay.driven ? ""
+      : `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known`),
     interventions: replay.interventions.toLocaleString("en"),
   });
   const made = make("section", "", {}, heading,
     make("dl", "", {}, ...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)])));
   if (replay.where.length) {
     made.append(make("ol", "", {class: "where"}, ...replay.where.map(([row, offset]) => {
-      const time = clock(page.open.columns.seconds[row]), go = make("button", time, {"aria-label": `Go to the intervention at ${time}`});
+      const time = clock(page.open.columns.seconds[row]);
+      const go = make("button", time, {"aria-label": `Go to the intervention at ${time}`});
       onClick(go, () => {
         seek(row);
         say(`Here ${name} was ${metres(offset)}, and was set back.`);

@@ -6,8 +6,10 @@ import {MODEL_COLOURS} from "./plots.js";
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
 const PICTURES = ["LRC_", "augmented-"]; // of pictures, in the order of the page
 const HEIGHT = 260; // px of a plot
+const WITHIN = "within the epoch"; // ends the label of such losses
 const LOSSES = 0.98; // share of the losses within the epochs that the plot shows: the first ones are far higher
-let open; // {id, run, runs, others, at, plots, timer}; at: observations of the picture that was chosen, undefined for the latest
+// {id, run, runs, others, at, plots, timer}; at: observations of the picture that was chosen, undefined for the latest
+let open;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
 export function leaveRun() {
@@ -28,7 +30,8 @@ export async function showRun(id, shown) {
 
 // This run, and those laid over it; the others that there are.
 async function load({id, others}) {
-  const [all, ...runs] = await Promise.all([request("/runs"), ...[id, ...others].map(each => request(`/runs/${each}`))]);
+  const shown = [id, ...others].map(each => request(`/runs/${each}`));
+  const [all, ...runs] = await Promise.all([request("/runs"), ...shown]);
   return {all, runs};
 }
 
@@ -38,8 +41,10 @@ const UNITS = {val_loss: "validation loss", val_drift: "drift"};
 function best({best, history}) {
   if (!best) return "none yet";
   const steadiest = history.filter(row => row.val_drift != null).sort((a, b) => a.val_drift - b.val_drift)[0];
-  return `epoch ${best.epoch}, in model-best.pt: it has the least ${UNITS[best.by]}, ${best.by == "val_drift" ? metres(best.value) : loss(best.value)}` +
-    (steadiest && steadiest.epoch != best.epoch ? `; the least drift, ${metres(steadiest.val_drift)}, is that of epoch ${steadiest.epoch}` : "");
+  const value = (best.by == "val_drift" ? metres : loss)(best.value);
+  const why = `epoch ${best.epoch}, in model-best.pt: it has the least ${UNITS[best.by]}, ${value}`;
+  if (!steadiest || steadiest.epoch == best.epoch) return why;
+  return `${why}; the least drift, ${metres(steadiest.val_drift)}, is that of epoch ${steadiest.epoch}`;
 }
 
 const metres = value => value == null ? "–" : `${value.toFixed(2)} m`;
@@ -49,7 +54,8 @@ export const stateOf = ({state, history, epochs, samples_per_epoch: samples, ima
   const where = `epoch ${Math.min(history.length + 1, epochs)} of ${epochs}`;
   if (state == "stopped") return `stopped or killed in ${where}; continue with --resume`;
   if (history.length == epochs) return "running: another run reads its recordings, or this one sums up";
-  return `running: ${where}, ${(100 * Math.min(1, images / samples)).toFixed(0)} % of it` + (left == null ? "" : `, ${duration(left)} left`);
+  const share = (100 * Math.min(1, images / samples)).toFixed(0);
+  return `running: ${where}, ${share} % of it` + (left == null ? "" : `, ${duration(left)} left`);
 };
 
 function duration(seconds) {
@@ -79,13 +85,15 @@ function update({all, runs}) {
   const name = nameOf(run);
   element("title").textContent = `/ training run in ${name}`;
   document.title = `${run.state}: ${name}`;
-  const share = run.state == "finished" ? 1 : (history.length + Math.min(1, run.images / run.samples_per_epoch)) / run.epochs;
-  element("run-bar").value = Math.min(1, share);
+  const done = history.length + Math.min(1, run.images / run.samples_per_epoch);
+  element("run-bar").value = run.state == "finished" ? 1 : Math.min(1, done / run.epochs);
   element("run-bar").setAttribute("aria-valuetext", stateOf(run));
   const lines = Object.entries({
-    state: stateOf(run) + (run.rate && run.state == "running" ? `; ${Math.round(run.rate).toLocaleString("en")} images/s, as of ${Math.round(run.age)} s ago` : ""),
+    state: stateOf(run) + (run.rate && run.state == "running"
+      ? `; ${Math.round(run.rate).toLocaleString("en")} images/s, as of ${Math.round(run.age)} s ago` : ""),
     best: best(run),
-    "last epoch": last ? `drift ${metres(last.val_drift)}, validation loss ${loss(last.val_loss)}, training loss ${loss(last.loss)}` : "none finished yet",
+    "last epoch": !last ? "none finished yet" : `drift ${metres(last.val_drift)}, ` +
+      `validation loss ${loss(last.val_loss)}, training loss ${loss(last.loss)}`,
     trained: `${run.robust ? "with --robust" : "as in the report"}, in ${run.folder}`,
   });
   element("run-figures").replaceChildren(...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)]));
@@ -93,12 +101,15 @@ function update({all, runs}) {
   element("run-count").textContent = many(run.recordings.length, "recording");
   renew(element("run-recordings"), run.recordings, () => run.recordings.map(folder => make("li", folder)));
   const others = all.filter(each => each.id != now.id && !each.message);
-  renew(element("run-others"), [now.others, others.map(({id, folder}) => [id, folder])], () => others.length ? ["Lay over it", ...others.map(each => {
-    const isShown = now.others.includes(String(each.id)), button = make("button", nameOf(each), {"aria-pressed": isShown, title: each.folder});
+  const overlay = each => {
+    const isShown = now.others.includes(String(each.id));
+    const button = make("button", nameOf(each), {"aria-pressed": isShown, title: each.folder});
     const chosen = isShown ? now.others.filter(id => id != each.id) : [...now.others, each.id];
     onClick(button, () => location.hash = `#/run/${now.id}${chosen.length ? `?with=${chosen}` : ""}`);
     return button;
-  })] : []);
+  };
+  renew(element("run-others"), [now.others, others.map(({id, folder}) => [id, folder])], () =>
+    others.length ? ["Lay over it", ...others.map(overlay)] : []);
   showOptions(runs);
   const shown = all => JSON.stringify(all.map(({history, trail, loss}) => [history, trail, loss]));
   if (shown(before) != shown(runs)) draw();
@@ -110,10 +121,12 @@ function update({all, runs}) {
 function showOptions(runs) {
   const names = [...new Set(runs.flatMap(({options}) => Object.keys(options)))];
   const shown = names.filter(name => runs.length == 1 || new Set(runs.map(({options}) => options[name])).size > 1);
-  element("run-options").firstElementChild.textContent = runs.length == 1 ? "Its options" : `Options in which they differ (${shown.length})`;
+  element("run-options").firstElementChild.textContent =
+    runs.length == 1 ? "Its options" : `Options in which they differ (${shown.length})`;
   renew(element("run-table"), runs.map(({options, folder}) => [folder, options]), () => [
-    make("tr", "", {}, make("th", "option", {scope: "col"}), ...runs.map(run => make("th", nameOf(run), {scope: "col"}))),
-    ...shown.map(name => make("tr", "", {}, make("th", name, {scope: "row"}), ...runs.map(({options}) => make("td", options[name] ?? "–")))),
+    make("tr", "", {}, ...["option", ...runs.map(nameOf)].map(text => make("th", text, {scope: "col"}))),
+    ...shown.map(name => make("tr", "", {},
+      make("th", name, {scope: "row"}), ...runs.map(({options}) => make("td", options[name] ?? "–")))),
   ]);
 }
 
@@ -121,30 +134,43 @@ const loss = value => value == null ? "not a number" : value.toFixed(4);
 
 // Drift and losses by epoch, of all runs, and the losses within the epochs.
 function draw() {
-  const {runs, plots} = open, colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
+  const {runs, plots} = open, colours = getComputedStyle(document.body);
+  const colour = name => colours.getPropertyValue(name), good = colour("--good");
   plots.forEach(plot => plot.destroy());
-  const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif", grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
+  const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
+    grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
   const [drift, losses] = [[], []]; // [epochs, values], and the curve's looks
   runs.forEach((run, at) => {
-    const {history, trail} = run, paint = at ? MODEL_COLOURS[(at - 1) % MODEL_COLOURS.length] : colour("--line");
-    const of = runs.length > 1 ? `${nameOf(run)} ` : "", epochs = history.map(({epoch}) => epoch), values = key => history.map(row => row[key]);
-    const points = {show: true, size: 7, fill: paint}, chosen = run.best?.by == "val_drift" ? drift : losses;
-    drift.push([[epochs, values("val_drift")], {label: `${of}drift`, stroke: paint, width: 2, points}]);
-    losses.push([[epochs, values("val_loss")], {label: `${of}validation`, stroke: paint, width: 2, points}],
-      [[epochs, values("loss")], {label: `${of}training`, stroke: paint, width: 1, dash: [5, 3], points: {...points, fill: colour("--paper"), stroke: paint}}],
-      [[trail.map(([done]) => done), trail.map(([, loss]) => loss)], {label: `${of}within the epoch`, stroke: `color-mix(in srgb, ${paint} 55%, transparent)`, width: 1, points: {show: false}}]);
-    if (run.best) chosen.push([[[run.best.epoch], [run.best.value]], {label: `${of}best`, stroke: colour("--good"), width: 0, points: {show: true, size: 15, width: 3, fill: "transparent", stroke: colour("--good")}}]);
+    const {history, trail, best} = run, stroke = at ? MODEL_COLOURS[(at - 1) % MODEL_COLOURS.length] : colour("--line");
+    const of = runs.length > 1 ? `${nameOf(run)} ` : "", points = {show: true, size: 7, fill: stroke};
+    const values = key => [history.map(({epoch}) => epoch), history.map(row => row[key])];
+    drift.push([values("val_drift"), {label: `${of}drift`, stroke, width: 2, points}]);
+    losses.push(
+      [values("val_loss"), {label: `${of}validation`, stroke, width: 2, points}],
+      [values("loss"), {label: `${of}training`, stroke, width: 1, dash: [5, 3],
+        points: {...points, fill: colour("--paper")}}],
+      [[trail.map(([done]) => done), trail.map(([, loss]) => loss)], {label: `${of}${WITHIN}`,
+        stroke: `color-mix(in srgb, ${stroke} 55%, transparent)`, width: 1, points: {show: false}}],
+    );
+    if (!best) return;
+    const ring = {show: true, size: 15, width: 3, fill: "transparent", stroke: good};
+    (best.by == "val_drift" ? drift : losses).push(
+      [[[best.epoch], [best.value]], {label: `${of}best`, stroke: good, width: 0, points: ring}]);
   });
   open.plots = [[drift, 2, " m"], [losses, 4, ""]].map(([curves, digits, unit], at) => {
     const holder = element("losses").children[at].lastElementChild;
     holder.replaceChildren();
-    const most = curves.flatMap(([[x, y], {label}]) => label.endsWith("within the epoch") ? y.toSorted((a, b) => a - b).slice(0, Math.ceil(LOSSES * y.length)).slice(-1) : y);
+    const usual = values => values.toSorted((a, b) => a - b)[Math.ceil(LOSSES * values.length) - 1] ?? 0;
+    const most = curves.flatMap(([[, values], {label}]) => label.endsWith(WITHIN) ? usual(values) : values);
     return new uPlot({
       width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
-      scales: {x: {time: false, range: [0, Math.max(...runs.map(({epochs}) => epochs))]}, y: {range: [0, Math.max(...most, 0) * 1.08 || 0.1]}},
-      axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font, incrs: [1, 2, 5, 10, 20, 50, 100]}, {...axis, size: 56}],
+      scales: {x: {time: false, range: [0, Math.max(...runs.map(({epochs}) => epochs))]},
+        y: {range: [0, Math.max(...most, 0) * 1.08 || 0.1]}},
+      axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font,
+        incrs: [1, 2, 5, 10, 20, 50, 100]}, {...axis, size: 56}],
       series: [{label: "epoch", value: (_, at) => at == null ? "–" : at.toFixed(Number.isInteger(at) ? 0 : 2)},
-        ...curves.map(([, looks]) => ({...looks, spanGaps: true, value: (_, value) => value == null ? "–" : value.toFixed(digits) + unit}))],
+        ...curves.map(([, looks]) => ({...looks, spanGaps: true,
+          value: (_, value) => value == null ? "–" : value.toFixed(digits) + unit}))],
     }, uPlot.join(curves.map(([values]) => values), curves.map(() => [0, 1])), holder);
   });
 }
@@ -159,7 +185,8 @@ function showPictures() {
   PICTURES.forEach((name, index) => {
     const [picture, caption] = element("run-pictures").children[index].children;
     const address = `/runs/${id}/training_generator_${name}${shown}.png?of=${run.run}`; // another run's is another one
-    if (shown != undefined && picture.getAttribute("src") != address) Object.assign(picture, {src: address, alt: caption.textContent});
+    if (shown == undefined || picture.getAttribute("src") == address) return;
+    Object.assign(picture, {src: address, alt: caption.textContent});
   });
 }
 

@@ -21,8 +21,12 @@ export function remember() {
 export function note() {
   const {id, row, limit, attention, condition, plots: {zoom}, marks: {first, last}, speed, loop, paths} = page.open;
   const state = {
-    limit, look: attention, find: condition, speed: speed == 1 ? null : speed, loop: loop ? 1 : null, paths: paths ? null : 0,
-    zoom: zoom && zoom.map(Math.round).join("-"), mark: first == undefined && last == undefined ? null : `${first ?? ""}-${last ?? ""}`,
+    limit, look: attention, find: condition,
+    speed: speed == 1 ? null : speed,
+    loop: loop ? 1 : null,
+    paths: paths ? null : 0,
+    zoom: zoom && zoom.map(Math.round).join("-"),
+    mark: first == undefined && last == undefined ? null : `${first ?? ""}-${last ?? ""}`,
   };
   const shown = new URLSearchParams(Object.entries(state).filter(([, value]) => value != null && value !== ""));
   history.replaceState(null, "", `#/${id}/${row}${shown.size ? `?${shown}` : ""}`);

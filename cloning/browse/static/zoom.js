@@ -11,8 +11,9 @@ export function showWindow({zoom, count, columns: {seconds}}) {
   box.hidden = element("whole").hidden = !zoom;
   box.style.left = `${100 * low / count}%`;
   box.style.width = `${100 * (high + 1 - low) / count}%`;
-  element("zoomed").textContent = zoom ? `The curves show ${clock(seconds[Math.ceil(low)])} to ${clock(seconds[Math.floor(high)])}.`
-    : "Drag, turn the wheel or pinch in the curves to zoom.";
+  const [from, to] = [Math.ceil(low), Math.floor(high)].map(row => clock(seconds[row]));
+  element("zoomed").textContent =
+    zoom ? `The curves show ${from} to ${to}.` : "Drag, turn the wheel or pinch in the curves to zoom.";
   if (page.open) remember();
 }
 
@@ -28,14 +29,18 @@ export function zoomable(plot, plots) {
     if (along) plots.setZoom(low + by, high + by);
     else plots.scale(WHEEL ** event.deltaY, rowAt(event.clientX));
   }, {passive: false});
-  over.addEventListener("pointerdown", event => event.pointerType == "touch" && touches.set(event.pointerId, event.clientX));
-  for (const ended of ["pointerup", "pointercancel"]) over.addEventListener(ended, event => touches.delete(event.pointerId));
+  over.addEventListener("pointerdown", ({pointerType, pointerId, clientX}) =>
+    pointerType == "touch" && touches.set(pointerId, clientX));
+  for (const ended of ["pointerup", "pointercancel"]) {
+    over.addEventListener(ended, ({pointerId}) => touches.delete(pointerId));
+  }
   over.addEventListener("pointermove", event => {
     if (!touches.has(event.pointerId)) return;
     const before = [...touches.values()], rows = before.map(rowAt);
     touches.set(event.pointerId, event.clientX);
     if (before.length < 2) return;
-    const [one, two] = touches.values(), wide = Math.max(20, Math.abs(one - two)), factor = Math.abs(before[0] - before[1]) / wide;
+    const [one, two] = touches.values(), wide = Math.max(20, Math.abs(one - two));
+    const factor = Math.abs(before[0] - before[1]) / wide;
     const middle = (rows[0] + rows[1]) / 2, [low, high] = plots.zoom ?? [0, plots.count - 1];
     const at = ((one + two) / 2 - over.getBoundingClientRect().left) / over.clientWidth, rest = (high - low) * factor;
     plots.setZoom(middle - at * rest, middle + (1 - at) * rest);
@@ -65,10 +70,11 @@ function dragging(target, from, now) {
   const isEnd = target.matches("b"), {first, last} = now.marks, {plots} = now;
   const isRight = isEnd && !target.nextElementSibling;
   if (target.closest(".mark")) {
-    if (isEnd) return row => mark(isRight ? "last" : "first", isRight ? Math.max(row, first ?? 0) : Math.min(row, last ?? row));
+    if (isEnd && isRight) return row => mark("last", Math.max(row, first ?? 0));
+    if (isEnd) return row => mark("first", Math.min(row, last ?? row));
     return row => {
       const by = Math.min(now.count - 1 - (last ?? first), Math.max(-(first ?? last), row - from));
-      for (const name of ["first", "last"]) if (now.marks[name] != undefined) now.marks[name] = {first, last}[name] + by;
+      for (const [name, at] of Object.entries({first, last})) if (at != undefined) now.marks[name] = at + by;
       showStretches();
     };
   }
