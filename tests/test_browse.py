@@ -17,7 +17,7 @@ from cloning.base.errors import RecordingError, message_of
 from cloning.browse import analyse, analyses, library, summary
 from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
 from cloning.browse.library import UnknownError
-from cloning.lane.localise import Localisation
+from cloning.lane.search import Localisation
 from cloning.network.network import load_model, steer
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_recording, read_uncut

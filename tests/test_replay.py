@@ -110,7 +110,7 @@ def test_the_car_goes_where_geometry_says(recording):
 def lane(recording, monkeypatch) -> LanePosition:
     """What will be estimated: the human drives 0.8 m right of the lane's centre."""
     n = len(recording)
-    position = LanePosition(np.full(n, 0.8, np.float32), np.zeros(n, np.float32), np.ones(n, bool))
+    position = LanePosition.read(np.full(n, 0.8, np.float32), np.zeros(n, np.float32), np.ones(n, bool))
     monkeypatch.setattr("cloning.lane.known.estimate_lane_position", lambda *_: position)
     return position
 
