@@ -18,7 +18,7 @@ from cloning.browse import analyse, analyses, library, summary
 from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
 from cloning.browse.filter import ConditionError, matching
 from cloning.browse.library import UnknownError
-from cloning.lane.localise import Localisation
+from cloning.lane.search import Localisation
 from cloning.network.network import load_model, steer
 from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame

@@ -16,9 +16,9 @@ from scenes import Here, lake_drive, recorded
 
 from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
-from cloning.lane import reader
+from cloning.lane import parts, reader
 from cloning.lane.ahead import centre_ahead
-from cloning.lane.localise import MIN_LOG_LIKELIHOOD, estimate_lane_position, localise
+from cloning.lane.localise import estimate_lane_position
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
@@ -33,6 +33,7 @@ from cloning.lane.reader import (
     read_strips,
 )
 from cloning.lane.recovery import LanePosition
+from cloning.lane.search import MIN_LOG_LIKELIHOOD, localise
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
@@ -292,8 +293,9 @@ def test_a_damaged_image_is_named(copied):
 def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsys):
     """The table of differences, of a rendered recording against the same places rendered again."""
     recording, _ = drive
-    monkeypatch.setattr("cloning.lane.localise.MIN_LOCALISED_ROWS", len(recording) // 2)  # the drive is short
+    monkeypatch.setattr("cloning.lane.parts.WINDOW", len(recording) // 2)  # the drive is short
     picture = tmp_path / "both.png"
+    monkeypatch.setitem(parts.ANCHOR_TURN_RESIDUAL, "lake", ((0, 1), (0.5, 0.5)))
     assert likeness.main([str(recording.folder), "--frames", "8", "--picture", str(picture)]) == 0
     table = capsys.readouterr().out
     assert table.startswith(f"lake, ccw, {len(stretches(recording)[0])} rows\n")

@@ -23,7 +23,7 @@ from drive_process import serving
 from rendered import render_recording
 
 from cloning.base.errors import SimulatorError
-from cloning.lane.recovery import LanePosition
+from cloning.lane.recovery import MISHAP, LanePosition
 from cloning.network.network import CROP, Network, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
@@ -110,7 +110,7 @@ def test_the_car_goes_where_geometry_says(recording):
 def lane(recording, monkeypatch) -> LanePosition:
     """What will be estimated: the human drives 0.8 m right of the lane's centre."""
     n = len(recording)
-    position = LanePosition(np.full(n, 0.8, np.float32), np.zeros(n, np.float32), np.ones(n, bool))
+    position = LanePosition.read(np.full(n, 0.8, np.float32), np.zeros(n, np.float32), np.ones(n, bool))
     monkeypatch.setattr("cloning.lane.known.estimate_lane_position", lambda *_: position)
     return position
 
@@ -128,6 +128,32 @@ def test_the_lane_is_the_reference_where_it_is_trusted(recording, lane):
     lane.trusted[:] = False
     [line] = replay.reference_lines(recording)
     assert not line.is_lane_centre and not line.offset.any()
+
+
+def test_a_report_tells_known_rows_from_others(recording, lane):
+    """The first third placed, then a mishap, then rows whose lane is not trusted."""
+    lane.placed[:100], lane.trusted[100:] = True, False
+    lane.piece[100:140], lane.piece[140:] = MISHAP, 2
+    lines = replay.reference_lines(recording)
+    done = replay.drive(recording, lines, 1.0, lambda frame: 0.02 * (frame.row % 2))
+    done.interventions = {30: 1.1, 150: 1.2, 180: -1.3}  # of the rows driven: 100 by the lane, 160 by the human's path
+    report = replay_report(recording, lines, [done], "lane")
+    assert report["reference"] == {"lane_centre": 100, "human_way": 160} and report["rows_placed"] == 100
+    mishap, unread = report["unknown"]
+    assert (mishap["first"], mishap["last"], mishap["rows"]) == (recording.name(100), recording.name(139), 40)
+    assert unread["first"] == recording.name(140) and unread["rows"] == 160 and unread["why"] != mishap["why"]
+    metrics = report["limits"]["1"]
+    parts = metrics["by_reference"]
+    assert [part["interventions"] for part in parts.values()] == [1, 2] and metrics["interventions"] == 3
+    seconds = np.array(done.seconds)
+    assert parts["lane_centre"]["autonomy_percent"] == pytest.approx(100 * (1 - 6 / seconds[:100].sum()), abs=1e-3)
+    assert parts["human_way"]["autonomy_percent"] == pytest.approx(100 * (1 - 12 / seconds[100:].sum()), abs=1e-3)
+    assert metrics["steering_roughness_per_s"] == pytest.approx(0.02 * 258 / seconds.sum(), abs=1e-3)
+    assert report["mean_speed_mph"] == pytest.approx(np.abs(recording.speed).mean(), abs=0.05)
+    text = report_text(report)
+    assert text.index("from the lane's centre: autonomy") < text.index("recorded driver's path: autonomy")
+    assert text.index("recorded driver's path: autonomy") < text.index("from both: autonomy")
+    assert f"40 rows from {mishap['first']}: not driven" in text and "33.3% of the rows" in text
 
 
 def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, lane):
@@ -201,7 +227,7 @@ def test_the_command_gives_the_same_figures_over_the_wire(sample_recording, mode
     assert alone.stdout == served.stdout
     [report] = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert set(report["limits"]) == {"1", "2.5"} and report["rows_driven"] == 60
-    assert report["reference"] == {"lane_centre": 0, "human_way": 60} and "cannot be estimated" not in alone.stdout
+    assert report["reference"] == {"lane_centre": 0, "human_way": 60} and "unknown" not in alone.stdout
     one = report["limits"]["1"]
     assert one["interventions"] == len(one["where"]) and one["autonomy_percent"] < 100
     assert (folder[-1] / "IMG" / one["where"][0]["image"]).is_file()
@@ -210,8 +236,8 @@ def test_the_command_gives_the_same_figures_over_the_wire(sample_recording, mode
     oracle = one["compared"]["oracle"]
     assert oracle["autonomy_percent"] == 100 and oracle["distance_mean_m"] == pytest.approx(0.11, abs=0.03)
     assert (
-        f"oracle (the recovery steering itself, driven): autonomy 100.0 %, 0 interventions; distance from the "
-        f"reference: mean {oracle['distance_mean_m']:.2f} m"
+        f"oracle (the recovery steering itself, driven): autonomy 100.0 %, 0 interventions; "
+        f"distance: mean {oracle['distance_mean_m']:.2f} m"
     ) in alone.stdout
     assert (tmp_path / "way.png").read_bytes()[:4] == b"\x89PNG"
     assert film_frames(tmp_path / "seen.mp4") == 60
@@ -236,8 +262,8 @@ def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):
         cv2.imwrite(str(path), rng.integers(0, 255, (160, 320, 3), np.uint8))
     done = run(folder, "--model", model, "--limit", "2", "--report", tmp_path / "r.json")
     assert done.returncode == 0, done.stderr
-    assert "from the human driver's path in 60 rows" in done.stdout
-    assert "the lane centre cannot be estimated reliably" in done.stdout
+    assert "lane's centre unknown in 60 rows from center_" in done.stdout
+    assert "2 m, from the recorded driver's path: autonomy" in done.stdout and "0.0% of the rows" in done.stdout
     assert list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]) == ["2"]
 
 

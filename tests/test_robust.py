@@ -44,7 +44,7 @@ def recording(steering, pause_after=None):
 
 def lanes(monkeypatch, steering=0.0, offset=0.0, trusted=True, **more) -> Lanes:
     """The lanes of a recording that is `offset` metres right of the centre; trusted: which rows' readings."""
-    reading = LanePosition(np.full(N, offset), np.zeros(N), np.full(N, trusted))
+    reading = LanePosition.read(np.full(N, offset), np.zeros(N), np.full(N, trusted))
     monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
     return Lanes.of(recording(steering, **more))
 

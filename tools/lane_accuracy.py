@@ -19,14 +19,9 @@ import numpy as np
 
 from cloning.base.arguments import number
 from cloning.lane import marking
-from cloning.lane.localise import (
-    MIN_LOCALISED_ROWS,
-    TrackFilter,
-    estimate_lane_position,
-    follow_line,
-    line_deviations,
-    localise,
-)
+from cloning.lane.follow import TrackFilter
+from cloning.lane.localise import estimate_lane_position, follow_line, line_deviations
+from cloning.lane.parts import WINDOW
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
@@ -37,6 +32,7 @@ from cloning.lane.reader import (
     load_network,
     read_strips,
 )
+from cloning.lane.search import localise
 from cloning.recordings.log import Recording, read_recording
 from cloning.road.motion import stretches
 from cloning.road.track import ROADS, Track
@@ -130,7 +126,7 @@ def measure_line(recording: Recording, strips: np.ndarray, centres: np.ndarray) 
     strips: of `read_strips`; centres: of `estimate_centres`.
     """
     for stretch in stretches(recording):
-        if len(stretch) < MIN_LOCALISED_ROWS:
+        if len(stretch) < WINDOW:
             continue
         detected, seen = centres[stretch.rows], strips.__getitem__
         found = localise(stretch, detected)

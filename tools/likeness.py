@@ -54,7 +54,7 @@ def compare(folder: Path, count: int, look: int, picture: str | None) -> None:
     check_folders(picture)
     recording = read_recording(folder)
     strips = read_strips(recording)
-    drives = list(localise_all(stretches(recording), estimate_centres(strips), strips.__getitem__))
+    drives = list(localise_all(recording, stretches(recording), estimate_centres(strips), strips.__getitem__))
     if not drives:
         raise RecordingError(f"{folder}: not on a known road; give a recording of the lake or the jungle")
     rows, located = max(drives, key=lambda drive: drive[0].stop - drive[0].start)

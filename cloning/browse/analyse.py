@@ -34,7 +34,7 @@ from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_uncut
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import Drive, ReplayFrame, drive, load_recording, reference_lines
-from cloning.replay.score import driving_metrics
+from cloning.replay.score import drive_metrics, reference_metrics
 from cloning.road.motion import stretches
 
 PART_ROWS = 256  # that are analysed at once: with their strips, 12 MB
@@ -153,7 +153,8 @@ def replayed(recording: Recording, analysis: Analysis) -> Result:
         "line": np.repeat(np.arange(len(lines)), [len(line.stretch) for line in lines]),
     }
     about = {
-        **driving_metrics(done),
+        **drive_metrics(lines, done),
+        **reference_metrics(recording, lines),
         "human_mean_m": round(float(np.abs(columns["human"]).mean()), 3),
         "where": [[at, round(metres, 2)] for at, metres in done.interventions.items()],
         "by_lane": sum(len(line.stretch) for line in lines if line.is_lane_centre),

@@ -51,7 +51,7 @@ def known_position(recording: Recording) -> LanePosition | None:
         raise RecordingError(f"{path}: names no centre image of a usable row of {DRIVING_LOG}; {REMEDY}")
     if not trusted.all():
         print(f"{path}: the lane is unknown in {(~trusted).sum()} of {len(names)} rows, which it does not name")
-    return LanePosition(offset, heading_error, trusted)
+    return LanePosition(offset, heading_error, trusted, trusted, np.zeros(len(names), np.int32))
 
 
 def read_known(path: Path) -> dict[bytes, tuple[float, float]]:

@@ -222,7 +222,7 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
         yaw[row] = -np.arctan(b)
         offset[row] = -a * np.cos(yaw[row])
     trusted = (np.abs(camera_error) < MAX_CAMERA_ERROR).all((1, 2)) & (_smooth(residual) < MAX_RESIDUAL)
-    return LanePosition(offset, yaw, trusted)
+    return LanePosition.read(offset, yaw, trusted)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

@@ -5,13 +5,16 @@ from the lane's centre (m) and heading error (radians), both positive to the rig
 origin on the lane's centre next to the recorded car's rear axle, and its forward axis along the lane.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
 from cloning.base.table import Column, Table
+from cloning.recordings.log import Recording
 from cloning.road.motion import (
+    MIN_STRETCH_ROWS,
     MIN_TRUSTED,
     OFF_ROAD,
     REAR_AXLE,
@@ -24,6 +27,7 @@ from cloning.road.motion import (
 
 LOOKAHEAD = 6.0  # m along the lane's centre, to the point that the recovery steering aims at
 MAX_LABEL_OFFSET = 1.0  # m: from a larger lateral offset the car returns at the same angle as from this one
+MISHAP = -1  # a piece's number, see `LanePosition`
 HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far behind to so far ahead
 
 
@@ -33,13 +37,34 @@ class LanePosition(Table):
 
     lateral_offset  float32 (n,): m from the lane's centre to the car's middle, right positive
     heading_error   float32 (n,): radians from the road's direction next to the car to the car's, right positive
-    trusted         bool (n,): whether the other two values can be relied on: the three cameras' detections agree with
-                    each other and over time, or the row was localised on a known track
+    trusted         bool (n,): whether these two values can be relied on: the three cameras' detections agree with each
+                    other and over time, or the row is placed
+    placed          bool (n,): whether it was localised on a known track, or the recording itself tells the position
+    piece           int32 (n,): rows of a stretch with the same number belong together; MISHAP: the car did not move as
+                    it steered, or was off the road, so that nothing can be learnt or judged by the row
     """
 
     lateral_offset: Column
     heading_error: Column
     trusted: Column
+    placed: Column
+    piece: Column
+
+    @staticmethod
+    def read(offset: np.ndarray, heading_error: np.ndarray, trusted: np.ndarray) -> "LanePosition":
+        """Return a position that was read from frames, in one piece."""
+        n = len(trusted)
+        return LanePosition(offset, heading_error, trusted, np.zeros(n, bool), np.zeros(n, np.int32))
+
+    def pieces(self, recording: Recording, stretch: Stretch) -> list[Stretch]:
+        """Return a stretch of the recording without mishaps, split where one piece ends; each is at least 2 s long."""
+        rows, piece = stretch.rows, self.piece[stretch.rows]
+        edges = np.flatnonzero(np.diff(piece)) + 1
+        runs = itertools.pairwise([0, *edges.tolist(), len(piece)])
+        kept = [(start, end) for start, end in runs if piece[start] != MISHAP and end - start >= MIN_STRETCH_ROWS]
+        if kept == [(0, len(piece))]:
+            return [stretch]
+        return [Stretch.of(recording, slice(rows.start + start, rows.start + end)) for start, end in kept]
 
 
 @dataclass(frozen=True)

@@ -40,10 +40,11 @@ MAX_YAW_FROM_HUMAN = 1.2  # radians: views further to the side cannot be warped 
 class ReferenceLine:
     """The line from which lateral offsets are measured, over one stretch of a recording.
 
-    stretch         of the recording
+    stretch         of the recording, or a part of one
     offset          float64 (n,): m from the line to the human driver's car, right positive
     yaw             float64 (n,): radians from the line to the human driver's heading, right positive
     is_lane_centre  if not, the line is the human driver's path, and offset and yaw are 0
+    placed          rows in which the lane is not read from single frames: see `LanePosition`
     ahead           the lane ahead at each row, along the same line, known or extended
     """
 
@@ -51,6 +52,7 @@ class ReferenceLine:
     offset: np.ndarray
     yaw: np.ndarray
     is_lane_centre: bool
+    placed: int
     ahead: LaneAhead
 
     @staticmethod
@@ -58,7 +60,7 @@ class ReferenceLine:
         """Return the human driver's path over a stretch."""
         zeros = np.zeros(len(stretch))
         ahead = LaneAhead.of_stretch(stretch, zeros, zeros.astype(bool)).extended()
-        return ReferenceLine(stretch, zeros, zeros, is_lane_centre=False, ahead=ahead)
+        return ReferenceLine(stretch, zeros, zeros, is_lane_centre=False, placed=0, ahead=ahead)
 
     @property
     def rows(self) -> slice:
@@ -109,8 +111,9 @@ def load_recording(folder: str | Path) -> CheckedRecording:
 def reference_lines(recording: Recording, by_lane: bool = True) -> list[ReferenceLine]:
     """Return the reference lines of the stretches to replay.
 
-    by_lane: use the lane centre in stretches in which it is known or its estimate is trusted, and leave out the parts
-    in which the human driver is off the road; in other stretches, and if not by_lane, use the human driver's path.
+    by_lane: use the lane centre in pieces in which it is known or its estimate is trusted, and leave out mishaps and
+    the parts in which the human driver is off the road; in other pieces, and if not by_lane, use the human driver's
+    path.
     Raises RecordingError if there is no stretch to replay.
     """
     driven, lines = stretches(recording), list[ReferenceLine]()
@@ -118,7 +121,8 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
         from cloning.lane.known import lane_position  # imports torch
 
         lane = lane_position(recording, driven)
-        lines = [line for stretch in driven for line in _lines_of(recording, stretch, lane.take(stretch.rows))]
+        parts = [part for stretch in driven for part in lane.pieces(recording, stretch)]
+        lines = [line for part in parts for line in _lines_of(recording, part, lane.take(part.rows))]
     else:
         lines = [ReferenceLine.human_path(stretch) for stretch in driven]
     if not lines:
@@ -139,7 +143,8 @@ def _lines_of(recording: Recording, stretch: Stretch, lane: LanePosition) -> lis
         if end - start >= MIN_STRETCH_ROWS:
             first, rows = stretch.rows.start, slice(start, end)
             part = stretch if rows == slice(0, len(lane)) else Stretch.of(recording, slice(first + start, first + end))
-            lines.append(ReferenceLine(part, offset[rows], yaw[rows], True, ahead.take(rows)))
+            placed = int(lane.placed[rows].sum())
+            lines.append(ReferenceLine(part, offset[rows], yaw[rows], True, placed, ahead.take(rows)))
     return lines
 
 

@@ -1,6 +1,7 @@
 """Replay metrics, as a report, as text, as a plot and as a film."""
 
 import io
+import itertools
 from pathlib import Path
 from typing import TypedDict
 
@@ -12,14 +13,24 @@ from cloning.base.outputs import plural, write_output
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, drive
+from cloning.road.autonomy import autonomy
 from cloning.road.camera import FIRST_BONNET_ROW
+from cloning.road.motion import stretch_rows
 from cloning.road.overlay import overlay
 
 SMOOTHED_ROWS = 9  # rows (0.6 s) over which steering is averaged before it is correlated
 CAPTION_ROWS = 28  # of the film, above each frame
 LISTED = 10  # interventions that the text lists for each limit
+LANE_CENTRE, HUMAN_WAY = "lane_centre", "human_way"  # the report's keys of the reference lines
+REFERENCES = {LANE_CENTRE: "from the lane's centre", HUMAN_WAY: "from the recorded driver's path"}
+# Why the lane's centre is not the reference.
+NOT_DRIVEN = "not driven: standing, or less than two seconds without a break"
+NOT_ON_THE_ROAD = "not driven: off the road, or the car did not move as it was steered"
+NOT_READ = (
+    "measured from the recorded driver's path: not placed on a known track, and not read reliably from the frames"
+)
 ORACLE = "oracle"  # the report's key of the recovery steering as the driver: the best that the measure allows
-YARDSTICKS = {"steering_zero": "steering 0", "mean_steering": "mean steering", "human": "human driver"}  # key: words
+YARDSTICKS = {"steering_zero": "steering 0", "mean_steering": "mean steering", "human": "recorded driver"}  # key: words
 
 
 class DrivingMetrics(TypedDict):
@@ -49,7 +60,39 @@ class Intervention(TypedDict):
     metres: float
 
 
-class LimitReport(DrivingMetrics):
+class DriveMetrics(DrivingMetrics):
+    """The metrics of one drive, of all its rows, and separately of those with each kind of reference line.
+
+    by_reference: by `LANE_CENTRE` and `HUMAN_WAY`, those that there are; steering_roughness_per_s: mean absolute change
+    of the steering, -1..1, per second.
+    """
+
+    by_reference: dict[str, DrivingMetrics]
+    steering_roughness_per_s: float
+
+
+class Unknown(TypedDict):
+    """Successive rows whose lane is not known: the first and the last centre image, their number, and why."""
+
+    first: str
+    last: str
+    rows: int
+    why: str
+
+
+class ReferenceMetrics(TypedDict):
+    """What is known of the lane in a recording.
+
+    rows_placed: whose position is that on a known track, or told by the recording itself; unknown: where the lane's
+    centre is not the reference; mean_speed_mph: of the rows driven.
+    """
+
+    rows_placed: int
+    unknown: list[Unknown]
+    mean_speed_mph: float
+
+
+class LimitReport(DriveMetrics):
     """The metrics of the drive at one limit; compared: those of the yardsticks, by name."""
 
     steering: SteeringMetrics
@@ -57,7 +100,7 @@ class LimitReport(DrivingMetrics):
     compared: dict[str, DrivingMetrics]
 
 
-class ReplayReport(TypedDict):
+class ReplayReport(ReferenceMetrics):
     """The report of one recording.
 
     reference_asked: "lane" or "human"; reference: the rows measured from the lane's centre, `lane_centre`, and from the
@@ -75,14 +118,49 @@ class ReplayReport(TypedDict):
     steering_compared: dict[str, SteeringMetrics]
 
 
-def driving_metrics(done: Drive) -> DrivingMetrics:
-    """Return the metrics of one drive."""
-    distance = np.abs(done.offset)
+def driving_metrics(done: Drive, counted: np.ndarray | None = None) -> DrivingMetrics:
+    """Return the metrics of one drive; counted: bool (n,), the entries that count, at least one; None: all."""
+    counted = np.ones(len(done.row), bool) if counted is None else counted
+    distance = np.abs(done.offset)[counted]
+    interventions = sum(bool(counted[at]) for at in done.interventions)
     return {
-        "autonomy_percent": round(100 * done.autonomy(), 4),
-        "interventions": len(done.interventions),
+        "autonomy_percent": round(100 * autonomy(interventions, float(np.array(done.seconds)[counted].sum())), 4),
+        "interventions": interventions,
         "distance_mean_m": round(float(distance.mean()), 3),
         "distance_p95_m": round(float(np.percentile(distance, 95)), 3),
+    }
+
+
+def drive_metrics(lines: list[ReferenceLine], done: Drive) -> DriveMetrics:
+    """Return the metrics of the drive along these lines."""
+    by_lane = np.repeat([line.is_lane_centre for line in lines], [len(line.stretch) for line in lines])
+    seconds, change = np.array(done.seconds), np.abs(np.diff(done.steering, prepend=done.steering[0]))
+    inside = seconds > 0  # not the first row of a line
+    parts = {LANE_CENTRE: by_lane, HUMAN_WAY: ~by_lane}
+    return {
+        **driving_metrics(done),
+        "by_reference": {name: driving_metrics(done, counted) for name, counted in parts.items() if counted.any()},
+        "steering_roughness_per_s": round(float(change[inside].sum() / max(seconds.sum(), 1e-9)), 3),
+    }
+
+
+def reference_metrics(recording: Recording, lines: list[ReferenceLine]) -> ReferenceMetrics:
+    """Return what is known of the lane in a recording; lines: of `reference_lines`."""
+    why, driven = np.full(len(recording), NOT_DRIVEN, object), np.zeros(len(recording), bool)
+    for rows in stretch_rows(recording):
+        why[rows] = NOT_ON_THE_ROAD
+    for line in lines:
+        why[line.rows], driven[line.rows] = "" if line.is_lane_centre else NOT_READ, True
+    edges = np.flatnonzero(why[1:] != why[:-1]) + 1
+    runs = itertools.pairwise([0, *edges.tolist(), len(why)])
+    return {
+        "rows_placed": sum(line.placed for line in lines),
+        "unknown": [
+            {"first": recording.name(start), "last": recording.name(end - 1), "rows": end - start, "why": why[start]}
+            for start, end in runs
+            if why[start]
+        ],
+        "mean_speed_mph": round(float(np.abs(recording.speed[driven]).mean()), 1),
     }
 
 
@@ -116,7 +194,7 @@ def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list
 
     def limit_report(done: Drive) -> LimitReport:
         return {
-            **driving_metrics(done),
+            **drive_metrics(lines, done),
             "steering": steering_metrics(np.array(done.steering), human),
             "where": [
                 {
@@ -137,8 +215,9 @@ def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list
         "rows_driven": rows,
         "stretches": len(lines),
         "seconds": round(sum(drives[0].seconds), 2),
+        **reference_metrics(recording, lines),
         "reference_asked": asked,
-        "reference": {"lane_centre": by_lane, "human_way": rows - by_lane},
+        "reference": {LANE_CENTRE: by_lane, HUMAN_WAY: rows - by_lane},
         "limits": {f"{done.limit:g}": limit_report(done) for done in drives},
         "steering_compared": {
             "steering_zero": steering_metrics(np.zeros_like(human), human),
@@ -149,19 +228,24 @@ def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list
 
 def report_text(report: ReplayReport) -> str:
     """Return a report as lines for a terminal."""
-    by_lane, by_human = report["reference"]["lane_centre"], report["reference"]["human_way"]
-    references = [f"the lane centre in {by_lane} rows"] if by_lane else []
-    references += [f"the human driver's path in {by_human} rows"] if by_human else []
-    stretches = plural(report["stretches"], "stretch", "stretches")
+    stretches, rows = plural(report["stretches"], "stretch", "stretches"), report["rows"]
     lines = [
-        f"{report['recording']}: replayed {report['seconds']:.1f} s in {stretches} ({report['rows_driven']} of "
-        f"{report['rows']} rows); offsets are measured from {' and '.join(references)}"
+        f"{report['recording']}: replayed {report['seconds']:.1f} s in {stretches} ({report['rows_driven']} of {rows} "
+        f"rows) at {report['mean_speed_mph']:.1f} mph on average; {report['rows_placed'] / rows:.1%} of the rows are "
+        "placed, on a known track or by the recording itself"
     ]
-    if report["reference_asked"] == "lane" and by_human:
-        lines.append("  the lane centre cannot be estimated reliably where the human driver's path is used instead")
+    if report["reference_asked"] == "lane":
+        unknown = [f"{plural(u['rows'], 'row')} from {u['first']}: {u['why']}" for u in report["unknown"]]
+        lines += [f"  lane's centre unknown in {words}" for words in unknown[:LISTED]]
+        if (more := len(unknown) - LISTED) > 0:
+            lines.append(f"  … and in {plural(more, 'more place')}")
     for limit, metrics in report["limits"].items():
         others = {words: metrics["compared"][name] for name, words in YARDSTICKS.items()}
-        lines.append(f"limit {limit} m: {_driving(metrics)}")
+        kinds = [(REFERENCES[name], part) for name, part in metrics["by_reference"].items()]
+        if len(kinds) > 1:
+            kinds.append(("from both", metrics))
+        lines += [f"limit {limit} m, {words}: {_driving(part)}" for words, part in kinds]
+        lines.append(f"  mean absolute change of the steering: {metrics['steering_roughness_per_s']:.2f} per second")
         lines.append(f"  oracle (the recovery steering itself, driven): {_driving(metrics['compared'][ORACLE])}")
         yardsticks = (f"{words} {o['autonomy_percent']:.0f} % ({o['interventions']})" for words, o in others.items())
         lines.append("  yardsticks, autonomy (interventions): " + ", ".join(yardsticks))
@@ -177,7 +261,7 @@ def report_text(report: ReplayReport) -> str:
     errors = (f"{YARDSTICKS[name]} {other['error']:.3f}" for name, other in report["steering_compared"].items())
     correlation = "undefined (constant steering)" if steering["correlation"] is None else steering["correlation"]
     lines.append(
-        f"steering compared with the human driver's, at limit {limit} m: RMS error {steering['error']:.3f} "
+        f"steering compared with the recorded driver's, at limit {limit} m: RMS error {steering['error']:.3f} "
         f"(yardsticks: {', '.join(errors)}); correlation, both smoothed over {SMOOTHED_ROWS} rows: {correlation}"
     )
     return "\n".join(lines)
@@ -187,7 +271,7 @@ def _driving(metrics: DrivingMetrics) -> str:
     """Return the metrics of one drive in the text."""
     return (
         f"autonomy {metrics['autonomy_percent']:.1f} %, {plural(metrics['interventions'], 'intervention')}; "
-        f"distance from the reference: mean {metrics['distance_mean_m']:.2f} m, "
+        f"distance: mean {metrics['distance_mean_m']:.2f} m, "
         f"95th percentile {metrics['distance_p95_m']:.2f} m"
     )
 
@@ -204,7 +288,7 @@ def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> N
         offset[np.flatnonzero(np.diff(done.row) > 1) + 1] = np.nan  # no line is plotted across a break
         ax.axhspan(-done.limit, done.limit, color="0.93")
         ax.plot(seconds, offset, linewidth=0.9, label="model")
-        ax.plot(seconds, human_offset, linewidth=0.7, color="0.5", label="human driver")
+        ax.plot(seconds, human_offset, linewidth=0.7, color="0.5", label="recorded driver")
         for at in done.interventions:
             ax.axvline(seconds[at], color="tab:red", linewidth=0.8)
         count = plural(len(done.interventions), "intervention")
@@ -212,7 +296,7 @@ def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> N
         ax.set(ylabel="m right of the reference", title=title)
     seconds = np.cumsum(drives[-1].seconds)
     axes[-1].plot(seconds, drives[-1].steering, linewidth=0.8, label="model")
-    axes[-1].plot(seconds, drives[-1].human_steering, linewidth=0.6, color="0.5", label="human driver")
+    axes[-1].plot(seconds, drives[-1].human_steering, linewidth=0.6, color="0.5", label="recorded driver")
     axes[-1].set(xlabel="s", ylabel="steering")
     for ax in axes:
         ax.legend(loc="upper right", fontsize=8)
@@ -246,7 +330,7 @@ class ReplayFilm(DriveFilm):
             caption += f"   {plural(len(done.interventions), 'intervention')}"
         views = [
             captioned(frame.view, done.steering[-1], caption),
-            captioned(frame.recorded, frame.human_steering, f"human driver   steering {frame.human_steering:+.3f}"),
+            captioned(frame.recorded, frame.human_steering, f"recorded driver   steering {frame.human_steering:+.3f}"),
         ]
         self.add(np.hstack(views))
 

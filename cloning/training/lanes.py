@@ -4,6 +4,7 @@ Poses and the lane's frame are those of `cloning/lane/recovery.py`.
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Self
@@ -59,7 +60,7 @@ class Lanes(LaneAhead):
         whole = stretches(recording)
         position = lane_position(recording, whole)
         lanes = cls.unknown(len(recording))
-        for stretch in whole:
+        for stretch in itertools.chain.from_iterable(position.pieces(recording, each) for each in whole):
             rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
             ahead = LaneAhead.of_stretch(stretch, position.lateral_offset[rows], position.trusted[rows])
             for column in fields(LaneAhead):

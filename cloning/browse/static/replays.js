@@ -89,12 +89,18 @@ function section(replay, index) {
     failed: [`Failed: ${replay.message}. `, orderButton("Try again", "POST", `columns/replay-${index}-${limit}`)],
   }[replay.state];
   if (waiting) return make("section", "", {}, heading, make("p", "", {}, ...waiting));
+  const score = ({autonomy_percent: percent, interventions}) => `${percent.toFixed(1)} %, ${many(interventions, "intervention")}`;
+  const {lane_centre: byLane, human_way: byHuman} = replay.by_reference;
   const lines = Object.entries({
+    ...(byLane && byHuman && {"where the lane is known": score(byLane), "elsewhere, from the human's path": score(byHuman)}),
     autonomy: `${replay.autonomy_percent.toFixed(1)} %`,
     distance: `mean ${replay.distance_mean_m.toFixed(2)} m, 95 % below ${replay.distance_p95_m.toFixed(2)} m`,
     "human's distance": `mean ${replay.human_mean_m.toFixed(2)} m`,
-    driven: many(replay.driven, "frame") + (replay.by_lane == replay.driven ? ""
-      : `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known`),
+    driven: many(replay.driven, "frame") + (replay.by_lane < replay.driven
+      ? `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known` : ""),
+    placed: many(replay.rows_placed, "frame"),
+    "mean speed": `${replay.mean_speed_mph.toFixed(1)} mph`,
+    "steering's change": `${replay.steering_roughness_per_s.toFixed(2)} per second`,
     interventions: replay.interventions.toLocaleString("en"),
   });
   const made = make("section", "", {}, heading,

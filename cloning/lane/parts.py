@@ -1,0 +1,279 @@
+"""Finds the parts of a recording that certainly are on a known track, whatever lies between them.
+
+A window of a stretch that certainly is on a track is followed in both directions for as long as what the cameras see
+and how the car turns agree with the track. So a car that is stuck, pushed back or off the road ends a part, and the
+rows after it are sought near its end, where the car must be.
+"""
+
+import functools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cloning.lane.follow import Candidate, TrackFilter
+from cloning.lane.search import MAX_TURN_RESIDUAL, MIN_LOG_LIKELIHOOD, Localisation, followed, known_tracks, search
+from cloning.recordings.log import Recording
+from cloning.road.motion import MIN_STRETCH_ROWS, MPH, Stretch
+
+WINDOW, WINDOW_STEP = 300, 150  # rows: a shorter window may resemble a bend of any track
+# A row's score is 1 if all agrees, and 0 at this log-likelihood of its detections, or at so many standard deviations
+# between its turn and the expected one. In the jungle, brows and hairpins hide the road.
+ANCHOR_TURN_RESIDUAL = {"lake": ((130, 270, 400), (0.25, 0.4, 0.5)), "jungle": ((130, 270, 400), (0.9, 0.9, 1.2))}
+FIT_SCALE, TURN_SCALE = {"lake": 0.15, "jungle": 1.0}, {"lake": 1.2, "jungle": 3.5}
+ALARM = 15.0  # a fall of the sum of the scores by so much ends a part, at the rows before the fall
+SEED_COVARIANCE = np.diag([1.0, 0.1, 0.003])  # of the state at which a part begins to grow; as `INITIAL_COVARIANCE`
+START_COVARIANCE = np.diag([4.0, 0.5, 0.01])  # of its first row's state, once it has grown
+LENIENCE = 0.7  # added to the scores to find where a fall begins: rows before a mishap may agree less, as at a brow
+PROBE, FIRST_PROBE = 40, 15  # rows over which candidates near a neighbour are followed
+KEPT = 4  # candidates that are followed over all of PROBE
+PROBES = np.array([0, 10, 20, 30, 45, 60, 80, 100, 130, 160, 200, 250])  # rows after a neighbour, from which to try
+# What a part beside another one needs, where the car should be and anywhere near: rows, log-likelihood, turn residual.
+EXPECTED = {"lake": (60, -0.05, 0.3), "jungle": (45, -0.42, 1.45)}
+MISHAP = {"lake": (100, -0.04, 0.25), "jungle": (80, -0.25, 0.85)}
+PROBE_STEP = 5.0  # m between candidates
+SLACK, SLACK_PER_METRE = 5.0, 0.1  # m, and of the metres driven: where the car should be without a mishap
+BACK, BEYOND = 30.0, 20.0  # m: further back, or further on than it drove, the car is not after a mishap
+MAX_REACH, MAX_PAUSE = 200.0, 10.0  # m, s: after more, it may be anywhere
+AMBIGUOUS, SAME_OFFSET = 0.8, 0.3  # share of the best part's quality, and m: see `Placing.near`
+
+
+@dataclass(frozen=True)
+class Part:
+    """Rows of a stretch that certainly are on a track.
+
+    stretch, track  their indices
+    start, end      rows of the stretch
+    found           in these rows
+    """
+
+    stretch: int
+    track: int
+    start: int
+    end: int
+    found: Localisation
+
+    def quality(self) -> float:
+        """Return a measure of how many rows agree with the track, and how well."""
+        found = self.found
+        fit = found.log_likelihood / -MIN_LOG_LIKELIHOOD
+        return (self.end - self.start) * (2 + fit - (found.turn_residual / MAX_TURN_RESIDUAL[found.track.name]) ** 2)
+
+    def is_beyond(self, limits: tuple[int, float, float]) -> bool:
+        """Return whether the part has more rows, a higher log-likelihood and a lower turn residual than these."""
+        rows, log_likelihood, turn_residual = limits
+        found = self.found
+        fits = found.log_likelihood > log_likelihood and found.turn_residual < turn_residual
+        return fits and self.end - self.start >= rows
+
+    def away_from(self, other: "Part") -> float:
+        """Return how far from here another part is placed in the rows of both, across the road, on average, m."""
+        start, end = max(self.start, other.start), min(self.end, other.end)
+        if start >= end:
+            return np.inf
+        here, there = (part.found.states[start - part.start : end - part.start, 1] for part in (self, other))
+        return float(np.abs(here - there).mean())
+
+
+class Followers:
+    """The filters of a stretch on all known tracks, in both directions of time."""
+
+    def __init__(self, stretch: Stretch, centres: np.ndarray):
+        """centres: of the stretch's rows."""
+        self.stretch = stretch
+        self.ahead = [TrackFilter(stretch, centres, track) for track in known_tracks()]
+
+    @functools.cached_property
+    def back(self) -> list[TrackFilter]:
+        """The same, from the last row to the first."""
+        return [follower.backwards() for follower in self.ahead]
+
+    def grow(
+        self, track: int, seed: int, state: np.ndarray, first: int, end: int
+    ) -> tuple[int, int, Localisation] | None:
+        """Return the rows around a seed that agree with a track, and their localisation; None if they are too few.
+
+        state: in the row `seed`; first, end: the rows beyond which not to grow.
+        """
+        n = len(self.stretch)
+        later = follow_while_certain(Candidate(self.ahead[track], state, seed, SEED_COVARIANCE), end)
+        back = Candidate(self.back[track], state, n - 1 - seed, SEED_COVARIANCE)
+        earlier = n - follow_while_certain(back, n - first)
+        begin = back.filtered[seed - earlier][0]
+        while later - earlier >= MIN_STRETCH_ROWS:
+            whole = Candidate(self.ahead[track], begin, earlier, START_COVARIANCE)
+            found = followed(whole, later)
+            turns = np.r_[0, whole.turns(found.states)]
+            scores = score(found.track.name, np.array(whole.fits), turns)
+            after = agreeing(scores[seed - earlier :])
+            before = agreeing(scores[: seed - earlier + 1][::-1])
+            if after == later - seed and before == seed - earlier + 1:
+                return earlier, later, found
+            begin = found.states[seed - earlier + 1 - before]
+            earlier, later = seed + 1 - before, seed + after
+        return None
+
+
+def is_anchor(found: Localisation) -> bool:
+    """Return whether a part is certain by itself."""
+    metres = found.states[-1, 0] - found.states[0, 0]
+    limit = np.interp(metres, *ANCHOR_TURN_RESIDUAL[found.track.name])
+    return found.is_certain() and found.turn_residual < limit
+
+
+def score(name: str, fits: np.ndarray | float, turns: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the scores of rows on a track of this name; fits, turns: of `Candidate`."""
+    return 1 + fits / FIT_SCALE[name] - (np.asarray(turns) / TURN_SCALE[name]) ** 2
+
+
+def agreeing(scores: np.ndarray) -> int:
+    """Return how many rows, from the first on, are before the first fall by ALARM of the sum of their scores."""
+    total = np.cumsum(scores)
+    fallen = np.maximum.accumulate(total) - total > ALARM
+    if not fallen.any():
+        return len(scores)
+    return int(np.cumsum(scores[: fallen.argmax() + 1] + LENIENCE).argmax()) + 1
+
+
+def follow_while_certain(candidate: Candidate, end: int) -> int:
+    """Follow a candidate until the sum of its scores falls by ALARM; return the row after the last before that fall."""
+    name, total, best = candidate.follower.track.name, 0.0, 0.0
+    for row in range(candidate.first, end):
+        candidate.follow(row + 1)
+        total += float(score(name, candidate.fits[-1]))
+        best = max(best, total)
+        if best - total > ALARM:
+            break
+    return candidate.first + agreeing(score(name, np.array(candidate.fits)))
+
+
+class Placing:
+    """The search for the parts of a recording that certainly are on a known track."""
+
+    def __init__(self, recording: Recording, stretches: list[Stretch], centres: np.ndarray):
+        """centres: float32 (n, 3, 5): of `reader.detect_centres`, in the recording's rows."""
+        self.recording = recording
+        self.followers = [Followers(stretch, centres[stretch.rows]) for stretch in stretches]
+        self.parts: list[Part] = []
+
+    def anchors(self) -> None:
+        """Find the parts that are certain by themselves."""
+        for index, followers in enumerate(self.followers):
+            n, at, free = len(followers.stretch), 0, 0
+            while at + WINDOW <= n:
+                candidate = search(followers.ahead, at, at + WINDOW)
+                window = followed(candidate, at + WINDOW)
+                if is_anchor(window):
+                    track, middle = known_tracks().index(window.track), WINDOW // 2
+                    grown = followers.grow(track, at + middle, window.states[middle], free, n)
+                    if grown and grown[1] - grown[0] >= WINDOW and is_anchor(grown[2]):
+                        self.parts.append(Part(index, track, *grown))
+                        at = free = grown[1]
+                        continue
+                at = at + WINDOW_STEP if at + WINDOW == n else min(at + WINDOW_STEP, n - WINDOW)
+
+    def spread(self, forward: bool) -> None:
+        """Place what is left, from the ends of the parts that there are on, or from their starts back."""
+        parts, self.parts = self.parts[:: 1 if forward else -1], []
+        if not parts:
+            return
+        for part, other in zip(parts, [*parts[1:], None], strict=True):
+            self.parts.append(part)
+            while found := self.next_to(self.parts[-1], other, forward):
+                self.parts.append(found)
+        self.parts = self.parts[:: 1 if forward else -1]
+
+    def next_to(self, part: Part, other: Part | None, forward: bool) -> Part | None:
+        """Return the nearest part that is certain between two, or None; other: the next one, as yet, if any."""
+        for index, first, end in self.gaps(part, other, forward):
+            for skipped in PROBES:
+                start = first + skipped if forward else end - PROBE - skipped
+                start = int(start)
+                if not first <= start <= end - PROBE:
+                    break
+                reach = self.reach(part, index, start if forward else start + PROBE - 1, forward)
+                if reach > MAX_REACH:
+                    return None
+                if found := self.near(part, index, (start, first, end), reach, forward):
+                    return found
+        return None
+
+    def gaps(self, part: Part, other: Part | None, forward: bool) -> Iterable[tuple[int, int, int]]:
+        """Yield the rows between two parts: the index of a stretch, and its rows."""
+        last = other.stretch if other else (len(self.followers) - 1 if forward else 0)
+        for index in range(part.stretch, last + (1 if forward else -1), 1 if forward else -1):
+            first, end = 0, len(self.followers[index].stretch)
+            for each, is_before in ((part, forward), (other, not forward)):
+                if each and each.stretch == index:
+                    first, end = (max(first, each.end), end) if is_before else (first, min(end, each.start))
+            if end - first >= PROBE:
+                yield index, first, end
+
+    def reach(self, part: Part, index: int, row: int, forward: bool) -> float:
+        """Return how many metres the car may have driven between a part's end, or start, and a row of a stretch."""
+        recording = self.recording
+        inside = self.followers[part.stretch].stretch.rows.start + (part.end - 1 if forward else part.start)
+        outside = self.followers[index].stretch.rows.start + row
+        rows = slice(min(inside, outside), max(inside, outside) + 1)
+        pause = np.diff(recording.time[rows])
+        if len(pause) and (pause.max() > MAX_PAUSE or pause.min() < 0):
+            return np.inf
+        speed = np.abs(recording.speed[rows].astype(float)) * MPH
+        return float((np.maximum(speed[1:], speed[:-1]) * pause).sum())
+
+    def near(self, part: Part, index: int, rows: tuple[int, int, int], reach: float, forward: bool) -> Part | None:
+        """Return the part around some rows of a stretch if it certainly is near another one.
+
+        First it is sought where the car should be by its speed, then wherever it may be after a mishap. rows: the first
+        row of those that are probed, and the rows beyond which not to grow; reach: m that the car drove between.
+        """
+        start = rows[0]
+        probed = float(self.followers[index].ahead[part.track].step[start : start + PROBE].sum())
+        s = part.found.states[-1, 0] if forward else part.found.states[0, 0] - probed
+        slack = SLACK + SLACK_PER_METRE * reach
+        for limits, least, most in ((EXPECTED, reach - slack, reach + slack), (MISHAP, -BACK, reach + BEYOND)):
+            least, most = (least, most) if forward else (-most, -least)
+            positions = s + np.arange(least, most + PROBE_STEP / 2, PROBE_STEP)
+            found = self.best_of(positions, part.track, index, rows)
+            if found and found.is_beyond(limits[found.found.track.name]):
+                return found
+        return None
+
+    def best_of(self, positions: np.ndarray, track: int, index: int, rows: tuple[int, int, int]) -> Part | None:
+        """Return the part that grows best from one of these positions.
+
+        None if from another one it grows nearly as well elsewhere across the road. rows: as for `near`.
+        """
+        (start, first, end), followers = rows, self.followers[index]
+        candidates = [Candidate(followers.ahead[track], np.array([s, 0.0, 0.0]), start) for s in positions]
+        for until in (start + FIRST_PROBE, start + PROBE):
+            fits = {candidate: candidate.follow(until) for candidate in candidates}
+            candidates = sorted(candidates, key=fits.__getitem__, reverse=True)[:KEPT]
+        grown = []
+        for candidate in candidates:
+            state = candidate.smooth()[PROBE // 2]
+            if found := followers.grow(track, start + PROBE // 2, state, first, end):
+                grown.append(Part(index, track, *found))
+        best = max(grown, key=Part.quality, default=None)
+        if not best:
+            return None
+        rivals = [other for other in grown if other.quality() > AMBIGUOUS * best.quality()]
+        return None if any(best.away_from(other) > SAME_OFFSET for other in rivals) else best
+
+
+def certain_parts(
+    recording: Recording, stretches: list[Stretch], centres: np.ndarray
+) -> list[tuple[Stretch, Localisation]]:
+    """Return the parts of a recording that certainly are on a known track, in order.
+
+    centres: float32 (n, 3, 5): of `reader.detect_centres`, in the recording's rows.
+    """
+    placing = Placing(recording, stretches, centres)
+    placing.anchors()
+    for forward in (True, False):
+        placing.spread(forward)
+    found = []
+    for part in placing.parts:
+        whole = stretches[part.stretch].rows.start
+        found.append((Stretch.of(recording, slice(whole + part.start, whole + part.end)), part.found))
+    return found

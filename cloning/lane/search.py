@@ -1,0 +1,100 @@
+"""Finds where on which known track a stretch of a recording is, by how its road bends and what a network detects."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from cloning.lane.follow import Candidate, TrackFilter
+from cloning.road.motion import Stretch
+from cloning.road.track import ROADS, Track
+
+PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m: part of the trajectory whose heading is compared, and its step
+MAX_DEVIATION = 0.5  # radians, standard deviation: windows of real recordings have 0.02 to 0.29 where they are
+SEARCH = ((8, 100), (3, 200), (2, 600))  # rounds: number of the best candidates that the filter follows, and rows
+# Stretches of 300 rows of real recordings have -0.25 to 0 on their own track, -0.45 or less on the other.
+MIN_LOG_LIKELIHOOD = -0.35
+# Real recordings and rendered drives have 0.12 to 0.33 on the lake and 0.56 to 0.92 in the jungle. Laps of generated
+# roads, which a position on a track can follow nearly as well, have at least 1.5; 315 m along the middle of gentle ones
+# at least 0.67. Of 135 m along the middle, a quarter of the roads still has less than 0.5.
+MAX_TURN_RESIDUAL = {"lake": 0.5, "jungle": 1.2}
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """The result of localising a stretch of a recording on a known track.
+
+    track           in the direction driven
+    states          float64 (n, 3): the rear axle's state in each row: s, m along the track; lateral offset, m to the
+                    right of its centre line; heading error, radians to its right
+    log_likelihood  of a detection, on average, for a Cauchy distribution: 0 where detections agree with the track,
+                    -2.3 where they have nothing to do with it
+    turn_residual   root mean square of the changes of the heading error that neither steering nor the track explains,
+                    in standard deviations of the process noise: below 1 on the right track, where the car turns as it
+                    steers
+    """
+
+    track: Track
+    states: np.ndarray
+    log_likelihood: float
+    turn_residual: float
+
+    def is_certain(self) -> bool:
+        """Return whether the stretch certainly is on this track."""
+        likely = self.log_likelihood > MIN_LOG_LIKELIHOOD
+        return likely and self.turn_residual < MAX_TURN_RESIDUAL[self.track.name]
+
+
+@functools.cache
+def known_tracks() -> tuple[Track, ...]:
+    """Return the known tracks in both directions."""
+    return tuple(Track(name, direction) for name in ROADS for direction in ("ccw", "cw"))
+
+
+def candidate_positions(follower: TrackFilter, first: int = 0) -> list[tuple[float, float]]:
+    """Find positions on the track at which the road bends like a stretch from row `first` on.
+
+    Returns (deviation, s): the standard deviation of the difference in heading, radians, and m along the track; only
+    local minima of the deviation.
+    """
+    driven = np.r_[0, np.cumsum(follower.step[first:])]
+    wanted = np.arange(0, min(PROFILE_LENGTH, driven[-1]), PROFILE_STEP)
+    heading = np.interp(wanted, driven, np.r_[0, np.cumsum(follower.turn[first:])])
+    track = follower.track
+    n = round(track.length / PROFILE_STEP)
+    two_laps = np.r_[track.heading, track.heading + track.turns(), track.heading[0] + 2 * track.turns()]
+    resampled = np.interp(np.arange(n + len(wanted)) * PROFILE_STEP, np.arange(len(two_laps)) * track.step, two_laps)
+    deviation = (np.lib.stride_tricks.sliding_window_view(resampled, len(wanted))[:n] + heading).std(1)
+    minima = (deviation <= np.roll(deviation, 1)) & (deviation < np.roll(deviation, -1))
+    return [(float(deviation[i]), i * PROFILE_STEP) for i in np.flatnonzero(minima)]
+
+
+def search(filters: list[TrackFilter], first: int, end: int) -> Candidate:
+    """Return the best candidate for the rows from `first` to `end` of a stretch, followed over some of them."""
+    found = [
+        (badness, Candidate(each, np.array([s, 0.0, 0.0]), first))
+        for each in filters
+        for badness, s in candidate_positions(each, first)
+    ]
+    likely = [candidate for candidate in found if candidate[0] < MAX_DEVIATION]
+    found = likely or [min(found, key=lambda candidate: candidate[0])]
+    for count, rows in SEARCH:
+        best = sorted(found, key=lambda candidate: candidate[0])[:count]
+        found = [(-candidate.follow(min(first + rows, end)), candidate) for _, candidate in best]
+    return min(found, key=lambda candidate: candidate[0])[1]
+
+
+def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
+    """Localise a whole stretch on the track and direction that it fits best.
+
+    centres: float32 (n, 3, 5): of `reader.detect_centres`, in the stretch's rows.
+    """
+    found = search([TrackFilter(stretch, centres, track) for track in known_tracks()], 0, len(stretch))
+    return followed(found, len(stretch))
+
+
+def followed(candidate: Candidate, end: int) -> Localisation:
+    """Return the localisation of the rows from a candidate's first to `end`."""
+    log_likelihood, states = candidate.follow(end), candidate.smooth()
+    turn_residual = float(np.sqrt(np.mean(candidate.turns(states) ** 2)))
+    return Localisation(candidate.follower.track, states, log_likelihood, turn_residual)
