@@ -140,10 +140,12 @@ def bridge(track: Track, rng: Generator, palette: Palette, offsets: np.ndarray) 
     """Return the cobbles on the bridge and its low black walls."""
     s = distances(*ROAD.bridge)
     cobbles = Material(palette["cobbles"], textures.cobbles(rng), 4.5)
-    black = Material((0.02, 0.02, 0.02), textures.plain(), 4.0, across=(0, 1))
+    black, grey = (Material((level,) * 3, textures.plain(), 4.0, across=(0, 1)) for level in (0.03, 0.14))
     meshes = [ribbon(track, s, offsets, 0.02, cobbles)]
     for side in (LEFT, RIGHT):
-        meshes += wall(track, s, side, [(4.9, 0), (4.9, 0.75), (5.5, 0.75), (5.5, -2)], black)
+        meshes += wall(track, s, side, [(4.9, 0), (4.9, 0.75)], black)
+        meshes += wall(track, s, side, [(4.9, 0.75), (5.5, 0.75)], grey)  # the sky on its top
+        meshes += wall(track, s, side, [(5.5, 0.75), (5.5, -2)], black)
     return meshes
 
 
