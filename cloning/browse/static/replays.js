@@ -93,8 +93,8 @@ function section(replay, index) {
     autonomy: `${replay.autonomy_percent.toFixed(1)} %`,
     distance: `mean ${replay.distance_mean_m.toFixed(2)} m, 95 % below ${replay.distance_p95_m.toFixed(2)} m`,
     "human's distance": `mean ${replay.human_mean_m.toFixed(2)} m`,
-    driven: many(replay.driven, "frame") + (replay.by_lane == replay.driven ? ""
-      : `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known`),
+    driven: many(replay.driven, "frame") + (replay.by_lane < replay.driven
+      ? `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known` : ""),
     interventions: replay.interventions.toLocaleString("en"),
   });
   const made = make("section", "", {}, heading,
