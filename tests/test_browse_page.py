@@ -123,6 +123,7 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     centre = read_recording(sample_recording).path(39).read_bytes()
     page.until(lambda: page.difference("center", centre) < 3)
     page.press("a")
+    page.shows("figure:has(#center)", "computing what it looks at")
     assert page.run(f"fetch('{here}/rows/39/center/0.png').then(answer => answer.status)") == 200
     page.until(lambda: page.difference("center", centre) > 6)
     page.press("a")
@@ -405,6 +406,8 @@ def test_what_failed_is_tried_again(linked, page, tmp_path, models):
         replayed(linked, models[0], 1.0, np.zeros(60), [])
         page.click("#replay-list button")
         page.wait("document.querySelector('.replayed')")
+        width = "document.querySelector('{}').clientWidth"
+        assert page.run(f"{width.format('#view-0')} == {width.format('#center')}"), "a single view fills the row"
         page.press("a")
         page.shows("figure:has(#center)", "cannot show what it looks at")
         page.press("ArrowRight")
@@ -412,6 +415,19 @@ def test_what_failed_is_tried_again(linked, page, tmp_path, models):
         page.press("ArrowLeft")
         asked = f"{server.recordings()['lake']}/rows/0/center/0.png"
         page.until(lambda: page.text() and sum(asked in address for address in page.addresses()) == 2)
+
+
+def test_the_analysis_that_begins_by_itself_can_be_paused(linked, page, tmp_path):
+    (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)", encoding="utf-8")
+    with browsing(linked, modules=tmp_path) as server:
+        page.open(server.base)
+        page.shows("article", "road not known yet: 0 % analysed")
+        page.click("#analysing button")
+        page.shows("article", "road not known yet: paused")
+        page.run(f"location.hash = '{server.hash('lake')}'")
+        page.shows("#findings", "lateral offset: paused. Go on")
+        page.click("#findings button")
+        page.shows("#findings", "lateral offset: 0 % analysed. Pause")
 
 
 def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked, page):
