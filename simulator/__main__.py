@@ -214,7 +214,7 @@ def add_join(commands: "Subparsers") -> None:
         default=0.0,
         metavar="FACTOR",
         help="let simulated time follow the wall clock: 1 in real time, 0.5 half as fast; by default it waits for the "
-        "answer to each telemetry, which is too fast for programs that answer at once and think later, as maxitwo's",
+        "answer to each telemetry, and in the dialect roads for the program's driver",
     )
     parser.add_argument(
         "--fps",

@@ -61,9 +61,11 @@ class Dialect:
     still  whether simulated time stands still until the program says something else
     ready  whether the program is to get telemetry
     more   s after an answer in which more may come that belongs to it
+    apart  whether the program's driver may be in another thread than its answers
+    same   whether the last answer is the same as the one before
     """
 
-    more = 0.0
+    more, apart, same = 0.0, False, False
 
     def __init__(self, stage: Stage):
         self.stage, self.still, self.ready, self.episodes = stage, False, True, 0
@@ -166,15 +168,22 @@ class Measures(Dialect):
 
 
 class Roads(Dialect):
-    """Roads sent as text; the car stays where it leaves them until the program sets it back. Speed is in m/s."""
+    """Roads sent as text; the car stays where it leaves them until the program sets it back. Speed is in m/s.
+
+    These programs answer at once, with what their driver, in another thread, has commanded last.
+    """
+
+    apart = True
 
     def __init__(self, stage: Stage):
         super().__init__(stage)
         self.text = ""  # of the road that lies there
         self.still = True
+        self._last: Any = None  # data of the last answer
 
     def handle(self, event: str, data: Any) -> bool:
         """Steer, lay a road, or set the car back at its start. Raises TrackError for a text that is no road."""
+        self.same, self._last = event == "steer" and data == self._last, data
         if event == "steer":
             self.still = self.run.at_end
             return self.apply(parse_commands(data))

@@ -18,13 +18,18 @@ from simulator.dialects import Dialect
 ASK_AGAIN = 5.0  # s without an answer, after which the telemetry is sent again: programs drop some
 SETTLE = 0.2  # s without a word from the server, after which its greeting is over
 STILL = 1 / 15  # s of real time between two telemetries while simulated time stands still
+# How long a driver in another thread than the program's answers is waited for, s: until one is known to be there, and
+# then. Commands may be constant, and drivers in the same thread, so after so many vain attempts it is not waited for.
+BRIEFLY, PATIENTLY, ATTEMPTS = 0.15, 2.0, 3
 MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 200,000
 
 
 class Joined(ClientSession):
     """Sends telemetry to a server and does what it says, until the server has gone for `wait` seconds.
 
-    In lock-step simulated time waits for the answer to each telemetry; otherwise it follows the wall clock.
+    In lock-step simulated time waits for the answer to each telemetry; otherwise it follows the wall clock. Where a
+    program may answer at once, with what its driver has commanded last, the same telemetry is sent again until the
+    answer changes: then the driver has seen it.
     """
 
     def __init__(self, dialect: Dialect, host: str, port: int, wait: float, pace: float, rate: float):
@@ -35,6 +40,9 @@ class Joined(ClientSession):
         super().__init__(host, port, wait, max_packet=MAX_PACKET)
         self.dialect, self.pace, self.period = dialect, pace, max(STEP, 1 / rate)
         self.frames, self.time, self.due = 0, 0.0, 0.0  # sent; simulated s in all; when the next is due
+        self._thinking = 0.02  # s that the driver takes
+        self._apart: bool | None = None if dialect.apart else False  # whether it is in another thread; None: unknown
+        self._vain = self._constant = 0  # attempts to find it there; answers in a row that did not change
         self._origin = 0.0  # simulated s at time.perf_counter() 0, with a pace
 
     def run(self) -> None:
@@ -65,10 +73,37 @@ class Joined(ClientSession):
         while True:
             while not self.dialect.ready:
                 self._listen(ASK_AGAIN)
-            self.connection.send(self.dialect.telemetry())
-            self.frames += 1
-            if self._await_answer():
+            telemetry = self.dialect.telemetry()
+            if self._ask(telemetry):
+                if not self.pace:
+                    self._await_driver(telemetry)
                 self._drive()
+
+    def _ask(self, telemetry: str) -> bool:
+        """Send a telemetry; return whether it was answered."""
+        self.connection.send(telemetry)
+        self.frames += 1
+        return self._await_answer()
+
+    def _await_driver(self, telemetry: str) -> None:
+        """Send the telemetry again until the answer changes, if the program's driver may be in another thread."""
+        is_new = not self.dialect.same
+        if is_new:
+            self._constant = 0
+        if self._apart is False or self.dialect.still or self._constant >= ATTEMPTS:
+            return
+        begin, pause = time.monotonic(), self._thinking
+        while time.monotonic() < begin + (PATIENTLY if self._apart else BRIEFLY):
+            self._listen(pause)
+            if self._ask(telemetry) and not self.dialect.same:
+                self._apart = True
+                self._thinking += 0.1 * (min(time.monotonic() - begin, 0.2) - self._thinking)
+                return
+            pause *= 1.5
+        self._constant += 1
+        if is_new and self._apart is None:
+            self._vain += 1
+            self._apart = False if self._vain >= ATTEMPTS else None
 
     def _listen(self, pause: float) -> bool:
         """Do what the server says until it is silent for `pause` seconds; return whether it answered a telemetry."""
