@@ -29,8 +29,9 @@ PROBE, FIRST_PROBE = 40, 15  # rows over which candidates near a neighbour are f
 KEPT = 4  # candidates that are followed over all of PROBE
 PROBES = np.array([0, 10, 20, 30, 45, 60, 80, 100, 130, 160, 200, 250])  # rows after a neighbour, from which to try
 # What a part beside another one needs, where the car should be and anywhere near: rows, log-likelihood, turn residual.
-EXPECTED = {"lake": (60, -0.05, 0.3), "jungle": (45, -0.42, 1.45)}
-MISHAP = {"lake": (100, -0.04, 0.25), "jungle": (80, -0.25, 0.85)}
+# At looser limits in the jungle (-0.42, 1.45) most of a generated road fits there in pieces, after a pause.
+EXPECTED = {"lake": (60, -0.05, 0.3), "jungle": (60, -0.25, 0.75)}
+MISHAP = {"lake": (100, -0.04, 0.25), "jungle": (100, -0.2, 0.65)}
 PROBE_STEP = 5.0  # m between candidates
 SLACK, SLACK_PER_METRE = 5.0, 0.1  # m, and of the metres driven: where the car should be without a mishap
 BACK, BEYOND = 30.0, 20.0  # m: further back, or further on than it drove, the car is not after a mishap
