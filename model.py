@@ -439,10 +439,9 @@ def run(command: Command, ranks: Ranks) -> None:
         with training_run.stop:
             training_run.train()
         if ranks.first:
-            better = (
-                "" if training_run.recipe.name == ROBUST.name else "\nmodel.py --robust trains one that drives better"
-            )
-            print(f"{training_run.summary()}\n\nnext: python drive.py {training_run.files.last}{better}")
+            print(f"{training_run.summary()}\n\nnext: python drive.py {training_run.files.last}")
+            if training_run.recipe.name != ROBUST.name:
+                print("`python model.py --robust` trains a network that drives better")
     finally:
         training_run.pool.shutdown(cancel_futures=True)
 

@@ -134,6 +134,7 @@ class Page:
         for kind, share in moves:
             place = {"x": left + share * width, "y": top + height * tall}
             self.send("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **place)
+            self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")  # moves are late
 
     def wheel(self, selector: str, pixels: float) -> None:
         """Turn the mouse's wheel over the middle of an element."""

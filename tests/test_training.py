@@ -46,7 +46,8 @@ def test_what_a_run_prints(finished, sample_recording):
     assert all(re.match(r"1[5-9]\d images \[={30}\] - \d+s - loss: ", line) for line in epochs)
     assert any("steer 0" in line and "model-best.pt" in line for line in lines)
     assert "nan" not in finished[0].stdout
-    assert lines[-1] == f"next: python drive.py {finished[1] / 'model.pt'}"
+    assert lines[-2] == f"next: python drive.py {finished[1] / 'model.pt'}"
+    assert lines[-1] == "`python model.py --robust` trains a network that drives better"
 
 
 def test_a_run_tells_once_how_long_it_will_take_and_then_what_is_left(monkeypatch, capsys):
