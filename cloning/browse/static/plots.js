@@ -22,6 +22,14 @@ export class Plots {
     this.resizing.observe(element("plots"));
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.redo = () => this.build();
+    const release = () => setTimeout(() => { // after the plot has heard of it
+      this.held = false;
+      if (this.late) this.build();
+    });
+    element("plots").onpointerdown = () => {
+      this.held = true;
+      for (const ended of ["pointerup", "pointercancel"]) addEventListener(ended, release, {once: true});
+    };
     this.dark.addEventListener("change", this.redo);
     this.build();
   }
@@ -39,8 +47,11 @@ export class Plots {
     element("plots").replaceChildren();
   }
 
-  // The curves of each plot, again: when a column has arrived, or when the colours have changed.
+  // The curves of each plot, again: when a column has arrived, or when the colours have changed, but not while a pointer
+  // drags in the old ones.
   build() {
+    this.late = this.held;
+    if (this.held) return;
     this.plots?.forEach(plot => plot.destroy());
     element("plots").replaceChildren();
     const {steering, throttle, speed, offset, label} = this.columns, colours = getComputedStyle(document.body);
