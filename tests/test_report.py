@@ -51,7 +51,7 @@ def test_the_report_contains_the_run(written, finished):
     assert "lake sample 60 0 0 0.1 30.2" in text, "the recording's rows, cuts, unusable rows, minutes and mph"
     assert "leaves out 20 % of the rows with less than 0.02" in text and "throttle below 0.25" in text
     assert "lake sample , which it was trained on, it drives with" in text
-    assert f"python drive.py &#39;{written / 'model-best.pt'}&#39;" in text and "my run-robust/model.pt" in text
+    assert f"python drive.py &#39;{written / 'model-best.pt'}&#39;" in text and "my run/robust/model.pt" in text
     for driver in ("the network", *YARDSTICKS.values(), "recovery steering"):
         assert text.count(f" {driver} ") >= 2, f"{driver}, at both limits"
     named = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)

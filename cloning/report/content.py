@@ -153,7 +153,7 @@ class Report:
         output, train = folder / "model.pt", ("python", "model.py")
         if not self.run["robust"]:
             why = "Train with recovery steering from other positions, which drives best"
-            robust = ("--robust", "--output", folder.with_name(f"{self.name}-robust") / "model.pt")
+            robust = ("--robust", "--output", folder / "robust" / "model.pt")
             steps.append((why, (*train, *self.run["recordings"], *robust)))
         if self.run["best"]["epoch"] == (epochs := self.run["epochs"]):
             why = "The last epoch is the best one: train longer"
