@@ -1,5 +1,6 @@
 """The report of a training run: what it contains, and that it needs nothing else."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -70,12 +71,24 @@ def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):
     done = report(copy, "--lap", copy / "training_log.csv")
     assert (
         done.returncode == 2
-        and done.stderr == f"report: {copy}/training_log.csv: not a picture; name a PNG or a JPEG\n"
+        and done.stderr
+        == f"report: {copy}/training_log.csv: not a whole picture, such as a PNG or a JPEG; make it again\n"
     )
     (copy / "model.pt").unlink()
     (copy / "model-best.pt").unlink()
     done = report(copy)
     assert done.returncode == 2 and "no epoch is finished" in done.stderr
+    assert not (copy / "report.html").exists()
+
+
+def test_a_run_of_another_version_is_told_in_a_sentence(written, tmp_path):
+    copy = shutil.copytree(written, tmp_path / "copy")
+    (copy / "report.html").unlink()
+    arguments = json.loads((copy / "training_arguments.json").read_bytes())
+    del arguments["recipe"]["flip"]
+    (copy / "training_arguments.json").write_text(json.dumps(arguments), encoding="utf-8")
+    done = report(copy)
+    assert done.returncode == 2 and "'flip'" in done.stderr and done.stderr.endswith("train again with this one\n")
     assert not (copy / "report.html").exists()
 
 

@@ -17,7 +17,7 @@ import argparse
 from pathlib import Path
 
 from cloning.base.errors import UserError
-from cloning.base.outputs import write_output
+from cloning.base.outputs import check_folders, write_output
 from cloning.recordings.log import find_folders
 from cloning.report.content import Report
 
@@ -36,6 +36,7 @@ def main() -> int:
     output = arguments.run / "report.html"
     try:
         report = Report(arguments.run, arguments.lap)
+        check_folders(str(output))
         report.replay(find_folders(arguments.held_out) if arguments.held_out else [])
         write_output(output, report.page().encode(errors="replace"))
     except (UserError, OSError) as error:

@@ -61,7 +61,8 @@ class Report:
             raise RunError(f"{folder}: no epoch is finished, so there is nothing to report; let model.py go on")
         one_thread()  # as drive.py does; replays run at the same time
         self.network = load_model(self.model)
-        self.recipe = json.loads(files.arguments.read_bytes()).get("recipe")
+        self.arguments = files.arguments
+        self.recipe = json.loads(self.arguments.read_bytes()).get("recipe")
         self.lap = lap and picture_uri(lap)
         numbers = self.run["pictures"]
         self.augmentations = [
@@ -169,7 +170,7 @@ class Report:
         return [(why, shlex.join(map(str, command))) for why, command in steps]
 
     def page(self) -> str:
-        """Return the page, which needs no other file. Raises ModelError, RecordingError."""
+        """Return the page, which needs no other file. Raises ModelError, RecordingError, RunError."""
         run, folder = self.run, Path(__file__).with_name("templates")
         best = next((row["val_drift"] for row in run["history"] if row["epoch"] == run["best"]["epoch"]), None)
         verdict = next((words for limit, words in VERDICTS if best is not None and best <= limit), "")
@@ -178,16 +179,20 @@ class Report:
             loader=jinja2.FileSystemLoader(folder), autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined
         )
         losses = {"loss": "training, augmented", "val_loss": "validation"}
-        return environment.get_template("report.html").render(
-            report=self,
-            run=run,
-            recipe=self.recipe,
-            style=STYLE.read_text(encoding="utf-8"),
-            examples=self.examples(),
-            duration=duration(sum(row["seconds"] for row in run["history"])),
-            layers=layer_table(self.network),
-            steering=steering_chart(counts) if self.recordings else None,
-            drift=epochs_chart(run, {"val_drift": "drift"}, "m") if best is not None else None,
-            losses=epochs_chart(run, losses, "mean squared error"),
-            verdict=verdict.format(remedy="see what to do next, at the end"),
-        )
+        page = environment.get_template("report.html")
+        try:
+            return page.render(
+                report=self,
+                run=run,
+                recipe=self.recipe,
+                style=STYLE.read_text(encoding="utf-8"),
+                examples=self.examples(),
+                duration=duration(sum(row["seconds"] for row in run["history"])),
+                layers=layer_table(self.network),
+                steering=steering_chart(counts) if self.recordings else None,
+                drift=epochs_chart(run, {"val_drift": "drift"}, "m") if best is not None else None,
+                losses=epochs_chart(run, losses, "mean squared error"),
+                verdict=verdict.format(remedy="see what to do next, at the end"),
+            )
+        except jinja2.UndefinedError as error:
+            raise RunError(f"{self.arguments}: of another version ({error}); train again with this one") from None

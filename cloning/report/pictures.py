@@ -41,11 +41,13 @@ def frame_uri(frame: np.ndarray) -> str:
 
 
 def picture_uri(source: Path | Image.Image) -> str:
-    """Return a data URI of a picture, at most WIDEST wide. Raises UserError if the file is not a picture, OSError."""
+    """Return a data URI of a picture, at most WIDEST wide. Raises UserError if it is no whole picture, OSError."""
     try:
         picture = (Image.open(source) if isinstance(source, Path) else source).convert("RGB")
-    except Image.UnidentifiedImageError:
-        raise UserError(f"{source}: not a picture; name a PNG or a JPEG") from None
+    except OSError as error:
+        if error.filename:  # cannot be read
+            raise
+        raise UserError(f"{source}: not a whole picture, such as a PNG or a JPEG; make it again") from None
     picture.thumbnail((WIDEST, WIDEST))
     file = io.BytesIO()
     picture.save(file, "JPEG", quality=QUALITY)
