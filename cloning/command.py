@@ -17,6 +17,7 @@ COMMANDS = {
     "simulator": ("simulator.__main__", "the stand-in simulator: python -m simulator"),
     "replay": ("simulator.__main__", "let a network drive recordings: python -m simulator replay"),
     "browse": ("cloning.browse.__main__", "look at recordings and training runs: python -m cloning.browse"),
+    "report": ("cloning.report.__main__", "write a training run's report: python -m cloning.report"),
     "export": ("cloning.network.export", "write a network as ONNX: python -m cloning.network.export"),
 }
 USAGE = "usage: behavioral-cloning COMMAND …\n\n" + "\n".join(

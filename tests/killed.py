@@ -56,6 +56,8 @@ def check_whole(folder: Path) -> None:
                 assert sum(1 for _ in film.decode(video=0)) == film.streams.video[0].frames > 0
         elif path.suffix == ".json":
             json.loads(data)
+        elif path.suffix == ".html":
+            assert data.endswith(b"</html>"), "the page is cut short"
         elif path.suffix == ".npz":
             with np.load(path) as arrays:
                 assert all(arrays[name].size for name in arrays)

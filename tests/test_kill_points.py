@@ -68,6 +68,13 @@ def test_resumed_training_killed_anywhere(lake, trained, tmp_path):
     Trial(tmp_path / "trial", command, command, trained).killed_everywhere(2)
 
 
+def test_a_report_killed_anywhere_and_on_a_full_disk(trained, tmp_path):
+    command = ["-m", "cloning.report", "."]
+    trial = Trial(tmp_path / "trial", command, command, trained)
+    trial.killed_everywhere(1)
+    trial.disk_full_everywhere(1, status=2)
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Recording
 

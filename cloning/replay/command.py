@@ -10,7 +10,7 @@ import cv2
 from tqdm import tqdm
 
 from cloning.base import program
-from cloning.base.outputs import check_folders, run_all, write_json
+from cloning.base.outputs import check_folders, run_all, write_json, write_output
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.processes import CAN_FORK, ForkedDrives
 from cloning.replay.replay import (
@@ -23,7 +23,7 @@ from cloning.replay.replay import (
     load_recording,
     reference_lines,
 )
-from cloning.replay.score import ReplayFilm, ReplayReport, replay_report, report_text, write_plot
+from cloning.replay.score import ReplayFilm, ReplayReport, plot, replay_report, report_text
 
 if TYPE_CHECKING:
     from cloning.replay.model_driver import ModelDriver
@@ -79,7 +79,7 @@ def run(options: Options) -> None:
             if options.picture:
                 path = Path(options.picture)
                 path = path if len(folders) == 1 else path.with_stem(f"{path.stem}-{folder.name}")
-                write_plot(path, recording, drives)
+                write_output(path, plot(recording, drives))
 
     steps: list[Callable[[], object]] = [replay_all, driver.close]
     if film:

@@ -2,14 +2,13 @@
 
 import io
 import itertools
-from pathlib import Path
 from typing import TypedDict
 
 import cv2
 import numpy as np
 
 from cloning.base.film import DriveFilm, frame_rate
-from cloning.base.outputs import plural, write_output
+from cloning.base.outputs import plural
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import Recording
 from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, drive
@@ -276,8 +275,8 @@ def _driving(metrics: DrivingMetrics) -> str:
     )
 
 
-def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> None:
-    """Plot offsets and steering over time, with the interventions, into a PNG file. Raises OutputError."""
+def plot(recording: Recording, drives: list[Drive]) -> bytes:
+    """Return a PNG of offsets and steering over time, with the interventions."""
     from matplotlib.figure import Figure  # slow to import, and not needed without a plot
 
     figure = Figure(figsize=(12, 2.6 * (len(drives) + 1)), layout="constrained")
@@ -303,7 +302,7 @@ def write_plot(path: str | Path, recording: Recording, drives: list[Drive]) -> N
     file = io.BytesIO()
     figure.suptitle(recording.folder.name)
     figure.savefig(file, format="png", dpi=90)
-    write_output(path, file.getvalue())
+    return file.getvalue()
 
 
 class ReplayFilm(DriveFilm):

@@ -1,0 +1,49 @@
+"""Write the report of a training run: report.html, one file with everything in it, to hand in or to print.
+
+    python -m cloning.report runs/a                                     # the folder that model.py has written to
+    python -m cloning.report runs/a --held-out data/lake-cw             # also let the network drive recordings
+    python -m cloning.report runs/a --lap lap.png                       # also show the picture of a lap
+
+Replays take about as long as the recordings; everything else takes seconds. `python -m simulator drive --picture
+lap.png` makes the picture of a lap.
+"""
+
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("report")
+
+import argparse
+from pathlib import Path
+
+from cloning.base.errors import UserError
+from cloning.base.outputs import check_folders, write_output
+from cloning.recordings.log import find_folders
+from cloning.report.content import Report
+
+
+def main() -> int:
+    """Write the report and print its name; return the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m cloning.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("run", type=Path, metavar="FOLDER", help="folder that model.py has written to; report.html is written there")
+    held_out = "recordings, or folders of recordings, that the network was not trained on: it drives them"
+    add("--held-out", nargs="+", default=[], metavar="FOLDER", help=held_out)
+    add("--lap", type=Path, metavar="FILE.png", help="the picture of a lap, to show")
+    arguments = parser.parse_args()
+    output = arguments.run / "report.html"
+    try:
+        report = Report(arguments.run, arguments.lap)
+        check_folders(str(output))
+        report.replay(find_folders(arguments.held_out) if arguments.held_out else [])
+        write_output(output, report.page().encode(errors="replace"))
+    except (UserError, OSError) as error:
+        return program.failed("report", error)
+    print(f"{output}: open {output.resolve().as_uri()} in a browser")
+    return program.DONE
+
+
+if __name__ == "__main__":
+    program.run(main)

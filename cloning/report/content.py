@@ -1,0 +1,198 @@
+"""What a report contains: figures, tables and pictures of a run, and the page made of them."""
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from cloning.base.errors import ModelError, UserError, message_of
+from cloning.browse import summary
+from cloning.browse.runs import RunError, overview
+from cloning.network.attention import visual_backprop
+from cloning.network.compute import one_thread
+from cloning.network.layer_table import layer_table
+from cloning.network.network import load_model
+from cloning.recordings.images import read_frame
+from cloning.recordings.log import Recording, find_folders, read_recording
+from cloning.replay.command import drive_at_limits
+from cloning.replay.model_driver import ModelDriver
+from cloning.replay.replay import Drive, ReplayFrame, load_recording, reference_lines
+from cloning.replay.score import ORACLE, YARDSTICKS, captioned, plot, replay_report
+from cloning.report.pictures import epochs_chart, frame_uri, picture_uri, steering_chart, uri
+from cloning.road.autonomy import LIMITS
+from cloning.road.overlay import overlay
+from cloning.server.site import STYLE
+from cloning.training.pictures import panel
+from cloning.training.run_files import RunFiles
+from cloning.training.summary import VERDICTS, duration
+
+EXAMPLES = {"a bend to the left": 0.05, "hardly a bend": 0.5, "a bend to the right": 0.95}  # quantiles of the steering
+SHOWN = 6  # interventions of each replay that are shown
+DRIVERS = {"network": "the network", **YARDSTICKS, ORACLE: "recovery steering"}  # rows of the table of replays
+PICTURES = ("LRC_", "augmented-")  # of the training: the three cameras' images, and those made from them
+
+
+class Shots:
+    """Keeps the rows before the first interventions, which show where the car went."""
+
+    def __init__(self) -> None:
+        self.before: ReplayFrame | None = None
+        self.taken: list[tuple[ReplayFrame, float]] = []  # with the network's steering, -1..1
+
+    def watch(self, frame: ReplayFrame, done: Drive) -> None:
+        """Look at a row that was just driven."""
+        if self.before and len(self.taken) < min(len(done.interventions), SHOWN):
+            self.taken.append((self.before, done.steering[-2]))
+        self.before = frame
+
+
+class Report:
+    """The report of one run."""
+
+    def __init__(self, folder: Path, lap: Path | None = None):
+        """Read a run; lap: a picture to show, or None. Raises RunError, ModelError, UserError, OSError."""
+        files = RunFiles(str(folder / "model.pt"))
+        self.run, self.name = overview(files), folder.resolve().name
+        self.model = files.best if files.best.exists() else files.last
+        if not self.run["best"] or not self.model.exists():
+            raise RunError(f"{folder}: no epoch is finished, so there is nothing to report; let model.py go on")
+        one_thread()  # as drive.py does; replays run at the same time
+        self.network = load_model(self.model)
+        self.arguments = files.arguments
+        self.recipe = json.loads(self.arguments.read_bytes()).get("recipe")
+        self.lap = lap and picture_uri(lap)
+        numbers = self.run["pictures"]
+        self.augmentations = [
+            (number, *(picture_uri(files.pictures / f"training_generator_{kind}{number}.png") for kind in PICTURES))
+            for number in sorted({*numbers[:1], *numbers[-1:]})
+        ]
+        self.recordings: list[dict[str, Any]] = []
+        self.missing: list[str] = []  # why recordings are not shown
+        self.looked_at: Recording | None = None  # the recording whose frames are shown
+        for name in self.run["recordings"]:
+            self._read(name)
+        self.replays: list[dict[str, Any]] = []
+
+    def _read(self, name: str) -> None:
+        """Read the recordings in one of the folders that the run was given."""
+        try:
+            for folder in find_folders([name]):
+                recording = read_recording(folder)
+                figures = summary.figures(recording, np.zeros(len(recording), bool))
+                cut = sum(rows for _, rows in recording.cuts)
+                self.recordings.append({**figures, "name": str(folder), "cut_frames": cut})
+                self.looked_at = self.looked_at or recording
+        except (UserError, OSError) as error:
+            self.missing.append(message_of(error))
+
+    def replay(self, folders: list[Path]) -> None:
+        """Let the network drive recordings, at both limits. Raises UserError."""
+        for folder in folders:
+            recording, shots = load_recording(folder), Shots()
+            lines, limits = reference_lines(recording), sorted(LIMITS, reverse=True)
+            drives = drive_at_limits(recording, lines, ModelDriver(self.network), limits, shots.watch, parallel=True)
+            drives.reverse()  # the one at the lower limit was driven last, because that is watched
+            report = replay_report(recording, lines, drives, "lane")
+            rows = [
+                (limit, name, found["compared"].get(key, found))
+                for limit, found in report["limits"].items()
+                for key, name in DRIVERS.items()
+            ]
+            where = report["limits"][f"{limits[-1]:g}"]["where"]
+            captions = [
+                f"{at['seconds']:.1f} s   {abs(at['metres']):.2f} m to the {'right' if at['metres'] > 0 else 'left'}"
+                for at in where
+            ]
+            pictures = [
+                (caption, frame_uri(captioned(frame.view, steering, caption)))
+                for caption, (frame, steering) in zip(captions, shots.taken, strict=False)
+            ]
+            self.replays.append(
+                {
+                    **report,
+                    "trained_on": folder.resolve() in [Path(each["name"]).resolve() for each in self.recordings],
+                    "table": rows,
+                    "plot": uri(plot(recording, drives), "png"),
+                    "interventions": len(where),
+                    "pictures": pictures,
+                }
+            )
+            self.looked_at = recording  # the network has not seen it, which tells more
+
+    def examples(self) -> list[dict[str, str]]:
+        """Return frames in different bends, each as recorded, and with what the network looks at.
+
+        Raises ModelError, RecordingError.
+        """
+        if self.looked_at is None:
+            return []
+        recording, shown = self.looked_at, []
+        order = np.argsort(recording.steering, kind="stable")
+        for name, quantile in EXAMPLES.items():
+            row = int(order[round(quantile * (len(order) - 1))])
+            frame, human = read_frame(recording.path(row)), float(recording.steering[row])
+            try:
+                steering, mask = visual_backprop(self.network, frame)
+            except ArithmeticError as error:
+                raise ModelError(f"{self.model}: {error}; train the model again") from None
+            shown.append(
+                {
+                    "name": name,
+                    "recorded": picture_uri(panel(frame, recording.name(row), human)),
+                    "attention": frame_uri(overlay(frame, steering, mask)),
+                    "steering": f"{steering:+.2f}, the driver {human:+.2f}",
+                }
+            )
+        return shown
+
+    def next_steps(self) -> list[tuple[str, str]]:
+        """Return what to do next: why, and a command."""
+        folder, steps = self.model.parent, list[tuple[str, tuple[object, ...]]]()
+        output, train = folder / "model.pt", ("python", "model.py")
+        if not self.run["robust"]:
+            why = "Train with recovery steering from other positions, which drives best"
+            robust = ("--robust", "--output", folder / "robust" / "model.pt")
+            steps.append((why, (*train, *self.run["recordings"], *robust)))
+        if self.run["best"]["epoch"] == (epochs := self.run["epochs"]):
+            why = "The last epoch is the best one: train longer"
+            steps.append((why, (*train, "--resume", "--epochs", 2 * epochs, "--output", output)))
+        if not self.replays:
+            why = "Let it drive recordings that it was not trained on, and write this report again"
+            steps.append((why, ("python", "-m", "cloning.report", folder, "--held-out", "FOLDER")))
+        for each in self.replays:
+            if each["interventions"]:
+                why = f"Watch the interventions on {Path(each['recording']).name}, and record more of such places"
+                steps.append((why, ("python", "-m", "cloning.browse", each["recording"], "--model", self.model)))
+        steps.append(("Let it drive the simulator, or the stand-in for it", ("python", "drive.py", self.model)))
+        return [(why, shlex.join(map(str, command))) for why, command in steps]
+
+    def page(self) -> str:
+        """Return the page, which needs no other file. Raises ModelError, RecordingError, RunError."""
+        run, folder = self.run, Path(__file__).with_name("templates")
+        best = next((row["val_drift"] for row in run["history"] if row["epoch"] == run["best"]["epoch"]), None)
+        verdict = next((words for limit, words in VERDICTS if best is not None and best <= limit), "")
+        counts = np.sum([each["histogram"] for each in self.recordings], axis=0, dtype=int)
+        environment = jinja2.Environment(
+            loader=jinja2.FileSystemLoader(folder), autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined
+        )
+        losses = {"loss": "training, augmented", "val_loss": "validation"}
+        page = environment.get_template("report.html")
+        try:
+            return page.render(
+                report=self,
+                run=run,
+                recipe=self.recipe,
+                style=STYLE.read_text(encoding="utf-8"),
+                examples=self.examples(),
+                duration=duration(sum(row["seconds"] for row in run["history"])),
+                layers=layer_table(self.network),
+                steering=steering_chart(counts) if self.recordings else None,
+                drift=epochs_chart(run, {"val_drift": "drift"}, "m") if best is not None else None,
+                losses=epochs_chart(run, losses, "mean squared error"),
+                verdict=verdict.format(remedy="see what to do next, at the end"),
+            )
+        except jinja2.UndefinedError as error:
+            raise RunError(f"{self.arguments}: of another version ({error}); train again with this one") from None

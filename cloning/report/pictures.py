@@ -1,0 +1,101 @@
+"""Pictures of a report, as data URIs: a page that contains them needs no other file."""
+
+import base64
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from PIL import Image
+
+from cloning.base.errors import UserError
+from cloning.browse.summary import BINS
+from cloning.recordings.images import encode
+
+QUALITY = 85  # of JPEGs
+WIDEST = 1400  # px: sharp on paper, and a tenth of the bytes of the run's own pictures
+CLEAR = {f"{part}.facecolor": "none" for part in ("figure", "axes", "savefig")}
+TEXT = {"svg.fonttype": "none", "svg.hashsalt": "report"}  # as text, not as curves; with the same identifiers each time
+
+
+class Chart(NamedTuple):
+    """The same curves as data URIs: in dark ink for light paper, and the other way round."""
+
+    light: str
+    dark: str
+
+
+def uri(data: bytes, kind: str) -> str:
+    """Return a data URI; kind: of the picture, such as "jpeg"."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def frame_uri(frame: np.ndarray) -> str:
+    """Return a data URI of a frame, uint8 (rows, columns, 3), RGB."""
+    return uri(encode(frame, QUALITY), "jpeg")
+
+
+def picture_uri(source: Path | Image.Image) -> str:
+    """Return a data URI of a picture, at most WIDEST wide. Raises UserError if it is no whole picture, OSError."""
+    try:
+        picture = (Image.open(source) if isinstance(source, Path) else source).convert("RGB")
+    except OSError as error:
+        if error.filename:  # cannot be read
+            raise
+        raise UserError(f"{source}: not a whole picture, such as a PNG or a JPEG; make it again") from None
+    picture.thumbnail((WIDEST, WIDEST))
+    file = io.BytesIO()
+    picture.save(file, "JPEG", quality=QUALITY)
+    return uri(file.getvalue(), "jpeg")
+
+
+def chart(draw: Callable[[Axes], object]) -> Chart:
+    """Return what a function draws on axes, without text or background of its own colour."""
+    drawn = []
+    for style in ("default", "dark_background"):
+        with matplotlib.style.context([style, CLEAR, TEXT]):
+            figure = Figure(figsize=(7, 3), layout="constrained")
+            axes = figure.add_subplot()
+            draw(axes)
+            axes.grid(alpha=0.3)
+            file = io.BytesIO()
+            figure.savefig(file, format="svg", metadata={"Date": None})
+            drawn.append(uri(file.getvalue(), "svg+xml"))
+    return Chart(*drawn)
+
+
+def steering_chart(counts: np.ndarray) -> Chart:
+    """Return a histogram of steering; counts: int (BINS,), rows from -1 to 1."""
+
+    def draw(axes: Axes) -> None:
+        axes.stairs(counts, np.linspace(-1, 1, BINS + 1), fill=True)
+        axes.set(xlabel="steering, -1 left to 1 right", ylabel="rows", yscale="log", xlim=(-1, 1), ylim=(0.7, None))
+
+    return chart(draw)
+
+
+def epochs_chart(run: dict[str, Any], names: dict[str, str], ylabel: str) -> Chart:
+    """Return metrics by epoch, with the best epoch marked.
+
+    run: of `browse.runs.overview`; names: metric -> its name in the legend. With the loss, it shows those within the
+    epochs, too, where the run knows them.
+    """
+    epochs, best = [row["epoch"] for row in run["history"]], run["best"]["epoch"]
+
+    def draw(axes: Axes) -> None:
+        for metric, name in names.items():
+            values = [row[metric] for row in run["history"]]
+            axes.plot(epochs, np.array(values, float), "o-", label=name)  # None, which is unknown, becomes nan
+        axes.axvline(best, linestyle=":", color="tab:green", label=f"best epoch: {best}")
+        if "loss" in names and run["trail"]:
+            axes.plot(*zip(*run["trail"], strict=True), color="tab:gray", linewidth=0.8, label="within the epochs")
+        axes.set(xlabel="epoch", ylabel=ylabel, ylim=(0, None))
+        axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True))
+        axes.legend()
+
+    return chart(draw)

@@ -1,0 +1,114 @@
+"""The report of a training run: what it contains, and that it needs nothing else."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+import warm
+from browser import LOOKS, chromium, needs_chromium
+from commands import ROOT, log
+
+from cloning.replay.score import YARDSTICKS
+from cloning.training.summary import csv_bytes
+
+
+def report(*arguments) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "cloning.report", *map(str, arguments)]
+    return warm.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def written(finished, sample_recording, tmp_path_factory):
+    """The folder of a run with its report, which replays its own recording and shows the run's losses as a lap.
+
+    The recording is too short to know the drift of; it is 0.5 and 0.7 m here.
+    """
+    folder = shutil.copytree(finished[1], tmp_path_factory.mktemp("report") / "my run")
+    epochs = log(folder)
+    for row, drift in zip(epochs, ("0.5", "0.7"), strict=True):
+        row["val_drift"] = drift
+    (folder / "training_log.csv").write_bytes(csv_bytes(epochs[0], [row.values() for row in epochs]))
+    done = report(folder, "--held-out", sample_recording, "--lap", folder / "training_loss.png")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"{folder / 'report.html'}: open {(folder / 'report.html').as_uri()} in a browser\n"
+    return folder
+
+
+def test_the_report_contains_the_run(written, finished):
+    page = (written / "report.html").read_text(encoding="utf-8")
+    text = re.sub(r"\s+", " ", re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL))
+    for title in ("my run", "Data", "Recipe", "Network", "Training", "Driving", "What to do next"):
+        assert re.search(rf"<h[12]>[^<]*{title}</h[12]>", page), title
+    printed = finished[0].stdout
+    layers = printed[printed.index("Layer (type)") : printed.index("Total params")].split()
+    assert " ".join(layers) in text, "the table of layers that the run printed"
+    assert (
+        "The best epoch is 1 : it has the least drift, 0.50 m." in text
+        and "Networks like this one stay on the road" in text
+    )
+    assert "lake sample 60 0 0 0.1 30.2" in text, "the recording's rows, cuts, unusable rows, minutes and mph"
+    assert "leaves out 20 % of the rows with less than 0.02" in text and "throttle below 0.25" in text
+    assert "lake sample , which it was trained on, it drives with" in text
+    assert f"python drive.py &#39;{written / 'model-best.pt'}&#39;" in text and "my run/robust/model.pt" in text
+    for driver in ("the network", *YARDSTICKS.values(), "recovery steering"):
+        assert text.count(f" {driver} ") >= 2, f"{driver}, at both limits"
+    named = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)
+    assert len(named) >= 3 * 2 + 2 + 6 + 2, "three charts twice, examples, augmentations, drive and lap"
+    assert all(address.startswith("data:image/") for address in named)
+    assert "//" not in re.sub(r'<style>.*?</style>|"data:[^"]*"', "", page, flags=re.DOTALL), "no outside host"
+    assert len(page) < 15e6
+
+
+def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):
+    for folder, words in ((tmp_path, "no training run in this folder yet"), (tmp_path / "none", "no training run")):
+        done = report(folder)
+        assert done.returncode == 2 and done.stderr.startswith(f"report: {folder}: {words}") and not done.stdout
+    copy = shutil.copytree(written, tmp_path / "copy")
+    (copy / "report.html").unlink()
+    done = report(copy, "--lap", copy / "training_log.csv")
+    assert (
+        done.returncode == 2
+        and done.stderr
+        == f"report: {copy}/training_log.csv: not a whole picture, such as a PNG or a JPEG; make it again\n"
+    )
+    (copy / "model.pt").unlink()
+    (copy / "model-best.pt").unlink()
+    done = report(copy)
+    assert done.returncode == 2 and "no epoch is finished" in done.stderr
+    assert not (copy / "report.html").exists()
+
+
+def test_a_run_of_another_version_is_told_in_a_sentence(written, tmp_path):
+    copy = shutil.copytree(written, tmp_path / "copy")
+    (copy / "report.html").unlink()
+    arguments = json.loads((copy / "training_arguments.json").read_bytes())
+    del arguments["recipe"]["flip"]
+    (copy / "training_arguments.json").write_text(json.dumps(arguments), encoding="utf-8")
+    done = report(copy)
+    assert done.returncode == 2 and "'flip'" in done.stderr and done.stderr.endswith("train again with this one\n")
+    assert not (copy / "report.html").exists()
+
+
+def test_recordings_that_are_gone_are_named_in_the_report(written, tmp_path):
+    copy = shutil.copytree(written, tmp_path / "copy")
+    arguments = (copy / "training_arguments.json").read_text(encoding="utf-8")
+    moved = re.sub(r'"recordings": \[[^]]*\]', '"recordings": ["gone/<lake>"]', arguments)
+    (copy / "training_arguments.json").write_text(moved, encoding="utf-8")
+    assert report(copy).returncode == 0
+    page = (copy / "report.html").read_text(encoding="utf-8")
+    assert "Not shown: gone/&lt;lake&gt;: no such folder" in page and "No recording was held out" in page
+
+
+@needs_chromium
+def test_the_page_fits_every_screen_bars_nobody_and_asks_for_nothing(written, tmp_path):
+    with chromium(tmp_path / "profile") as page:
+        for width, dark in LOOKS:
+            page.look(width, 900, dark)
+            page.open((written / "report.html").as_uri())
+            page.wait("document.readyState == 'complete'")
+            assert page.fits() and page.has_colours(dark) and page.barriers() == [] and page.complaints() == []
+            assert page.run("[...document.images].every(image => image.naturalWidth > 100)")
+            assert all(address.startswith(("file:", "data:")) for address in page.addresses())
