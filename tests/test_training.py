@@ -46,7 +46,8 @@ def test_what_a_run_prints(finished, sample_recording):
     assert all(re.match(r"1[5-9]\d images \[={30}\] - \d+s - loss: ", line) for line in epochs)
     assert any("steer 0" in line and "model-best.pt" in line for line in lines)
     assert "nan" not in finished[0].stdout
-    assert lines[-1] == f"next: python drive.py {finished[1] / 'model.pt'}"
+    better = "model.py --robust trains one that drives better"
+    assert lines[-2:] == [f"next: python drive.py {finished[1] / 'model.pt'}", better]
 
 
 def test_a_run_tells_once_how_long_it_will_take_and_then_what_is_left(monkeypatch, capsys):
@@ -230,12 +231,13 @@ def test_wrong_arguments_are_refused_before_anything_is_written(linked, tmp_path
     done = run_here(*arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert "model.py: " in done.stderr and words in done.stderr and "Traceback" not in done.stderr
-    assert all(linked in path.parents for path in tmp_path.rglob("*") if path.is_file())
+    assert {path for path in tmp_path.rglob("*") if linked not in path.parents} == {linked.parent, linked}
 
 
 def test_without_recordings_the_user_is_told_where_to_get_some(tmp_path):
-    done = run_here(cwd=tmp_path)
+    done = run_here("--output", "runs/a/model.pt", cwd=tmp_path)
     assert done.returncode == 2 and "data/README.md" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path):
