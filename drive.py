@@ -299,7 +299,7 @@ def main() -> int:
         if arguments.folder:
             server.saver, server.recording = saved_frames.FrameSaver(arguments.folder), True  # last: it empties it
     except (UserError, OSError) as error:
-        return program.failed("drive.py", error)
+        return program.failed(error)
     stopped, port = connections.noted_signals(), listener.getsockname()[1]
     watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(arguments.host, arguments.host)
     print(

@@ -138,7 +138,7 @@ def main() -> int:
     try:
         left_out = make_film(folder, fps, load_overlay(arguments.overlay) if arguments.overlay else None)
     except (UserError, OSError) as error:
-        return program.failed("video.py", error)
+        return program.failed(error)
     return program.INCOMPLETE if left_out else program.DONE
 
 

@@ -393,7 +393,7 @@ def run_join(arguments: argparse.Namespace) -> int:
         try:
             joined.run()
         except UserError as error:
-            return program.failed("simulator", error)
+            return program.failed(error)
         finally:
             seconds = time.perf_counter() - begin
             print(
@@ -409,7 +409,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return arguments.run(arguments)
     except UserError as error:
-        return program.failed("simulator", error)
+        return program.failed(error)
 
 
 if __name__ == "__main__":

@@ -61,7 +61,7 @@ def main() -> int:
                 raise UserError(f"{folder}: no such folder; name one that `python model.py` writes to")
         listener = connections.claim_port(HOST, arguments.port)
     except (UserError, OSError) as error:
-        return program.failed("browse", error)
+        return program.failed(error)
     stopped = connections.noted_signals()
     stderr = terminal.log_to_stderr("browse")
     library, runs = Library(folders, arguments.model), Runs(arguments.run or [])

@@ -95,7 +95,7 @@ def main() -> int:
         check_folders(str(arguments.output), model=arguments.model)
         export(load_model(arguments.model), arguments.output)
     except (UserError, OSError) as error:
-        return program.failed("export", error)
+        return program.failed(error)
     print(f"{arguments.output}: opset {OPSET}, frames uint8 (n, 160, 320, 3) RGB -> steering float32 (n,)")
     print(f"the same steering as {arguments.model} to {TOLERANCE:g}, compared with ONNX Runtime")
     return program.DONE
