@@ -439,10 +439,10 @@ def run(command: Command, ranks: Ranks) -> None:
         with training_run.stop:
             training_run.train()
         if ranks.first:
-            better = (
-                "" if training_run.recipe.name == ROBUST.name else "\nmodel.py --robust trains one that drives better"
-            )
-            print(f"{training_run.summary()}\n\nnext: python drive.py {training_run.files.last}{better}")
+            is_robust = training_run.recipe.name == ROBUST.name
+            better = "" if is_robust else "\npython model.py --robust trains one that drives better"
+            following = f"next: python drive.py {training_run.files.last}{better}"
+            print(program.in_commands(f"{training_run.summary()}\n\n{following}"))
     finally:
         training_run.pool.shutdown(cancel_futures=True)
 

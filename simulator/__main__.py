@@ -237,7 +237,7 @@ def add_join(commands: "Subparsers") -> None:
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; its `run` is the command's function."""
     parser = argparse.ArgumentParser(
-        prog="python -m simulator", description="A stand-in for Udacity's driving simulator."
+        prog=program.in_commands("python -m simulator"), description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
     for add in (add_replay, add_record, add_drive, add_correct, add_window, add_join):

@@ -46,7 +46,7 @@ def test_what_a_run_prints(finished, sample_recording):
     assert all(re.match(r"1[5-9]\d images \[={30}\] - \d+s - loss: ", line) for line in epochs)
     assert any("steer 0" in line and "model-best.pt" in line for line in lines)
     assert "nan" not in finished[0].stdout
-    better = "model.py --robust trains one that drives better"
+    better = "python model.py --robust trains one that drives better"
     assert lines[-2:] == [f"next: python drive.py {finished[1] / 'model.pt'}", better]
 
 
@@ -332,7 +332,7 @@ def test_two_processes_continue_with_the_runs_own_arguments(finished, two_proces
 def test_a_rank_prints_the_error_that_it_alone_meets(tmp_path, capsys):
     """And not the one that rank 0 meets, which prints it."""
     own = RecordingError("1.jpg: cut short")
-    for error, printed in ((own, "model.py: 1.jpg: cut short\n"), (FirstRankFailed(), "")):
+    for error, printed in ((own, "python: 1.jpg: cut short\n"), (FirstRankFailed(), "")):
         ranks = Ranks(rank=1)
         status = status_of(Mock(side_effect=error), Process(str(tmp_path / "model.pt")), ranks)
         assert (status, capsys.readouterr().err) == (2, printed)

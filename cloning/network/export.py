@@ -83,8 +83,8 @@ def check_frames() -> np.ndarray:
 def main() -> int:
     """Export a model and print what the file contains; return the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m cloning.network.export",
-        description=__doc__,
+        prog=program.in_commands("python -m cloning.network.export"),
+        description=program.in_commands(__doc__ or ""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, help="model file to read")
