@@ -146,6 +146,7 @@ REPORT = Recipe(
         label_source="driver",
         aimed_at="the driver's path",
         remedy="train longer, record more, or use --robust",
+        val_loss="",
     ),
     # Data preprocessing
     select=select_driven,
