@@ -259,7 +259,7 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; arguments: those of this process if None."""
     parser = argparse.ArgumentParser(
-        description=__doc__,
+        description=program.in_commands(__doc__ or ""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="Exit status: 0 after Ctrl-C, 1 if frames could not be saved, 2 if the server could not start.",
     )
@@ -283,7 +283,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
 def main() -> int:
     """Load the model, listen, and drive until Ctrl-C; return the exit status."""
     arguments = parse_arguments()
-    stderr = terminal.log_to_stderr("drive.py")
+    stderr = terminal.log_to_stderr(program.name)
     log.setLevel(logging.INFO)
     torch.set_num_threads(1)  # a second thread would make single frames slower and their latency less regular
     try:
@@ -299,13 +299,14 @@ def main() -> int:
         if arguments.folder:
             server.saver, server.recording = saved_frames.FrameSaver(arguments.folder), True  # last: it empties it
     except (UserError, OSError) as error:
-        return program.failed("drive.py", error)
+        return program.failed(error)
     stopped, port = connections.noted_signals(), listener.getsockname()[1]
     watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(arguments.host, arguments.host)
+    stand_in = program.in_commands("python -m simulator drive")
     print(
         f"Driving with {model}{origin and f' ({origin})'}.\n"
         f"Listening on {arguments.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE,\n"
-        f"or in a second terminal its stand-in: `python -m simulator drive{f' --port {port}' * (port != PORT)}`.\n"
+        f"or in a second terminal its stand-in: `{stand_in}{f' --port {port}' * (port != PORT)}`.\n"
         f"Watch at http://{f'[{watched}]' if ':' in watched else watched}:{port}/ . Ctrl-C ends.",
         file=sys.stderr,
         flush=True,
@@ -321,7 +322,7 @@ def main() -> int:
             try:
                 server.saver.close()
             except UserError as error:
-                print(f"drive.py: {error}", file=sys.stderr)
+                print(f"{program.name}: {error}", file=sys.stderr)
                 status = program.INCOMPLETE
         stderr.finish()
     return status

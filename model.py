@@ -146,6 +146,7 @@ REPORT = Recipe(
         label_source="driver",
         aimed_at="the driver's path",
         remedy="train longer, record more, or use --robust",
+        val_loss="",
     ),
     # Data preprocessing
     select=select_driven,
@@ -439,9 +440,10 @@ def run(command: Command, ranks: Ranks) -> None:
         with training_run.stop:
             training_run.train()
         if ranks.first:
-            print(f"{training_run.summary()}\n\nnext: python drive.py {training_run.files.last}")
+            following = f"next: python drive.py {training_run.files.last}"
             if training_run.recipe.name != ROBUST.name:
-                print("`python model.py --robust` trains a network that drives better")
+                following += "\n`python model.py --robust` trains a network that drives better"
+            print(program.in_commands(f"{training_run.summary()}\n\n{following}"))
     finally:
         training_run.pool.shutdown(cancel_futures=True)
 

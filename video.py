@@ -67,7 +67,7 @@ def abbreviated(names: list[str]) -> str:
 
 def print_note(message: str) -> None:
     """Print a message about something that was left out or changed."""
-    print(f"video.py: {message}", file=sys.stderr)
+    print(f"{program.name}: {message}", file=sys.stderr)
 
 
 def make_film(folder: Path, fps: Fraction | None = None, draw: Overlay | None = None) -> int:
@@ -127,7 +127,9 @@ def load_overlay(model_file: Path) -> Overlay:
 
 def main() -> int:
     """Parse the command line and make the film; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=program.in_commands(__doc__ or ""), formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, help="the folder with the frames; the film is FOLDER.mp4")
     fps_help = "frames per second, such as 60 or 30000/1001 (default: from the frames' times)"
     parser.add_argument("--fps", type=number(ratio, *FPS_RANGE), help=fps_help)
@@ -138,7 +140,7 @@ def main() -> int:
     try:
         left_out = make_film(folder, fps, load_overlay(arguments.overlay) if arguments.overlay else None)
     except (UserError, OSError) as error:
-        return program.failed("video.py", error)
+        return program.failed(error)
     return program.INCOMPLETE if left_out else program.DONE
 
 

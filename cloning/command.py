@@ -10,18 +10,18 @@ import sys
 
 from cloning.base import program
 
-COMMANDS = {
-    "train": ("cloning.scripts.model", "train a network on recordings: python model.py"),
-    "drive": ("cloning.scripts.drive", "let a network drive the simulator: python drive.py"),
-    "video": ("cloning.scripts.video", "make a film of a drive: python video.py"),
-    "simulator": ("simulator.__main__", "the stand-in simulator: python -m simulator"),
-    "replay": ("simulator.__main__", "let a network drive recordings: python -m simulator replay"),
-    "browse": ("cloning.browse.__main__", "look at recordings and training runs: python -m cloning.browse"),
-    "report": ("cloning.report.__main__", "write a training run's report: python -m cloning.report"),
-    "export": ("cloning.network.export", "write a network as ONNX: python -m cloning.network.export"),
+COMMANDS = {  # name: its module, the command of a clone, what it does
+    "train": ("cloning.scripts.model", "python model.py", "train a network on recordings"),
+    "drive": ("cloning.scripts.drive", "python drive.py", "let a network drive the simulator"),
+    "video": ("cloning.scripts.video", "python video.py", "make a film of a drive"),
+    "simulator": ("simulator.__main__", "python -m simulator", "the stand-in simulator"),
+    "replay": ("simulator.__main__", "python -m simulator replay", "let a network drive recordings"),
+    "browse": ("cloning.browse.__main__", "python -m cloning.browse", "look at recordings and training runs"),
+    "report": ("cloning.report.__main__", "python -m cloning.report", "write a training run's report"),
+    "export": ("cloning.network.export", "python -m cloning.network.export", "write a network as ONNX"),
 }
 USAGE = "usage: behavioral-cloning COMMAND …\n\n" + "\n".join(
-    f"  {name:10} {does}" for name, (_, does) in COMMANDS.items()
+    f"  {name:10} {does}: {clone}" for name, (_, clone, does) in COMMANDS.items()
 )
 
 
@@ -43,5 +43,6 @@ def main() -> None:
         print(USAGE, file=sys.stdout if name in ("-h", "--help") else sys.stderr)
         sys.exit(program.DONE if name in ("-h", "--help") else program.FAILED)
     sys.argv = [f"behavioral-cloning {name}", *sys.argv[1 if name == "replay" else 2 :]]
+    program.installed = {clone: f"behavioral-cloning {command}" for command, (_, clone, _) in COMMANDS.items()}
     program.end_on_interrupt(f"behavioral-cloning {name}")
     program.run(functools.partial(start, COMMANDS[name][0]))

@@ -7,16 +7,14 @@ if __name__ == "__main__":
     program.end_on_interrupt("simulator", "stopped; the files that it has written are complete")
 
 import argparse
-import contextlib
 import functools
-import os
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from cloning.base.arguments import MAX_PORT, address, number
 from cloning.base.errors import UserError
-from cloning.base.outputs import check_folders, plural, run_all, write_json
+from cloning.base.outputs import check_folders, run_all, write_json
 from cloning.recordings.format import PROBLEM_AREAS, SAMPLE_RATE
 from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
 from cloning.road.autonomy import LIMITS
@@ -237,7 +235,7 @@ def add_join(commands: "Subparsers") -> None:
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; its `run` is the command's function."""
     parser = argparse.ArgumentParser(
-        prog="python -m simulator", description="A stand-in for Udacity's driving simulator."
+        prog=program.in_commands("python -m simulator"), description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
     for add in (add_replay, add_record, add_drive, add_correct, add_window, add_join):
@@ -373,33 +371,13 @@ def run_window(arguments: argparse.Namespace) -> int:
 
 
 def run_join(arguments: argparse.Namespace) -> int:
-    """Let another program's server drive; print what was driven."""
+    """Let another program's server drive, or write the program that does this."""
     with program.loading():
-        from simulator.dialects import DIALECTS, Stage
-        from simulator.join import Joined, write_launcher
+        from simulator.join import join, write_launcher
 
-    if arguments.launcher:
-        write_launcher(arguments)
-        return program.DONE
-    with open(arguments.log or os.devnull, "w", encoding="utf-8", buffering=1) as log, contextlib.ExitStack() as stack:
-        if arguments.log:
-            stack.enter_context(contextlib.redirect_stdout(log))
-            stack.enter_context(contextlib.redirect_stderr(log))
-        own = given_for_road(arguments)
-        track = chosen_track(arguments, needs_file=False)
-        dialect = DIALECTS[arguments.dialect](Stage(track.source, arguments.direction, arguments.look, own))
-        joined = Joined(dialect, arguments.host, arguments.port, arguments.wait, arguments.pace, arguments.fps)
-        begin = time.perf_counter()
-        try:
-            joined.run()
-        except UserError as error:
-            return program.failed("simulator", error)
-        finally:
-            seconds = time.perf_counter() - begin
-            print(
-                f"{plural(dialect.episodes, 'episode')}, {plural(joined.frames, 'telemetry', 'telemetries')}, "
-                f"{joined.time:.0f} simulated seconds in {seconds:.0f} s"
-            )
+    if not arguments.launcher:
+        return join(arguments, chosen_track(arguments, needs_file=False), given_for_road(arguments))
+    write_launcher(arguments)
     return program.DONE
 
 
@@ -409,7 +387,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return arguments.run(arguments)
     except UserError as error:
-        return program.failed("simulator", error)
+        return program.failed(error)
 
 
 if __name__ == "__main__":

@@ -1,19 +1,24 @@
 """The simulator joined to another program's server, in one of the dialects of `simulator.dialects`."""
 
 import argparse
+import contextlib
 import os
 import shlex
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
-from cloning.base.errors import SimulatorError
+from cloning.base import program
+from cloning.base.errors import SimulatorError, UserError
 from cloning.base.files import written_whole
+from cloning.base.outputs import plural
+from cloning.road.track import Track
 from cloning.wire.client import ConnectionLost, parse_event
 from cloning.wire.session import MAX_UNASKED, ClientSession
 from simulator.car import STEP
 from simulator.client import MAX_CATCH_UP
-from simulator.dialects import Dialect
+from simulator.dialects import DIALECTS, Dialect, Stage
 
 ASK_AGAIN = 5.0  # s without an answer, after which the telemetry is sent again: programs drop some
 SETTLE = 0.2  # s without a word from the server, after which its greeting is over
@@ -176,6 +181,32 @@ class Joined(ClientSession):
                 self._step()
         if behind > MAX_CATCH_UP or self.dialect.still:
             self._origin = self.time - self.pace * time.perf_counter()
+
+
+def join(arguments: argparse.Namespace, track: Track, own: dict[str, Any]) -> int:
+    """Let a server drive, print what was driven, into `arguments.log` if that is given, and return the exit status.
+
+    track: the first; own: the options about a road of one's own, which hold for roads that the server sends, too.
+    Raises UserError, OSError.
+    """
+    with open(arguments.log or os.devnull, "w", encoding="utf-8", buffering=1) as log, contextlib.ExitStack() as stack:
+        if arguments.log:
+            stack.enter_context(contextlib.redirect_stdout(log))
+            stack.enter_context(contextlib.redirect_stderr(log))
+        dialect = DIALECTS[arguments.dialect](Stage(track.source, arguments.direction, arguments.look, own))
+        joined = Joined(dialect, arguments.host, arguments.port, arguments.wait, arguments.pace, arguments.fps)
+        begin = time.perf_counter()
+        try:
+            joined.run()
+        except UserError as error:
+            return program.failed(error)
+        finally:
+            seconds = time.perf_counter() - begin
+            print(
+                f"{plural(dialect.episodes, 'episode')}, {plural(joined.frames, 'telemetry', 'telemetries')}, "
+                f"{joined.time:.0f} simulated seconds in {seconds:.0f} s"
+            )
+    return program.DONE
 
 
 def write_launcher(arguments: argparse.Namespace) -> None:

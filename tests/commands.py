@@ -6,11 +6,14 @@ import io
 import os
 import subprocess
 import sys
+import unittest.mock
 from pathlib import Path
 from typing import Any
 
 import torch
 import warm
+
+from cloning.base import program
 
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
@@ -36,7 +39,8 @@ def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
 
     command = list(map(str, arguments))
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
+    named = unittest.mock.patch.object(program, "name", "model.py")
+    with named, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
         try:
             status: Any = model.main(command)
         except SystemExit as error:  # argparse's

@@ -236,5 +236,5 @@ def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, mon
         ([sample_recording, "--model", tmp_path / "m.pt"], f"{tmp_path / 'm.pt'}: no such model file"),
     ):
         monkeypatch.setattr(sys, "argv", ["browse", *map(str, arguments), "--port", "0"])
-        assert browse.main() == 2 and (said := capsys.readouterr().err).startswith(f"browse: {words}")
+        assert browse.main() == 2 and (said := capsys.readouterr().err).startswith(f"python: {words}")
         assert "python -m simulator record data/lake" in said or "model" in words

@@ -34,7 +34,7 @@ def test_mistakes_are_reported(model_file, tmp_path, monkeypatch, capsys):
             monkeypatch.setattr(sys, "argv", ["drive.py", *map(str, arguments)])
             assert drive.main() == 2
             message = capsys.readouterr().err
-            assert message.startswith("drive.py: ") and words in message and message.count("\n") == 1
+            assert message.startswith("python: ") and words in message and message.count("\n") == 1
     assert any((tmp_path / "run1").iterdir()), "a server that cannot start deletes nothing"
 
 

@@ -144,7 +144,7 @@ def test_a_track_of_a_generated_road_lies_where_the_road_does(direction):
 def test_a_road_that_does_not_exist_is_a_clear_error(command, name, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert simulator.main([*command, "--track", name]) == 2
-    assert f"simulator: {name}: there is no such track; there are lake, jungle, road-1" in capsys.readouterr().err
+    assert f"python: {name}: there is no such track; there are lake, jungle, road-1" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

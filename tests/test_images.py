@@ -304,7 +304,7 @@ def test_an_image_that_changes_while_it_is_replayed_is_named(copied, monkeypatch
     assert simulator.main(["replay", str(copied), "--model", str(SHIPPED_MODEL), "--reference", "human"]) == 2
     name = sorted((copied / "IMG").glob("left*"))[30].name.replace("left", "center")
     assert capsys.readouterr().err == (
-        f"simulator: {copied / 'IMG' / name}: {reason}; copy it again, or delete its row from the log\n"
+        f"python: {copied / 'IMG' / name}: {reason}; copy it again, or delete its row from the log\n"
     )
 
 

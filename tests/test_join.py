@@ -187,7 +187,7 @@ def test_a_driver_in_another_thread_is_waited_for_however_slow_it_is():
 def test_a_text_that_is_no_road_ends_the_drive_with_its_reason(capsys):
     with Program(lambda data, n: [["track", {"track_string": "0,0,0@1,x,0"}]]) as program:
         assert join("roads", program) == 2
-    assert "simulator: point 2: '1,x,0' is not x,y,z" in capsys.readouterr().err
+    assert "python: point 2: '1,x,0' is not x,y,z" in capsys.readouterr().err
 
 
 def test_a_road_that_crosses_itself_is_laid_all_the_same():

@@ -279,7 +279,7 @@ def test_commands_without_weights_report_it(sample_recording, tmp_path, monkeypa
     assert "lane.pt: no such file" in capsys.readouterr().err
     assert simulator.main(["replay", str(sample_recording), "--model", str(SHIPPED_MODEL)]) == 2
     error = capsys.readouterr().err
-    assert "simulator: " in error and "lane.pt: no such file" in error
+    assert "python: " in error and "lane.pt: no such file" in error
     load_network.cache_clear()
 
 

@@ -66,7 +66,8 @@ def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
         done = run(command, name, "--help")
         assert done.returncode == 0 and "usage:" in done.stdout, done.stderr
     missing = run(command, "train", "nowhere")
-    assert missing.returncode == 2 and "nowhere" in missing.stderr and "Traceback" not in missing.stderr
+    assert missing.returncode == 2 and missing.stderr.startswith("behavioral-cloning train: nowhere: no such folder")
+    assert "`behavioral-cloning simulator record data/lake-ccw`" in missing.stderr and not list(elsewhere.iterdir())
 
     make = "import gymnasium; env = gymnasium.make('simulator.environment:behavioral-cloning/Drive-v0')"
     shape = run(folder / "python", "-c", f"{make}; print(env.reset()[0].shape)")

@@ -356,7 +356,7 @@ def test_a_full_disk_costs_the_film_alone(sample_recording, model, tmp_path, cap
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     printed = capsys.readouterr()
-    assert re.search(r"^simulator: \S+x\.mp4: .*no film was written", printed.err, re.MULTILINE)
+    assert re.search(r"^python: \S+x\.mp4: .*no film was written", printed.err, re.MULTILINE)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.png", "r.json"]
     assert "autonomy" in printed.out
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]["2"]

@@ -199,6 +199,7 @@ def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording)
     metres = 2 * recovery.HEADING_CHORD + recovery.LOOKAHEAD  # at the beginning and at the end
     assert int(row.split()[-2]) == pytest.approx(metres / (30.19 * MPH * 0.067), abs=2)
     assert "correlation with the recovery steering" in done.stdout
+    assert "val_loss is of them and of as many views from other poses" in done.stdout
     for name in ("training_generator_LRC_0.png", "training_generator_augmented-0.png"):
         assert (folder / "diagnostic_images" / name).exists()
     arguments = torch.load(folder / "model.pt", weights_only=True)["arguments"]

@@ -102,7 +102,7 @@ def test_a_full_disk_costs_the_film_alone(tmp_path, capsys):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     printed = capsys.readouterr()
-    assert re.search(r"simulator: \S+x\.mp4: .*no film was written", printed.err)
+    assert re.search(r"python: \S+x\.mp4: .*no film was written", printed.err)
     assert "departures: " in printed.out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["above.png", "report.json"]
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["distance_m"] > 20

@@ -238,7 +238,7 @@ def test_the_command_ends_with_status_2(capsys):
     with Hostile(CASES["closes at once"]) as server:
         assert main(["drive", "--wait", str(WAIT), "--port", str(server.port)]) == 2
     printed = capsys.readouterr().err
-    assert re.search(r"^simulator: .*no usable answer in 0\.2 s", printed, re.MULTILINE) and "Traceback" not in printed
+    assert re.search(r"^python: .*no usable answer in 0\.2 s", printed, re.MULTILINE) and "Traceback" not in printed
 
 
 @hostile

@@ -108,7 +108,7 @@ def test_answers_are_read():
 
 def test_a_missing_server_is_waited_for_then_reported(capsys):
     assert main(["drive", "--wait", "0.5", "--port", str(unused_port())]) == 2
-    assert re.search(r"^simulator: no server at 127\.0\.0\.1.*drive\.py", capsys.readouterr().err, re.MULTILINE)
+    assert re.search(r"^python: no server at 127\.0\.0\.1.*drive\.py", capsys.readouterr().err, re.MULTILINE)
 
 
 @pytest.mark.parametrize("realtime", [False, True])

@@ -231,12 +231,13 @@ def test_wrong_arguments_are_refused_before_anything_is_written(linked, tmp_path
     done = run_here(*arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert "model.py: " in done.stderr and words in done.stderr and "Traceback" not in done.stderr
-    assert all(linked in path.parents for path in tmp_path.rglob("*") if path.is_file())
+    assert {path for path in tmp_path.rglob("*") if linked not in path.parents} == {linked.parent, linked}
 
 
 def test_without_recordings_the_user_is_told_where_to_get_some(tmp_path):
-    done = run_here(cwd=tmp_path)
+    done = run_here("--output", "runs/a/model.pt", cwd=tmp_path)
     assert done.returncode == 2 and "data/README.md" in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path):
@@ -331,7 +332,7 @@ def test_two_processes_continue_with_the_runs_own_arguments(finished, two_proces
 def test_a_rank_prints_the_error_that_it_alone_meets(tmp_path, capsys):
     """And not the one that rank 0 meets, which prints it."""
     own = RecordingError("1.jpg: cut short")
-    for error, printed in ((own, "model.py: 1.jpg: cut short\n"), (FirstRankFailed(), "")):
+    for error, printed in ((own, "python: 1.jpg: cut short\n"), (FirstRankFailed(), "")):
         ranks = Ranks(rank=1)
         status = status_of(Mock(side_effect=error), Process(str(tmp_path / "model.pt")), ranks)
         assert (status, capsys.readouterr().err) == (2, printed)

@@ -14,6 +14,7 @@ import warm
 from commands import ROOT
 
 import video
+from cloning.base import program
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.network.network import Network, save_model
 
@@ -42,6 +43,7 @@ def run(tmp_path, monkeypatch, capsys):
     def run(*arguments) -> tuple[object, str]:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", ["video.py", *arguments])
+        monkeypatch.setattr(program, "name", "video.py")
         status: object
         try:
             status = video.main()

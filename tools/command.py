@@ -19,14 +19,14 @@ def command_line(name: str, documentation: str | None) -> argparse.ArgumentParse
     return argparse.ArgumentParser(name, description=documentation, formatter_class=raw)
 
 
-def run_tool(name: str, main: Callable[[], int]) -> NoReturn:
-    """Run a tool's main function, print an error of the user as `NAME: MESSAGE`, and end with the exit status."""
+def run_tool(main: Callable[[], int]) -> NoReturn:
+    """Run a tool's main function, print an error of the user as `PROGRAM: MESSAGE`, and end with the exit status."""
 
     def status() -> int:
         try:
             return main()
         except (UserError, OSError) as error:
-            return program.failed(name, error)
+            return program.failed(error)
 
     program.run(status)
 

@@ -161,4 +161,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool("lane_accuracy", main)
+    run_tool(main)

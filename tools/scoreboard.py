@@ -43,7 +43,7 @@ from cloning.recordings.log import find_folders
 from cloning.replay.score import ORACLE, DrivingMetrics, ReplayReport
 from cloning.road.generated import road_number
 from cloning.road.track import ROADS, find_points
-from cloning.server.server import MAX_CLIENTS
+from cloning.server.telemetry import MAX_CLIENTS
 from simulator.report import LapReport
 from tools.command import ROOT, command_line, python, run_tool
 from tools.score_table import Board, Driven, NetworkResults, RealRecording, Replayed, course, driven, table
@@ -244,4 +244,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool("scoreboard", main)
+    run_tool(main)

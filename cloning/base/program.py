@@ -27,20 +27,28 @@ DONE = 0
 INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film, a car that left the road
 FAILED = 2  # not done: argparse's status for wrong arguments, and that of every other error the user can correct
 NO_MEMORY = ("allocate", "out of memory", "start new thread")  # in a RuntimeError of torch or Python
-name = "python"  # of the command, which begins its messages
+name = "python"  # of the command, which begins its messages; this one if another program calls its `main`
+installed: dict[str, str] = {}  # a clone's commands, such as python drive.py -> as the installed project calls them
 end_at_once: Callable[[int, FrameType | None], None] | None = None  # the handler of `end_on_interrupt`
 
 
-def failed(program: str, error: UserError | OSError) -> int:
+def in_commands(text: str) -> str:
+    """Return a text with the commands as the user starts them: `behavioral-cloning drive` for `python drive.py`."""
+    for clone, command in installed.items():
+        text = text.replace(clone, command)
+    return text
+
+
+def failed(error: UserError | OSError) -> int:
     """Print an error as `PROGRAM: MESSAGE` to stderr and return the exit status."""
-    print(f"{program}: {message_of(error)}", file=sys.stderr)
+    print(in_commands(f"{name}: {message_of(error)}"), file=sys.stderr)
     return FAILED
 
 
 @functools.cache
 def warn_once(message: str) -> None:
     """Print a warning as `PROGRAM: MESSAGE` to stderr, unless it was printed before."""
-    print(f"{name}: {message}", file=sys.stderr)
+    print(in_commands(f"{name}: {message}"), file=sys.stderr)
 
 
 def end_on_interrupt(program: str, message: str = "stopped") -> None:
@@ -146,11 +154,11 @@ def run(main: Callable[[], int | None]) -> NoReturn:
         if callable(stop):
             stop(signal.SIGINT, None)
     except OSError as error:  # of stdout, for example: a full disk, or a pipe that nobody reads
-        status = failed(name, error)
+        status = failed(error)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not any(words in str(error) for words in NO_MEMORY):
             raise
-        status = failed(name, UserError(f"too little memory is free: {str(error) or 'MemoryError'}"))
+        status = failed(UserError(f"too little memory is free: {str(error) or 'MemoryError'}"))
     finally:
         signal.signal(signal.SIGINT, stop)
     leave(status)

@@ -30,8 +30,8 @@ HOST, PORT = "127.0.0.1", 4568  # this machine only; next to the port of drive.p
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; arguments: those of this process if None."""
     parser = argparse.ArgumentParser(
-        prog="python -m cloning.browse",
-        description=__doc__,
+        prog=program.in_commands("python -m cloning.browse"),
+        description=program.in_commands(__doc__ or ""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="Exit status: 0 after Ctrl-C, 2 if the server could not start.",
     )
@@ -61,9 +61,9 @@ def main() -> int:
                 raise UserError(f"{folder}: no such folder; name one that `python model.py` writes to")
         listener = connections.claim_port(HOST, arguments.port)
     except (UserError, OSError) as error:
-        return program.failed("browse", error)
+        return program.failed(error)
     stopped = connections.noted_signals()
-    stderr = terminal.log_to_stderr("browse")
+    stderr = terminal.log_to_stderr(program.name)
     library, runs = Library(folders, arguments.model), Runs(arguments.run or [])
     print(
         f"{len(folders)} recording{'s' * (len(folders) != 1)}. "

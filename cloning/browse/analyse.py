@@ -63,7 +63,7 @@ def main() -> int:
             result = lane(recording) if analysis.kind == "lane" else steering(recording, analysis.model)
         write_result(folder, analysis, before, result)
     except (UserError, OSError) as error:
-        return program.failed("analyse", error)
+        return program.failed(error)
     return program.DONE
 
 

@@ -83,8 +83,8 @@ def check_frames() -> np.ndarray:
 def main() -> int:
     """Export a model and print what the file contains; return the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m cloning.network.export",
-        description=__doc__,
+        prog=program.in_commands("python -m cloning.network.export"),
+        description=program.in_commands(__doc__ or ""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("model", type=Path, help="model file to read")
@@ -95,7 +95,7 @@ def main() -> int:
         check_folders(str(arguments.output), model=arguments.model)
         export(load_model(arguments.model), arguments.output)
     except (UserError, OSError) as error:
-        return program.failed("export", error)
+        return program.failed(error)
     print(f"{arguments.output}: opset {OPSET}, frames uint8 (n, 160, 320, 3) RGB -> steering float32 (n,)")
     print(f"the same steering as {arguments.model} to {TOLERANCE:g}, compared with ONNX Runtime")
     return program.DONE

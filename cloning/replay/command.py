@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
-from tqdm import tqdm
 
 from cloning.base import program
 from cloning.base.outputs import check_folders, run_all, write_json, write_output
+from cloning.base.progress import progress_bar
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.processes import CAN_FORK, ForkedDrives
 from cloning.replay.replay import (
@@ -123,7 +123,7 @@ def drive_at_limits(
 
     def drive_at(index: int, watch: Watcher | None = None) -> Drive:
         name = f"{recording.folder.name}, limit {limits[index]:g} m"
-        with tqdm(total=rows, desc=name, unit="row", disable=None, leave=False, position=index) as bar:
+        with progress_bar(rows, "row", desc=name, leave=False, position=index) as bar:
 
             def after_row(frame: ReplayFrame, done: Drive) -> None:
                 bar.update()

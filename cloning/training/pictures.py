@@ -87,9 +87,9 @@ def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:
     name = f"validation (lowest: {best['val_loss']:.4f} in epoch {best['epoch']:.0f})"
     (line,) = axes.plot(epochs, [row["val_loss"] for row in history], "o-", label=name)
     axes.plot(best["epoch"], best["val_loss"], "o", color=line.get_color(), markersize=13, fillstyle="none")
-    axes.margins(x=0.08)
     axes.set(title="Mean squared error of the steering", xlabel="epoch", ylabel="mean squared error", ylim=(0, None))
-    axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True))
+    axes.set_xlim(0.5, len(history) + 0.5)
+    axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True, min_n_ticks=1))
     drift = [row["val_drift"] for row in history]
     if not np.isnan(drift).all():
         right = axes.twinx()
@@ -97,7 +97,7 @@ def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:
         right.set(ylabel="drift, m", ylim=(0, None))
         label = "drift in two seconds of driving, validation"
         axes.plot([], [], "s--", color="tab:green", label=label)  # for the one legend
-    axes.legend()
+    figure.legend(loc="outside lower center")
     axes.grid(alpha=0.3)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DPI)

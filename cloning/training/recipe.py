@@ -55,6 +55,7 @@ class Words(NamedTuple):
     label_source  whose steering the label is
     aimed_at      where the car should be
     remedy        what helps a network that drives badly
+    val_loss      how it differs from the errors of the summary's table, after a line end; "" if it does not
     """
 
     dropped: str
@@ -62,6 +63,7 @@ class Words(NamedTuple):
     label_source: str
     aimed_at: str
     remedy: str
+    val_loss: str
 
 
 @dataclass(frozen=True)

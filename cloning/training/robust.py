@@ -31,6 +31,7 @@ def robust(report: Recipe) -> Recipe:
             label_source="recovery steering",
             aimed_at="the lane's centre",
             remedy="train longer, or record more",
+            val_loss="\nThese are the recorded images; val_loss is of them and of as many views from other poses.",
         ),
         # The label is the recovery steering; instead of a filter by throttle and resampling, bends are sampled more.
         select=select_known_lane,

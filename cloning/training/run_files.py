@@ -35,11 +35,14 @@ class RunFiles:
     def claimed(self, ranks: "Ranks") -> Iterator[None]:
         """Make the folders and keep other runs out of them until the block ends, or this process.
 
-        On Windows, and on a file system without locks, other runs are not kept out. Raises OutputError, OSError.
+        Folders that are still empty then are removed. On Windows, and on a file system without locks, other runs are
+        not kept out. Raises OutputError, OSError.
         """
         with contextlib.ExitStack() as stack:
 
             def claim() -> None:
+                new = [folder for folder in (self.pictures, *self.pictures.parents) if not folder.exists()]
+                stack.callback(_remove_empty, new)
                 self.pictures.mkdir(parents=True, exist_ok=True)
                 check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
                 if os.name == "nt":
@@ -90,3 +93,11 @@ class RunFiles:
         """Return what shows whether model-resume.pt was replaced; None if there is none."""
         now = self.resume.stat() if os.path.exists(self.resume) else None
         return now and (now.st_ino, now.st_mtime_ns)
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove folders, each before the one around it, until one is in use."""
+    for folder in folders:
+        if not folder.is_dir() or any(folder.iterdir()):
+            break
+        folder.rmdir()

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from types import FrameType
 
+from cloning.base import program
 from cloning.base.errors import UserError, message_of
 from cloning.training.distributed import Ranks
 from cloning.training.options import Process
@@ -65,5 +66,5 @@ def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:
     except KeyboardInterrupt:
         status, message = 128 + SIGNALS[0], f"stopped at once; {files.next_step(before, resume)}"
     if message and (ranks.first or status == 2):  # the other ranks' errors are their own
-        print(f"model.py: {message}", file=sys.stderr)
+        print(program.in_commands(f"{program.name}: {message}"), file=sys.stderr)
     return status

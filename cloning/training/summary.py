@@ -171,6 +171,7 @@ def error_table(labels: np.ndarray, mean: float, models: Mapping[Path, np.ndarra
     values = "".join(f"{'-' if np.isnan(value) else f'{value:.2f}':>15}" for value in correlations.values())
     lines.append(f"{f'correlation with the {label_source}':39}{values}")
     lines.append("\nsteer 0 and steer mean, constant steering, are for comparison; they have no correlation (-).")
+    lines[-1] += recipe.words.val_loss
     path, guess = next(iter(models.items()))
     last, worse = path.name, np.mean((guess - labels) ** 2) > np.mean(labels**2)
     if not correlations[last] > MIN_CORRELATION:
