@@ -94,6 +94,15 @@ def server_address(driver: str) -> tuple[str, int] | None:
     return (match[1], int(match[2])) if match else None
 
 
+def check_driver(driver: str) -> None:
+    """Raise UserError if there is no such file or server."""
+    if address := server_address(driver):
+        with closing(ClientSession(*address, WAIT)) as session:
+            session.connect()
+    else:
+        load_driver(driver)
+
+
 def drive(conditions: Conditions, road: PointRoad) -> Drive:
     """Drive a road as `python -m simulator drive` and drive.py do, until the first failure. Raises UserError."""
     address = server_address(conditions.driver)
@@ -106,7 +115,10 @@ def drive(conditions: Conditions, road: PointRoad) -> Drive:
             commands = steering(telemetry.image), controller.throttle(telemetry.speed)
             return Answer(*(float(format_number(value)) for value in commands))
 
-        return _drive(conditions, road, answer)
+        try:
+            return _drive(conditions, road, answer)
+        except ArithmeticError as error:
+            raise SimulatorError(f"{conditions.driver}: {error}; train the model again") from None
     with closing(ClientSession(*address, WAIT)) as session:
         try:
             session.connect()
@@ -118,7 +130,7 @@ def drive(conditions: Conditions, road: PointRoad) -> Drive:
 
 @functools.cache
 def _cameras() -> list[Cameras]:
-    """Return a place for this process's cameras, which move from road to road."""
+    """Return the list for this process's cameras, which move from road to road: new ones for each would add up."""
     return []
 
 

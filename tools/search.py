@@ -1,11 +1,11 @@
 """Search for roads on which a driver fails, at random and by evolution, as programs that test driving networks do.
 
-    python -m tools.search found                            # the network that comes with the project
-    python -m tools.search found --driver model.pt --look 10015 --marking grass --land desert --hills 0.2
+    python -m tools.search found                                  # the network that comes with the project
+    python -m tools.search found --max-angle 60 --hills 0.2       # on roads that are harder than those of other teams
     python -m tools.search found --driver 127.0.0.1:4567 --processes 1     # a server that drives one car at a time
-    python -m simulator drive --road found/evolution-1-17.json --look 0    # drive a road again, with a running drive.py
+    python -m simulator drive --road found/evolution-1-17.json    # drives a failure again, with drive.py --speed 20
 
-A road has 7 or 8 nodes, 10 to 25 m apart, with a turn at each, through which a Catmull-Rom spline goes. The driver
+A road has 7 or 8 nodes, 10 to 25 m apart, with a turn at each, through which a Catmull-Rom spline goes. A driver
 fails if a wheel leaves the road, or the car does not arrive at its end in time. Evolution keeps the roads on which the
 car came farthest from the lane's centre, and changes the turns and distances of some of their nodes. The same options
 find the same roads, on any number of processes. Each failure is driven again, and must be the same to the last digit.
@@ -17,9 +17,11 @@ printed; and failures.png: the roads from above, and where the car left them.
 import functools
 import io
 import itertools
+import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,7 +44,7 @@ from cloning.road.points import LAND, MARKING, MAX_GRADE, make_road
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.record import renderers_context, start_renderer
 from tools.command import command_line, head, row, run_tool
-from tools.driving import Conditions, Drive, drive, load_driver, server_address
+from tools.driving import Conditions, Drive, check_driver, drive
 
 SEARCHES = ("random", "evolution")
 NODES = (7, 8)  # of a road, with these lengths in m between them, as in maxitwo's and MultiSim's generators
@@ -202,6 +204,13 @@ def picture(failures: Sequence[Driven], title: str) -> bytes:
     return image.getvalue()
 
 
+def end(pool: ProcessPoolExecutor) -> None:
+    """End the pool's processes, which after Ctrl-C would drive on to the end of their roads."""
+    for process in multiprocessing.active_children():
+        process.terminate()
+    pool.shutdown(cancel_futures=True)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Search, print a table, and return 1 if a failure was not the same when it was driven again.
 
@@ -223,30 +232,29 @@ def main(argv: list[str] | None = None) -> int:
     add("--land", choices=LANDS, default=LAND, help="default: %(default)s")
     add("--processes", type=number(int, 1), default=threads(), help="drives at a time (default: cores)")
     options = parser.parse_args(argv)
-    if not server_address(options.driver):
-        load_driver(options.driver)  # a wrong file is told of before processes start
+    check_driver(options.driver)  # before processes start
     folder: Path = options.folder
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder}: is not empty; name a new folder")
     folder.mkdir(parents=True, exist_ok=True)
     kind = Kind(options.max_angle, options.hills, options.marking, options.land)
     work = functools.partial(drive, Conditions(options.driver, options.speed, options.look))
-    with program.interrupt_deferred():
-        pool = ProcessPoolExecutor(options.processes, renderers_context(), start_renderer)
-        for _ in range(options.processes):  # each starts a process
-            pool.submit(int)
     searches, failures = [], []
-    try:
-        for seed, search in itertools.product(options.seeds, options.searches):
-            figures, failed = run_search(
-                folder, search, seed, options.roads, kind, lambda roads: list(pool.map(work, roads))
-            )
-            searches.append(figures)
-            failures += failed
-    except BrokenExecutor as error:
-        raise SimulatorError(f"a driving process was killed, perhaps for lack of memory: {error}") from error
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+    with ExitStack() as stack:
+        with program.interrupt_deferred():
+            pool = ProcessPoolExecutor(options.processes, renderers_context(), start_renderer)
+            stack.callback(end, pool)
+            for _ in range(options.processes):  # each starts a process
+                pool.submit(int)
+        try:
+            for seed, search in itertools.product(options.seeds, options.searches):
+                figures, failed = run_search(
+                    folder, search, seed, options.roads, kind, lambda roads: list(pool.map(work, roads))
+                )
+                searches.append(figures)
+                failures += failed
+        except BrokenExecutor as error:
+            raise SimulatorError("a driving process was killed, perhaps for lack of memory") from error
     print(head(*searches[0]))
     for figures in searches:
         print(row(*("" if value is None else value for value in figures.values())))
