@@ -33,7 +33,7 @@ from simulator.world import Scene
 MAX_RENDERERS = 3  # processes; each uses one core and 50 MB
 
 
-def _renderers_context() -> BaseContext:
+def renderers_context() -> BaseContext:
     """Return how rendering processes are started: on Linux as copies of one that has only imported this module.
 
     A copy of this process could wait for ever for a lock that one of its threads held at that moment, as torch's and
@@ -44,7 +44,7 @@ def _renderers_context() -> BaseContext:
     return context
 
 
-def _start_renderer() -> None:
+def start_renderer() -> None:
     """Make a rendering process ignore Ctrl-C, and end together with the recording process, even if that is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -113,7 +113,7 @@ def record(
     with ExitStack() as stack:
         with program.interrupt_deferred():
             recording = stack.enter_context(RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)))
-            pool = stack.enter_context(ProcessPoolExecutor(renderers, _renderers_context(), _start_renderer))
+            pool = stack.enter_context(ProcessPoolExecutor(renderers, renderers_context(), start_renderer))
             for _ in range(renderers):  # each starts a process
                 pool.submit(_prepare, track.source, look)
         bar = stack.enter_context(progress_bar(round(laps * track.length), "m", unit_scale=True))

@@ -15,6 +15,7 @@ from real_recordings import FOLDERS, MISSING
 
 from cloning.network.network import SHIPPED_MODEL, load_model
 from cloning.recordings.images import read_frame
+from tools.driving import load_driver
 
 
 def run(*arguments, **environment) -> subprocess.CompletedProcess:
@@ -41,6 +42,7 @@ def test_the_exported_file_steers_like_the_model(exported, sample_recording, rea
         expected = load_model(SHIPPED_MODEL)(torch.from_numpy(frames)).numpy()
     assert steering.dtype == np.float32 and np.ptp(expected) > 0.1
     np.testing.assert_allclose(steering, expected, atol=1e-5)
+    assert load_driver(str(exported))(frames[0]) == pytest.approx(np.clip(expected[0], -1, 1), abs=1e-5)
 
 
 def test_what_is_missing_is_told_and_nothing_is_written(tmp_path):

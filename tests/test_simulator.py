@@ -225,7 +225,7 @@ def test_recordings_are_as_the_simulators(tmp_path, capsys):
 def test_recordings_are_the_same_where_processes_cannot_fork_or_there_is_only_one(tmp_path, monkeypatch):
     """macOS and Windows start every process with a fresh interpreter. The look has shadows."""
     record.record(tmp_path / "default", Track("jungle"), laps=0.003, look=10_000)
-    monkeypatch.setattr(record, "_renderers_context", lambda: multiprocessing.get_context("spawn"))
+    monkeypatch.setattr(record, "renderers_context", lambda: multiprocessing.get_context("spawn"))
     monkeypatch.setattr(record, "MAX_RENDERERS", 1)
     record.record(tmp_path / "spawn", Track("jungle"), laps=0.003, look=10_000)
     assert len(list((tmp_path / "spawn" / "IMG").iterdir())) > 20
