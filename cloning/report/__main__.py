@@ -40,7 +40,7 @@ def main() -> int:
         report.replay(find_folders(arguments.held_out) if arguments.held_out else [])
         write_output(output, report.page().encode(errors="replace"))
     except (UserError, OSError) as error:
-        return program.failed("report", error)
+        return program.failed(error)
     print(f"{output}: open {output.resolve().as_uri()} in a browser")
     return program.DONE
 
