@@ -122,3 +122,8 @@ def written_run(folder, finished: int, images: int, epochs=4, losses=(0.5, 0.4, 
         for name in ("LRC_", "augmented-"):
             (files.pictures / f"training_generator_{name}{observations}.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     return files
+
+
+def at(page, row: int) -> None:
+    """Wait until the page shows a row of the sample recording."""
+    page.shows("#where", f"frame {row + 1} of 60")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
+from browser import chromium
 from commands import SHORT, finished_run
 from rendered import render_frame, render_recording
 
@@ -102,3 +103,11 @@ def steering(model_file, jpegs) -> list[np.float32]:
 def finished(sample_recording, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
     """A run of two epochs as in the report: what it printed, and its folder; not to be changed."""
     return finished_run(sample_recording, tmp_path_factory.mktemp("run"), *SHORT)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """A page of Chromium, empty at first."""
+    with chromium(tmp_path_factory.mktemp("profile")) as page:
+        page.look(1280, 900)
+        yield page

@@ -5,8 +5,8 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from browse_process import browsing, placed, replayed, steered, written_run
-from browser import LOOKS, chromium, decoded, needs_chromium
+from browse_process import at, browsing, placed, replayed, steered, written_run
+from browser import LOOKS, decoded, needs_chromium
 from test_excluded import center
 
 from cloning.recordings.log import read_recording
@@ -35,18 +35,6 @@ def served(sample_recording, models, tmp_path_factory):
     written_run(run, finished=1, images=500)
     with browsing(sample_recording, "--model", *models, "--run", run) as server:
         yield server
-
-
-@pytest.fixture(scope="module")
-def page(tmp_path_factory):
-    with chromium(tmp_path_factory.mktemp("profile")) as page:
-        page.look(1280, 900)
-        yield page
-
-
-def at(page, row: int) -> None:
-    """Wait until the page shows a row."""
-    page.shows("#where", f"frame {row + 1} of 60")
 
 
 def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
@@ -382,74 +370,3 @@ def test_the_focus_stays_on_a_button_of_what_is_shown_anew(served, page):
       return document.activeElement.textContent;
     })"""
     assert page.run(focused) == "Stop: 4 %"
-
-
-def test_what_failed_is_tried_again(linked, page, tmp_path, models):
-    """The road on the list, a model's steering, its replay, and what it looks at."""
-    (tmp_path / "torch.py").write_text("raise ImportError('no PyTorch today')", encoding="utf-8")
-    with browsing(linked, "--model", models[0], modules=tmp_path) as server:
-        page.look(1280, 900)
-        page.open(server.base)
-        page.wait("document.querySelector('article button')")
-        assert "not known, the analysis failed: ImportError: no PyTorch today" in page.text()
-        placed(linked, np.zeros(60))
-        page.click("article button")
-        page.shows("article", "lake, counter-clockwise")
-        page.run(f"location.hash = '{server.hash('lake')}'")
-        page.shows("#findings", "one.pt failed: ImportError")
-        steered(linked, models[0])
-        page.run("document.querySelector('#findings button').focus()")
-        page.press("Enter")
-        page.shows("#findings", "Every row could be read as it is.")
-        page.press("l")
-        page.shows("#replay-list", "Failed: ImportError")
-        replayed(linked, models[0], 1.0, np.zeros(60), [])
-        page.click("#replay-list button")
-        page.wait("document.querySelector('.replayed')")
-        width = "document.querySelector('{}').clientWidth"
-        assert page.run(f"{width.format('#view-0')} == {width.format('#center')}"), "a single view fills the row"
-        page.press("a")
-        page.shows("figure:has(#center)", "cannot show what it looks at")
-        page.press("ArrowRight")
-        at(page, 1)
-        page.press("ArrowLeft")
-        asked = f"{server.recordings()['lake']}/rows/0/center/0.png"
-        page.until(lambda: page.text() and sum(asked in address for address in page.addresses()) == 2)
-
-
-def test_the_analysis_that_begins_by_itself_can_be_paused(linked, page, tmp_path):
-    (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)", encoding="utf-8")
-    with browsing(linked, modules=tmp_path) as server:
-        page.open(server.base)
-        page.shows("article", "road not known yet: 0 % analysed")
-        page.click("#analysing button")
-        page.shows("article", "road not known yet: paused")
-        page.run(f"location.hash = '{server.hash('lake')}'")
-        page.shows("#findings", "lateral offset: paused. Go on")
-        page.click("#findings button")
-        page.shows("#findings", "lateral offset: 0 % analysed. Pause")
-
-
-def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked, page):
-    placed(linked, np.zeros(60))
-    cuts, elsewhere = linked / "excluded.csv", linked.with_name("elsewhere")
-    cuts.write_text("spoilt\n", encoding="utf-8")
-    with browsing(linked) as server:
-        page.open(server.base)
-        page.shows("article .bad", "excluded.csv: line 1")
-        cuts.unlink()
-        page.wait("document.querySelector('article .road')")
-        cuts.write_text("spoilt\n", encoding="utf-8")
-        page.run(f"location.hash = '{server.hash('lake')}/7'")
-        page.shows("#notice", "excluded.csv: line 1")
-        assert page.run("document.querySelector('#recording').hidden")
-        cuts.unlink()
-        at(page, 7)
-        linked.rename(elsewhere)
-        page.shows("#notice", "driving_log.csv: No such file")
-        page.press("End")
-        page.shows("figure:has(#center)", "driving_log.csv: No such file")
-        elsewhere.rename(linked)
-        page.wait("document.querySelector('#notice').hidden")
-        page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
-        at(page, 59)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from browser import LOOKS, chromium, decoded, needs_chromium
+from browser import LOOKS, decoded, needs_chromium
 from drive_process import ask, serving
 
 import drive
@@ -207,12 +207,6 @@ def feeding(port: int, message: object):
         finally:
             feeder.going = False
             thread.join()
-
-
-@pytest.fixture(scope="module")
-def page(tmp_path_factory):
-    with chromium(tmp_path_factory.mktemp("profile")) as page:
-        yield page
 
 
 STARTS = ("drive --realtime --track jungle", "window --autonomous")  # the stand-in simulator, of which the page tells

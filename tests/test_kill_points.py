@@ -12,6 +12,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import ROOT
@@ -255,6 +256,31 @@ def test_driving_on_a_full_disk(driving, jpegs):
 # Browsing
 
 
+class Browser:
+    """Sends one request about the only recording, and then has the server end."""
+
+    def __init__(self, path: str, content: object):
+        self.path, self.content, self.answer = path, content, dict[str, Any]()
+
+    def post(self, running: Watched) -> None:
+        if not (port := printed_port(running, r"http://[\d.]+:(\d+)/")):
+            return
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+
+        def ask(method: str, path: str, body: str | None = None) -> Any:
+            connection.request(method, path, body, {"Content-Type": "application/json"})
+            return json.loads(connection.getresponse().read())
+
+        try:
+            here = f"/recordings/{ask('GET', '/recordings')[0]['id']}"
+            version = ask("GET", f"{here}/details")["version"]
+            self.answer = ask("POST", f"{here}/{self.path}?version={version}", json.dumps(self.content))
+            connection.close()
+        except (ConnectionError, http.client.HTTPException):
+            return
+        running.process.send_signal(signal.SIGINT)
+
+
 def test_a_cut_killed_anywhere(lake, tmp_path):
     """An earlier cut stays; the new one is there or not, and can be made again."""
     names = rows_of(lake)
@@ -264,38 +290,63 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
     center = [images[0].decode() for images, _ in names]
     earlier, new = Cut(center[1], center[2], "off"), Cut(center[5], center[9], "off")
     add_cuts(recorded, earlier)
-    command, answers = ["-m", "cloning.browse", "lake", "--port", 0], []
+    command = ["-m", "cloning.browse", "lake", "--port", 0]
     trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin")
-
-    def cut(running: Watched) -> None:
-        if not (port := printed_port(running, r"http://[\d.]+:(\d+)/")):
-            return
-        try:
-            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-            connection.request("GET", "/recordings")
-            here = json.loads(connection.getresponse().read())[0]["id"]
-            body = json.dumps([{"first": new.first, "last": new.last, "reason": new.reason}])
-            connection.request("POST", f"/recordings/{here}/cuts", body, {"Content-Type": "application/json"})
-            answers.append(connection.getresponse().read().decode())
-            connection.close()
-        except (ConnectionError, http.client.HTTPException):
-            return
-        running.process.send_signal(signal.SIGINT)
+    browser = Browser("cuts", [{"first": new.first, "last": new.last, "reason": new.reason}])
 
     def checked() -> None:
         cuts = [each.row() for each in read_cuts(trial.folder / "lake")]
         assert cuts in ([earlier.row()], [earlier.row(), new.row()])
         assert len(read_recording(trial.folder / "lake")) in (38, 33)
 
-    trial.companion, trial.checked = cut, checked
+    trial.companion, trial.checked = browser.post, checked
     trial.killed_everywhere(4)
     _, points = trial.whole_run()
     for number in writes(points, 10):
         trial.restore()
         assert trial.run(command, full=number).status == 0
-        assert "excluded.csv: No space left on device" in json.loads(answers[-1])["message"]
+        assert "excluded.csv: No space left on device" in browser.answer["message"]
         assert [each.row() for each in read_cuts(trial.folder / "lake")] == [earlier.row()]
         assert sorted(path.name for path in (trial.folder / "lake").iterdir()) == sorted(os.listdir(recorded))
+
+
+def test_an_exported_part_is_whole_or_no_recording(lake, tmp_path):
+    """Also with a `lane.csv`; on a full disk nothing is left of it."""
+    recorded = tmp_path / "begin" / "lake"
+    (recorded / "IMG").mkdir(parents=True)
+    images = [[name.decode() for name in names] for names, _ in rows_of(lake)[:3]]
+    lines = (lake / "driving_log.csv").read_text(encoding="utf-8").splitlines(keepends=True)[1:4]
+    (recorded / "driving_log.csv").write_text("".join(lines), encoding="utf-8")
+    known = "".join(f"{center},0.1,0\n" for center, *_ in images)
+    header = "center image,lateral offset (m),heading error (radians)\n"
+    (recorded / "lane.csv").write_text(header + known, encoding="utf-8")
+    for name in (name for names in images for name in names):
+        shutil.copy(lake / "IMG" / name, recorded / "IMG")
+    command = ["-m", "cloning.browse", "lake", "--port", 0]
+    trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin")
+    browser, part = Browser("export", {"rows": "1-3", "name": "part"}), trial.folder / "part"
+    trial.companion = browser.post
+
+    def check_part() -> None:
+        written = check_images(read_recording(part), show_progress=False)
+        assert [written.name(row) for row in range(len(written))] == [center for center, *_ in images[1:]]
+        assert (part / "lane.csv").read_text(encoding="utf-8").splitlines() == [header.strip(), *known.splitlines()[1:]]
+
+    def next_run(wanted: dict[str, object]) -> None:
+        if (part / "driving_log.csv").exists():
+            check_part()
+        shutil.rmtree(part, ignore_errors=True)  # its name is taken
+        trial.goes_on(wanted)
+
+    _, points = trial.whole_run()
+    check_part()
+
+    trial.killed_everywhere(3, next_run)
+    for number in writes(points, 2):
+        trial.restore()
+        assert trial.run(command, full=number).status == 0
+        assert "No space left on device; mend it, and export again" in browser.answer["message"]
+        assert not part.exists()
 
 
 def test_an_analysis_of_the_lane_killed_anywhere(lake, tmp_path):
@@ -348,6 +399,13 @@ def test_a_simulated_drive_killed_anywhere_and_on_a_full_disk(simulator_drive):
     simulator_drive.killed_everywhere(1)
     simulator_drive.killed_at_every_length("film.mp4", 20 if ALL else 1)
     simulator_drive.disk_full_everywhere(1, status=2)
+
+
+def test_writing_a_launcher_killed_anywhere_and_on_a_full_disk(tmp_path):
+    command = ["-m", "simulator", "join", "--dialect", "roads", "--launcher", "sim.x86_64"]
+    trial = Trial(tmp_path / "trial", command, command)
+    trial.killed_everywhere(3)
+    trial.disk_full_everywhere(1, status=2)
 
 
 def test_a_replay_killed_anywhere_and_on_a_full_disk(lake, model_file, tmp_path):

@@ -1,0 +1,81 @@
+"""What the page of recordings says, in a real Chromium, where something fails, takes long, or is gone."""
+
+import shutil
+
+import numpy as np
+from browse_process import at, browsing, placed, replayed, steered
+from browser import needs_chromium
+
+pytestmark = needs_chromium
+
+
+def test_what_failed_is_tried_again(linked, page, tmp_path, model_file):
+    """The road on the list, a model's steering, its replay, and what it looks at."""
+    model = shutil.copy(model_file, tmp_path / "one.pt")
+    (tmp_path / "torch.py").write_text("raise ImportError('no PyTorch today')", encoding="utf-8")
+    with browsing(linked, "--model", model, modules=tmp_path) as server:
+        page.look(1280, 900)
+        page.open(server.base)
+        page.wait("document.querySelector('article button')")
+        assert "not known, the analysis failed: ImportError: no PyTorch today" in page.text()
+        placed(linked, np.zeros(60))
+        page.click("article button")
+        page.shows("article", "lake, counter-clockwise")
+        page.run(f"location.hash = '{server.hash('lake')}'")
+        page.shows("#findings", "one.pt failed: ImportError")
+        steered(linked, model)
+        page.run("document.querySelector('#findings button').focus()")
+        page.press("Enter")
+        page.shows("#findings", "Every row could be read as it is.")
+        page.press("l")
+        page.shows("#replay-list", "Failed: ImportError")
+        replayed(linked, model, 1.0, np.zeros(60), [])
+        page.click("#replay-list button")
+        page.wait("document.querySelector('.replayed')")
+        width = "document.querySelector('{}').clientWidth"
+        assert page.run(f"{width.format('#view-0')} == {width.format('#center')}"), "a single view fills the row"
+        page.press("a")
+        page.shows("figure:has(#center)", "cannot show what it looks at")
+        page.press("ArrowRight")
+        at(page, 1)
+        page.press("ArrowLeft")
+        asked = f"{server.recordings()['lake']}/rows/0/center/0.png"
+        page.until(lambda: page.text() and sum(asked in address for address in page.addresses()) == 2)
+
+
+def test_the_analysis_that_begins_by_itself_can_be_paused(linked, page, tmp_path):
+    (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)", encoding="utf-8")
+    with browsing(linked, modules=tmp_path) as server:
+        page.open(server.base)
+        page.shows("article", "road not known yet: 0 % analysed")
+        page.click("#analysing button")
+        page.shows("article", "road not known yet: paused")
+        page.run(f"location.hash = '{server.hash('lake')}'")
+        page.shows("#findings", "lateral offset: paused. Go on")
+        page.click("#findings button")
+        page.shows("#findings", "lateral offset: 0 % analysed. Pause")
+
+
+def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked, page):
+    placed(linked, np.zeros(60))
+    cuts, elsewhere = linked / "excluded.csv", linked.with_name("elsewhere")
+    cuts.write_text("spoilt\n", encoding="utf-8")
+    with browsing(linked) as server:
+        page.open(server.base)
+        page.shows("article .bad", "excluded.csv: line 1")
+        cuts.unlink()
+        page.wait("document.querySelector('article .road')")
+        cuts.write_text("spoilt\n", encoding="utf-8")
+        page.run(f"location.hash = '{server.hash('lake')}/7'")
+        page.shows("#notice", "excluded.csv: line 1")
+        assert page.run("document.querySelector('#recording').hidden")
+        cuts.unlink()
+        at(page, 7)
+        linked.rename(elsewhere)
+        page.shows("#notice", "driving_log.csv: No such file")
+        page.press("End")
+        page.shows("figure:has(#center)", "driving_log.csv: No such file")
+        elsewhere.rename(linked)
+        page.wait("document.querySelector('#notice').hidden")
+        page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
+        at(page, 59)
