@@ -26,4 +26,4 @@ def test_training_and_replays_need_no_socket_library(sample_recording, tmp_path)
     arguments = map(str, (sample_recording, tmp_path / "model.pt", *SHORT))
     done = subprocess.run([sys.executable, "-c", COMMANDS, *arguments], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "limit 1 m" in done.stdout and "autonomy" in done.stdout
+    assert "limit 1 m, from the " in done.stdout and "autonomy" in done.stdout
