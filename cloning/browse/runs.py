@@ -10,7 +10,7 @@ from typing import Any
 
 from cloning.base.errors import UserError, message_of
 from cloning.browse.library import UnknownError
-from cloning.training.run_files import RunFiles
+from cloning.training.run_files import RunFiles, best_epoch, judged_by
 
 PICTURE = re.compile(r"training_generator_(LRC_|augmented-)([0-9]{1,12})\.png")
 SIGNATURE = b"\x89PNG\r\n\x1a\n"  # begins every PNG
@@ -133,14 +133,14 @@ def _trail(progress: dict[str, Any], done: float) -> list[list[float]]:
 
 
 def _best(history: list[dict[str, float]], options: dict[str, Any]) -> dict[str, Any] | None:
-    """Return {"epoch", "by", "value"} of the best epoch as `training.checkpoint.best_epoch` chooses it, or None."""
+    """Return {"epoch", "by", "value"} of the best epoch, or None."""
     robust = options.get("robust") is True or options.get("name") == "robust"
     by = options.get("best_by") or ("val_loss" if robust else "val_drift")
-    if by not in ("val_loss", "val_drift") or not history or math.isnan(history[-1]["val_drift"]):
-        by = "val_loss"
-    known = [row for row in history if not math.isnan(row[by])]
-    best = min(known, key=lambda row: row[by], default=None)
-    return best and {"epoch": best["epoch"], "by": by, "value": best[by]}
+    if not history:
+        return None
+    by = judged_by(history, by if by in ("val_loss", "val_drift") else "val_loss")
+    best = best_epoch(history, by)
+    return None if math.isnan(best[by]) else {"epoch": best["epoch"], "by": by, "value": best[by]}
 
 
 def _flat(options: dict[str, Any]) -> dict[str, str]:

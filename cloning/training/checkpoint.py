@@ -40,9 +40,8 @@ from cloning.training.adam import Adam
 from cloning.training.observations import Observations
 from cloning.training.options import Command, Process, Run
 from cloning.training.recipe import Recipe, option_name
-from cloning.training.run_files import RunFiles
+from cloning.training.run_files import EpochMetrics, RunFiles, best_epoch
 
-EpochMetrics = dict[str, float]  # a row of training_log.csv: METRICS
 NEW_RUN = "start a new run without --resume"
 POSITION = ("number", "images", "loss", "seconds", "smooth")  # of Progress
 TRAIL_EVERY, TRAIL_LENGTH = 5, 2000  # batches between two losses of `Progress.trail`, doubled when it has so many
@@ -125,16 +124,6 @@ class Progress:
         self.history.append(row)
         self.images, self.loss, self.seconds = 0, 0.0, 0.0
         return best_epoch(self.history, by) is row
-
-
-def best_epoch(history: list[EpochMetrics], by: str) -> EpochMetrics:
-    """Return the epoch whose model is the best, the first of equals.
-
-    by: the metric whose lowest value is the best; it is val_loss if the last epoch's val_drift is unknown.
-    """
-    if math.isnan(history[-1]["val_drift"]):
-        by = "val_loss"
-    return min(history, key=lambda row: math.inf if math.isnan(row[by]) else row[by])
 
 
 class SavedRun(NamedTuple):

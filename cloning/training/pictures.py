@@ -7,9 +7,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from cloning.recordings.format import CAMERAS
 from cloning.road.motion import FULL_LOCK
-from cloning.training.checkpoint import EpochMetrics
 from cloning.training.observations import Choices
 from cloning.training.recipe import Recipe
+from cloning.training.run_files import EpochMetrics
 
 SCALE = 3  # of a frame's pixels: three frames in a row are 25 cm wide at 300 dpi
 FONT, MARGIN = 44, 12  # pixels: of the captions, which stay legible at a third of the size; between panels

@@ -1,6 +1,7 @@
-"""The files of a run, and whether one is writing them; without PyTorch, so that a page can show them."""
+"""The files of a run, and what they say of its epochs; without PyTorch, so that a page can show them."""
 
 import contextlib
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,20 @@ if os.name != "nt":
 
 if TYPE_CHECKING:
     from cloning.training.distributed import Ranks
+
+
+EpochMetrics = dict[str, float]  # a row of training_log.csv: `checkpoint.METRICS`
+
+
+def judged_by(history: list[EpochMetrics], by: str) -> str:
+    """Return the metric by which the epochs are judged: `by`, or val_loss if the last one's val_drift is unknown."""
+    return "val_loss" if math.isnan(history[-1]["val_drift"]) else by
+
+
+def best_epoch(history: list[EpochMetrics], by: str) -> EpochMetrics:
+    """Return the epoch whose model is the best, the first of equals; by: the metric that is the lowest then."""
+    metric = judged_by(history, by)
+    return min(history, key=lambda row: math.inf if math.isnan(row[metric]) else row[metric])
 
 
 class RunFiles:

@@ -21,10 +21,10 @@ from cloning.network.layer_table import layer_table
 from cloning.network.network import Network
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
-from cloning.training.checkpoint import EpochMetrics, Progress, best_epoch
+from cloning.training.checkpoint import Progress
 from cloning.training.distributed import Ranks
 from cloning.training.recipe import Recipe
-from cloning.training.run_files import RunFiles
+from cloning.training.run_files import EpochMetrics, RunFiles, best_epoch
 
 MIN_CORRELATION = 0.3  # with the labels; below it, the model has hardly learned anything
 # By val_drift in m, how networks drove in the stand-in simulator: see the study in writeup_report.md.
