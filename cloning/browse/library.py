@@ -199,14 +199,14 @@ class ShownRecording:
         called as on the page: model1, driver1 and replay1 belong to the first model, the last two at a replay's limit.
         Raises ConditionError, UnknownError, RecordingError.
         """
-        recording, cuts = self.read(version), tuple(read_cuts(self.folder))
+        recording = self.read(version)
         names = {"offset": "offset", "label": "label"} | {name: name for name in COLUMNS}
         for index in range(len(self.models)):
             names[f"model{index + 1}"] = f"model-{index}"
             if limit:
                 names |= {f"{kind}{index + 1}": f"{kind}-{index}-{limit}" for kind in ("replay", "driver")}
         rows = matching(condition, lambda name: self.column(names[name], version), list(names))
-        rows &= ~np.logical_or.reduce(_rows_cut(self.folder, cuts, recording))
+        rows &= self._kept(recording)
         found = stretches_of(rows)
         ends = [[first, end, recording.name(first), recording.name(end - 1)] for first, end in found]
         return {"rows": int(rows.sum()), "stretches": ends}
@@ -219,8 +219,8 @@ class ShownRecording:
         shown, models = self.overview(), list[dict[str, Any]]()
         if "message" in shown:
             return shown
-        recording, cuts = self.read(), tuple(read_cuts(self.folder))
-        kept = ~np.logical_or.reduce(_rows_cut(self.folder, cuts, recording))
+        recording = self.read()
+        kept = self._kept(recording)
         if begin:
             self.analyses.resume()
         for at, column in enumerate(self._replays(limit)):
@@ -263,6 +263,10 @@ class ShownRecording:
             raise RecordingError(f"{path}: {error}") from None
         return jpeg
 
+    def _kept(self, recording: Recording) -> np.ndarray:
+        """Return the rows that are not cut: bool (n,). Raises RecordingError."""
+        return ~np.logical_or.reduce(_rows_cut(self.folder, tuple(read_cuts(self.folder)), recording))
+
     def _with_row(self, row: int, version: str | None) -> Recording:
         recording = self.read(version)
         if row >= len(recording):
@@ -288,7 +292,7 @@ class ShownRecording:
         chosen = np.zeros(len(recording), bool)
         for first, end in stretches:
             chosen[first:end] = True
-        chosen &= ~np.logical_or.reduce(_rows_cut(self.folder, tuple(read_cuts(self.folder)), recording))
+        chosen &= self._kept(recording)
         if not chosen.any():
             raise RecordingError(f"{self.folder}: all of the selection is cut; select other frames")
         return recording.take(chosen)

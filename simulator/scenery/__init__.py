@@ -29,8 +29,8 @@ def build(source: str | PointRoad, look: int = 0) -> Scenery:
     if style is None:
         return scenery
     shade = Shade(Track(source), scenery.meshes, scenery.light, style, elevation)
-    # Of the meshes along the road the asphalt has the most points. Its darkest 2 % are left out as single spots; the
-    # shade of cliffs, where it is part of the colours, covers more.
-    road = max((mesh for mesh in scenery.meshes if mesh.road is not None), key=lambda mesh: len(mesh.points))
+    # The darkest 2 % of the asphalt are left out as single spots; the shade of cliffs, where it is part of the colours,
+    # covers more.
+    road = scenery.asphalt
     darkest = np.quantile(road.colours, 0.02, axis=0) * shade.factor * road.texture.mean()
     return replace(scenery, shade=shade, tone=expose(scenery.tone, darkest))

@@ -41,6 +41,11 @@ class Scenery:
     tone: np.ndarray | None = None
     shade: Shade | None = None
 
+    @property
+    def asphalt(self) -> Mesh:
+        """The road itself: of the meshes along it, the one with the most points."""
+        return max((mesh for mesh in self.meshes if mesh.road is not None), key=lambda mesh: len(mesh.points))
+
 
 def assemble(meshes: list[Mesh], look: Look, haze: Haze | None = None) -> Scenery:
     """Return the scenery of these meshes, with the sky and the car in the light and colours of the look."""

@@ -18,8 +18,7 @@ def segments(scenery: Scenery) -> Scenery:
 
     Road is the asphalt with its lines; verge is what lies or stands along it.
     """
-    ribbons = [mesh for mesh in scenery.meshes if mesh.road is not None]
-    road = max(ribbons, key=lambda mesh: len(mesh.points))
+    road = scenery.asphalt
 
     def kind(mesh: Mesh) -> tuple[int, int, int]:
         if mesh.texture.shape[2] == 4:
