@@ -25,7 +25,9 @@ from cloning.report.content import Report
 def main() -> int:
     """Write the report and print its name; return the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m cloning.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=program.in_commands("python -m cloning.report"),
+        description=program.in_commands(__doc__ or ""),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
     add("run", type=Path, metavar="FOLDER", help="folder that model.py has written to; report.html is written there")

@@ -8,6 +8,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from cloning.base import program
 from cloning.base.errors import ModelError, UserError, message_of
 from cloning.browse import summary
 from cloning.browse.runs import RunError, overview
@@ -167,7 +168,7 @@ class Report:
                 why = f"Watch the interventions on {Path(each['recording']).name}, and record more of such places"
                 steps.append((why, ("python", "-m", "cloning.browse", each["recording"], "--model", self.model)))
         steps.append(("Let it drive the simulator, or the stand-in for it", ("python", "drive.py", self.model)))
-        return [(why, shlex.join(map(str, command))) for why, command in steps]
+        return [(why, program.in_commands(shlex.join(map(str, command)))) for why, command in steps]
 
     def page(self) -> str:
         """Return the page, which needs no other file. Raises ModelError, RecordingError, RunError."""
