@@ -25,7 +25,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -243,8 +243,10 @@ class Generator:
         at = np.where(slots < 0, -1, np.searchsorted(order, slots))  # and where they are in its share
         labels = np.empty(len(order), np.float32)
         labels[at[at >= 0]] = choices.views.labels[mine][at >= 0]
-        images: Any = np.empty((len(order), *SEEN_SHAPE), np.uint8)
-        parts = list[Future[None]]()
+        on_gpu = self.observations.gpu is not None
+        images: Any = (
+            batch_images(choices, augmentations, mine, at) if on_gpu else np.empty((len(order), *SEEN_SHAPE), np.uint8)
+        )
 
         def make(part: slice) -> None:
             for i, (augmentation, seen) in enumerate(zip(augmentations, choices.views.images(mine[part]), strict=True)):
@@ -255,10 +257,7 @@ class Generator:
                 chosen = (column[which] for column in choices.augmenting[i])
                 images[at[part, i][has]] = augmentation.change(seen, CROP[0], *chosen)
 
-        if self.observations.gpu:
-            images = batch_images(choices, augmentations, mine, at)
-        else:
-            parts += [self.pool.submit(make, piece) for piece in pieces(len(mine))]
+        parts = [] if on_gpu else [self.pool.submit(make, piece) for piece in pieces(len(mine))]
 
         def wait() -> Batch:
             for part in parts:

@@ -27,7 +27,7 @@ START_COVARIANCE = np.diag([4.0, 0.5, 0.01])  # of its first row's state, once i
 LENIENCE = 0.7  # added to the scores to find where a fall begins: rows before a mishap may agree less, as at a brow
 PROBE, FIRST_PROBE = 40, 15  # rows over which candidates near a neighbour are followed
 KEPT = 4  # candidates that are followed over all of PROBE
-PROBES = np.array([0, 10, 20, 30, 45, 60, 80, 100, 130, 160, 200, 250])  # rows after a neighbour, from which to try
+PROBES = (0, 10, 20, 30, 45, 60, 80, 100, 130, 160, 200, 250)  # rows after a neighbour, from which to try
 # What a part beside another one needs, where the car should be and anywhere near: rows, log-likelihood, turn residual.
 # At looser limits in the jungle (-0.42, 1.45) most of a generated road fits there in pieces, after a pause.
 EXPECTED = {"lake": (60, -0.05, 0.3), "jungle": (60, -0.25, 0.75)}
@@ -189,7 +189,6 @@ class Placing:
         for index, first, end in self.gaps(part, other, forward):
             for skipped in PROBES:
                 start = first + skipped if forward else end - PROBE - skipped
-                start = int(start)
                 if not first <= start <= end - PROBE:
                     break
                 reach = self.reach(part, index, start if forward else start + PROBE - 1, forward)

@@ -150,9 +150,12 @@ class SquaredErrors(nn.Module):
         """Return the sum of the squared errors of real images, and its gradients."""
         # As new variables, because what autograd keeps of the parameters belongs to another of the GPU's streams.
         weights = {name: each.detach().requires_grad_() for name, each in self.network.named_parameters()}
-        network = functools.partial(torch.func.functional_call, self.network, weights)
+
+        def network(*inputs: torch.Tensor | None) -> torch.Tensor:
+            return torch.func.functional_call(self.network, weights, inputs)
+
         with torch.enable_grad(), in_precision(self.precision, self.device):
-            total = squared_errors(lambda *inputs: network(inputs), images, labels, keep, self.huber, real)
+            total = squared_errors(network, images, labels, keep, self.huber, real)
             return [total.detach(), *torch.autograd.grad(total, list(weights.values()))]
 
     def in_pieces(self, batch: Batch, meanwhile: Callable[[], None]) -> tuple[torch.Tensor, list[torch.Tensor]]:
