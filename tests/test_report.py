@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import warm
@@ -31,7 +32,17 @@ def written(finished, sample_recording, tmp_path_factory):
     for row, drift in zip(epochs, ("0.5", "0.7"), strict=True):
         row["val_drift"] = drift
     (folder / "training_log.csv").write_bytes(csv_bytes(epochs[0], [row.values() for row in epochs]))
-    done = report(folder, "--held-out", sample_recording, "--lap", folder / "training_loss.png")
+    lap = Path(shutil.copy(folder / "training_loss.png", folder / "The lake.png"))
+    figures = {
+        "distance_m": 1137.9,
+        "mean_speed_mph": 29.6,
+        "departures": [],
+        "offset_mean_m": 0.07,
+        "offset_max_m": 0.2,
+    }
+    lap.with_suffix(".json").write_text(json.dumps(figures), encoding="utf-8")
+    lap.with_suffix(".mp4").write_bytes(b"film")
+    done = report(folder, "--held-out", sample_recording, "--lap", lap, folder / "training_loss.png")
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"{folder / 'report.html'}: open {(folder / 'report.html').as_uri()} in a browser\n"
     return folder
@@ -56,8 +67,9 @@ def test_the_report_contains_the_run(written, finished):
     for driver in ("the network", *YARDSTICKS.values(), "recovery steering"):
         assert text.count(f" {driver} ") >= 2, f"{driver}, at both limits"
     named = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)
-    assert len(named) >= 3 * 2 + 2 + 6 + 2, "three charts twice, examples, augmentations, drive and lap"
-    assert all(address.startswith("data:image/") for address in named)
+    assert len(named) >= 3 * 2 + 2 + 6 + 4, "three charts twice, examples, augmentations, drive, laps and a film"
+    assert all(address.startswith(("data:image/", "data:video/mp4;base64,ZmlsbQ==")) for address in named)
+    assert "The lake : 1138 m at 30 mph, never left the road; 0.07 m from the centre line on average" in text
     assert "//" not in re.sub(r'<style>.*?</style>|"data:[^"]*"', "", page, flags=re.DOTALL), "no outside host"
     assert len(page) < 15e6
 
@@ -74,6 +86,9 @@ def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):
         and done.stderr
         == f"report: {copy}/training_log.csv: not a whole picture, such as a PNG or a JPEG; make it again\n"
     )
+    (copy / "The lake.json").write_text("{}", encoding="utf-8")
+    done = report(copy, "--lap", copy / "The lake.png")
+    assert done.returncode == 2 and f"{copy}/The lake.json: not a report of `simulator drive`" in done.stderr
     (copy / "model.pt").unlink()
     (copy / "model-best.pt").unlink()
     done = report(copy)

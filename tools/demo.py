@@ -1,4 +1,4 @@
-"""Record, train and drive in the stand-in simulator, and show the result on a page: five minutes on two cores.
+"""Record, train and drive in the stand-in simulator, and show the result in a report: five minutes on two cores.
 
     make demo                   # installs what is needed first
     python -m tools.demo        # the same in an environment that has it
@@ -9,14 +9,13 @@ again; without the folder it begins anew.
 Exit status: 0 if every lap was driven without leaving the road, 1 if the car left it, 2 if a step failed.
 """
 
-import html
 import json
-import shutil
-import string
+import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 from cloning.base import program
 
@@ -25,20 +24,17 @@ if __name__ == "__main__":
 
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError
-from cloning.base.files import write
 from cloning.network.network import SHIPPED_MODEL
-from cloning.server.site import STYLE
-from simulator.report import LapReport
+from cloning.report.content import lap_in_words
 from tools.command import ROOT, command_line, python, run_tool
 from tools.server_process import ServerProcess
 from tools.shipped import Lap, render
 
 FOLDER = Path("demo")
-MODEL = FOLDER / "model.pt"
+MODEL, LAPS = FOLDER / "model.pt", FOLDER / "laps"
 IMAGES = 20_000  # to train on: such a network drove both laps at 30 mph at most 0.25 m off the centre line
 RECORDED = [Lap("lake", "ccw", look=0), Lap("lake", "cw", look=0)]
-TEMPLATE = Path(__file__).with_name("demo.html")
-# Printed at the end, and shown on the page: what to type, and what it does.
+# Printed at the end: what to type, and what it does.
 ACTIVATE = "source .venv/bin/activate"  # of the environment that make installs; README.md has other systems'
 NEXT = (
     ("python -m simulator window", "drive yourself: the arrow keys steer, R records to data/, F1 shows all keys"),
@@ -50,14 +46,12 @@ NEXT = (
 class Drive(NamedTuple):
     """A lap that a network drives.
 
-    name              of its folder, which holds lap.json (report), lap.png (picture) and lap.mp4 (film)
-    title             on the page
+    title             of its files in the report: a report (JSON), a picture (PNG) and a film (MP4)
     model             the network's file
     track, direction  of the road
     speed             set speed in mph
     """
 
-    name: str
     title: str
     model: Path
     track: str
@@ -65,19 +59,19 @@ class Drive(NamedTuple):
     speed: int
 
     @property
-    def folder(self) -> Path:
-        """The folder, which exists once the lap is driven."""
-        return FOLDER / self.name
+    def picture(self) -> Path:
+        """The last file that is written, so that the lap is driven once it exists."""
+        return LAPS / f"{self.title}.png"
 
-    def report(self) -> LapReport:
+    def report(self) -> dict[str, Any]:
         """Return the lap report, once the lap is driven."""
-        return json.loads((self.folder / "lap.json").read_text(encoding="utf-8"))
+        return dict(json.loads(self.picture.with_suffix(".json").read_bytes()))
 
 
 DRIVES = [
-    Drive("lake-ccw", "The lake, by the network just trained", MODEL, "lake", "ccw", 30),
-    Drive("lake-cw", "The lake the other way round", MODEL, "lake", "cw", 30),
-    Drive("jungle", "The jungle, by the network that comes with the project", SHIPPED_MODEL, "jungle", "cw", 15),
+    Drive("The lake, by the network just trained", MODEL, "lake", "ccw", 30),
+    Drive("The lake the other way round", MODEL, "lake", "cw", 30),
+    Drive("The jungle, by the network that comes with the project", SHIPPED_MODEL, "jungle", "cw", 15),
 ]
 
 
@@ -99,19 +93,19 @@ def train() -> None:
 
 def drive(lap: Drive) -> None:
     """Let drive.py drive a lap, unless that is done, and print its figures. Raises UserError, OSError."""
-    if not lap.folder.exists():
-        unfinished = FOLDER / f"unfinished-{lap.name}"
-        shutil.rmtree(unfinished, ignore_errors=True)
-        unfinished.mkdir()
-        outputs = ("json", "--report"), ("png", "--picture"), ("mp4", "--film")
-        files = [word for suffix, option in outputs for word in (option, unfinished / f"lap.{suffix}")]
-        with ServerProcess(ROOT / "drive.py", lap.model, "--speed", str(lap.speed), "--port", "0") as server:
-            road = ("--track", lap.track, "--direction", lap.direction, "--port", server.port)
-            done = python("-m", "simulator", "drive", *road, *files, capture_output=True)
-        if done.returncode not in (program.DONE, program.INCOMPLETE) or not (unfinished / "lap.json").exists():
-            raise SimulatorError(f"{lap.title}: {done.stderr.strip()}; start the demo again to continue")
-        unfinished.rename(lap.folder)
-    print(f"{lap.title}: {in_words(lap.report())}", flush=True)
+    if not lap.picture.exists():
+        with TemporaryDirectory(dir=FOLDER, prefix="unfinished-") as folder:
+            files = {kind: Path(folder, f"lap.{kind}") for kind in ("json", "mp4", "png")}
+            outputs = ("--report", files["json"], "--film", files["mp4"], "--picture", files["png"])
+            with ServerProcess(ROOT / "drive.py", lap.model, "--speed", str(lap.speed), "--port", "0") as server:
+                road = ("--track", lap.track, "--direction", lap.direction, "--port", server.port)
+                done = python("-m", "simulator", "drive", *road, *outputs, capture_output=True)
+            if done.returncode not in (program.DONE, program.INCOMPLETE) or not files["json"].exists():
+                raise SimulatorError(f"{lap.title}: {done.stderr.strip()}; start the demo again to continue")
+            LAPS.mkdir(exist_ok=True)
+            for kind, file in files.items():
+                file.rename(lap.picture.with_suffix(f".{kind}"))
+    print(f"{lap.title}: {lap_in_words(lap.report())}", flush=True)
 
 
 def drive_all() -> None:
@@ -120,39 +114,11 @@ def drive_all() -> None:
         list(pool.map(drive, reversed(DRIVES)))  # the jungle takes as long as both laps of the lake
 
 
-def in_words(report: LapReport) -> str:
-    """Return the figures of a lap in one line."""
-    times = {0: "never left the road", 1: "left the road once"}
-    departures = len(report["departures"])
-    return (
-        f"{report['distance_m']:.0f} m at {report['mean_speed_mph']:.0f} mph, "
-        f"{times.get(departures, f'left the road {departures} times')}; "
-        f"{report['offset_mean_m']:.2f} m from the centre line on average, {report['offset_max_m']:.2f} m at most"
-    )
-
-
-def page() -> str:
-    """Return the page: one HTML file that needs nothing but the files beside it."""
-    figures = [
-        f'<figure><video src="{lap.name}/lap.mp4" controls autoplay muted loop playsinline '
-        f'aria-label="{html.escape(lap.title)}, from behind the car"></video>'
-        f"<figcaption><b>{html.escape(lap.title)}</b> {html.escape(in_words(lap.report()))}.</figcaption></figure>"
-        for lap in DRIVES
-    ]
-    maps = [
-        f'<figure><a href="{lap.name}/lap.png"><img src="{lap.name}/lap.png" loading="lazy" '
-        f'alt="{html.escape(lap.title)}: the road from above, and the distance from the centre line"></a></figure>'
-        for lap in DRIVES
-    ]
-    steps = [f"<dt><code>{html.escape(command)}</code><dd>{html.escape(text)}" for command, text in NEXT]
-    return string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(
-        style=STYLE.read_text(encoding="utf-8"),
-        films="\n".join(figures),
-        maps="\n".join(maps),
-        steps="\n".join(steps),
-        activate=ACTIVATE,
-        images=f"{IMAGES:,}",
-    )
+def report() -> None:
+    """Write the report of the training, with the laps. Raises SimulatorError."""
+    laps = [drive.picture for drive in DRIVES]
+    if python("-m", "cloning.report", FOLDER, "--lap", *laps, stdout=subprocess.DEVNULL).returncode != program.DONE:
+        raise SimulatorError("the report was not written; start the demo again to continue")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -166,15 +132,15 @@ def main(argv: list[str] | None = None) -> int:
         ("record an expert who drives a lap of the lake in each direction (1 minute)", record),
         (f"train a network on {IMAGES:,} images of the two laps (1 minute)", train),
         ("let it drive the lake at 30 mph, and the project's network the jungle, with films (2 minutes)", drive_all),
+        ("write a report of it all", report),
     )
     for n, (text, step) in enumerate(steps, 1):
         print(f"\n{n} of {len(steps)}: {text}", flush=True)
         begin = time.perf_counter()
         step()
         print(f"{n} of {len(steps)}: done in {time.perf_counter() - begin:.0f} s", flush=True)
-    write(FOLDER / "index.html", page().encode())
     width = max(len(command) for command, _ in NEXT)
-    print(f"\nLook at it in a browser: {(FOLDER / 'index.html').resolve().as_uri()}")
+    print(f"\nLook at it in a browser: {(FOLDER / 'report.html').resolve().as_uri()}")
     print(f"\nThree things to do next, after `{ACTIVATE}` in every new terminal:")
     print("\n".join(f"  {command:{width}}  # {text}" for command, text in NEXT))
     return program.INCOMPLETE if any(lap.report()["departures"] for lap in DRIVES) else program.DONE

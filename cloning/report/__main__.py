@@ -2,10 +2,10 @@
 
     python -m cloning.report runs/a                                     # the folder that model.py has written to
     python -m cloning.report runs/a --held-out data/lake-cw             # also let the network drive recordings
-    python -m cloning.report runs/a --lap lap.png                       # also show the picture of a lap
+    python -m cloning.report runs/a --lap lap.png                       # also show laps
 
 Replays take about as long as the recordings; everything else takes seconds. `python -m simulator drive --picture
-lap.png` makes the picture of a lap.
+lap.png --report lap.json --film lap.mp4` makes the picture of a lap, and what is shown with it.
 """
 
 from cloning.base import program
@@ -33,7 +33,8 @@ def main() -> int:
     add("run", type=Path, metavar="FOLDER", help="folder that model.py has written to; report.html is written there")
     held_out = "recordings, or folders of recordings, that the network was not trained on: it drives them"
     add("--held-out", nargs="+", default=[], metavar="FOLDER", help=held_out)
-    add("--lap", type=Path, metavar="FILE.png", help="the picture of a lap, to show")
+    lap = "pictures of laps, to show with the film FILE.mp4 and the figures of FILE.json if they are beside it"
+    add("--lap", nargs="+", type=Path, default=[], metavar="FILE.png", help=lap)
     arguments = parser.parse_args()
     output = arguments.run / "report.html"
     try:

@@ -2,8 +2,9 @@
 
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import numpy as np
@@ -50,11 +51,47 @@ class Shots:
         self.before = frame
 
 
+class Lap(NamedTuple):
+    """A lap in the stand-in simulator.
+
+    title          the name of its picture
+    figures        in words; "" if its report is not beside the picture
+    picture, film  data URIs; film: "" if it is not beside the picture
+    """
+
+    title: str
+    figures: str
+    picture: str
+    film: str
+
+    @classmethod
+    def of(cls, picture: Path) -> "Lap":
+        """Read a lap's picture, and its report and film if they are beside it. Raises UserError, OSError."""
+        report, film = picture.with_suffix(".json"), picture.with_suffix(".mp4")
+        try:
+            figures = lap_in_words(json.loads(report.read_bytes())) if report.exists() else ""
+        except (ValueError, LookupError, TypeError) as error:
+            raise UserError(f"{report}: not a report of `simulator drive` ({error!r}); make it again") from None
+        shown = uri(film.read_bytes(), "video/mp4") if film.exists() else ""
+        return cls(picture.stem, figures, picture_uri(picture), shown)
+
+
+def lap_in_words(report: dict[str, Any]) -> str:
+    """Return the figures of a lap in one line; report: of `python -m simulator drive --report`."""
+    times = {0: "never left the road", 1: "left the road once"}
+    departures = len(report["departures"])
+    return (
+        f"{report['distance_m']:.0f} m at {report['mean_speed_mph']:.0f} mph, "
+        f"{times.get(departures, f'left the road {departures} times')}; "
+        f"{report['offset_mean_m']:.2f} m from the centre line on average, {report['offset_max_m']:.2f} m at most"
+    )
+
+
 class Report:
     """The report of one run."""
 
-    def __init__(self, folder: Path, lap: Path | None = None):
-        """Read a run; lap: a picture to show, or None. Raises RunError, ModelError, UserError, OSError."""
+    def __init__(self, folder: Path, laps: Sequence[Path] = ()):
+        """Read a run; laps: pictures to show. Raises RunError, ModelError, UserError, OSError."""
         files = RunFiles(str(folder / "model.pt"))
         self.run, self.name = overview(files), folder.resolve().name
         self.model = files.best if files.best.exists() else files.last
@@ -64,7 +101,7 @@ class Report:
         self.network = load_model(self.model)
         self.arguments = files.arguments
         self.recipe = json.loads(self.arguments.read_bytes()).get("recipe")
-        self.lap = lap and picture_uri(lap)
+        self.laps = [Lap.of(picture) for picture in laps]
         numbers = self.run["pictures"]
         self.augmentations = [
             (number, *(picture_uri(files.pictures / f"training_generator_{kind}{number}.png") for kind in PICTURES))
@@ -116,7 +153,7 @@ class Report:
                     **report,
                     "trained_on": folder.resolve() in [Path(each["name"]).resolve() for each in self.recordings],
                     "table": rows,
-                    "plot": uri(plot(recording, drives), "png"),
+                    "plot": uri(plot(recording, drives), "image/png"),
                     "interventions": len(where),
                     "pictures": pictures,
                 }

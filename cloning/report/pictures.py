@@ -31,13 +31,13 @@ class Chart(NamedTuple):
 
 
 def uri(data: bytes, kind: str) -> str:
-    """Return a data URI; kind: of the picture, such as "jpeg"."""
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+    """Return a data URI; kind: of the data, such as "image/jpeg"."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def frame_uri(frame: np.ndarray) -> str:
     """Return a data URI of a frame, uint8 (rows, columns, 3), RGB."""
-    return uri(encode(frame, QUALITY), "jpeg")
+    return uri(encode(frame, QUALITY), "image/jpeg")
 
 
 def picture_uri(source: Path | Image.Image) -> str:
@@ -51,7 +51,7 @@ def picture_uri(source: Path | Image.Image) -> str:
     picture.thumbnail((WIDEST, WIDEST))
     file = io.BytesIO()
     picture.save(file, "JPEG", quality=QUALITY)
-    return uri(file.getvalue(), "jpeg")
+    return uri(file.getvalue(), "image/jpeg")
 
 
 def chart(draw: Callable[[Axes], object]) -> Chart:
@@ -65,7 +65,7 @@ def chart(draw: Callable[[Axes], object]) -> Chart:
             axes.grid(alpha=0.3)
             file = io.BytesIO()
             figure.savefig(file, format="svg", metadata={"Date": None})
-            drawn.append(uri(file.getvalue(), "svg+xml"))
+            drawn.append(uri(file.getvalue(), "image/svg+xml"))
     return Chart(*drawn)
 
 
