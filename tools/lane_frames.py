@@ -50,11 +50,12 @@ def every_second_shadowed(look: int) -> int:
     return shadowed(look) if look % 4 < 2 else look
 
 
-def scenes(looks: int, roads: int, frames: int) -> list[RenderedScene]:
-    """Return what the lane network is trained on: both tracks in so many looks, and so many generated roads.
+def scenes(looks: int, number_of: dict[str, int], frames: int) -> list[RenderedScene]:
+    """Return what the lane network is trained on: both tracks in so many looks, and generated roads.
 
-    Each look of a track comes without and with shadows; every second road has shadows. frames: of a scene, times the
-    track's share. Look 0, which resembles the real simulator, gets three times as many.
+    Each look of a track comes without and with shadows; every second road has shadows. number_of: generated roads of
+    each kind; frames: of a scene, times the track's share. Look 0, which resembles the real simulator, gets three times
+    as many.
     """
     tracks = [
         RenderedScene(track, twin, frames * share * (1 if look else 3))
@@ -62,7 +63,11 @@ def scenes(looks: int, roads: int, frames: int) -> list[RenderedScene]:
         for track, share in FRAME_SHARES.items()
         for twin in (look, shadowed(look))
     ]
-    return tracks + [RenderedScene(f"road-{FIRST_ROAD + k}", every_second_shadowed(k), frames) for k in range(roads)]
+    return tracks + [
+        RenderedScene(f"{kind}-{FIRST_ROAD + k}", every_second_shadowed(k), frames)
+        for kind, roads in number_of.items()
+        for k in range(roads)
+    ]
 
 
 def render_strips(scene: RenderedScene, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -305,12 +305,13 @@ def main(argv: list[str] | None = None) -> int:
     frames = "frames of the lake in a look, and of each road; twice as many of the jungle (default %(default)s)"
     add("--frames", type=number(int, 1), default=150, help=frames)
     add("--roads", type=number(int, 0), default=100, help="generated roads (default %(default)s)")
+    add("--mountains", type=number(int, 0), default=100, help="generated mountain roads (default %(default)s)")
     add("--steps", type=number(int, 1), default=3600, help="batches to train on (default %(default)s)")
     add("--seed", type=number(int, 0), default=0, help="of all random choices (default %(default)s)")
     add("--output", type=Path, default=Path("lane.pt"), help="file of weights (default %(default)s)")
     options = parser.parse_args(argv)
     recordings = [RealRecording(folder) for folder in find_folders(options.recordings)]
-    chosen = scenes(options.looks, options.roads, options.frames)
+    chosen = scenes(options.looks, {"road": options.roads, "mountain": options.mountains}, options.frames)
     print(f"rendering {sum(scene.frames for scene in chosen)} frames of {len(chosen)} scenes", flush=True)
     strips, centres = render_all(chosen, options.seed)
     save_network(options.output, train(BatchSampler(strips, centres, recordings, options.seed), options.steps))
