@@ -77,6 +77,18 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         page.shows("#cuts", "None")
         assert cuts.read_text(encoding="utf-8") == header
         at(page, 42)
+        for key in "o", "ArrowRight", "i", "x":
+            page.press(key)
+        page.wait("document.querySelector('#reason[open]')")
+        for key in "bend":
+            page.press(key)
+        page.run("document.querySelector('#reason [value=tags]').click()")
+        page.shows("#tags", "2 frames: bend")
+        tags = f"first image,last image,tag\n{center(linked, 42)},{center(linked, 43)},bend\n"
+        assert (linked / "tags.csv").read_text(encoding="utf-8") == tags and len(read_recording(linked)) == 60
+        assert page.run("document.querySelector('#stretches i.tag').style.left") == "70%"
+        page.press("ArrowLeft")
+        at(page, 42)
         page.press(" ")
         page.shows("#play", "Pause")
         at(page, 59)

@@ -182,6 +182,10 @@ def test_cuts_over_the_socket(linked):
             ("crash, hard", 1, [[10, 11]]),
         ]
         assert len(read_recording(linked)) == 56
+        assert server.ask(f"{here}/tags", "POST", [one, two])[0] == 200
+        assert server.ask(f"{here}/tags", "DELETE", [one])[0] == 200
+        assert [tag["reason"] for tag in server.get(f"{here}/details")["tags"]] == ["crash, hard"]
+        assert server.get(f"{here}/overview")["tags"] == ["crash, hard"], "by which the list is searched"
         refused("is not there any more", "cuts", "DELETE", [two, one | {"reason": "other"}])
         assert server.get(f"{here}/details")["cut_frames"] == 4, "none of them is deleted then"
         assert server.ask(f"{here}/cuts", "DELETE", [one])[0] == 200

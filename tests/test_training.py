@@ -25,7 +25,7 @@ from cloning.training import options, pictures, summary
 from cloning.training.checkpoint import Progress
 from cloning.training.distributed import FirstRankFailed, Ranks
 from cloning.training.lanes import Lanes, Poses
-from cloning.training.options import FIGURES, Process, Run, build_parser
+from cloning.training.options import FIGURES, ROBUST_ONLY, Process, Run, build_parser
 from cloning.training.recipe import Recipe, option_name
 from cloning.training.stop import status_of
 from model import REPORT, ROBUST
@@ -270,7 +270,8 @@ def test_options_are_fields_of_the_recipe_the_run_and_the_process():
     assert {action.dest for action in actions} - {"help", "robust"} <= names
     for name in FIGURES:
         value: Any = {"epochs": 3, "batch_size": 5, "samples_per_epoch": 7, "repeats": 2}.get(name, 0.5)
-        assert parse([option_name(name), str(value)]).run.recipe == replace(REPORT, **{name: value})
+        recipe, *robust = (ROBUST, "--robust") if name in ROBUST_ONLY else (REPORT,)
+        assert parse([*robust, option_name(name), str(value)]).run.recipe == replace(recipe, **{name: value})
     assert parse(["--robust", "--epochs", "1"]).run.recipe == replace(ROBUST, epochs=1)
 
 

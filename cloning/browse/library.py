@@ -18,7 +18,7 @@ from cloning.browse import replays, summary
 from cloning.browse.analyses import LANE, Analyses, Analysis, Result, file_stamp, read_result, stamp
 from cloning.browse.attention import Attention
 from cloning.browse.filter import matching, stretches_of
-from cloning.recordings.excluded import Cut, add_cuts, cut_rows, delete_cuts, one_line, read_cuts
+from cloning.recordings.excluded import EXCLUDED, TAGS, Cut, add_cuts, cut_rows, delete_cuts, one_line, read_cuts
 from cloning.recordings.format import CAMERAS, DRIVING_LOG, SAMPLE_RATE
 from cloning.recordings.images import jpeg_size, read_frame, read_jpeg
 from cloning.recordings.log import Recording, read_uncut
@@ -113,6 +113,7 @@ class ShownRecording:
         try:
             cuts = tuple(read_cuts(self.folder))
             shown |= _figures(self.folder, self.version(), cuts)
+            shown["tags"] = sorted({tag.reason for tag in read_cuts(self.folder, TAGS)})
             shown["lane"] = self._state("offset")
             if shown["lane"]["state"] == "ready":
                 shown |= _road(self.folder, self.version(), cuts, stamp(self.folder, LANE))
@@ -129,20 +130,17 @@ class ShownRecording:
         self.analyses.urgent = self.folder
         models = [{"name": Path(model).name, **self._state(f"model-{at}")} for at, model in enumerate(self.models)]
         shown = self.overview() | {"lane": self._state("offset"), "version": self.version()}
-        rows_cut = _rows_cut(self.folder, tuple(cuts), recording)
-        shown["cuts"] = [
-            {
-                **cut.__dict__,
-                "frames": int(rows.sum()),
-                "stretches": stretches_of(rows),
-            }
-            for cut, rows in zip(cuts, rows_cut, strict=True)
-        ]
+        for kind, some in (("cuts", cuts), ("tags", read_cuts(self.folder, TAGS))):
+            covered = _rows_cut(self.folder, tuple(some), recording)
+            shown[kind] = [
+                {**each.__dict__, "frames": int(rows.sum()), "stretches": stretches_of(rows)}
+                for each, rows in zip(some, covered, strict=True)
+            ]
         offset = self.column("offset") if shown["lane"]["state"] == "ready" else None
         steering = [self.column(f"model-{at}") for at, model in enumerate(models) if model["state"] == "ready"]
         return shown | {
             "models": models,
-            "jumps": summary.jumps(recording.steering, offset, steering, np.logical_or.reduce(rows_cut)),
+            "jumps": summary.jumps(recording.steering, offset, steering, ~self._kept(recording)),
             "limit": limit,
             "replays": [self._replay(recording, column) for column in self._replays(limit)] if limit else [],
         }
@@ -273,17 +271,17 @@ class ShownRecording:
             raise UnknownError(f"no row {row}: the recording has {len(recording)}")
         return recording
 
-    def cut(self, cuts: Iterable[Cut]) -> list[Cut]:
-        """Cut stretches, and return the cuts as they are written. Raises RecordingError, OSError."""
+    def cut(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
+        """Cut or tag stretches, and return the cuts as they are written. Raises RecordingError, OSError."""
         cuts = [Cut(cut.first, cut.last, one_line(cut.reason)) for cut in cuts]
         _rows_cut(self.folder, tuple(cuts), self.read())  # refuses what is no stretch
-        add_cuts(self.folder, *cuts)
+        add_cuts(self.folder, *cuts, file=file)
         return cuts
 
-    def restore(self, cuts: Iterable[Cut]) -> list[Cut]:
-        """Undo cuts, and return them. Raises RecordingError, OSError."""
+    def restore(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
+        """Undo cuts or tags, and return them. Raises RecordingError, OSError."""
         cuts = list(cuts)
-        delete_cuts(self.folder, *cuts)
+        delete_cuts(self.folder, *cuts, file=file)
         return cuts
 
     def _selected(self, stretches: list[list[int]], version: str) -> Recording:

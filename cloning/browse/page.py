@@ -11,7 +11,7 @@ from cloning.base.errors import UserError, message_of
 from cloning.browse.library import Library, ShownRecording, UnknownError
 from cloning.browse.replays import NotReplayedError
 from cloning.browse.runs import Runs
-from cloning.recordings.excluded import BYTES, Cut
+from cloning.recordings.excluded import BYTES, EXCLUDED, TAGS, Cut
 from cloning.road.autonomy import LIMITS
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
 from cloning.road.motion import FULL_LOCK, WHEELBASE
@@ -26,8 +26,9 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     `/` is the page; `/recordings` lists identifiers. Below `/recordings/ID`: `overview` and `details`, JSON;
     `columns/NAME`, little-endian float32 (n,), and POST tries its analysis again, which failed; `rows/N`, JSON,
-    `rows/N/PICTURE.jpg`, and what a model looks at on it, `rows/N/PICTURE/MODEL.png`; `cuts`, to which POST adds and
-    DELETE deletes some, [{"first", "last", "reason"}, …]; they answer with the details, and with the cuts as "changed".
+    `rows/N/PICTURE.jpg`, and what a model looks at on it, `rows/N/PICTURE/MODEL.png`; `cuts` and `tags`, to which POST
+    adds and DELETE deletes some, [{"first", "last", "reason"}, …]; they answer with the details, and with the changed
+    ones as "changed".
     `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are.
     `matches?condition=` has the stretches that meet a condition, `compared?limit=` the models' figures, and POST begins
     what they need. `export` writes a recording, {"rows", "name"}; `film.mp4?rows=` is one: rows are "first-end,…".
@@ -105,10 +106,10 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
         # In a thread, so that others are answered meanwhile.
         return kept(eventlet.tpool.execute(library.attention.png, jpeg, library.model(model)), "image/png")
 
-    @app.route("/recordings/<identifier>/cuts", methods=["POST", "DELETE"])
-    def cut(identifier: str) -> dict[str, Any]:
+    @app.route("/recordings/<identifier>/<any(cuts, tags):kind>", methods=["POST", "DELETE"])
+    def cut(identifier: str, kind: str) -> dict[str, Any]:
         change = shown(identifier).cut if flask.request.method == "POST" else shown(identifier).restore
-        changed = change(cuts())
+        changed = change(cuts(), TAGS if kind == "tags" else EXCLUDED)
         return shown(identifier).details(limit()) | {"changed": changed}
 
     @app.get("/recordings/<identifier>/matches")

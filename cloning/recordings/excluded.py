@@ -1,6 +1,7 @@
-"""The stretches that are cut from a recording: `excluded.csv` beside the log, which itself is never changed.
+"""The stretches that are cut from a recording, or tagged: `excluded.csv` and `tags.csv` beside the log.
 
-Each line names the centre images of a stretch's first and last row, and a reason. A cut is undone by deleting its line.
+Each line names the centre images of a stretch's first and last row, and a reason or a tag. A cut is undone by deleting
+its line. The log itself is never changed.
 """
 
 import contextlib
@@ -22,8 +23,8 @@ from cloning.recordings.images import NONBLOCKING
 if os.name != "nt":
     import fcntl
 
-EXCLUDED = "excluded.csv"
-HEADER = ("first image", "last image", "reason")
+EXCLUDED, TAGS = "excluded.csv", "tags.csv"
+HEADERS = {EXCLUDED: ("first image", "last image", "reason"), TAGS: ("first image", "last image", "tag")}
 MAX_REASON = 200  # characters
 BYTES = {"encoding": "utf-8", "errors": "surrogateescape"}  # names of files may hold any bytes
 _changing = threading.Lock()  # for Windows, where no other lock is taken
@@ -31,11 +32,11 @@ _changing = threading.Lock()  # for Windows, where no other lock is taken
 
 @dataclass(frozen=True)
 class Cut:
-    """A stretch that is cut.
+    """A stretch that is cut, or tagged.
 
     first, last  file names of the centre images of its first and last row
-    reason       one line of text, perhaps empty
-    line         in excluded.csv, from 1; 0 for one that is not written yet
+    reason       or the tag: one line of text, perhaps empty
+    line         in its file, from 1; 0 for one that is not written yet
     """
 
     first: str
@@ -44,16 +45,16 @@ class Cut:
     line: int = 0
 
     def row(self) -> tuple[str, str, str]:
-        """Return its fields, in the order of HEADER."""
+        """Return its fields, in the order of HEADERS."""
         return self.first, self.last, self.reason
 
 
-def read_cuts(folder: Path) -> list[Cut]:
-    """Return the cuts of a recording's `excluded.csv`, none if there is no such file.
+def read_cuts(folder: Path, file: str = EXCLUDED) -> list[Cut]:
+    """Return the cuts of a recording, or with TAGS its tags; none if there is no such file.
 
-    Raises RecordingError, with the line, for a file that is not as `HEADER` says.
+    Raises RecordingError, with the line, for a file that is not as `HEADERS` says.
     """
-    return _parse(folder / EXCLUDED, _lines(folder / EXCLUDED))
+    return _parse(folder / file, _lines(folder / file))
 
 
 def cut_rows(folder: Path, cuts: Iterable[Cut], names: np.ndarray, centres: np.ndarray) -> Iterator[np.ndarray]:
@@ -88,8 +89,8 @@ def _rows_with(where: str, name: str, names: np.ndarray, centres: np.ndarray) ->
     return rows
 
 
-def add_cuts(folder: Path, *cuts: Cut) -> None:
-    """Append cuts to a recording's `excluded.csv`, unless the same ones are there; the other lines stay as they are.
+def add_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> None:
+    """Append cuts or tags to a recording's, unless the same ones are there; the other lines stay as they are.
 
     Raises RecordingError if the file is not readable as such, and OSError if it cannot be written; then it stays.
     """
@@ -100,13 +101,13 @@ def add_cuts(folder: Path, *cuts: Cut) -> None:
         if not added:
             return lines
         ended = [line if line.endswith(("\n", "\r")) else f"{line}\n" for line in lines]
-        return [*(ended or [_line(HEADER)]), *added]
+        return [*(ended or [_line(HEADERS[file])]), *added]
 
-    _change(folder, append)
+    _change(folder / file, append)
 
 
-def delete_cuts(folder: Path, *cuts: Cut) -> None:
-    """Delete the lines of cuts from a recording's `excluded.csv`; the other lines stay as they are.
+def delete_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> None:
+    """Delete the lines of cuts or tags; the other lines stay as they are.
 
     Raises RecordingError if one of them is not there, and the errors of `add_cuts`; then none is deleted.
     """
@@ -116,13 +117,13 @@ def delete_cuts(folder: Path, *cuts: Cut) -> None:
         for cut in cuts:
             if cut.row() not in at:
                 raise RecordingError(
-                    f"{folder / EXCLUDED}: the cut from {cut.first} to {cut.last} is not there any more; it was "
+                    f"{folder / file}: the stretch from {cut.first} to {cut.last} is not there any more; it was "
                     "deleted elsewhere"
                 )
         deleted = {at[cut.row()] for cut in cuts}
         return [line for number, line in enumerate(lines, 1) if number not in deleted]
 
-    _change(folder, delete)
+    _change(folder / file, delete)
 
 
 def one_line(reason: str) -> str:
@@ -130,10 +131,9 @@ def one_line(reason: str) -> str:
     return " ".join("".join(c if c.isprintable() else " " for c in reason).split())[:MAX_REASON]
 
 
-def _change(folder: Path, change: Callable[[list[str], list[Cut]], list[str]]) -> None:
+def _change(path: Path, change: Callable[[list[str], list[Cut]], list[str]]) -> None:
     """Replace the file's lines by those that `change` returns, while no other thread or process does the same."""
-    path = folder / EXCLUDED
-    with _changing, _locked(folder / DRIVING_LOG):
+    with _changing, _locked(path.with_name(DRIVING_LOG)):
         lines = _lines(path)
         changed = change(lines, _parse(path, lines))
         if changed != lines:
@@ -173,20 +173,20 @@ def _lines(path: Path) -> list[str]:
 
 def _parse(path: Path, lines: list[str]) -> list[Cut]:
     """Return the cuts in the file's lines. Raises RecordingError."""
-    cuts = []
+    cuts, header = [], HEADERS[path.name]
     for at, line in enumerate(lines, 1):
         text = line.removeprefix("\ufeff").strip()
         try:
             fields = next(csv.reader([text], strict=True, skipinitialspace=True), [])
         except csv.Error as error:
-            raise RecordingError(f"{path}: line {at}: {error}; a line is {_line(HEADER).strip()}") from None
+            raise RecordingError(f"{path}: line {at}: {error}; a line is {_line(header).strip()}") from None
         fields = [field.strip() for field in fields]
-        if not any(fields) or (at == 1 and tuple(field.lower() for field in fields) == HEADER):
+        if not any(fields) or (at == 1 and tuple(field.lower() for field in fields) == header):
             continue
-        if len(fields) != len(HEADER):
+        if len(fields) != len(header):
             raise RecordingError(
-                f"{path}: line {at}: {len(fields)} fields where {len(HEADER)} are expected: "
-                f"{_line(HEADER).strip()}; put a reason that has commas in double quotes"
+                f"{path}: line {at}: {len(fields)} fields where {len(header)} are expected: "
+                f"{_line(header).strip()}; put a reason that has commas in double quotes"
             )
         first, last = (name.replace("\\", "/").rpartition("/")[2] for name in fields[:2])
         cuts.append(Cut(first, last, fields[2], at))

@@ -1,4 +1,4 @@
-// Marking stretches, cutting them from a recording, and undoing it; what can be undone survives leaving the page.
+// Marking stretches, cutting them from a recording or tagging them, and undoing it; what can be undone survives leaving the page.
 import {ask, clock, element, make, many, notice, renew} from "./common.js";
 import {find} from "./filter.js";
 import {seek, stop} from "./moving.js";
@@ -10,17 +10,19 @@ let asked; // the cuts that the dialog asks a reason for, without it: [first, ro
 export function showCuts() {
   const now = page.open, {details} = now;
   showStretches();
-  const cuts = details.cuts.map(cut => ({...cut, begin: cut.stretches[0]?.[0] ?? 0})).sort((a, b) => a.begin - b.begin);
-  const item = ({begin, frames, first, last, reason}) => {
-    const time = clock(now.columns.seconds[begin]);
-    const go = make("button", time, {"aria-label": `Go to the cut at ${time}`});
-    const remove = make("button", "Delete", {"aria-label": `Delete the cut at ${time}`});
-    go.onclick = () => seek(begin);
-    remove.onclick = () => change("DELETE", [{first, last, reason}], "Deleted the cut");
-    return make("li", "", {}, go, ` ${many(frames, "frame")}: ${reason || "no reason given"} `, remove);
-  };
-  renew(element("cuts"), [now.id, details.version, cuts], () =>
-    cuts.length ? cuts.map(item) : [make("li", "None. Mark a stretch, then cut it.", {class: "quiet"})]);
+  for (const [kind, word, none] of [["cuts", "cut", "Mark a stretch, then cut it."], ["tags", "tag", "Cut has a button for it."]]) {
+    const some = details[kind].map(cut => ({...cut, begin: cut.stretches[0]?.[0] ?? 0})).sort((a, b) => a.begin - b.begin);
+    const item = ({begin, frames, first, last, reason}) => {
+      const time = clock(now.columns.seconds[begin]);
+      const go = make("button", time, {"aria-label": `Go to the ${word} at ${time}`});
+      const remove = make("button", "Delete", {"aria-label": `Delete the ${word} at ${time}`});
+      go.onclick = () => seek(begin);
+      remove.onclick = () => change(kind, "DELETE", [{first, last, reason}], `Deleted the ${word}`);
+      return make("li", "", {}, go, ` ${many(frames, "frame")}: ${reason || "no reason given"} `, remove);
+    };
+    renew(element(kind), [now.id, details.version, some], () =>
+      some.length ? some.map(item) : [make("li", `None. ${none}`, {class: "quiet"})]);
+  }
 }
 
 // The marked stretch: [first row, row after the last], or undefined.
@@ -31,8 +33,9 @@ export function marked() {
 
 // What is cut, found and marked, behind the curves and on the strip.
 export function showStretches() {
-  const now = page.open, {first, last} = now.marks, from = first ?? last, stretches = now.details.cuts
-    .flatMap(cut => cut.stretches).map(([first, end]) => [first, end, "--cut"]);
+  const now = page.open, {first, last} = now.marks, from = first ?? last;
+  const coloured = (some, colour) => some.flatMap(cut => cut.stretches).map(([first, end]) => [first, end, colour]);
+  const stretches = [...coloured(now.details.tags, "--tag"), ...coloured(now.details.cuts, "--cut")];
   for (const [first, end] of now.matches?.stretches ?? []) stretches.push([first, end, "--match"]);
   if (from != undefined) stretches.push([from, (last ?? first) + 1, "--mark"]);
   now.plots.setStretches(stretches);
@@ -76,27 +79,28 @@ export function askForReason(cuts, reason = element("reason-text").value) {
 
 element("reason").onclose = async () => {
   const now = page.open, reason = element("reason-text").value;
-  if (element("reason").returnValue != "cut" || !now) return;
+  const kind = element("reason").returnValue;
+  if (!kind || !now) return;
   const name = async row => (await ask(`/${now.id}/rows/${row}?version=${now.details.version}`)).images[0];
   try {
     const cuts = await Promise.all(asked.map(async cut => Array.isArray(cut)
       ? {first: await name(cut[0]), last: await name(cut[1] - 1), reason} : {...cut, reason}));
-    if (page.open == now) await change("POST", cuts, "Cut");
+    if (page.open == now) await change(kind, "POST", cuts, kind == "cuts" ? "Cut" : "Tagged");
   } catch (error) {
     notice(error.message);
   }
 };
 
-// Add or delete cuts; what: for the message; from: the list that it was taken from, if it is undone or done again.
-async function change(method, cuts, what, from = "") {
+// Add or delete cuts or tags; what: for the message; from: the list that it was taken from, if it is undone or done again.
+async function change(kind, method, cuts, what, from = "") {
   const now = page.open;
   try {
-    const details = await ask(`/${now.id}/cuts${now.query()}`, {
+    const details = await ask(`/${now.id}/${kind}${now.query()}`, {
       method, headers: {"Content-Type": "application/json"}, body: JSON.stringify(cuts),
     });
     if (page.open != now) return;
     const changed = details.changed.map(({first, last, reason}) => ({first, last, reason}));
-    now[from == "done" ? "undone" : "done"].push({method: OPPOSITE[method], cuts: changed});
+    now[from == "done" ? "undone" : "done"].push({kind, method: OPPOSITE[method], cuts: changed});
     if (!from) now.undone = [];
     if (method == "POST") now.marks = {};
     notice();
@@ -123,13 +127,13 @@ export function undo() {
     showStretches();
     remember();
   } else if (now.done.length) {
-    const {method, cuts} = now.done.pop();
-    change(method, cuts, "Undone", "done");
+    const {kind = "cuts", method, cuts} = now.done.pop();
+    change(kind, method, cuts, "Undone", "done");
   } else say("Nothing to undo; a cut in the list has a button that deletes it.");
 }
 
 export function redo() {
   const now = page.open, next = now.undone.pop();
-  if (next) change(next.method, next.cuts, "Done again", "undone");
+  if (next) change(next.kind ?? "cuts", next.method, next.cuts, "Done again", "undone");
   else say("Nothing to do again.");
 }

@@ -130,12 +130,13 @@ async function fill(id, card, now) {
   }
 }
 
-// What is worth telling besides the figures: what was repaired, refused or cut.
+// What is worth telling besides the figures: what was repaired, refused, cut or tagged.
 function words(overview) {
   const counted = (count, word, what) => count ? [`${many(count, word)} ${what}`] : [];
   const [first] = [...overview.first_rejected ?? [], ...overview.first_unusable ?? []];
   return [...counted(repaired(overview), "row", "repaired"), ...counted(overview.cut_frames, "frame", "cut"),
-    ...counted(refused(overview), "row", `refused, as line ${first?.[0]}: ${first?.[1]}`)];
+    ...counted(refused(overview), "row", `refused, as line ${first?.[0]}: ${first?.[1]}`),
+    ...overview.tags?.length ? [`tagged ${overview.tags.join(", ")}`] : []];
 }
 
 function draw(overview, card) {
