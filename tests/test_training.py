@@ -223,6 +223,7 @@ def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_pat
         (["--device", "mps"], "error: --device mps: "),
         (["--robust", "--throttle-threshold", "0.1"], "--throttle-threshold has no effect with --robust"),
         (["--robust", "--side-correction", "0.1"], "--side-correction has no effect with --robust"),
+        (["--disturbed", "0.1"], "--disturbed has no effect without --robust"),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(linked, tmp_path, monkeypatch, arguments, words):

@@ -19,7 +19,7 @@ export const KEYS = [
   ["PageUp PageDown", "ten seconds back, on"],
   ["Home End", "to the beginning, the end"],
   ["I O", "mark the first, the last frame of a stretch"],
-  ["X", "cut the marked stretch"],
+  ["X", "cut or tag the marked stretch"],
   ["Z Y", "undo the marks, or the last cut or deleted cut; do it again"],
   ["/", "find frames by a condition"],
   ["G Shift+G", "next, previous stretch that meets the condition"],
