@@ -42,7 +42,7 @@ def written(finished, sample_recording, tmp_path_factory):
     }
     lap.with_suffix(".json").write_text(json.dumps(figures), encoding="utf-8")
     lap.with_suffix(".mp4").write_bytes(b"film")
-    done = report(folder, "--held-out", sample_recording, "--lap", lap, folder / "training_loss.png")
+    done = report(folder, "--held-out", sample_recording, "--lap", lap, folder / "training_loss.png", "--markdown")
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"{folder / 'report.html'}: open {(folder / 'report.html').as_uri()} in a browser\n"
     return folder
@@ -72,6 +72,18 @@ def test_the_report_contains_the_run(written, finished):
     assert "The lake : 1138 m at 30 mph, never left the road; 0.07 m from the centre line on average" in text
     assert "//" not in re.sub(r'<style>.*?</style>|"data:[^"]*"', "", page, flags=re.DOTALL), "no outside host"
     assert len(page) < 15e6
+
+
+def test_the_report_is_written_as_markdown(written):
+    text = (written / "report.md").read_text(encoding="utf-8")
+    assert (
+        text.startswith("# A network that learned to drive: my run") and "## Training" in text and "data:" not in text
+    )
+    assert re.search(r"^\| .*lake sample \| 60 \| 0 \| 0 \|", text, re.MULTILINE)
+    assert re.search(r"^\| the network \| -?[\d.]+ % \|", text, re.MULTILINE)
+    pictures = re.findall(r"!\[[^]]+\]\((report/\d+\.(?:jpg|png|svg))\)", text)
+    assert len(pictures) == len([*(written / "report").iterdir()]) >= 3 + 6 + 2 + 3
+    assert all((written / picture).stat().st_size for picture in pictures)
 
 
 def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):

@@ -20,6 +20,7 @@ from cloning.base.errors import UserError
 from cloning.base.outputs import check_folders, write_output
 from cloning.recordings.log import find_folders
 from cloning.report.content import Report
+from cloning.report.markdown import write_markdown
 
 
 def main() -> int:
@@ -35,13 +36,17 @@ def main() -> int:
     add("--held-out", nargs="+", default=[], metavar="FOLDER", help=held_out)
     lap = "pictures of laps, to show with the film FILE.mp4 and the figures of FILE.json if they are beside it"
     add("--lap", nargs="+", type=Path, default=[], metavar="FILE.png", help=lap)
+    add("--markdown", action="store_true", help="also write report.md, with its pictures in report/")
     arguments = parser.parse_args()
     output = arguments.run / "report.html"
     try:
         report = Report(arguments.run, arguments.lap)
         check_folders(str(output))
         report.replay(find_folders(arguments.held_out) if arguments.held_out else [])
-        write_output(output, report.page().encode(errors="replace"))
+        page = report.page()
+        write_output(output, page.encode(errors="replace"))
+        if arguments.markdown:
+            write_markdown(page, output.with_suffix(".md"))
     except (UserError, OSError) as error:
         return program.failed(error)
     print(f"{output}: open {output.resolve().as_uri()} in a browser")
