@@ -5,12 +5,14 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from commands import SHORT, finished_run, log, run_here, run_model, same, started_run, weights
+from commands import ROOT, SHORT, finished_run, log, run_here, run_model, same, started_run, weights
 from killed import ALL
 from rendered import render_recording
 
@@ -73,6 +75,31 @@ def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_inte
     )
     assert ours == theirs
     assert not list(tmp_path.glob("*previous*"))  # a run never takes its own files for an earlier run's
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
+def test_a_run_whose_terminal_is_closed_saves_its_state(sample_recording, tmp_path):
+    import fcntl
+    import termios
+
+    ours, its = os.openpty()
+    command = [sys.executable, str(ROOT / "model.py"), str(sample_recording), *map(str, SHORT), "--output", "model.pt"]
+    run = subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdin=its,
+        stdout=its,
+        stderr=its,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(its)
+    printed = b""
+    while b"Epoch" not in printed:
+        printed += os.read(ours, 1000)
+    os.close(ours)
+    assert run.wait(60) == 128 + signal.SIGHUP
+    assert torch.load(tmp_path / "model-resume.pt", weights_only=True)["training"]["images"] > 0
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")

@@ -1,5 +1,6 @@
 """How a run ends: stopped by a signal, after it has saved its state, or by an error, with what the user can do."""
 
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -22,7 +23,8 @@ class Interrupted(Exception):
 class StopSignals:
     """A context in which SIGNALS are noted; after one, Ctrl-C or SIGTERM raises KeyboardInterrupt.
 
-    SIGHUP is that of a closed terminal. What the process ignores already, as after `nohup`, it still does.
+    SIGHUP is that of a closed terminal; what is printed after it is lost. What the process ignores already, as after
+    `nohup`, it still does.
 
     received  the number of the signal, 0 without one
     """
@@ -32,6 +34,7 @@ class StopSignals:
         self.received = 0
 
     def __enter__(self) -> "StopSignals":
+        self._terminals = [file for file in (1, 2) if os.isatty(file)]
         noted = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
         self._handlers = {number: signal.signal(number, self._note) for number in noted}
         return self
@@ -41,6 +44,10 @@ class StopSignals:
             signal.signal(number, handler)
 
     def _note(self, number: int, _: FrameType | None) -> None:
+        if number == getattr(signal, "SIGHUP", None):  # printing would fail, before the state is saved
+            with open(os.devnull, "w") as nowhere:
+                for file in self._terminals:
+                    os.dup2(nowhere.fileno(), file)
         if self.received and number != getattr(signal, "SIGHUP", None):  # which may come twice
             raise KeyboardInterrupt
         self.received = self.received or number
