@@ -8,6 +8,7 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from cloning.lerobot import TASK
+from cloning.road.motion import MPH
 from simulator.environment import ID
 
 
@@ -16,7 +17,7 @@ class LeRobotDrive(gymnasium.Wrapper):
 
     | | |
     |---|---|
-    | observation | `pixels`: `center`, uint8 (160, 320, 3), RGB; `agent_pos`: float32 (1,), speed, mph |
+    | observation | `pixels`: `center`, uint8 (160, 320, 3), RGB; `agent_pos`: float32 (2,), speed in mph and m/s |
     | action | float32 (3,): steering, -1..1, right positive; throttle and brake, 0..1 |
     | info | `is_success`: the laps are finished; all else is that of the environment, as are the rewards |
     """
@@ -27,7 +28,7 @@ class LeRobotDrive(gymnasium.Wrapper):
         """env: of `simulator.environment`."""
         super().__init__(env)
         pixels = spaces.Dict({"center": env.observation_space})
-        self.observation_space = spaces.Dict({"pixels": pixels, "agent_pos": spaces.Box(-100, 100, (1,), np.float32)})
+        self.observation_space = spaces.Dict({"pixels": pixels, "agent_pos": spaces.Box(-100, 100, (2,), np.float32)})
         self.action_space = spaces.Box(np.array([-1, 0, 0], np.float32), np.ones(3, np.float32))
 
     def reset(self, **options: Any) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -42,7 +43,7 @@ class LeRobotDrive(gymnasium.Wrapper):
         return observation, reward, terminated, truncated, info
 
     def _described(self, frame: np.ndarray, info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        observation = {"pixels": {"center": frame}, "agent_pos": np.array([info["speed"]], np.float32)}
+        observation = {"pixels": {"center": frame}, "agent_pos": np.array([1, MPH], np.float32) * info["speed"]}
         return observation, {**info, "is_success": info["laps"] >= self.get_wrapper_attr("laps")}
 
 

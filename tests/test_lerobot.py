@@ -77,12 +77,11 @@ def test_a_data_set_has_what_lerobots_format_names(written):
     assert info["codebase_version"] == "v3.0" and info["fps"] == 15 and info["splits"] == {"train": "0:3"}
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 19, 1)
     assert info["features"]["action"]["names"] == ["steering", "throttle", "brake"]
-    assert info["features"]["observation.state"] == {
-        **{"dtype": "float32", "shape": [1], "names": ["speed"], "units": ["mph"]}
-    }
+    assert info["features"]["observation.state"]["units"] == ["mph", "m/s"]
     place = {"chunk_index": 0, "file_index": 0}
     rows = pq.read_table(written / info["data_path"].format(**place)).to_pydict()
     assert rows.keys() == {key for key, feature in info["features"].items() if feature["dtype"] != "video"}
+    assert rows["observation.state"][0] == pytest.approx([30.19, 30.19 * 0.44704])
     assert rows["episode_index"] == [0] * 8 + [1] * 6 + [2] * 5 and rows["index"] == list(range(19))
     np.testing.assert_allclose(rows["timestamp"], np.array(rows["frame_index"]) / 15, rtol=1e-6)
     episodes = pq.read_table(written / "meta/episodes/chunk-000/file-000.parquet").to_pydict()

@@ -3,7 +3,7 @@
 | feature | what it holds |
 |---|---|
 | `observation.images.center`, `.left`, `.right` | the cameras' frames, 160 x 320, RGB: a film each, H.264 |
-| `observation.state` | speed, mph |
+| `observation.state` | speed in mph, and in m/s, because LeRobot's policies fail with a state of one number |
 | `action` | steering, -1..1 for -25..25 degrees, right positive; throttle and brake, 0..1 |
 | `recorded_at` | seconds since 1970 by the recording computer's clock; `timestamp` counts frames of equal length |
 
@@ -29,12 +29,13 @@ from cloning.lerobot import TASK
 from cloning.recordings.format import CAMERAS, DRIVE_GAP, SAMPLE_RATE
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording
+from cloning.road.motion import MPH
 
 FORMAT = "v3.0"
 FILMS = {f"observation.images.{camera}": camera for camera in CAMERAS}
 STATE, ACTION, RECORDED_AT = "observation.state", "action", "recorded_at"
 UNITS = {  # of each number, by its name
-    STATE: {"speed": "mph"},
+    STATE: {"speed": "mph", "speed in m/s": "m/s"},
     ACTION: {"steering": "-1..1 for -25..25 degrees, right positive", "throttle": "0..1", "brake": "0..1"},
     RECORDED_AT: {"recorded_at": "seconds since 1970 by the recording computer's clock"},
 }
@@ -72,14 +73,15 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
     RecordingError if an image cannot be read; then nothing is written.
     """
     recordings = [recording.without_copies() for recording in recordings]
-    times = np.concatenate([recording.time for recording in recordings])
+    times, speed = (np.concatenate([getattr(each, name) for each in recordings]) for name in ("time", "speed"))
     rate = round(frame_rate(times.tolist(), SAMPLE_RATE))
     lengths = np.array([len(rows) for recording in recordings for rows in _drives(recording)])
     starts = np.cumsum(lengths) - lengths
     index, rows = np.arange(len(times)), [(each, row) for each in recordings for row in range(len(each))]
     episode = np.repeat(np.arange(len(lengths)), lengths)
     columns = {
-        **{name: np.concatenate([_numbers(recording, name) for recording in recordings]) for name in (STATE, ACTION)},
+        STATE: np.stack([speed, speed * np.float32(MPH)], axis=1),
+        ACTION: np.concatenate([np.stack([getattr(each, name) for name in UNITS[ACTION]], 1) for each in recordings]),
         RECORDED_AT: times,
         "timestamp": ((index - starts[episode]) / rate).astype(np.float32),
         **dict(zip(COUNTS, (index - starts[episode], episode, index, 0 * index), strict=True)),
@@ -134,11 +136,6 @@ def _drives(recording: Recording) -> list[np.ndarray]:
     return np.split(np.arange(len(recording)), np.flatnonzero(np.diff(recording.time) > DRIVE_GAP) + 1)
 
 
-def _numbers(recording: Recording, key: str) -> np.ndarray:
-    """Return a feature's values: float32 (n,) if it has one name, otherwise (n, names)."""
-    return np.stack([getattr(recording, name) for name in UNITS[key]], axis=-1).squeeze(-1 if key == STATE else ())
-
-
 def _features(rate: int) -> dict[str, dict[str, Any]]:
     """Return what info.json says of each feature; rate: frames a second."""
     film = {
@@ -158,9 +155,10 @@ def _features(rate: int) -> dict[str, dict[str, Any]]:
 
 
 def _data(columns: dict[str, np.ndarray]) -> pa.Table:
-    """Return the table of the rows; columns: (n,), but those of the action (n, 3)."""
+    """Return the table of the rows; columns: (n,), but those of the state and the action (n, k)."""
     arrays = {key: pa.array(column.ravel()) for key, column in columns.items()}
-    arrays[ACTION] = pa.FixedSizeListArray.from_arrays(arrays[ACTION], len(UNITS[ACTION]))
+    for key in (STATE, ACTION):
+        arrays[key] = pa.FixedSizeListArray.from_arrays(arrays[key], len(UNITS[key]))
     return pa.table(arrays)
 
 
