@@ -22,6 +22,7 @@ from cloning.base.outputs import plural
 from cloning.lerobot.source import write_recording
 from cloning.lerobot.tub import MANIFEST, read_tub
 from cloning.recordings.check import check_images
+from cloning.recordings.format import LANE_FILE
 from cloning.recordings.log import find_folders, print_findings, read_recording
 
 
@@ -69,6 +70,8 @@ def main() -> int:
                 recordings = [check_images(read_recording(folder)) for folder in find_folders(arguments.source)]
                 for recording in recordings:
                     print_findings(recording)
+                    if (lane := recording.folder / LANE_FILE).exists():
+                        print(f"{lane}: left out; of what comes back, --robust will have to estimate the lane")
                 print(f"{output}: {write_data_set(recordings, output)}")
                 return program.DONE
             samples = read_data_set(source, arguments.camera, arguments.steering)

@@ -7,7 +7,7 @@
 | `action` | steering, -1..1 for -25..25 degrees, right positive; throttle and brake, 0..1 |
 | `recorded_at` | seconds since 1970 by the recording computer's clock; `timestamp` counts frames of equal length |
 
-The format: https://huggingface.co/docs/lerobot/lerobot-dataset-v3, and what LeRobot 0.4.4 and 0.6.1 write and read.
+The format: https://huggingface.co/docs/lerobot/lerobot-dataset-v3; read back with LeRobot 0.4.4.
 """
 
 import io
@@ -31,7 +31,6 @@ from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording
 from cloning.road.motion import MPH
 
-FORMAT = "v3.0"
 FILMS = {f"observation.images.{camera}": camera for camera in CAMERAS}
 STATE, ACTION, RECORDED_AT = "observation.state", "action", "recorded_at"
 UNITS = {  # of each number, by its name
@@ -55,14 +54,10 @@ from simulator.lerobot import make_env  # noqa: F401
 CARD = """---
 tags: [LeRobot]
 task_categories: [robotics]
-configs: [{{config_name: default, data_files: data/*/*.parquet}}]
+configs: [{config_name: default, data_files: data/*/*.parquet}]
 ---
-{drives} in the Udacity simulator, or a stand-in for it, as a [LeRobot](https://github.com/huggingface/lerobot) data
-set; written by `python -m cloning.lerobot` of the project behavioral-cloning. A row is a moment, {rate} a second.
+Drives in the Udacity simulator, or its stand-in, written by `python -m cloning.lerobot` of behavioral-cloning.
 
-| feature | name | unit |
-|---|---|---|
-{units}
 """
 
 
@@ -109,24 +104,16 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
         statistics = {key: _statistics(value) for key, value in values.items()}
         write(temporary / "meta/stats.json", json.dumps(statistics, indent=1).encode())
         info = {
-            "codebase_version": FORMAT,
-            "robot_type": "udacity car",
-            "total_episodes": len(lengths),
-            "total_frames": len(times),
-            "total_tasks": 1,
-            "chunks_size": 1000,
-            "data_files_size_in_mb": 100,
-            "video_files_size_in_mb": 200,
+            **{"codebase_version": "v3.0", "robot_type": "udacity car"},
+            **{"total_episodes": len(lengths), "total_frames": len(times), "total_tasks": 1},
+            **{"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200},
             "fps": rate,
             "splits": {"train": f"0:{len(lengths)}"},
             **PATHS,
             "features": _features(rate),
         }
         write(temporary / "meta/info.json", json.dumps(info, indent=1).encode())
-        drives = plural(len(lengths), "drive")
-        units = [f"| `{key}` | {name} | {unit} |" for key, names in UNITS.items() for name, unit in names.items()]
-        card = CARD.format(drives=drives, rate=plural(rate, "frame"), units="\n".join(units))
-        write(temporary / "README.md", card.encode())
+        write(temporary / "README.md", (CARD + (__doc__ or "").partition("\n\n")[2]).encode())
         write(temporary / "env.py", ENVIRONMENT.encode())
     return f"{plural(len(times), 'frame')} of 3 cameras in {plural(len(lengths), 'episode')}, {rate} a second"
 
