@@ -224,6 +224,15 @@ def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_pat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lake"]
 
 
+@pytest.mark.parametrize("row", ["{", "[]", "{}", '{"cam/image_array": "0_cam_image_array_.jpg", "user/angle": null}'])
+def test_a_damaged_tub_is_reported_with_its_line(tub, tmp_path, row):
+    catalog = tub / "catalog_1.catalog"
+    catalog.write_text(f"{catalog.read_text(encoding='utf-8')}{row}\n", encoding="utf-8")
+    done = run(tub, "--output", tmp_path / "recording")
+    assert done.returncode == 2 and "catalog_1.catalog: line 7: " in done.stderr and done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["tub"]
+
+
 def test_what_exists_is_not_replaced(recordings, written, tub):
     for source in (recordings[0], written, tub):
         done = run(source, "--output", tub)

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cloning.base.errors import RecordingError
 from cloning.lerobot.dataset import ACTION, RECORDED_AT
-from cloning.lerobot.source import Sample
+from cloning.lerobot.source import Sample, decoded
 from cloning.recordings.columns import column_of
 from cloning.recordings.format import CAMERAS, NUMBERS
 
@@ -104,7 +103,7 @@ def _images(
     """Yield the frame of a camera in each row of an episode: uint8 (rows, columns, 3), RGB. Raises RecordingError."""
     if info["features"][key]["dtype"] == "image":
         for image in table[key].to_pylist():
-            if (pixels := cv2.imdecode(np.frombuffer(image["bytes"], np.uint8), cv2.IMREAD_COLOR_RGB)) is None:
+            if (pixels := decoded(image["bytes"])) is None:
                 raise RecordingError(f"{key}: a damaged image in episode {episode['episode_index']}; copy it again")
             yield pixels
         return

@@ -19,6 +19,7 @@ from cloning.road.camera import CAMERA_OFFSETS
 from cloning.road.warp import warp
 
 JPEG_QUALITY = 95  # of images that were compressed before
+ROUNDING = 1e-6  # of the steering at full lock
 MILLISECOND = 0.001  # s: two images with the same time stamp would have the same name
 NOT_THERE = {
     "throttle": "no throttle: 0 is written; train with --throttle-threshold 0",
@@ -64,11 +65,12 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
             if not np.isfinite([steering, throttle, brake, speed]).all():
                 notes["a row whose numbers are not finite is left out"] += 1
                 continue
-            if abs(steering) > 1:
+            if abs(steering) > 1 + ROUNDING:
                 raise RecordingError(
                     f"steering {steering * full_lock:g} where {full_lock:g} is the full lock to the right: name the "
                     "value of 25 degrees to the right with --full-lock, below 0 if left is positive"
                 )
+            steering = max(-1.0, min(steering, 1.0))
             if throttle < 0:
                 notes["throttle below 0 is written as brake"] += 1
                 throttle, brake = 0, max(brake, -throttle)
@@ -89,6 +91,11 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
             raise RecordingError("no usable row")
         write(temporary / DRIVING_LOG, csv_bytes([list(COLUMNS), *rows]))
     return len(rows)
+
+
+def decoded(image: bytes) -> np.ndarray | None:
+    """Return an image file's pixels, uint8 (rows, columns, 3), RGB, or None if it is damaged."""
+    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR_RGB) if image else None
 
 
 def fit(image: np.ndarray, notes: Counter[str]) -> np.ndarray:

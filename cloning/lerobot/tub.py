@@ -9,13 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from cloning.base.errors import RecordingError
-from cloning.lerobot.source import Sample
+from cloning.lerobot.source import Sample, decoded
 
 MANIFEST = "manifest.json"
-INPUTS = {"steering": "user/angle", "throttle": "user/throttle"}
 FRAME_SECONDS = 0.05  # donkeycar's usual 20 rows a second, for tubs without times
 
 
@@ -32,18 +29,23 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
     for path in lines[4]["paths"]:
         for line, row in enumerate(_lines(folder / path), 1):
             index += 1
-            where = f"{folder / path}: line {line}"
-            if index in deleted:
-                notes["a row that is marked as deleted is left out"] += 1
-            elif row.get("user/mode", "user") != "user":
-                notes[f"a row that the {row['user/mode']} drove is left out"] += 1
-            elif not {camera, "user/angle"} <= row.keys():
-                raise RecordingError(f"{where}: has no {camera} or no user/angle; name another camera, or correct it")
-            elif (image := cv2.imread(str(folder / "images" / row[camera]), cv2.IMREAD_COLOR_RGB)) is None:
-                notes["a row whose image is missing or damaged is left out"] += 1
-            else:
-                time = row["_timestamp_ms"] / 1000 if "_timestamp_ms" in row else index * FRAME_SECONDS
-                yield Sample(time, [image], {name: row[key] for name, key in INPUTS.items() if key in row})
+            try:
+                if index in deleted:
+                    notes["a row that is marked as deleted is left out"] += 1
+                elif row.get("user/mode", "user") != "user":
+                    notes[f"a row that the {row['user/mode']} drove is left out"] += 1
+                elif (
+                    not (file := folder / "images" / row[camera]).is_file()
+                    or (image := decoded(file.read_bytes())) is None
+                ):
+                    notes["a row whose image is missing or damaged is left out"] += 1
+                else:
+                    time = row["_timestamp_ms"] / 1000 if "_timestamp_ms" in row else index * FRAME_SECONDS
+                    throttle = {"throttle": float(row["user/throttle"])} if "user/throttle" in row else {}
+                    yield Sample(time, [image], {"steering": float(row["user/angle"]), **throttle})
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                problem = f"no {error}" if isinstance(error, KeyError) else str(error)
+                raise RecordingError(f"{folder / path}: line {line}: {problem}; correct or delete the line") from None
 
 
 def _lines(path: Path) -> list[Any]:
