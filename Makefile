@@ -38,7 +38,7 @@ lint: .venv/installed
 
 lock:
 	$(PYTHON) -m venv .venv-lock
-	.venv-lock/bin/python -m pip install --quiet '.[simulator,gymnasium,export,markdown,dev]'
+	.venv-lock/bin/python -m pip install --quiet '.[simulator,gymnasium,lerobot,export,markdown,dev]'
 	(head -n 2 requirements.txt; .venv-lock/bin/python -m pip list --format=freeze --exclude behavioral-cloning \
 		--exclude pip --exclude setuptools | sed 's/+cpu$$//') > .venv-lock/requirements.txt
 	mv .venv-lock/requirements.txt requirements.txt

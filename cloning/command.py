@@ -19,6 +19,7 @@ COMMANDS = {  # name: its module, the command of a clone, what it does
     "browse": ("cloning.browse.__main__", "python -m cloning.browse", "look at recordings and training runs"),
     "report": ("cloning.report.__main__", "python -m cloning.report", "write a training run's report"),
     "export": ("cloning.network.export", "python -m cloning.network.export", "write a network as ONNX"),
+    "lerobot": ("cloning.lerobot.__main__", "python -m cloning.lerobot", "to and from data sets of LeRobot"),
 }
 USAGE = "usage: behavioral-cloning COMMAND …\n\n" + "\n".join(
     f"  {name:10} {does}: {clone}" for name, (_, clone, does) in COMMANDS.items()

@@ -354,6 +354,23 @@ def test_an_analysis_of_the_lane_killed_anywhere(lake, tmp_path):
     Trial(tmp_path / "trial", command, command).killed_everywhere(1)
 
 
+@pytest.fixture(params=["to LeRobot", "from LeRobot"])
+def converting(lake, tmp_path, request):
+    command = ["-m", "cloning.lerobot", lake, "--output", "lake"]
+    to_lerobot = Trial(tmp_path / "trial", command, command)
+    if request.param == "to LeRobot":
+        return to_lerobot
+    to_lerobot.whole_run()
+    shutil.move(tmp_path / "trial", tmp_path / "begin")
+    command = ["-m", "cloning.lerobot", "lake", "--output", "recording"]
+    return Trial(tmp_path / "trial", command, command, tmp_path / "begin")
+
+
+def test_a_data_set_and_a_recording_of_one_killed_anywhere_and_on_a_full_disk(converting):
+    converting.killed_everywhere(1)
+    converting.disk_full_everywhere(1, status=2)
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Films and reports
 

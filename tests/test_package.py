@@ -61,7 +61,7 @@ def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
 
     assert run(command).returncode == 2
     commands = re.findall(r"^  (\w+)", run(command, "--help").stdout, re.MULTILINE)
-    assert commands == ["train", "drive", "video", "simulator", "replay", "browse", "report", "export"]
+    assert commands == ["train", "drive", "video", "simulator", "replay", "browse", "report", "export", "lerobot"]
     for name in commands:
         done = run(command, name, "--help")
         assert done.returncode == 0 and "usage:" in done.stdout, done.stderr

@@ -9,6 +9,7 @@ import functools
 import os
 import re
 import secrets
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -56,6 +57,30 @@ def _clean(folder: Path) -> None:
         for entry in os.scandir(folder):
             if TEMPORARY_NAME.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > LEFT_BEHIND:
                 os.unlink(entry)
+
+
+@contextmanager
+def folder_written_whole(path: str | Path) -> Iterator[Path]:
+    """Yield an empty folder beside `path`, and rename it to `path` when the block ends without an exception.
+
+    A process killed at any time leaves `path` absent or complete, and perhaps the other folder, `.NAME.part`, which the
+    next one deletes. Raises OSError, with the name `path`, also if that exists.
+    """
+    path = Path(path).absolute()
+    if os.path.lexists(path):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        if temporary.exists():
+            shutil.rmtree(temporary)
+        temporary.mkdir()
+        yield temporary
+        os.rename(temporary, path)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError) and error.filename and str(error.filename).startswith(str(temporary)):
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
 
 
 def write(path: str | Path, data: bytes) -> None:

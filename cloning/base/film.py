@@ -38,11 +38,18 @@ class FilmWriter:
     thread only. After an error the unfinished film is deleted at once.
     """
 
-    def __init__(self, path: str | Path, rate: Fraction | int, quality: int = 18, max_bits: int | None = None):
+    def __init__(
+        self,
+        path: str | Path,
+        rate: Fraction | int,
+        quality: int = 18,
+        max_bits: int | None = None,
+        key_frames: int | None = None,
+    ):
         """Open the film; it appears at `path` when it is closed.
 
         rate: frames per second; quality: x264's crf, 0..51, lower is better; max_bits: bits/s above which the quality
-        is lowered, or None. Raises OSError.
+        is lowered, or None; key_frames: one at least after so many frames, x264's 250 if None. Raises OSError.
         """
         import av  # slow to import, and not needed without a film
 
@@ -51,6 +58,8 @@ class FilmWriter:
         self.options = {"crf": str(quality), "preset": "veryfast"}
         if max_bits:
             self.options |= {"maxrate": str(max_bits), "bufsize": str(2 * max_bits)}
+        if key_frames:
+            self.options["g"] = str(key_frames)
         self.stream: VideoStream | None = None
         self._renaming = contextlib.ExitStack()  # renames the temporary file when it is closed
         self.temporary = self._renaming.enter_context(written_whole(path))

@@ -42,8 +42,8 @@ def write_part(recording: Recording, folder: Path) -> None:
             names = {recording.name(row) for row in range(len(recording))}
             with open(recording.folder / LANE_FILE, encoding="utf-8", errors="surrogateescape", newline="") as file:
                 known = [line for line in csv.reader(file) if line and line[0] in names]
-            write(folder / LANE_FILE, _csv([list(LANE_COLUMNS), *known]))
-        write(folder / DRIVING_LOG, _csv([list(COLUMNS), *rows]))
+            write(folder / LANE_FILE, csv_bytes([list(LANE_COLUMNS), *known]))
+        write(folder / DRIVING_LOG, csv_bytes([list(COLUMNS), *rows]))
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
         raise RecordingError(f"{error.filename or folder}: {error.strerror}; mend it, and export again") from None
@@ -59,7 +59,8 @@ def _link(source: Path, copy: Path) -> None:
         shutil.copyfile(source, copy)
 
 
-def _csv(rows: list[list[str]]) -> bytes:
+def csv_bytes(rows: list[list[str]]) -> bytes:
+    """Return a csv file's contents; names of files in it may hold any bytes."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode(errors="surrogateescape")

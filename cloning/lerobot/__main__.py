@@ -1,0 +1,91 @@
+"""Carry data between this project and LeRobot or donkeycar.
+
+    python -m cloning.lerobot data/lake-ccw data/lake-cw --output lake    # recordings -> a data set for LeRobot
+    python -m cloning.lerobot lake --output data/lake                     # LeRobot's data set -> a recording
+    python -m cloning.lerobot mycar/data --output data/mycar              # donkeycar's tub -> a recording
+
+What does not fit into a recording is told. Parquet needs pyarrow: pip install pyarrow
+"""
+
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("lerobot")
+
+import argparse
+from collections import Counter
+from pathlib import Path
+
+from cloning.base.arguments import number
+from cloning.base.errors import OutputError, RecordingError, UserError
+from cloning.base.outputs import plural
+from cloning.lerobot.source import write_recording
+from cloning.lerobot.tub import MANIFEST, read_tub
+from cloning.recordings.check import check_images
+from cloning.recordings.format import LANE_FILE
+from cloning.recordings.log import find_folders, print_findings, read_recording
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Return the arguments of the command line."""
+    parser = argparse.ArgumentParser(
+        prog=program.in_commands("python -m cloning.lerobot"),
+        description=program.in_commands(__doc__ or ""),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("source", nargs="+", help="recordings, or folders with recordings; or one data set or tub")
+    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="new folder to write")
+    parser.add_argument("--camera", metavar="NAME", help="of a data set or tub: the camera that looks ahead")
+    parser.add_argument("--steering", metavar="NAME", help="of a data set: the number that is the steering")
+    parser.add_argument(
+        "--full-lock",
+        type=number(float),
+        default=1.0,
+        metavar="VALUE",
+        help="of a data set or tub: its steering at 25 degrees to the right (default 1)",
+    )
+    arguments = parser.parse_args()
+    if not arguments.full_lock:
+        parser.error("argument --full-lock: 0 is straight ahead")
+    return arguments
+
+
+def main() -> int:
+    """Write the data set or recording; return the exit status."""
+    arguments = parse_arguments()
+    source, output, notes = Path(arguments.source[0]), arguments.output, Counter[str]()
+    is_tub, is_data_set = (source / MANIFEST).is_file(), (source / "meta" / "info.json").is_file()
+    try:
+        if output.exists():
+            raise OutputError(f"{output}: exists already; name another folder, or delete this one")
+        if (is_tub or is_data_set) and len(arguments.source) > 1:
+            raise UserError(f"{source} is a {'tub' if is_tub else 'data set'}: name it alone")
+        if is_tub:
+            samples = read_tub(source, arguments.camera, notes)
+        else:
+            with program.loading():
+                from cloning.lerobot.dataset import write_data_set
+                from cloning.lerobot.reader import read_data_set
+            if not is_data_set:
+                recordings = [check_images(read_recording(folder)) for folder in find_folders(arguments.source)]
+                for recording in recordings:
+                    print_findings(recording)
+                    if (lane := recording.folder / LANE_FILE).exists():
+                        print(f"{lane}: left out; of what comes back, --robust will have to estimate the lane")
+                print(f"{output}: {write_data_set(recordings, output)}")
+                return program.DONE
+            samples = read_data_set(source, arguments.camera, arguments.steering)
+        try:
+            rows = write_recording(samples, output, arguments.full_lock, notes)
+        except RecordingError as error:
+            raise RecordingError(f"{source}: {error}") from None
+        for note, times in notes.items():
+            print(f"{source}: {note} ({plural(times, 'time')})")
+        print(f"{output}: {plural(rows, 'row')}; look at them with `python -m cloning.browse {output}`")
+    except (UserError, OSError) as error:
+        return program.failed(error)
+    return program.DONE
+
+
+if __name__ == "__main__":
+    program.run(main)

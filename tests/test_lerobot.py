@@ -1,0 +1,260 @@
+"""Recordings as LeRobot's data sets and back, and donkeycar's tubs as recordings."""
+
+import json
+import runpy
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import warm
+from commands import ROOT
+from rendered import render_frame, render_recording
+
+from cloning.recordings.check import check_images
+from cloning.recordings.images import read_frame
+from cloning.recordings.log import CheckedRecording, read_recording
+
+CENTER = "observation.images.center"
+
+
+def run(*arguments) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "cloning.lerobot", *map(str, arguments)]
+    return warm.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+def checked(folder: Path) -> CheckedRecording:
+    """A recording whose rows and images are all usable."""
+    recording = check_images(read_recording(folder), show_progress=False)
+    assert not recording.rejected and not recording.repairs
+    return recording
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory) -> list[Path]:
+    """Two recordings, the first with a pause and with a row twice; not to be changed."""
+    folder = tmp_path_factory.mktemp("data")
+    log = render_recording(folder / "a", rows=30) / "driving_log.csv"
+    lines = log.read_text(encoding="utf-8").splitlines(keepends=True)
+    log.write_text("".join([*lines[:8], lines[7], *lines[24:]]), encoding="utf-8")
+    return [folder / "a", render_recording(folder / "b", rows=5, seed=1)]
+
+
+@pytest.fixture(scope="module")
+def written(recordings, tmp_path_factory) -> Path:
+    """The data set of these recordings; not to be changed."""
+    folder = tmp_path_factory.mktemp("data sets") / "lake"
+    done = run(*recordings, "--output", folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("lake: 19 frames of 3 cameras in 3 episodes, 15 a second\n")
+    return folder
+
+
+@pytest.fixture
+def data_set(written, tmp_path) -> Path:
+    """A copy that a test may change."""
+    return shutil.copytree(written, tmp_path / "lake")
+
+
+def edit(data_set: Path, **changed) -> None:
+    """Change what its info.json says."""
+    path = data_set / "meta" / "info.json"
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | changed), encoding="utf-8")
+
+
+def features(data_set: Path) -> dict:
+    return json.loads((data_set / "meta" / "info.json").read_text(encoding="utf-8"))["features"]
+
+
+def test_a_data_set_has_what_lerobots_format_names(written):
+    """Its documentation, and what LeRobot 0.4.4 writes; that version's own reader has read such a data set."""
+    info = json.loads((written / "meta" / "info.json").read_text(encoding="utf-8"))
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 15 and info["splits"] == {"train": "0:3"}
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 19, 1)
+    assert info["features"]["action"]["names"] == ["steering", "throttle", "brake"]
+    assert info["features"]["observation.state"]["units"] == ["mph", "m/s"]
+    place = {"chunk_index": 0, "file_index": 0}
+    rows = pq.read_table(written / info["data_path"].format(**place)).to_pydict()
+    assert rows.keys() == {key for key, feature in info["features"].items() if feature["dtype"] != "video"}
+    assert rows["observation.state"][0] == pytest.approx([30.19, 30.19 * 0.44704])
+    assert rows["episode_index"] == [0] * 8 + [1] * 6 + [2] * 5 and rows["index"] == list(range(19))
+    np.testing.assert_allclose(rows["timestamp"], np.array(rows["frame_index"]) / 15, rtol=1e-6)
+    episodes = pq.read_table(written / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    assert episodes["length"] == [8, 6, 5] and episodes["dataset_to_index"] == [8, 14, 19]
+    np.testing.assert_allclose(episodes[f"videos/{CENTER}/from_timestamp"], [0, 8 / 15, 14 / 15])
+    assert pq.read_table(written / "meta/tasks.parquet").to_pandas().loc["Follow the road."].task_index == 0
+    for key in (key for key, feature in info["features"].items() if feature["dtype"] == "video"):
+        with av.open(str(written / info["video_path"].format(video_key=key, **place))) as film:
+            times = [frame.time for frame in film.decode(video=0)]
+            assert film.streams.video[0].codec.name == "h264" and (film.streams.video[0].width) == 320
+        np.testing.assert_allclose(times, np.arange(19) / 15, atol=1e-4)  # LeRobot's tolerance
+    statistics = json.loads((written / "meta" / "stats.json").read_text(encoding="utf-8"))
+    np.testing.assert_allclose(statistics["action"]["std"], np.std(rows["action"], axis=0))
+    np.testing.assert_allclose(statistics["action"]["q90"], np.quantile(rows["action"], 0.9, axis=0))
+    assert np.shape(statistics[CENTER]["mean"]) == (3, 1, 1) and 0.3 < np.mean(statistics[CENTER]["mean"]) < 0.6
+    assert episodes["stats/action/max"][2] == pytest.approx(np.max(rows["action"][14:], axis=0))
+
+
+def test_a_recording_comes_back_with_the_same_rows(recordings, written, tmp_path):
+    done = run(written, "--output", tmp_path / "back")
+    assert done.returncode == 0 and done.stdout.startswith(f"{tmp_path}/back: 19 rows"), done.stderr
+    back, before = checked(tmp_path / "back"), [checked(folder).without_copies() for folder in recordings]
+    for name in ("steering", "throttle", "brake", "speed", "time"):
+        np.testing.assert_array_equal(getattr(back, name), np.concatenate([getattr(each, name) for each in before]))
+    at = 0
+    for recording in before:
+        for row in range(len(recording)):
+            for camera in range(3):
+                assert back.name(at, camera) == recording.name(row, camera)
+                difference = cv2.absdiff(read_frame(back.path(at, camera)), read_frame(recording.path(row, camera)))
+                assert difference.mean() < 4, "the film's compression"
+            at += 1
+
+
+def test_another_cars_data_set_becomes_a_recording_and_what_does_not_fit_is_told(data_set, tmp_path):
+    """One camera; steering of another name, unit and sign; no speed in mph; episodes that each begin at 0."""
+    known = features(data_set)
+    known["action"] |= {"names": {"axes": ["wheel", "gas", "x"]}}
+    kept = {key: known[key] for key in known if key not in (f"{CENTER[:-6]}left", "observation.state")}
+    edit(data_set, features=kept)
+    output = tmp_path / "recording"
+    done = run(data_set, "--output", output)
+    assert done.returncode == 2 and f"--camera: {CENTER}, observation.images.right\n" in done.stderr
+    done = run(data_set, "--output", output, "--camera", CENTER)
+    assert done.returncode == 2 and "--steering: action:wheel, action:gas, action:x, recorded_at:" in done.stderr
+    options = ("--camera", CENTER, "--steering", "action:wheel", "--full-lock")
+    done = run(data_set, "--output", output, *options, 0.2)
+    assert done.returncode == 2 and "where 0.2 is the full lock to the right" in done.stderr and not output.exists()
+    path = data_set / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.drop_columns(["recorded_at"]), path)
+    done = run(data_set, "--output", output, *options, -0.5)
+    assert done.returncode == 0, done.stderr
+    for told in ("only one camera", "no speed in mph", "no brake: 0 is written (19 times)"):
+        assert told in done.stdout
+    recording = checked(output)
+    np.testing.assert_allclose(recording.steering, -2 * np.array(table["action"].to_pylist())[:, 0], rtol=1e-6)
+    assert list(np.flatnonzero(np.diff(recording.time) > 1)) == [7, 13], "each episode is a drive"
+    assert recording.throttle.max() == 1 and recording.speed.max() == 0
+
+
+def test_a_data_set_of_version_2_with_images_in_its_tables(data_set, tmp_path):
+    frame = render_frame(0.3, 0, np.random.default_rng(0))
+    table = pq.read_table(data_set / "data/chunk-000/file-000.parquet").slice(0, 8)
+    png = cv2.imencode(".png", cv2.resize(frame, (640, 480))[..., ::-1])[1].tobytes()
+    table = table.append_column("observation.image", [[{"bytes": png, "path": None}] * 8])
+    for part in ("data", "videos", "meta/episodes"):
+        shutil.rmtree(data_set / part)
+    (data_set / "data/chunk-000").mkdir(parents=True)
+    pq.write_table(table, data_set / "data/chunk-000/episode_000000.parquet")
+    image = {"observation.image": {"dtype": "image", "shape": [480, 640, 3], "names": None}}
+    kept = {key: each for key, each in features(data_set).items() if each["dtype"] != "video"} | image
+    place = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    edit(data_set, codebase_version="v2.1", total_episodes=1, features=kept, data_path=place)
+    done = run(data_set, "--output", tmp_path / "recording")
+    assert done.returncode == 0, done.stderr
+    assert "of images of 640x480 pixels the middle 640x320 are scaled to 320x160 (8 times)" in done.stdout
+    recording = checked(tmp_path / "recording")
+    assert len(recording) == 8
+    assert cv2.absdiff(read_frame(recording.path(0))[80], cv2.resize(frame, (320, 240))[120]).mean() < 12
+
+
+@pytest.fixture
+def tub(tmp_path) -> Path:
+    """A tub of 12 rows in two catalogs: one row deleted, one that the pilot drove, and one without its image."""
+    folder, rng = tmp_path / "tub", np.random.default_rng(0)
+    (folder / "images").mkdir(parents=True)
+    for catalog in range(2):
+        rows = []
+        for index in range(6 * catalog, 6 * catalog + 6):
+            name = f"{index}_cam_image_array_.jpg"
+            cv2.imwrite(str(folder / "images" / name), cv2.resize(render_frame(0, 0, rng)[..., ::-1], (160, 120)))
+            row = {"_index": index, "_timestamp_ms": 1_600_000_000_000 + 50 * index, "cam/image_array": name}
+            row |= {"user/angle": index / 10 - 0.5, "user/throttle": 0.3 if index < 10 else -0.2}
+            rows.append(json.dumps(row | {"user/mode": "local" if index == 4 else "user"}))
+        (folder / f"catalog_{catalog}.catalog").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    (folder / "images" / "7_cam_image_array_.jpg").unlink()
+    catalogs = {"paths": ["catalog_0.catalog", "catalog_1.catalog"], "current_index": 12, "deleted_indexes": [2]}
+    lines: list[object] = [["cam/image_array", "user/angle"], ["image_array", "float"], {}, {}, catalogs]
+    (folder / "manifest.json").write_text("\n".join(map(json.dumps, lines)) + "\n", encoding="utf-8")
+    return folder
+
+
+def test_a_donkeycar_tub_becomes_a_recording(tub, tmp_path):
+    done = run(tub, "--output", tmp_path / "recording")
+    assert done.returncode == 0, done.stderr
+    for told in ("marked as deleted is left out (1 time)", "local drove is left out (1 time)", "is missing or damaged"):
+        assert told in done.stdout
+    for told in ("the middle 160x80 are scaled to 320x160 (9 times)", "throttle below 0 is written as brake (2 times)"):
+        assert told in done.stdout
+    recording = checked(tmp_path / "recording")
+    rows = np.array([0, 1, 3, 5, 6, 8, 9, 10, 11])
+    np.testing.assert_array_equal(recording.steering, np.float32(rows / 10 - 0.5))
+    np.testing.assert_allclose(recording.time, 1.6e9 + rows / 20)
+    np.testing.assert_allclose(recording.brake[-2:], 0.2)
+    middles = []
+    for camera in range(3):
+        road = np.ptp(read_frame(recording.path(0, camera))[90].astype(int), axis=1) < 40
+        middles.append(road.nonzero()[0].mean())
+    assert middles[1] > middles[0] + 10 > middles[2] + 20, "seen from the left, the road lies further to the right"
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (
+            lambda folder: folder.joinpath("meta/info.json").write_text("{", encoding="utf-8"),
+            "not a data set in LeRobot",
+        ),
+        (lambda folder: folder.joinpath("data/chunk-000/file-000.parquet").write_bytes(b"PAR1"), "copy it again"),
+        (lambda folder: shutil.rmtree(folder / "videos" / CENTER), "No such file or directory"),
+        (lambda folder: edit(folder, fps=5), "before its episode 0 does"),
+    ],
+    ids=["info", "table", "no film", "short film"],
+)
+def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_path, damage, message):
+    damage(data_set)
+    done = run(data_set, "--output", tmp_path / "recording")
+    assert done.returncode == 2 and message in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lake"]
+
+
+@pytest.mark.parametrize("row", ["{", "[]", "{}", '{"cam/image_array": "0_cam_image_array_.jpg", "user/angle": null}'])
+def test_a_damaged_tub_is_reported_with_its_line(tub, tmp_path, row):
+    catalog = tub / "catalog_1.catalog"
+    catalog.write_text(f"{catalog.read_text(encoding='utf-8')}{row}\n", encoding="utf-8")
+    done = run(tub, "--output", tmp_path / "recording")
+    assert done.returncode == 2 and "catalog_1.catalog: line 7: " in done.stderr and done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["tub"]
+
+
+def test_what_exists_is_not_replaced(recordings, written, tub):
+    for source in (recordings[0], written, tub):
+        done = run(source, "--output", tub)
+        assert done.returncode == 2 and "tub: exists already; name another folder" in done.stderr
+
+
+def test_the_environment_for_lerobot(written):
+    """Its evaluation steps such environments with actions in float32, and expects these keys."""
+    [(track, environments)] = runpy.run_path(str(written / "env.py"))["make_env"](n_envs=1).items()
+    drive = environments[0]
+    observation, _ = drive.reset(seed=[1])
+    assert track == "lake" and observation["pixels"]["center"].shape == (1, 160, 320, 3)
+    for _ in range(15):
+        observation, reward, terminated, _, info = drive.step(np.array([[0, 1, 0]], np.float32))
+    speed = observation["agent_pos"][0, 0]
+    assert speed == pytest.approx(info["speed"][0]) and speed > 3 and reward[0] > 0 and not terminated[0]
+    drive.step(np.array([[0, 0, 1]], np.float32))
+    assert drive.step(np.array([[0, 0, 1]], np.float32))[0]["agent_pos"][0, 0] < speed, "it brakes"
+    for _ in range(100):
+        *_, terminated, _, info = drive.step(np.array([[1, 1, 0]], np.float32))
+        if terminated[0]:
+            break
+    assert info["final_info"]["is_success"].tolist() == [False]
+    assert drive.call("task_description") == ("Follow the road.",) and drive.call("_max_episode_steps") == (9000,)
+    drive.close()
