@@ -16,6 +16,7 @@ from panda3d import core
 from cloning.base.errors import SimulatorError
 from cloning.recordings.writer import RecordingWriter, SampleClock, check_name_of_corrections
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
+from cloning.road.disturbances import Disturbance
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import scenery
@@ -71,11 +72,18 @@ class Gamepad:
 class Window(ShowBase):
     """The window; its run is `simulation`, because ShowBase has a method `run`."""
 
-    def __init__(self, track: Track, folder: str | Path, look: int = 0, server: tuple[str, int] | None = None):
+    def __init__(
+        self,
+        track: Track,
+        folder: str | Path,
+        look: int = 0,
+        server: tuple[str, int] | None = None,
+        disturbance: Disturbance | None = None,
+    ):
         """Open the window. Raises SimulatorError, and RecordingError for a name that does not say what is recorded.
 
         folder: of the recording, created when recording first starts; server: host and port of drive.py if it drives.
-        Then only what the person drives is recorded: the corrections.
+        Then only what the person drives is recorded: the corrections. disturbance: of what the car's cameras see.
         """
         if server:
             check_name_of_corrections(folder)
@@ -95,14 +103,14 @@ class Window(ShowBase):
             self.simulation.set_back()
         self.scene = Scene(scenery.build(track.source, look))
         self.scene.root.reparent_to(self.render)
-        self.cameras = Cameras(self.scene)
+        self.cameras = Cameras(self.scene, disturbance=disturbance)
         self.controls, self.gamepad = Controls(), Gamepad()
         self.remote: RemoteDriver | None = None
         self.by_hand = not server  # whether the person drove before the last frame
         self.started = bool(server)  # until somebody drives, the car stands still, also on a slope
         if server:
             host, port = server
-            self.remote = RemoteDriver(host, port, Cameras(self.scene, ("center",)))
+            self.remote = RemoteDriver(host, port, Cameras(self.scene, ("center",), disturbance))
         self.folder, self.clock, self.recording_on = folder, SampleClock(), False
         self.recording: RecordingWriter | None = None
         self.saved = (self.simulation.s, 0.0)  # position to jump back to: m along the track, lateral offset in m
