@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from datetime import timedelta
 from multiprocessing.context import BaseContext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from panda3d.core import TransformState
 
@@ -58,18 +58,13 @@ def start_renderer() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-class _View(NamedTuple):
-    """What a rendering process shows of a drive besides the car's pose."""
-
-    source: str | PointRoad
-    look: int
-    disturbance: Disturbance | None
-    seed: int
+_View = tuple[str | PointRoad, int, Disturbance | None, int]  # road, look, disturbance and its seed
 
 
 @functools.cache
 def _cameras(view: _View) -> Cameras:
-    return Cameras(Scene(scenery.build(view.source, view.look)), disturbance=view.disturbance, seed=view.seed)
+    source, look, disturbance, seed = view
+    return Cameras(Scene(scenery.build(source, look)), disturbance=disturbance, seed=seed)
 
 
 def _prepare(view: _View) -> None:
@@ -120,7 +115,7 @@ def record(
     run.car.speed_limit = speed * MPH
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
     clock = SampleClock()
-    view = _View(track.source, look, disturbance, seed)
+    view = (track.source, look, disturbance, seed)
     # A disturbed frame depends on those before it; without a disturbance it depends on the car's pose alone.
     renderers = 1 if disturbance else min(MAX_RENDERERS, threads())
     pending: deque[tuple[Future[list[bytes]], dict[str, Any]]] = deque()  # images being rendered, and their samples

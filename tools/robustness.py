@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple
 
 from cloning.base import program
 
@@ -49,69 +49,54 @@ from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
 from simulator.record import renderers_context, start_renderer
 from simulator.run import Run
+from tools import driving
 from tools.command import command_line, head, row, run_tool
-from tools.driving import Conditions, cameras_at, drive, load_driver
 from tools.search import end
 
 TRACKS, SPEEDS, DIRECTIONS = ("lake", "jungle"), (30.0, 15.0), ("ccw", "cw")  # mph on each
-NONE = "none"  # what results without a disturbance are called
-STAND_IN, REPLAYS = "Stand-in simulator", f"Real recordings, replayed, limit {LIMITS[-1]:g} m"
+STAND_IN, REPLAYS = "stand-in simulator", f"replays at {LIMITS[-1]:g} m"
 GALLERY_PLACE, GALLERY_FRAMES = 200.0, 12  # m along the jungle; frames, some of which come late or not at all
 TILE, GALLERY_SEED, GALLERY_QUALITY = (160, 80), 3, 60  # columns and rows
 
 
-class Model(NamedTuple):
-    """A model file, its name in tables, and its contents' SHA-256."""
+class Drive(NamedTuple):
+    """A drive of a model in the stand-in, or a replay, whose speed is 0.
 
-    file: str
-    name: str
-    sha256: str
-
-
-class Course(NamedTuple):
-    """A drive in the stand-in, or the replay of a recording, whose speed is 0.
-
-    on    track, or folder of the recording
-    seed  of the disturbance, so that not every drive has its drops in the same place
+    name    of the model in tables; sha256: of its file
+    on      track, or folder of a recording
+    number  of the course, the seed of the disturbance: so not every drive has its drops in the same place
     """
 
+    model: str
+    name: str
+    sha256: str
     on: str
-    seed: int = 0
-    speed: float = 0.0
-    direction: str = ""
-    laps: float = 0.0
-    look: int = 0
+    number: int
+    speed: float
+    look: int
+    direction: str
+    laps: float
+    disturbance: Disturbance | None
+
+    @property
+    def where(self) -> str:
+        """The title under which its figures stand."""
+        return f"{self.name}, {STAND_IN if self.speed else REPLAYS}"
 
     def __str__(self) -> str:
-        laps = f" {self.direction}, {self.speed:g} mph, look {self.look}, {self.laps:g} laps"
-        return self.on + laps * bool(self.speed)
+        course = f" {self.direction}, {self.speed:g} mph, look {self.look}, {self.laps:g} laps" * bool(self.speed)
+        return f"{self.name} {self.sha256[:16]}, {self.on}{course}, {self.disturbance or 'clear'}"
 
 
-class Result(TypedDict):
-    """A drive; sha256: of the model; disturbance: such as `fog:3`, or NONE; departures: interventions in a replay."""
+class Figures(NamedTuple):
+    """How a model drove; autonomy: percent; departures: interventions in a replay; distance: m from the centre."""
 
-    model: str
-    sha256: str
-    where: str
-    course: str
-    disturbance: str
-    autonomy_percent: float
+    autonomy: float
     departures: int
-    distance_mean_m: float
+    distance: float
 
-
-Job = tuple[Model, Course, Disturbance | None]
-
-
-def key(result: Result) -> tuple[str, ...]:
-    """Return what tells a result from all others."""
-    return result["sha256"], result["model"], result["course"], result["disturbance"]
-
-
-def key_of(job: Job) -> tuple[str, ...]:
-    """Return the key of a job's result."""
-    model, course, disturbance = job
-    return model.sha256, model.name, str(course), str(disturbance or NONE)
+    def __str__(self) -> str:
+        return f"{self.autonomy:.1f} %, {self.departures}, {self.distance:.2f} m"
 
 
 @functools.lru_cache(maxsize=1)
@@ -120,119 +105,83 @@ def _recording(folder: str) -> tuple[Recording, list[replay.ReferenceLine]]:
     return recording, replay.reference_lines(recording)
 
 
-def measure(job: Job) -> Result:
+def measure(drive: Drive) -> Figures:
     """Drive, in any process. Raises UserError."""
-    model, course, disturbance = job
-    if course.speed:
-        metres = course.laps * Track(course.on).length
-        way = (course.speed, course.look, course.direction, metres, True, disturbance, course.seed)
-        driven = drive(Conditions(model.file, *way), course.on)
-        departures, mean = len(driven.departures), driven.mean
-        percent = 0.0 if driven.failed else 100 * max(0.0, autonomy(departures, driven.planned))
-    else:
-        steering, (recording, lines) = load_driver(model.file), _recording(course.on)
+    if drive.speed:
+        metres = drive.laps * Track(drive.on).length
+        way = (drive.speed, drive.look, drive.direction, metres, True, drive.disturbance, drive.number)
+        driven = driving.drive(driving.Conditions(drive.model, *way), drive.on)
+        departures = len(driven.departures)
+        share = 0.0 if driven.failed else max(0.0, autonomy(departures, driven.planned))
+        return Figures(round(100 * share, 2), departures, round(driven.mean, 3))
+    steering, (recording, lines) = driving.load_driver(drive.model), _recording(drive.on)
 
-        def driver(frame: replay.ReplayFrame) -> float:
-            return steering(decode(frame.jpeg()))
+    def driver(frame: replay.ReplayFrame) -> float:
+        return steering(decode(frame.jpeg()))
 
-        metrics = driving_metrics(replay.drive(recording, lines, LIMITS[-1], driver, disturbance=disturbance))
-        departures, mean = metrics["interventions"], metrics["distance_mean_m"]
-        percent = metrics["autonomy_percent"]
-    return {
-        "model": model.name,
-        "sha256": model.sha256,
-        "where": STAND_IN if course.speed else REPLAYS,
-        "course": str(course),
-        "disturbance": str(disturbance or NONE),
-        "autonomy_percent": round(percent, 2),
-        "departures": departures,
-        "distance_mean_m": round(mean, 3),
-    }
+    metrics = driving_metrics(replay.drive(recording, lines, LIMITS[-1], driver, disturbance=drive.disturbance))
+    return Figures(metrics["autonomy_percent"], metrics["interventions"], metrics["distance_mean_m"])
 
 
-def measure_all(jobs: Sequence[Job], file: Path, processes: int) -> list[Result]:
-    """Return the results of all jobs, of which those in the file are not driven again; it gets each as it comes.
-
-    Raises UserError.
-    """
-    results = {key(each): each for each in json.loads(file.read_text(encoding="utf-8"))} if file.exists() else {}
-    left = [job for job in jobs if key_of(job) not in results]
+def measure_all(drives: Sequence[Drive], file: Path, processes: int) -> dict[Drive, Figures]:
+    """Return the figures of all drives; the file gets each as it comes, and may have some. Raises UserError."""
+    kept = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     with ExitStack() as stack:
         with program.interrupt_deferred():
             pool = ProcessPoolExecutor(processes, renderers_context(), start_renderer)
             stack.callback(end, pool)
-            coming = [pool.submit(measure, job) for job in left]
-        bar = stack.enter_context(progress_bar(len(left), "drive"))
+            coming = {pool.submit(measure, drive): str(drive) for drive in drives if str(drive) not in kept}
+        bar = stack.enter_context(progress_bar(len(coming), "drive"))
         try:
             for done in as_completed(coming):
-                result = done.result()
-                results[key(result)] = result
-                write_json(file, [results[each] for each in sorted(results)])
+                kept[coming[done]] = done.result()._asdict()
+                write_json(file, dict(sorted(kept.items())))
                 bar.update()
         except BrokenExecutor as error:
             raise SimulatorError("a driving process was killed, perhaps for lack of memory; run it again") from error
-    return [results[key_of(job)] for job in jobs]
+    return {drive: Figures(**kept[str(drive)]) for drive in drives}
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Table and picture
 
-
-class Figures(NamedTuple):
-    """The results of a model with a disturbance on all courses; autonomy: percent, the mean of the drives'."""
-
-    autonomy: float
-    departures: int
-    distance: float
+Curves = dict[str, dict[Disturbance | None, Figures]]  # by where, and by disturbance
 
 
-def figures_of(results: Sequence[Result], where: str, model: str) -> dict[str, Figures]:
-    """Return the figures of a model by disturbance."""
-    found: dict[str, list[Result]] = {}
-    for each in results:
-        if (each["where"], each["model"]) == (where, model):
-            found.setdefault(each["disturbance"], []).append(each)
+def curves_of(found: dict[Drive, Figures]) -> Curves:
+    """Return the means of autonomy and distance, and the departures, of all courses together."""
+    groups: dict[str, dict[Disturbance | None, list[Figures]]] = {}
+    for drive, figures in found.items():
+        groups.setdefault(drive.where, {}).setdefault(drive.disturbance, []).append(figures)
     return {
-        disturbance: Figures(
-            statistics.fmean(each["autonomy_percent"] for each in group),
-            sum(each["departures"] for each in group),
-            statistics.fmean(each["distance_mean_m"] for each in group),
-        )
-        for disturbance, group in found.items()
+        where: {
+            disturbance: Figures(statistics.fmean(percents), sum(departures), statistics.fmean(metres))
+            for disturbance, group in each.items()
+            for percents, departures, metres in [zip(*group, strict=True)]
+        }
+        for where, each in groups.items()
     }
 
 
-def places(results: Sequence[Result]) -> list[tuple[str, str]]:
-    """Return where each model drove, and the model."""
-    return list(dict.fromkeys((each["where"], each["model"]) for each in results))
-
-
-def table(results: Sequence[Result], kinds: Sequence[str], strengths: Sequence[int]) -> str:
-    """Return the tables of all models in Markdown."""
+def table(curves: Curves, kinds: Sequence[str], strengths: Sequence[int]) -> str:
+    """Return the tables in Markdown."""
     lines = ["# Robustness", "", "Autonomy, departures (interventions in a replay), and m from the lane's centre."]
-    for where, model in places(results):
-        figures = figures_of(results, where, model)
-
-        def cell(disturbance: str, figures: dict[str, Figures] = figures) -> str:
-            found = figures[disturbance]
-            return f"{found.autonomy:.1f} %, {found.departures}, {found.distance:.2f} m"
-
-        lines += ["", f"## {where}: {model}", "", f"Without a disturbance: {cell(NONE)}.", ""]
+    for where, figures in curves.items():
+        lines += ["", f"## {where}", "", f"Without a disturbance: {figures[None]}.", ""]
         lines.append(head("kind", *(f"strength {strength}" for strength in strengths)))
         for kind in kinds:
-            held_out = " (held out)" * (kind in HELD_OUT)
-            lines.append(row(kind + held_out, *(cell(f"{kind}:{strength}") for strength in strengths)))
-        for name, chosen in (
-            ("kinds without a departure", [kind for kind in kinds if kind not in HELD_OUT]),
-            ("held out, likewise", [kind for kind in kinds if kind in HELD_OUT]),
-        ):
-            counts = [sum(not figures[f"{kind}:{strength}"].departures for kind in chosen) for strength in strengths]
-            lines.append(row(f"**{name}**", *(f"{count} of {len(chosen)}" for count in counts)))
+            cells = (figures[Disturbance(kind, strength)] for strength in strengths)
+            lines.append(row(kind + " (held out)" * (kind in HELD_OUT), *cells))
+        for held_out in (False, True):
+            chosen = [kind for kind in kinds if (kind in HELD_OUT) == held_out]
+            stayed = (sum(not figures[Disturbance(kind, each)].departures for kind in chosen) for each in strengths)
+            title = f"**{'held out' if held_out else 'others'}: kinds without a departure**"
+            lines.append(row(title, *(f"{count} of {len(chosen)}" for count in stayed)))
     return "\n".join(lines) + "\n"
 
 
-def picture(results: Sequence[Result], kinds: Sequence[str], strengths: Sequence[int]) -> bytes:
-    """Return a PNG with the models' autonomy by strength, 0 for none, a panel for each kind."""
+def picture(curves: Curves, kinds: Sequence[str], strengths: Sequence[int]) -> bytes:
+    """Return a PNG with autonomy by strength, 0 for none, a panel for each kind."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -241,16 +190,13 @@ def picture(results: Sequence[Result], kinds: Sequence[str], strengths: Sequence
     figure = Figure(figsize=(max(6, 2.3 * columns), 1.9 * rows + 0.8), layout="constrained")
     FigureCanvasAgg(figure)
     grid = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
-    models = list(dict.fromkeys(each["model"] for each in results))
-    for axes, kind in itertools.zip_longest(grid, kinds):
-        if kind is None:
-            axes.axis("off")
-            continue
-        for where, model in places(results):
-            figures = figures_of(results, where, model)
-            autonomies = [figures[name].autonomy for name in (NONE, *(f"{kind}:{strength}" for strength in strengths))]
-            style = {"color": f"C{models.index(model)}", "linestyle": "-" if where == STAND_IN else "--"}
-            axes.plot([0, *strengths], autonomies, marker=".", label=f"{model}, {where.lower()}", **style)
+    for axes in grid[len(kinds) :]:
+        axes.axis("off")
+    for axes, kind in zip(grid, kinds, strict=False):
+        shown = [None, *(Disturbance(kind, strength) for strength in strengths)]
+        for where, figures in curves.items():
+            style = "--" if where.endswith(REPLAYS) else "-"
+            axes.plot([0, *strengths], [figures[each].autonomy for each in shown], style, marker=".", label=where)
         held_out = kind in HELD_OUT
         axes.set_title(kind + ", held out" * held_out, fontsize=9, color="tab:red" if held_out else "black")
         axes.set(ylim=(-4, 104), xticks=[0, *strengths])
@@ -265,7 +211,7 @@ def picture(results: Sequence[Result], kinds: Sequence[str], strengths: Sequence
 
 def gallery() -> bytes:
     """Return a JPEG with a rendered frame under each disturbance, at each strength."""
-    run, cameras, frames = Run(Track("jungle")), cameras_at("jungle", 0), []
+    run, cameras, frames = Run(Track("jungle")), driving.cameras_at("jungle", 0), []
     for i in range(GALLERY_FRAMES):
         run.s = GALLERY_PLACE + i * SPEEDS[0] * MPH / SAMPLE_RATE
         run.set_back()
@@ -307,28 +253,33 @@ def main(argv: list[str] | None = None) -> int:
         return program.DONE
     models = []
     for file in dict.fromkeys(options.models):
-        load_driver(file)  # before processes start
+        driving.load_driver(file)  # before processes start
         stem = Path(file).stem
         unique = [Path(other).stem for other in options.models].count(stem) == 1
-        models.append(Model(file, stem if unique else file, hashlib.sha256(Path(file).read_bytes()).hexdigest()))
-    speeds = dict(zip(TRACKS, options.speeds, strict=True))
-    courses = [
-        Course(track, 2 * TRACKS.index(track) + i, speeds[track], direction, options.laps, options.look)
+        models.append((file, stem if unique else file, hashlib.sha256(Path(file).read_bytes()).hexdigest()))
+    courses: list[tuple[str, int, float, int, str, float]] = [
+        (track, 2 * TRACKS.index(track) + i, options.speeds[TRACKS.index(track)], options.look, way, options.laps)
         for track in options.tracks
-        for i, direction in enumerate(DIRECTIONS)
+        for i, way in enumerate(DIRECTIONS)
     ]
-    courses += [Course(str(folder)) for folder in (find_folders(options.recordings) if options.recordings else ())]
+    if options.recordings:
+        courses += [(str(folder), 0, 0, 0, "", 0) for folder in find_folders(options.recordings)]
     if not courses:
         raise UserError("nothing to drive: name --tracks or --recordings")
-    kinds, strengths = (list(dict.fromkeys(given)) for given in (options.kinds, sorted(options.strengths)))
+    kinds, strengths = list(dict.fromkeys(options.kinds)), sorted(set(options.strengths))
     disturbances = [None, *(Disturbance(*each) for each in itertools.product(kinds, strengths))]
-    jobs = [(model, *each) for each in itertools.product(courses, disturbances) for model in models]
+    drives = [
+        Drive(file, name, sha256, *course, each)
+        for course in courses
+        for each in disturbances
+        for file, name, sha256 in models
+    ]
     options.output.mkdir(parents=True, exist_ok=True)
-    results = measure_all(jobs, options.output / "robustness.json", options.processes)
-    tables = table(results, kinds, strengths)
+    curves = curves_of(measure_all(drives, options.output / "robustness.json", options.processes))
+    tables = table(curves, kinds, strengths)
     print(tables, end="")
     write_output(options.output / "robustness.md", tables.encode())
-    write_output(options.output / "robustness.png", picture(results, kinds, strengths))
+    write_output(options.output / "robustness.png", picture(curves, kinds, strengths))
     return program.DONE
 
 
