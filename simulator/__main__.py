@@ -18,6 +18,7 @@ from cloning.base.outputs import check_folders, run_all, write_json
 from cloning.recordings.format import PROBLEM_AREAS, SAMPLE_RATE
 from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
 from cloning.road.autonomy import LIMITS
+from cloning.road.disturbances import KINDS, STRENGTHS, Disturbance
 from cloning.road.generated import LANDS, MARKINGS
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.road.points import LAND, MARKING, MAX_WIDTH, MIN_WIDTH, WIDTH, read_road
@@ -72,6 +73,24 @@ ROAD: Options = {
 }
 
 
+def disturbance(text: str) -> Disturbance:
+    """Return the disturbance of a text such as `fog:3`, as a type for argparse."""
+    try:
+        return Disturbance.parse(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+DISTURB: Options = {
+    "--disturb": {
+        "type": disturbance,
+        "metavar": "KIND:STRENGTH",
+        "help": f"foul weather, dirt or a fault of the cameras, such as fog:3; kinds: {', '.join(KINDS)}; strengths: "
+        f"{STRENGTHS[0]} to {STRENGTHS[-1]}; the same in each drive (default: none)",
+    }
+}
+
+
 def add_command(
     commands: "Subparsers", run: Callable, help: str, *shared: Options, epilog: str | None = None
 ) -> argparse.ArgumentParser:
@@ -86,7 +105,7 @@ def add_command(
 
 def add_record(commands: "Subparsers") -> None:
     """Add `record`."""
-    parser = add_command(commands, run_record, "record an expert driver, faster than real time", LAPS, ROAD)
+    parser = add_command(commands, run_record, "record an expert driver, faster than real time", LAPS, ROAD, DISTURB)
     parser.add_argument("folder", help="folder for the new recording: IMG/ and driving_log.csv")
     parser.add_argument(
         "--speed",
@@ -101,7 +120,7 @@ def add_record(commands: "Subparsers") -> None:
         "--seed",
         type=number(int, 0),
         default=0,
-        help="seed of the expert's random lateral offsets, and of the dates in the image names (default 0)",
+        help="seed of the expert's random lateral offsets, the dates in the image names, and --disturb (default 0)",
     )
 
 
@@ -111,7 +130,7 @@ def add_drive(commands: "Subparsers") -> None:
         commands,
         run_drive,
         "let drive.py drive, and print a lap report",
-        *(LAPS, SERVER, WAIT, ROAD),
+        *(LAPS, SERVER, WAIT, ROAD, DISTURB),
         epilog="Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if an error ended the drive "
         "or a file could not be written.",
     )
@@ -133,7 +152,7 @@ def add_correct(commands: "Subparsers") -> None:
         commands,
         run_correct,
         "let drive.py drive, and record the expert, who takes over where the car is off the lane's centre",
-        *(LAPS, SERVER, WAIT, ROAD),
+        *(LAPS, SERVER, WAIT, ROAD, DISTURB),
         epilog="Exit status: as that of drive.",
     )
     parser.add_argument(
@@ -151,7 +170,7 @@ def add_correct(commands: "Subparsers") -> None:
 def add_replay(commands: "Subparsers") -> None:
     """Add `replay`."""
     help_text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
-    parser = add_command(commands, run_replay, help_text, SERVER, WAIT)
+    parser = add_command(commands, run_replay, help_text, SERVER, WAIT, DISTURB)
     parser.add_argument("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
     parser.add_argument("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
     parser.add_argument(
@@ -178,7 +197,9 @@ def add_replay(commands: "Subparsers") -> None:
 
 def add_window(commands: "Subparsers") -> None:
     """Add `window`."""
-    parser = add_command(commands, run_window, "drive and record by hand, or watch drive.py drive", SERVER, ROAD)
+    parser = add_command(
+        commands, run_window, "drive and record by hand, or watch drive.py drive", SERVER, ROAD, DISTURB
+    )
     parser.add_argument(
         "--folder",
         help="folder for the recording (default data/window-DATE-TIME, or data/window-DATE-TIME-corrections with "
@@ -197,7 +218,7 @@ def add_join(commands: "Subparsers") -> None:
         commands,
         run_join,
         "let another team's test program drive, in place of the modified simulator that it expects",
-        *(SERVER, WAIT, ROAD),
+        *(SERVER, WAIT, ROAD, DISTURB),
         epilog="It ends when the program's server has gone for --wait seconds. Unity's own options, with which such "
         "programs start their simulator, are accepted: -logFile FILE takes the messages, and -batchmode is always so.",
     )
@@ -275,7 +296,14 @@ def run_record(arguments: argparse.Namespace) -> int:
     track = chosen_track(arguments)
     begin = time.perf_counter()
     run, rows = record(
-        arguments.folder, track, arguments.laps, arguments.speed, arguments.seed, arguments.look, arguments.recovery
+        arguments.folder,
+        track,
+        arguments.laps,
+        arguments.speed,
+        arguments.seed,
+        arguments.look,
+        arguments.recovery,
+        arguments.disturb,
     )
     pace = run.time / (time.perf_counter() - begin)
     for departure in run.departures:
@@ -297,9 +325,8 @@ def run_drive(arguments: argparse.Namespace) -> int:
     check_folders(arguments.report, arguments.picture, arguments.film)
     run = Run(chosen_track(arguments), "autonomous")
     scene = Scene(scenery.build(run.track.source, arguments.look))
-    client = Client(
-        run, Cameras(scene, ("center",)), arguments.host, arguments.port, arguments.wait, arguments.realtime
-    )
+    cameras = Cameras(scene, ("center",), arguments.disturb)
+    client = Client(run, cameras, arguments.host, arguments.port, arguments.wait, arguments.realtime)
 
     def print_report() -> None:
         if run.time:
@@ -330,7 +357,8 @@ def run_correct(arguments: argparse.Namespace) -> int:
     run = Run(chosen_track(arguments), "autonomous")
     with RecordingWriter(arguments.folder) as recording:
         scene = Scene(scenery.build(run.track.source, arguments.look))
-        client = CorrectedClient(run, scene, arguments.speed, recording, arguments.host, arguments.port, arguments.wait)
+        server = (arguments.host, arguments.port, arguments.wait)
+        client = CorrectedClient(run, scene, arguments.speed, recording, *server, arguments.disturb)
 
         def print_report() -> None:
             if run.time:
@@ -361,7 +389,7 @@ def run_window(arguments: argparse.Namespace) -> int:
     ending = PROBLEM_AREAS[-1] if arguments.autonomous else ""
     folder = arguments.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}{ending}"
     server = (arguments.host, arguments.port) if arguments.autonomous else None
-    opened = Window(chosen_track(arguments), folder, arguments.look, server)
+    opened = Window(chosen_track(arguments), folder, arguments.look, server, arguments.disturb)
     print(HELP, flush=True)
     try:
         opened.run()

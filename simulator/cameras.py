@@ -8,6 +8,7 @@ from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
 from cloning.recordings.format import CAMERAS
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, MOUNT_PITCH, VERTICAL_FIELD
+from cloning.road.disturbances import Disturbance, Disturber
 from simulator.world import INSIDE, Scene
 
 JPEG_QUALITY = 75  # with colour at half resolution, as the tables in the real simulator's images show
@@ -69,8 +70,10 @@ class Buffer:
 class Cameras:
     """The car's cameras in a scene."""
 
-    def __init__(self, scene: Scene, names: tuple[str, ...] = CAMERAS):
-        """Mount the named cameras on the scene's car."""
+    def __init__(
+        self, scene: Scene, names: tuple[str, ...] = CAMERAS, disturbance: Disturbance | None = None, seed: int = 0
+    ):
+        """Mount the named cameras on the scene's car; disturbance, seed: see `disturb`."""
         self.last: np.ndarray | None = None  # what `frames` has returned last
         self.mounted = [core.NodePath(core.Camera(name, lens())) for name in names]
         for name, camera in zip(names, self.mounted, strict=True):
@@ -79,6 +82,12 @@ class Cameras:
             camera.set_hpr(-CAMERA_YAW, -MOUNT_PITCH, -CAMERA_ROLL)
         self.move(scene)
         self.buffer = Buffer(FINE_ROWS, COLUMNS, self.mounted)
+        self.disturb(disturbance, seed)
+
+    def disturb(self, disturbance: Disturbance | None, seed: int = 0) -> None:
+        """Begin a drive whose frames are disturbed, or not if None; the same seed disturbs them in the same way."""
+        self.disturbance = disturbance
+        self.disturbers = [Disturber(disturbance, seed) for _ in self.mounted] if disturbance else []
 
     def move(self, scene: Scene) -> None:
         """Mount the cameras on another scene's car; the engine never frees a buffer's memory, 0.8 MB a camera."""
@@ -87,13 +96,19 @@ class Cameras:
             camera.reparent_to(scene.car)
 
     def frames(self, transform: core.TransformState) -> np.ndarray:
-        """Render the frames with the car at the transform: uint8 (cameras, 160, 320, 3), RGB, in the names' order."""
+        """Render a drive's next frames: uint8 (cameras, 160, 320, 3), RGB, in the names' order.
+
+        transform: where the car is.
+        """
         self.scene.move_car(transform)
         rows = self.buffer.render().reshape(-1, COLUMNS, 3)
         tall = cv2.addWeighted(rows[0::2], 0.5, rows[1::2], 0.5, 0)  # as cv2.resize by area, in a sixteenth of its time
         tone = self.scene.scenery.tone
-        self.last = (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)
-        return self.last
+        frames = (tall if tone is None else cv2.transform(tall, tone)).reshape(-1, ROWS, COLUMNS, 3)
+        if self.disturbers:
+            frames = np.stack([seen(frame) for seen, frame in zip(self.disturbers, frames, strict=True)])
+        self.last = frames
+        return frames
 
     def segments(self, transform: core.TransformState) -> np.ndarray:
         """Render the first camera's frame without mixing neighbouring pixels: uint8 (160, 320, 3), RGB."""

@@ -7,6 +7,7 @@ So the network learns, where it gets to by its own faults, how to come back. Thi
 import math
 
 from cloning.recordings.writer import RecordingWriter
+from cloning.road.disturbances import Disturbance
 from cloning.road.motion import MPH
 from cloning.wire.client import MANUAL_TELEMETRY
 from simulator.cameras import Cameras
@@ -34,12 +35,23 @@ class CorrectedClient(Client):
     """
 
     def __init__(
-        self, run: Run, scene: Scene, speed: float, recording: RecordingWriter, host: str, port: int, wait: float
+        self,
+        run: Run,
+        scene: Scene,
+        speed: float,
+        recording: RecordingWriter,
+        host: str,
+        port: int,
+        wait: float,
+        disturbance: Disturbance | None = None,
     ):
-        """speed: the expert's set speed in mph, which the car never exceeds; wait: see ClientSession."""
-        super().__init__(run, Cameras(scene, ("center",)), host, port, wait, realtime=False)
+        """speed: the expert's set speed in mph, which the car never exceeds; wait: see ClientSession.
+
+        disturbance: of what drive.py sees, and of what is recorded.
+        """
+        super().__init__(run, Cameras(scene, ("center",), disturbance), host, port, wait, realtime=False)
         run.car.speed_limit = speed * MPH
-        self.recording, self.recorded = recording, Cameras(scene)
+        self.recording, self.recorded = recording, Cameras(scene, disturbance=disturbance)
         self.expert = Expert(run.track, top_speed=speed * MPH, wander=0.0)
         self.correcting, self.corrections, self.expert_time = False, 0, 0.0
         self._away_at = 0.0  # simulated seconds when the car was last not near the centre, in a correction

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from cloning.base.errors import TrackError
+from cloning.road.disturbances import Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.motion import FULL_LOCK, MPH
 from cloning.road.points import make_road, parse_track_string
@@ -28,7 +29,7 @@ from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
 from simulator.scenery.segments import segments
-from simulator.scenery.weather import in_weather
+from simulator.scenery.weather import FALLING, in_weather
 from simulator.world import Scene, free_unused
 
 SECTOR = 10.0  # m of road that waypoints and sectors count
@@ -46,12 +47,14 @@ class Stage:
 
     source, direction, look  of the track that lies there at the start, see Track and `scenery.build`
     road                     width, marking and land of the roads that a program sends, as `make_road` takes them
+    disturbance              of the camera's frames, or None for that of the weather, if there is one
     """
 
     source: str | PointRoad
     direction: str | None
     look: int
     road: dict[str, Any]
+    disturbance: Disturbance | None = None
 
 
 class Dialect:
@@ -69,6 +72,7 @@ class Dialect:
 
     def __init__(self, stage: Stage):
         self.stage, self.still, self.ready, self.episodes = stage, False, True, 0
+        self.disturbance = stage.disturbance
         self.views: list[Cameras] = []
         self.steering = self.throttle = 0.0
         self.replies: list[str] = []  # packets to send besides telemetry
@@ -92,6 +96,7 @@ class Dialect:
     def restart(self) -> None:
         """Set the car at the start of its road, at rest."""
         self.run = Run(self.track, "autonomous")
+        self.views[0].disturb(self.disturbance)
         self.steering = self.throttle = 0.0
 
     def step(self) -> None:
@@ -268,6 +273,7 @@ class Episodes(Dialect):
         source: str | PointRoad = TRACKS.get(track, track)
         changed = (source, weather) != (self.track.source, self.weather)
         self.weather, self.day = weather, daytime == "day"
+        self.disturbance = self.stage.disturbance or FALLING.get(weather)
         if changed:
             self.open(source)
         self.restart()

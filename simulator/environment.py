@@ -32,6 +32,7 @@ from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
+from cloning.road.disturbances import Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
@@ -43,7 +44,7 @@ from simulator.world import Scene, free_unused
 
 ID = "behavioral-cloning/Drive-v0"
 MAX_STEPS = 10 * 60 * SAMPLE_RATE  # ten simulated minutes, so that the episode of a car that stands still ends, too
-OPTIONS = ("s", "offset", "turn", "track", "direction", "look")  # of reset
+OPTIONS = ("s", "offset", "turn", "track", "direction", "look", "disturb")  # of reset
 DEPARTURE_PENALTY = 100.0  # m of progress; Gymnasium's CarRacing gives the same for leaving its playfield
 
 
@@ -60,6 +61,14 @@ def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> 
 def check_look(look: Any) -> None:
     """Raise SimulatorError if a look is not a number of one."""
     check("look", look, lambda number: number >= 0 and number % 1 == 0, "a whole number from 0")
+
+
+def parse_disturbance(text: Any) -> Disturbance | None:
+    """Return the disturbance that an argument or option names. Raises SimulatorError."""
+    try:
+        return None if text is None else Disturbance.parse(str(text))
+    except ValueError as error:
+        raise SimulatorError(f"disturb: {error}") from None
 
 
 def make_track(track: Any, direction: Any) -> Track:
@@ -98,6 +107,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         laps: float = 1,
         random_start: bool = False,
         render_mode: str | None = None,
+        disturb: str | None = None,
     ):
         """Build the track's scene. Raises TrackError for an unknown track, SimulatorError for other arguments.
 
@@ -106,15 +116,17 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         look: 0 like the real simulator, any greater number in other light, colours, textures and plants; speed: set
         speed in mph, 1 to 30, which the car never exceeds; laps: after which an episode is truncated, such as 0.5;
         random_start: begin each episode anywhere on the centre line instead of where the autonomous mode does;
-        render_mode: "rgb_array" (a view from behind the car) or None.
+        render_mode: "rgb_array" (a view from behind the car) or None; disturb: foul weather or a fault of the camera,
+        such as "fog:3" (see cloning.road.disturbances), in each episode another one, or None.
         """
-        EzPickle.__init__(self, track, direction, look, speed, laps, random_start, render_mode)
+        EzPickle.__init__(self, track, direction, look, speed, laps, random_start, render_mode, disturb)
         self.track = make_track(track, direction)
         check_look(look)
         check("speed", speed, lambda mph: 1 <= mph <= TOP_SPEED_MPH, f"1 to {TOP_SPEED_MPH} (mph)")
         check("laps", laps, lambda number: 0 < number < math.inf, "a number above 0")
         check("random_start", random_start, lambda value: isinstance(value, bool), "True or False")
         check("render_mode", render_mode, lambda mode: mode in ("rgb_array", None), "'rgb_array' or None")
+        self.disturbance = parse_disturbance(disturb)
         self.observation_space = spaces.Box(0, 255, FRAME, np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.look, self.speed, self.laps, self.random_start = look, speed, laps, random_start
@@ -130,8 +142,9 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
 
         seed: of the random starts. Of the options "s", m along the track, 0 up to its length, "offset", lateral offset
         in m, right positive (default 0), and "turn", radians from the road's direction to the right (default 0), say
-        where to start; "track", "direction" and "look", as above, which road to drive from now on. Raises TrackError or
-        SimulatorError if there is no road, and gymnasium's ClosedEnvironmentError after `close`.
+        where to start; "track", "direction" and "look", as above, which road to drive from now on, and "disturb" in
+        what. Raises TrackError or SimulatorError if there is no such thing, and gymnasium's ClosedEnvironmentError
+        after `close`.
         """
         self._check_open()
         super().reset(seed=seed)
@@ -139,6 +152,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         options = {} if options is None else options
         if not isinstance(options, dict) or options.keys() - set(OPTIONS):
             raise SimulatorError(f"options {options!r}: the options of reset are {', '.join(OPTIONS)}, in a dict")
+        disturbance = parse_disturbance(options["disturb"]) if "disturb" in options else self.disturbance
         self._choose_road(options)
         self.run = Run(self.track, "autonomous")
         self.run.car.speed_limit = self.speed * MPH
@@ -146,6 +160,8 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
             self.run.s = self.np_random.uniform(0, self.track.length)
         self._set_on_road(options)
         self.clock = SampleClock(1 / SAMPLE_RATE)
+        self.disturbance = disturbance
+        self.cameras.disturb(disturbance, int(self.np_random.integers(2**31)) if disturbance else 0)
         self.state = "driving"
         return self._frame(), self._info()
 

@@ -193,7 +193,8 @@ def join(arguments: argparse.Namespace, track: Track, own: dict[str, Any]) -> in
         if arguments.log:
             stack.enter_context(contextlib.redirect_stdout(log))
             stack.enter_context(contextlib.redirect_stderr(log))
-        dialect = DIALECTS[arguments.dialect](Stage(track.source, arguments.direction, arguments.look, own))
+        stage = Stage(track.source, arguments.direction, arguments.look, own, arguments.disturb)
+        dialect = DIALECTS[arguments.dialect](stage)
         joined = Joined(dialect, arguments.host, arguments.port, arguments.wait, arguments.pace, arguments.fps)
         begin = time.perf_counter()
         try:
@@ -215,7 +216,7 @@ def write_launcher(arguments: argparse.Namespace) -> None:
     Raises SimulatorError.
     """
     options = ["join", "--dialect", arguments.dialect]
-    road = ("track", "road", "width", "marking", "land", "direction", "look")
+    road = ("track", "road", "width", "marking", "land", "direction", "look", "disturb")
     for name in ("host", "port", "wait", *road, "pace", "fps"):
         value = getattr(arguments, name)
         if value is not None:

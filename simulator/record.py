@@ -21,6 +21,7 @@ from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError
 from cloning.base.progress import progress_bar
 from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
+from cloning.road.disturbances import Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
@@ -57,18 +58,22 @@ def start_renderer() -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
+_View = tuple[str | PointRoad, int, Disturbance | None, int]  # road, look, disturbance and its seed
+
+
 @functools.cache
-def _cameras(source: str | PointRoad, look: int) -> Cameras:
-    return Cameras(Scene(scenery.build(source, look)))
+def _cameras(view: _View) -> Cameras:
+    source, look, disturbance, seed = view
+    return Cameras(Scene(scenery.build(source, look)), disturbance=disturbance, seed=seed)
 
 
-def _prepare(source: str | PointRoad, look: int) -> None:
-    _cameras(source, look)
+def _prepare(view: _View) -> None:
+    _cameras(view)
 
 
-def _render(source: str | PointRoad, look: int, transform: TransformState) -> list[bytes]:
-    """Return the three cameras' JPEGs, which depend on the car's pose alone; runs in a rendering process."""
-    return [jpeg(frame) for frame in _cameras(source, look).frames(transform)]
+def _render(view: _View, transform: TransformState) -> list[bytes]:
+    """Return the three cameras' JPEGs; runs in a rendering process."""
+    return [jpeg(frame) for frame in _cameras(view).frames(transform)]
 
 
 def sample(run: Run) -> dict[str, Any]:
@@ -97,25 +102,29 @@ def record(
     seed: int = 0,
     look: int = 0,
     recovery: bool = False,
+    disturbance: Disturbance | None = None,
 ) -> tuple[Run, int]:
     """Record the expert's laps into a new folder; return the run and the number of rows. Call it in the main thread.
 
-    speed: set speed in mph; recovery: record only returns from the road's edges. The dates in the images' names depend
-    on the seed, not on today's date, so that the same arguments give the same files. Raises RecordingError if the
-    folder cannot be written or holds a recording, SimulatorError if a rendering process is killed.
+    speed: set speed in mph; recovery: record only returns from the road's edges; disturbance: of all images. The dates
+    in the images' names depend on the seed, not on today's date, so that the same arguments give the same files. Raises
+    RecordingError if the folder cannot be written or holds a recording, SimulatorError if a rendering process is
+    killed.
     """
     run = Run(track)
     run.car.speed_limit = speed * MPH
     expert = (Recovery if recovery else Expert)(track, seed, speed * MPH)
     clock = SampleClock()
-    renderers = min(MAX_RENDERERS, threads())
+    view = (track.source, look, disturbance, seed)
+    # A disturbed frame depends on those before it; without a disturbance it depends on the car's pose alone.
+    renderers = 1 if disturbance else min(MAX_RENDERERS, threads())
     pending: deque[tuple[Future[list[bytes]], dict[str, Any]]] = deque()  # images being rendered, and their samples
     with ExitStack() as stack:
         with program.interrupt_deferred():
             recording = stack.enter_context(RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)))
             pool = stack.enter_context(ProcessPoolExecutor(renderers, renderers_context(), start_renderer))
             for _ in range(renderers):  # each starts a process
-                pool.submit(_prepare, track.source, look)
+                pool.submit(_prepare, view)
         bar = stack.enter_context(progress_bar(round(laps * track.length), "m", unit_scale=True))
 
         def write() -> None:
@@ -130,7 +139,7 @@ def record(
                     recording.begin_drive()
                 run.step(*expert.drive(run))
                 if clock.due(run.time) and expert.recordable:
-                    images = pool.submit(_render, track.source, look, run.car.node.get_transform())
+                    images = pool.submit(_render, view, run.car.node.get_transform())
                     pending.append((images, sample(run)))
                     if len(pending) > 2 * renderers:
                         write()

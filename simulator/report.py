@@ -45,8 +45,9 @@ class RoundTrips(TypedDict):
 class LapReport(TypedDict):
     """The metrics of a drive; offsets are absolute distances from the centre line, steering is -1..1.
 
-    The keys from `ended` on exist if a server drove, those after it if it has answered. own_ms_a_frame is the time that
-    the simulator itself used, which is measured in lock-step only.
+    disturbance, such as "fog:3", exists if there was one. The keys from `ended` on exist if a server drove, those after
+    it if it has answered. own_ms_a_frame is the time that the simulator itself used, which is measured in lock-step
+    only.
     """
 
     track: str
@@ -61,6 +62,7 @@ class LapReport(TypedDict):
     offset_mean_m: float
     offset_max_m: float
     steering_roughness_per_s: float
+    disturbance: NotRequired[str]
     ended: NotRequired[DriveEnd]
     frames: NotRequired[int]
     frames_per_simulated_second: NotRequired[float]
@@ -99,6 +101,8 @@ def lap_report(run: Run, client: Client | None = None) -> LapReport:
         "steering_roughness_per_s": round(run.roughness(), 3),
     }
     if client is not None:
+        if client.cameras.disturbance:
+            report["disturbance"] = str(client.cameras.disturbance)
         report["ended"] = client.ended
     if client is not None and client.round_trips:
         milliseconds = np.array(client.round_trips) * 1000
@@ -124,6 +128,8 @@ def report_text(report: LapReport) -> str:
         f"{report['distance_m']:.0f} m in "
         f"{report['simulated_seconds']:.1f} s, {report['mean_speed_mph']:.1f} mph on average"
     ]
+    if "disturbance" in report:
+        lines.append(f"disturbance: {report['disturbance']}")
     if report["seconds_a_lap"]:
         lines.append("seconds per lap: " + ", ".join(f"{seconds:.1f}" for seconds in report["seconds_a_lap"]))
     lines.append(f"departures: {len(report['departures'])}, autonomy {100 * report['autonomy']:.1f} %")

@@ -14,8 +14,10 @@ from direct.task.Task import Task
 from panda3d import core
 
 from cloning.base.errors import SimulatorError
+from cloning.base.frame import FRAME
 from cloning.recordings.writer import RecordingWriter, SampleClock, check_name_of_corrections
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
+from cloning.road.disturbances import Disturbance
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from simulator import scenery
@@ -36,6 +38,7 @@ STRAIGHT = 40.0  # m of the straight on which a person starts
 TOLD_TIME = 4.0  # s for which the window tells of a departure, or of time that was skipped
 CHASE_TIME = 0.3  # s: time constant with which the camera follows the car's turns
 LETTERS, MARGIN = 0.06, 0.05  # height of a line, and distance from the window's edge; its height is 2
+CORNER, CORNER_SIZE = (0.45, 0, 0.4), (0.4, 1, 0.2)  # middle and half the size of what a disturbed camera sees
 BAR = 0.5  # half the width of the bar that shows the steering
 
 BUTTONS = {
@@ -68,14 +71,26 @@ class Gamepad:
         return Sticks(throttle.value, steering.value, held)
 
 
+def corner_texture(frame: np.ndarray) -> core.Texture:
+    """Return a texture with a frame, uint8 (160, 320, 3), RGB; the renderer takes powers of two only."""
+    return make_texture(cv2.resize(frame, (512, 256)), repeat=False, mipmaps=False)
+
+
 class Window(ShowBase):
     """The window; its run is `simulation`, because ShowBase has a method `run`."""
 
-    def __init__(self, track: Track, folder: str | Path, look: int = 0, server: tuple[str, int] | None = None):
+    def __init__(
+        self,
+        track: Track,
+        folder: str | Path,
+        look: int = 0,
+        server: tuple[str, int] | None = None,
+        disturbance: Disturbance | None = None,
+    ):
         """Open the window. Raises SimulatorError, and RecordingError for a name that does not say what is recorded.
 
         folder: of the recording, created when recording first starts; server: host and port of drive.py if it drives.
-        Then only what the person drives is recorded: the corrections.
+        Then only what the person drives is recorded: the corrections. disturbance: of what the car's cameras see.
         """
         if server:
             check_name_of_corrections(folder)
@@ -95,14 +110,20 @@ class Window(ShowBase):
             self.simulation.set_back()
         self.scene = Scene(scenery.build(track.source, look))
         self.scene.root.reparent_to(self.render)
-        self.cameras = Cameras(self.scene)
+        self.cameras = Cameras(self.scene, disturbance=disturbance)
         self.controls, self.gamepad = Controls(), Gamepad()
         self.remote: RemoteDriver | None = None
         self.by_hand = not server  # whether the person drove before the last frame
         self.started = bool(server)  # until somebody drives, the car stands still, also on a slope
         if server:
             host, port = server
-            self.remote = RemoteDriver(host, port, Cameras(self.scene, ("center",)))
+            self.remote = RemoteDriver(host, port, Cameras(self.scene, ("center",), disturbance))
+        self.corner: OnscreenImage | None = None
+        if disturbance:
+            black = corner_texture(np.zeros(FRAME, np.uint8))
+            self.corner = OnscreenImage(black, parent=self.a2dBottomLeft, pos=CORNER, scale=CORNER_SIZE)
+        self.seen = self.remote.cameras if self.remote else Cameras(self.scene, ("center",), disturbance)
+        self.seen_clock = SampleClock()
         self.folder, self.clock, self.recording_on = folder, SampleClock(), False
         self.recording: RecordingWriter | None = None
         self.saved = (self.simulation.s, 0.0)  # position to jump back to: m along the track, lateral offset in m
@@ -285,6 +306,12 @@ class Window(ShowBase):
             if self.recording_on:
                 state = "recording" if by_hand else "recording when you drive"
             lines.append(f"{state}: {self.recording.rows} rows in {self.recording.folder}")
+        if self.corner:
+            if not self.remote and self.seen_clock.due(run.time):
+                self.seen.frames(transform)
+            if self.seen.last is not None:
+                self.corner.set_texture(corner_texture(self.seen.last[0]), 1)
+            lines.append(f"in the corner: what the car's camera sees, {self.seen.disturbance}")
         lines.append("F1: help")
         self.text.setText("\n".join(lines))
         self.message.setText(self.told if time.monotonic() < self.told_until else "")

@@ -131,7 +131,7 @@ class Blank(Cameras):
     """Cameras that see grey noise, so that frames are as large as real ones."""
 
     def __init__(self):
-        pass
+        self.disturbance = None
 
     noise = np.random.default_rng(0).integers(60, 190, (160, 320, 3), np.uint8)
 

@@ -173,9 +173,10 @@ def screen():
 
 LOOK_AT_WINDOW = """
 from panda3d import core
+from cloning.road.disturbances import Disturbance
 from cloning.road.track import Track
-from simulator.window import Window
-window = Window(Track("lake"), "recorded")
+from simulator.window import Window, corner_texture
+window = Window(Track("lake"), "recorded", disturbance=Disturbance("fog", 4))
 window.finish()
 for size in ((960, 540), (960, 600), (500, 620)):
     properties = core.WindowProperties.size(*size)
@@ -189,6 +190,9 @@ for size in ((960, 540), (960, 600), (500, 620)):
         assert -width <= low.x < high.x <= width, (size, low, high)
     window.do_help()
 assert window.win.get_x_size() == 500
+assert "fog:4" in window.text.getText()
+shown, seen = window.corner.get_texture(), corner_texture(window.seen.last[0])
+assert bytes(shown.get_ram_image()) == bytes(seen.get_ram_image()) and window.seen.last.std() < 30, "fog in the corner"
 window.started = True
 window.simulation.set_back(4.5)
 window.task_mgr.step()

@@ -14,6 +14,8 @@ from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
+from cloning.road.autonomy import autonomy
+from cloning.road.disturbances import Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH
 from cloning.road.track import Track
@@ -24,7 +26,7 @@ from cloning.wire.session import ClientSession
 from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.client import Driven, current_telemetry
-from simulator.run import Run
+from simulator.run import Departure, Run
 from simulator.world import Scene, free_unused
 
 PATIENCE = 30.0  # s that a drive may take beyond twice the time at its set speed
@@ -32,22 +34,39 @@ WAIT = 60.0  # s for a server's answer
 
 
 class Conditions(NamedTuple):
-    """What all drives of a search have in common; driver: a file or HOST:PORT; speed: mph; look: see README.md."""
+    """How a road is driven.
+
+    driver       a model file, an .onnx file, or HOST:PORT of a server
+    speed, look  mph; see README.md
+    direction    "ccw", "cw", or None for that of the real simulator, or in which the road's points are listed
+    metres       to drive; None: the whole road
+    set_back     after a departure the car is set back onto the lane's centre and goes on, until the time of so many
+                 interventions is that of the whole drive; if not, the first departure ends it
+    disturbance  of the frames, or None; seed: the same disturbs them in the same way
+    """
 
     driver: str
     speed: float
     look: int
+    direction: str | None = None
+    metres: float | None = None
+    set_back: bool = False
+    disturbance: Disturbance | None = None
+    seed: int = 0
 
 
 @dataclass(frozen=True)
 class Drive:
     """How a road was driven.
 
-    farthest  m from the lane's centre
-    seconds   simulated, until the car arrived or failed
-    ended     "arrived", "left" or "right" for the side on which the car left the road, or "late"
-    along     m along the road where the drive ended
-    path      x, y of the car in m, one for each frame
+    farthest    m from the lane's centre
+    seconds     simulated, until the car arrived or failed
+    ended       "arrived", "left" or "right" for the side on which the car left the road for good, or "late"
+    along       m along the road where the drive ended
+    path        x, y of the car in m, one for each frame
+    mean        m from the lane's centre, on average
+    planned     s that it would have taken at its set speed
+    departures  from the road
     """
 
     farthest: float
@@ -55,6 +74,9 @@ class Drive:
     ended: str
     along: float
     path: tuple[tuple[float, float], ...]
+    mean: float = 0.0
+    planned: float = 0.0
+    departures: tuple[Departure, ...] = ()
 
     @property
     def failed(self) -> bool:
@@ -103,8 +125,8 @@ def check_driver(driver: str) -> None:
         load_driver(driver)
 
 
-def drive(conditions: Conditions, road: PointRoad) -> Drive:
-    """Drive a road as `python -m simulator drive` and drive.py do, until the first failure. Raises UserError."""
+def drive(conditions: Conditions, road: str | PointRoad) -> Drive:
+    """Drive a road as `python -m simulator drive` and drive.py do; road: as `Track` takes it. Raises UserError."""
     address = server_address(conditions.driver)
     if address is None:
         steering, controller = load_driver(conditions.driver), SpeedController(conditions.speed)
@@ -134,27 +156,54 @@ def _cameras() -> list[Cameras]:
     return []
 
 
-def _drive(conditions: Conditions, road: PointRoad, answer: Callable[[str], Answer]) -> Drive:
-    run, scene, kept = Run(Track(road), "autonomous"), Scene(scenery.build(road, conditions.look)), _cameras()
-    if kept:
+@functools.lru_cache(maxsize=1)  # of several drives of a road one after another
+def _scene(road: str | PointRoad, look: int) -> Scene:
+    return Scene(scenery.build(road, look))
+
+
+def cameras_at(road: str | PointRoad, look: int) -> Cameras:
+    """Return this process's cameras, on the car in this scene."""
+    scene, kept = _scene(road, look), _cameras()
+    if not kept:
+        kept.append(Cameras(scene, ("center",)))
+    elif kept[0].scene is not scene:
         kept[0].move(scene)
         free_unused()
-    else:
-        kept.append(Cameras(scene, ("center",)))
-    length, driven, clock = run.track.length, Driven(), SampleClock(1 / SAMPLE_RATE)
+    return kept[0]
+
+
+def _drive(conditions: Conditions, road: str | PointRoad, answer: Callable[[str], Answer]) -> Drive:
+    run, cameras = Run(Track(road, conditions.direction), "autonomous"), cameras_at(road, conditions.look)
+    cameras.disturb(conditions.disturbance, conditions.seed)
+    driven, clock = Driven(), SampleClock(1 / SAMPLE_RATE)
+    length = conditions.metres or run.track.length
+    planned = length / (conditions.speed * MPH)
     position = run.car.node.get_pos()
     path = [(position.x, position.y)]
-    late, ended = PATIENCE + 2 * length / (conditions.speed * MPH), ""
+    late, ended = PATIENCE + 2 * planned, ""
     while not ended:
-        driven.apply(answer(current_telemetry(run, kept[0], driven.steering, driven.throttle)))
+        driven.apply(answer(current_telemetry(run, cameras, driven.steering, driven.throttle)))
         due = False
         while not (due or ended):
             if not run.advance(driven.steering, driven.throttle):
-                ended = run.departures[0].side
+                if conditions.set_back and autonomy(len(run.departures), planned) > 0:
+                    run.set_back()
+                else:
+                    ended = run.departures[-1].side
             elif run.travelled >= length:
                 ended = "arrived"
             elif run.time > late:
                 ended = "late"
             due = clock.due(run.time)
         path.append((run.trajectory.x[-1], run.trajectory.y[-1]))
-    return Drive(float(np.abs(run.trajectory.offset).max()), run.time, ended, float(run.s), tuple(path))
+    offsets = np.abs(run.trajectory.offset)
+    return Drive(
+        farthest=float(offsets.max()),
+        seconds=run.time,
+        ended=ended,
+        along=float(run.s),
+        path=tuple(path),
+        mean=float(offsets.mean()),
+        planned=planned,
+        departures=tuple(run.departures),
+    )

@@ -24,6 +24,7 @@ from cloning.replay.replay import (
     reference_lines,
 )
 from cloning.replay.score import ReplayFilm, ReplayReport, plot, replay_report, report_text
+from cloning.road.disturbances import Disturbance
 
 if TYPE_CHECKING:
     from cloning.replay.model_driver import ModelDriver
@@ -40,6 +41,7 @@ class Options:
     limits                 m from the reference line
     reference              "lane" or "human"
     report, picture, film  files to write, or None; the film shows the drives at the last limit
+    disturb                disturbance of what the driver sees, or None
     """
 
     folders: list[str]
@@ -52,6 +54,7 @@ class Options:
     report: str | None
     picture: str | None
     film: str | None
+    disturb: Disturbance | None = None
 
 
 def run(options: Options) -> None:
@@ -73,8 +76,9 @@ def run(options: Options) -> None:
             lines = reference_lines(recording, options.reference == "lane")
             if film:
                 film.begin(recording)
-            drives = drive_at_limits(recording, lines, driver, limits, film.watch if film else None, in_process)
-            reports.append(replay_report(recording, lines, drives, options.reference))
+            watch = film.watch if film else None
+            drives = drive_at_limits(recording, lines, driver, limits, watch, in_process, options.disturb)
+            reports.append(replay_report(recording, lines, drives, options.reference, options.disturb))
             print(report_text(reports[-1]), flush=True)
             if options.picture:
                 path = Path(options.picture)
@@ -111,13 +115,14 @@ def drive_at_limits(
     limits: Sequence[float],
     watch: Watcher | None = None,
     parallel: bool = False,
+    disturbance: Disturbance | None = None,
 ) -> list[Drive]:
     """Return the drives of a recording at each limit, in this order.
 
     watch: of the drive at the last limit, called after each row, or None. parallel: on Linux, drive at all limits at
     the same time, each in a process of its own but the last, which is driven in this one; the driver must not learn
-    from one drive anything that it needs in another. If one drive fails, or on Ctrl-C, the others are ended.
-    Raises what a drive raises, and SimulatorError if its process was killed.
+    from one drive anything that it needs in another. disturbance: see `drive`. If one drive fails, or on Ctrl-C, the
+    others are ended. Raises what a drive raises, and SimulatorError if its process was killed.
     """
     rows = sum(len(line.stretch) for line in lines)
 
@@ -130,7 +135,7 @@ def drive_at_limits(
                 if watch:
                     watch(frame, done)
 
-            return drive(recording, lines, limits[index], driver, after_row)
+            return drive(recording, lines, limits[index], driver, after_row, disturbance)
 
     *others, last = range(len(limits))
     if not (parallel and CAN_FORK):

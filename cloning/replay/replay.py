@@ -21,6 +21,7 @@ from cloning.recordings.log import CheckedRecording, Recording, print_findings, 
 from cloning.replay.views import StretchViews
 from cloning.road.autonomy import autonomy
 from cloning.road.camera import VIEW_JPEG_QUALITY
+from cloning.road.disturbances import Disturbance, Disturber
 from cloning.road.motion import (
     MIN_STRETCH_ROWS,
     MIN_TRUSTED,
@@ -200,16 +201,19 @@ class ReplayedCar:
 class ReplayFrame:
     """What a driver is given at one row: speed, and the view from the car's pose, warped when it is first used."""
 
-    def __init__(self, recording: Recording, views: StretchViews, car: ReplayedCar, at: int):
-        self.views, self.at, self.pose = views, at, (car.right, car.yaw)
+    def __init__(
+        self, recording: Recording, views: StretchViews, car: ReplayedCar, at: int, disturber: Disturber | None = None
+    ):
+        self.views, self.at, self.pose, self.disturber = views, at, (car.right, car.yaw), disturber
         self.line, self.row = car.line, car.line.rows.start + at
         self.speed = float(recording.speed[self.row])  # mph
         self.human_steering = float(car.human_steering[at])  # -1..1
 
     @functools.cached_property
     def view(self) -> np.ndarray:
-        """The view from the car, uint8 (160, 320, 3), RGB."""
-        return self.views.view_from(self.at, *self.pose) if any(self.pose) else self.recorded
+        """The view from the car, disturbed if it is to be, uint8 (160, 320, 3), RGB."""
+        view = self.views.view_from(self.at, *self.pose) if any(self.pose) else self.recorded
+        return self.disturber(view) if self.disturber else view
 
     @property
     def recorded(self) -> np.ndarray:
@@ -217,8 +221,8 @@ class ReplayFrame:
         return self.views.frame(self.at, 0)
 
     def jpeg(self) -> bytes:
-        """Return the view as JPEG; at the human driver's pose, the recorded file itself."""
-        if not any(self.pose):
+        """Return the view as JPEG; undisturbed at the human driver's pose, the recorded file itself."""
+        if not (any(self.pose) or self.disturber):
             return self.views.jpeg(self.at)
         return encode(self.view, VIEW_JPEG_QUALITY)
 
@@ -227,6 +231,8 @@ class ReplayFrame:
 
         rows: of the frame.
         """
+        if self.disturber:
+            return compress(self.view, VIEW_JPEG_QUALITY)[rows]
         if not any(self.pose):
             return self.recorded[rows]
         made = compressed_rows(rows)
@@ -249,21 +255,28 @@ Watcher = Callable[[ReplayFrame, Drive], None]
 
 
 def drive(
-    recording: Recording, lines: list[ReferenceLine], limit: float, driver: Driver, watch: Watcher | None = None
+    recording: Recording,
+    lines: list[ReferenceLine],
+    limit: float,
+    driver: Driver,
+    watch: Watcher | None = None,
+    disturbance: Disturbance | None = None,
 ) -> Drive:
     """Replay a recording at one limit.
 
-    lines: of `reference_lines`; limit: m from the reference line; watch: called after each row, or None.
+    lines: of `reference_lines`; limit: m from the reference line; watch: called after each row, or None; disturbance:
+    of the warped frames, in each stretch with another seed.
     """
     done = Drive(limit)
-    for line in lines:
+    for number, line in enumerate(lines):
         car, views = ReplayedCar(recording, line), StretchViews(recording, line.stretch)
+        disturber = Disturber(disturbance, number) if disturbance else None
         for at in range(len(car)):
             if abs(offset := car.offset(at)) > limit:
                 if at:
                     done.interventions[len(done.row)] = offset
                 car.set_back(at)
-            frame = ReplayFrame(recording, views, car, at)
+            frame = ReplayFrame(recording, views, car, at, disturber)
             steering = float(np.float32(driver(frame)))  # float32 as in the network, whatever the wire's digits
             done.row.append(frame.row)
             done.seconds.append(float(car.seconds[at - 1]) if at else 0.0)

@@ -14,6 +14,7 @@ from cloning.recordings.log import Recording
 from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, drive
 from cloning.road.autonomy import autonomy
 from cloning.road.camera import FIRST_BONNET_ROW
+from cloning.road.disturbances import Disturbance
 from cloning.road.motion import stretch_rows
 from cloning.road.overlay import overlay
 
@@ -102,8 +103,9 @@ class LimitReport(DriveMetrics):
 class ReplayReport(ReferenceMetrics):
     """The report of one recording.
 
-    reference_asked: "lane" or "human"; reference: the rows measured from the lane's centre, `lane_centre`, and from the
-    human driver's path, `human_way`; limits: by the limit in metres; steering_compared: of constant steering.
+    disturbance: of what the driver saw, such as "fog:3"; reference_asked: "lane" or "human"; reference: the rows
+    measured from the lane's centre, `lane_centre`, and from the human driver's path, `human_way`; limits: by the limit
+    in metres; steering_compared: of constant steering.
     """
 
     recording: str
@@ -111,6 +113,7 @@ class ReplayReport(ReferenceMetrics):
     rows_driven: int
     stretches: int
     seconds: float
+    disturbance: str | None
     reference_asked: str
     reference: dict[str, int]
     limits: dict[str, LimitReport]
@@ -175,10 +178,17 @@ def steering_metrics(steering: np.ndarray, human: np.ndarray) -> SteeringMetrics
     }
 
 
-def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list[Drive], asked: str) -> ReplayReport:
+def replay_report(
+    recording: Recording,
+    lines: list[ReferenceLine],
+    drives: list[Drive],
+    asked: str,
+    disturbance: Disturbance | None = None,
+) -> ReplayReport:
     """Return the report of a recording's drives, one per limit, compared with the oracle and the YARDSTICKS.
 
-    lines: of `reference_lines`; asked: the reference that the user chose, "lane" or "human".
+    lines: of `reference_lines`; asked: the reference that the user chose, "lane" or "human"; disturbance: of the
+    drives.
     """
     human = np.array(drives[0].human_steering)
     mean = float(recording.steering.mean())
@@ -215,6 +225,7 @@ def replay_report(recording: Recording, lines: list[ReferenceLine], drives: list
         "stretches": len(lines),
         "seconds": round(sum(drives[0].seconds), 2),
         **reference_metrics(recording, lines),
+        "disturbance": None if disturbance is None else str(disturbance),
         "reference_asked": asked,
         "reference": {LANE_CENTRE: by_lane, HUMAN_WAY: rows - by_lane},
         "limits": {f"{done.limit:g}": limit_report(done) for done in drives},
@@ -233,6 +244,8 @@ def report_text(report: ReplayReport) -> str:
         f"rows) at {report['mean_speed_mph']:.1f} mph on average; {report['rows_placed'] / rows:.1%} of the rows are "
         "placed, on a known track or by the recording itself"
     ]
+    if report["disturbance"]:
+        lines.append(f"  disturbance: {report['disturbance']}")
     if report["reference_asked"] == "lane":
         unknown = [f"{plural(u['rows'], 'row')} from {u['first']}: {u['why']}" for u in report["unknown"]]
         lines += [f"  lane's centre unknown in {words}" for words in unknown[:LISTED]]

@@ -5,16 +5,18 @@ from dataclasses import replace
 import numpy as np
 
 from cloning.base.errors import TrackError
+from cloning.road.disturbances import Disturbance
 from simulator.scenery.looks import tone_matrix
 from simulator.scenery.parts import Haze, Scenery
 from simulator.scenery.textures import plain
 
-# Haze, and the camera's contrast, saturation and brightness. Neither drops nor flakes are rendered.
+# Haze, and the camera's contrast, saturation and brightness
 WEATHERS = {
     "rainy": (Haze((0.50, 0.53, 0.57), (15, 220), 0.95), (0.85, 0.5, -18.0)),
     "snowy": (Haze((0.88, 0.90, 0.93), (8, 150), 0.97), (0.90, 0.4, 14.0)),
     "foggy": (Haze((0.74, 0.76, 0.78), (5, 70), 0.99), (0.95, 0.7, 0.0)),
 }
+FALLING = {"rainy": Disturbance("rain", 2), "snowy": Disturbance("snow", 2)}  # drops and flakes in the cameras' frames
 
 
 def in_weather(scenery: Scenery, weather: str) -> Scenery:
