@@ -308,7 +308,7 @@ class TrainingRun:
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
         self.training, self.validation = training, validation
-        if self.device.type == "cuda":
+        if self.device.type == "cuda" and not recipe.disturbed:  # disturbances are made by the CPU
             self.training, self.validation = (part.on_gpu(self.device, self.pool) for part in (training, validation))
         self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, recipe.huber)
         if ranks.world > 1:

@@ -10,7 +10,7 @@ from simulator.car import CHARACTERISTIC_SPEED, STEP, TOP_SPEED
 from simulator.run import Run
 from simulator.world import GRAVITY
 
-MAX_LATERAL_ACCELERATION, MAX_DECELERATION = 5.0, 4.0  # m/s², in bends and before them
+LATERAL_ACCELERATION, MAX_DECELERATION = 5.0, 4.0  # m/s² at most, in bends and before them
 LOOKAHEAD, LOOKAHEAD_TIME = 3.0, 0.45  # m plus s of driving: distance to the point that the expert steers for
 # The expert's lateral offset varies with this standard deviation, limit and shortest wavelength, all in m. The human
 # drivers of the real recordings are 0.6 m (lake) to 1.6 m (jungle) off the centre on average.
@@ -20,9 +20,12 @@ STEERING_TIME = 0.12  # s: time constant of the steering
 PREVIEW_TIME = 0.1  # s: the speed limit is that of the point so far ahead
 
 
-def speed_limits(track: Track, top_speed: float) -> np.ndarray:
-    """Return the speed limit at each of the track's points, (n,) m/s: low enough for its bend and those ahead."""
-    limit = np.minimum(top_speed, np.sqrt(MAX_LATERAL_ACCELERATION / np.maximum(np.abs(track.curvature), 1e-6)))
+def speed_limits(track: Track, top_speed: float, lateral: float) -> np.ndarray:
+    """Return the speed limit at each of the track's points, (n,) m/s: low enough for its bend and those ahead.
+
+    lateral: the greatest acceleration sideways, m/s².
+    """
+    limit = np.minimum(top_speed, np.sqrt(lateral / np.maximum(np.abs(track.curvature), 1e-6)))
     for _ in range(2):  # the second pass continues the braking across the first point
         for i in range(len(limit) - 1, -1, -1):
             after = limit[(i + 1) % len(limit)]
@@ -37,10 +40,17 @@ class Expert:
     target      mean lateral offset in m, right positive
     """
 
-    def __init__(self, track: Track, seed: int = 0, top_speed: float = TOP_SPEED, wander: float = WANDER):
-        """top_speed: m/s; wander: standard deviation of the lateral offset in m; seed: of the lateral offsets."""
+    def __init__(
+        self,
+        track: Track,
+        seed: int = 0,
+        top_speed: float = TOP_SPEED,
+        wander: float = WANDER,
+        lateral: float = LATERAL_ACCELERATION,
+    ):
+        """seed: of the lateral offsets; wander: their standard deviation in m; top_speed: m/s; lateral: m/s²."""
         self.track, self.top_speed = track, min(top_speed, TOP_SPEED)
-        self.limits = speed_limits(track, self.top_speed)
+        self.limits = speed_limits(track, self.top_speed, lateral)
         rng = np.random.default_rng([seed, 1])
         waves = np.arange(1, max(2, int(track.length / MIN_WAVELENGTH)) + 1)
         # Wavelengths that do not divide the track's length, so that laps differ; in radians per m.

@@ -15,21 +15,22 @@ from cloning.road.generated import road_number
 from simulator.scenery.looks import SHADOWED
 from tools import shipped
 from tools.lane_frames import FIRST_ROAD, scenes
-from tools.shipped import FIRST_LOOK, Lap, laps, render, repeat
+from tools.shipped import FIRST_LOOK, Lap, drive_lap, laps, render, repeat
 
 
 def test_what_is_left_to_measure_with_is_not_trained_on():
-    chosen, taught = laps(101, 1000), scenes(101, 101, 10)
+    chosen, taught = laps(101, 100, {"road": 1000, "mountain": 1000}), scenes(101, 101, 10)
     for rendered in (chosen, taught):
         assert all((road_number(lap.track) or FIRST_ROAD) >= FIRST_ROAD for lap in rendered)
     assert {lap.look % SHADOWED for lap in chosen}.isdisjoint(range(1, FIRST_LOOK))
     assert all(scene.look % SHADOWED <= 100 for scene in taught)
-    assert len(set(laps(21, 40))) == len(laps(21, 40)) == 2 * (2 * 3 + 20) + 40
+    some = [lap.name for lap in laps(21, 10, {"road": 40, "mountain": 30})]
+    assert len(set(some)) == len(some) == 2 * (2 * 3 + 20) + 10 + 40 + 30
 
 
 def test_each_track_is_rendered_in_both_directions_and_lights():
-    chosen = laps(21, 40)
-    for start in ("lake", "jungle", "road-"):
+    chosen = laps(21, 20, {"road": 40, "mountain": 40})
+    for start in ("lake", "jungle", "road-", "mountain-"):
         some = [lap for lap in chosen if lap.track.startswith(start)]
         combined = {(lap.direction, lap.look >= SHADOWED) for lap in some}
         assert combined == {(direction, shadows) for direction in ("ccw", "cw") for shadows in (False, True)}
@@ -37,38 +38,30 @@ def test_each_track_is_rendered_in_both_directions_and_lights():
         assert 0.4 < np.mean([lap.look >= SHADOWED for lap in some]) < 0.6
 
 
-@pytest.fixture
-def expert(monkeypatch):
-    """A stand-in for the expert: the laps it was asked to drive, its departures, the lap that is interrupted."""
-    expert = SimpleNamespace(laps=[], departures=[], interrupted=0)
-
-    def record(folder, track, laps, seed, look):
-        folder.mkdir(parents=True)
-        expert.laps.append((track.name, track.direction, look, seed))
-        if len(expert.laps) == expert.interrupted:
-            raise KeyboardInterrupt
-        return SimpleNamespace(departures=expert.departures), 1
-
-    monkeypatch.setattr(shipped, "record", record)
-    return expert
+CHOSEN = [Lap("road-1001", "ccw", 0, 0.02), Lap("road-1001", "cw", 10_000, 0.02), Lap("mountain-1001", "ccw", 1, 0.02)]
+NAMES = ["road-1001-ccw-look0", "road-1001-cw-look10000", "mountain-1001-ccw-look1"]
 
 
-def test_rendering_goes_on_where_it_was_interrupted(tmp_path, expert):
-    chosen = [Lap("lake", "ccw", 0), Lap("lake", "cw", 10_000), Lap("road-1001", "ccw", 1)]
-    expert.interrupted = 2
-    with pytest.raises(KeyboardInterrupt):
-        render(tmp_path, chosen)
-    names = ["lake-ccw-look0", "lake-cw-look10000", "road-1001-ccw-look1"]
-    assert render(tmp_path, chosen) == [tmp_path / name for name in names]
-    assert expert.laps == [(*lap, seed) for lap, seed in zip([*chosen[:2], *chosen[1:]], (0, 1, 1, 2), strict=True)]
-    assert sorted(folder.name for folder in tmp_path.iterdir()) == names
+def test_rendering_goes_on_where_it_was_interrupted(tmp_path, capsys):
+    assert render(tmp_path, CHOSEN[:1]) == [tmp_path / NAMES[0]]
+    (tmp_path / "unfinished" / NAMES[1]).mkdir(parents=True)  # as a killed run leaves it
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / NAMES[0]).rglob("*")}
+    assert render(tmp_path, CHOSEN) == [tmp_path / name for name in NAMES]
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert capsys.readouterr().out.count("rows") == 3
+    assert sorted(folder.name for folder in tmp_path.iterdir()) == sorted(NAMES)
+    rows = read_recording(tmp_path / NAMES[2])
+    assert np.diff(rows.time) == pytest.approx(1 / shipped.RATE, abs=0.02)
 
 
-def test_a_lap_that_left_the_road_is_not_trained_on(tmp_path, expert):
-    expert.departures = ["one"]
-    with pytest.raises(RecordingError, match="lake-ccw-look0: the expert left the road"):
-        render(tmp_path, [Lap("lake", "ccw", 0)])
-    assert not (tmp_path / "lake-ccw-look0").exists()
+def test_a_fast_lap_has_a_name_of_its_own():
+    assert Lap("jungle", "cw", 1001, lateral=shipped.FAST).name == "jungle-cw-look1001-fast"
+
+
+def test_a_lap_that_left_the_road_is_not_trained_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(shipped, "Expert", lambda *_, **__: SimpleNamespace(drive=lambda run: (1.0, 1.0)))
+    with pytest.raises(RecordingError, match="lap: the expert left the road"):
+        drive_lap(tmp_path / "lap", Lap("lake", "ccw", 0), 0)
 
 
 @pytest.mark.parametrize("cut", [False, True])
@@ -109,21 +102,35 @@ def commands(monkeypatch) -> SimpleNamespace:
     return commands
 
 
-def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path, expert, commands):
+@pytest.fixture
+def rendered(monkeypatch) -> list[str]:
+    """The laps that are to be rendered, none of which is."""
+    names = list[str]()
+
+    def render(folder, chosen):
+        names.extend(lap.name for lap in chosen)
+        return [folder / lap.name for lap in chosen]
+
+    monkeypatch.setattr(shipped, "render", render)
+    return names
+
+
+def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path, rendered, commands):
     """The folder may hold laps and recordings of an earlier run with other options."""
     out, commands.status = tmp_path / "out", INCOMPLETE
     for name, roads in (("first", "2"), ("second", "1")):
         shutil.copytree(sample_recording, tmp_path / name)
-        options = [str(tmp_path / name), "--looks", "1", "--roads", roads, "--folder", str(out)]
+        options = [str(tmp_path / name), "--looks", "1", "--roads", roads, "--mountains", "1", "--folder", str(out)]
         assert shipped.main(options) == INCOMPLETE
     first, second = commands.run
     assert sum("road-" in part for part in first) == 2 and sum("road-" in part for part in second) == 1
     assert [part for part in second if "/real/" in part] == [str(out / "real" / f"second{PROBLEM_AREAS[0]}")]
+    assert sum("mountain-1001" in part for part in first) == 1
     with pytest.raises(RecordingError, match="none: no such folder"):
         shipped.main([str(tmp_path / "none"), "--folder", str(out)])
 
 
-def test_a_trained_network_is_measured(sample_recording, tmp_path, expert, commands):
+def test_a_trained_network_is_measured(sample_recording, tmp_path, rendered, commands):
     out = tmp_path / "out"
     assert shipped.main([str(sample_recording), "--looks", "1", "--roads", "0", "--folder", str(out)]) == DONE
     training, measuring = commands.run

@@ -13,6 +13,8 @@ what came out.
 
 import shutil
 import time
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,21 +24,33 @@ if __name__ == "__main__":
     program.end_on_interrupt("shipped")  # also while the libraries below are loaded
 
 from cloning.base.arguments import number
-from cloning.base.errors import RecordingError
+from cloning.base.cores import threads
+from cloning.base.errors import RecordingError, SimulatorError
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE, PROBLEM_AREAS
 from cloning.recordings.log import find_folders
+from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
 from cloning.road.track import ROADS, Track
-from simulator.record import record
+from simulator import scenery
+from simulator.cameras import Cameras
+from simulator.expert import LATERAL_ACCELERATION, Expert
+from simulator.record import renderers_context, start_renderer, write_row
+from simulator.run import Run
 from simulator.scenery.looks import SHADOWED
+from simulator.world import Scene
 from tools.command import ROOT, command_line, python, run_tool
 from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 
-REPEATS = 20  # how often each real recording counts, because the rendered ones are many
+REPEATS = 16  # how often each real recording counts, because the rendered ones are many
+DISTURBED = 0.4  # share of the images in foul weather, or of a faulty camera
 LEARNING_RATE = 2e-3  # half of --robust's: this training is longer
 DIRECTIONS = ("ccw", "cw")
 FIRST_LOOK = 1001  # the first look, besides look 0, that is trained on
 LAPS = 0.5  # of a generated road: of so many images, more roads teach more than whole laps
+RATE = 7.5  # rows a second, half of the simulator's: of so many images, more roads teach more than denser ones
+FAST = (
+    8.5  # m/s² sideways in the jungle's fast laps, where the simulator's drivers reach 8: frames don't show the speed
+)
 # What is driven in the end: both tracks and ten generated roads that were not trained on, in looks with shadows that
 # were not either.
 MEASURED = ("--tracks", *ROADS, *(f"road-{k}" for k in range(1, 11)), "--looks", "own+10100")
@@ -48,42 +62,79 @@ class Lap(NamedTuple):
     track: str
     direction: str
     look: int
+    laps: float = 1.0
+    lateral: float = LATERAL_ACCELERATION  # m/s², see `Expert`
+
+    @property
+    def name(self) -> str:
+        """The name of its recording, by which the scoreboard knows what a network was trained on."""
+        fast = "" if self.lateral == LATERAL_ACCELERATION else "-fast"
+        return f"{self.track}-{self.direction}-look{self.look}{fast}"
 
 
-def laps(looks: int, roads: int) -> list[Lap]:
-    """Return the laps to render: of both tracks in so many looks, and of so many generated roads, each in its own.
+def laps(looks: int, fast: int, number_of: dict[str, int]) -> list[Lap]:
+    """Return the laps to render: of both tracks in so many looks, fast ones of the jungle, and of generated roads.
 
-    Look 0, which resembles the real simulator, is driven in both directions, without and with both kinds of shadows,
-    any other look in one direction; every second one has shadows.
+    number_of: generated roads of each kind; each has a look of its own. Look 0, which resembles the real simulator, is
+    driven in both directions, without and with both kinds of shadows, any other look in one direction; every second one
+    has shadows.
     """
     twins = (0, SHADOWED, 2 * SHADOWED)
     chosen = [Lap(track, direction, look) for track in ROADS for direction in DIRECTIONS for look in twins]
     for look in range(FIRST_LOOK, FIRST_LOOK + looks - 1):
         chosen += [Lap(track, DIRECTIONS[look % 2], every_second_shadowed(look)) for track in ROADS]
-    for road in range(FIRST_ROAD, FIRST_ROAD + roads):
-        chosen.append(Lap(f"road-{road}", DIRECTIONS[road % 2], every_second_shadowed(road)))
+    for look in range(FIRST_LOOK, FIRST_LOOK + fast):  # not the direction in which the same look is driven slowly
+        chosen.append(Lap("jungle", DIRECTIONS[1 - look % 2], every_second_shadowed(look), lateral=FAST))
+    for kind, roads in number_of.items():
+        for road in range(FIRST_ROAD, FIRST_ROAD + roads):
+            chosen.append(Lap(f"{kind}-{road}", DIRECTIONS[road % 2], every_second_shadowed(road), LAPS))
     return chosen
 
 
-def render(folder: Path, chosen: list[Lap]) -> list[Path]:
-    """Record the laps that are not there yet, and return all recordings.
+def drive_lap(folder: Path, lap: Lap, seed: int) -> int:
+    """Record the expert's lap, rendered in this process; return the number of rows.
 
-    Raises RecordingError if the expert leaves the road, SimulatorError, OSError.
+    Raises RecordingError if the expert leaves the road, and the errors of `RecordingWriter`.
     """
-    recordings = [folder / f"{lap.track}-{lap.direction}-look{lap.look}" for lap in chosen]
-    for i, (lap, recording) in enumerate(zip(chosen, recordings, strict=True)):
-        if recording.exists():
-            continue
-        unfinished = folder / "unfinished"
-        shutil.rmtree(unfinished, ignore_errors=True)
-        begin = time.perf_counter()
-        length = 1 if lap.track in ROADS else LAPS
-        run, rows = record(unfinished, Track(lap.track, lap.direction), laps=length, seed=i, look=lap.look)
-        if run.departures:
-            raise RecordingError(f"{recording}: the expert left the road")
-        unfinished.rename(recording)
-        print(f"{i + 1}/{len(chosen)} {recording.name}: {rows} rows in {time.perf_counter() - begin:.0f} s", flush=True)
-    return recordings
+    track = Track(lap.track, lap.direction)
+    run, expert, clock = Run(track), Expert(track, seed, lateral=lap.lateral), SampleClock(rate=RATE)
+    cameras = Cameras(Scene(scenery.build(track.source, lap.look)))
+    with RecordingWriter(folder, DEFAULT_START + timedelta(days=seed)) as recording:
+        while run.travelled < lap.laps * track.length:
+            run.step(*expert.drive(run))
+            if run.departures:
+                raise RecordingError(f"{folder}: the expert left the road")
+            if clock.due(run.time):
+                write_row(recording, cameras, run)
+    return recording.rows
+
+
+def render(folder: Path, chosen: list[Lap]) -> list[Path]:
+    """Record the laps that are not there yet, each in a process of its own, and return all recordings.
+
+    Raises SimulatorError if a process is killed, and the errors of `drive_lap`.
+    """
+    wanted = [folder / lap.name for lap in chosen]
+    shutil.rmtree(unfinished := folder / "unfinished", ignore_errors=True)
+    begin = time.perf_counter()
+    with ProcessPoolExecutor(threads(), renderers_context(), start_renderer) as pool:
+        driven = {
+            pool.submit(drive_lap, unfinished / recording.name, lap, seed): recording
+            for seed, (recording, lap) in enumerate(zip(wanted, chosen, strict=True))
+            if not recording.exists()
+        }
+        try:
+            for i, lap in enumerate(as_completed(driven), 1):
+                rows, recording = lap.result(), driven[lap]
+                (unfinished / recording.name).rename(recording)
+                state = f"{rows} rows, {time.perf_counter() - begin:.0f} s since the start"
+                print(f"{i}/{len(driven)} {recording.name}: {state}", flush=True)
+        except BrokenExecutor as error:
+            raise SimulatorError("a rendering process was killed, perhaps for lack of memory; start again") from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+    shutil.rmtree(unfinished, ignore_errors=True)
+    return wanted
 
 
 def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
@@ -114,16 +165,19 @@ def main(argv: list[str] | None = None) -> int:
     add = parser.add_argument
     add("recordings", nargs="+", help="real recordings, or folders of recordings")
     add("--looks", type=number(int, 1, 101), default=15, help="looks of each track (default %(default)s)")
+    add("--fast", type=number(int, 0, 100), default=8, help="fast laps of the jungle (default %(default)s)")
     add("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
-    add("--epochs", type=number(int, 1), default=17, help="of 60,000 images (default %(default)s)")
+    add("--mountains", type=number(int, 0, 1000), default=100, help="generated mountain roads (default %(default)s)")
+    add("--epochs", type=number(int, 1), default=22, help="of 60,000 images (default %(default)s)")
     add("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
     add("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
     options = parser.parse_args(argv)
     model = options.folder / "model.pt"
     real = repeat(options.folder / "real", find_folders(options.recordings))  # first, since rendering takes long
-    rendered = render(options.folder / "rendered", laps(options.looks, options.roads))
+    number_of = {"road": options.roads, "mountain": options.mountains}
+    rendered = render(options.folder / "rendered", laps(options.looks, options.fast, number_of))
     length = ("--epochs", options.epochs, "--learning-rate", LEARNING_RATE)
-    training = ("--robust", *length, "--repeats", REPEATS, "--seed", options.seed, "--resume")
+    training = ("--robust", *length, "--repeats", REPEATS, "--disturbed", DISTURBED, "--seed", options.seed, "--resume")
     # By name, since the folders may also hold what an earlier run with other options left there.
     status = python(ROOT / "model.py", *real, *rendered, "--output", model, *training).returncode
     if status != program.DONE:

@@ -134,15 +134,15 @@ class RecordingWriter:
 
 
 class SampleClock:
-    """Tells at which simulation steps a sample is due, 15 a second."""
+    """Tells at which simulation steps a sample is due."""
 
-    def __init__(self, start: float = 0.0):
-        """start: when the first sample is due, simulated seconds."""
-        self.taken = math.ceil(start * SAMPLE_RATE - 1e-9)
+    def __init__(self, start: float = 0.0, rate: float = SAMPLE_RATE):
+        """start: when the first sample is due, simulated seconds; rate: samples a second."""
+        self.rate, self.taken = rate, math.ceil(start * rate - 1e-9)
 
     def due(self, time: float) -> bool:
         """Return whether a sample is due at this time, simulated seconds; if so, count it as taken."""
-        if time * SAMPLE_RATE < self.taken - 1e-9:
+        if time * self.rate < self.taken - 1e-9:
             return False
         self.taken += 1
         return True

@@ -104,7 +104,8 @@ class Lanes(LaneAhead):
         near = distance <= np.maximum(recipe.camera_reach, distance.min(1, keepdims=True))
         camera = np.argmax(near * rng.uniform(1, 2, (n, 3)), axis=1)
         colours, shade = light.tints(recipe, rng, n), light.sample_shades(recipe.shaded, rng, n)
-        return replace(Poses.of(self, offset, yaw, camera, mirrored), colours=colours, shade=shade)
+        seen = light.sample_disturbances(recipe.disturbed, rng, n)
+        return replace(Poses.of(self, offset, yaw, camera, mirrored), colours=colours, shade=shade, disturbance=seen)
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,7 @@ class Poses(Table):
     steering  float32 (n,): the label, -1..1
     colours   float32 (n, 3, 3): matrices by which (red, green, blue) is multiplied, see `light.tints`
     shade     int16 (n,): shadows, see `light.sample_shades`
+    disturbance  int32 (n,): foul weather and the like, see `light.sample_disturbances`
     """
 
     offset: Column
@@ -130,6 +132,7 @@ class Poses(Table):
     steering: Column
     colours: Column
     shade: Column
+    disturbance: Column
 
     @classmethod
     def of(cls, lanes: Lanes, offset: np.ndarray, yaw: np.ndarray, camera: np.ndarray, mirrored: np.ndarray) -> Self:
@@ -145,8 +148,8 @@ class Poses(Table):
         steering = lanes.steering(offset, yaw)
         labels = np.where(mirrored, -steering, steering)
         colours = np.tile(np.eye(3, dtype=np.float32), (len(turn), 1, 1))
-        shade = np.full(len(turn), -1, np.int16)
-        return cls(offset, yaw, camera, mirrored, np.stack(warps, axis=1), labels, colours, shade)
+        shade, disturbance = (np.full(len(turn), -1, kind) for kind in (np.int16, np.int32))
+        return cls(offset, yaw, camera, mirrored, np.stack(warps, axis=1), labels, colours, shade, disturbance)
 
     def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:
         """Return what the network sees of one row: uint8 (75, 320, 3), RGB.
@@ -158,7 +161,8 @@ class Poses(Table):
         image, seen = VIEW.warp(read(camera, False), self.warps[at, 0], mirrored)
         if not seen.all():  # only ground can be missing
             fill_ground(image, cv2.bitwise_not(seen), read(camera, True), self.warps[at, 1, 0])
-        return light.relight(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), self.colours[at], int(self.shade[at]))
+        image = light.relight(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), self.colours[at], int(self.shade[at]))
+        return light.disturbed(image, int(self.disturbance[at]))
 
     def on_gpu(self, road: torch.Tensor, earlier: torch.Tensor) -> torch.Tensor:
         """Return what `view` does for each row, made on a GPU: uint8 (n, 75, 320, 3).
@@ -172,7 +176,8 @@ class Poses(Table):
         """Return the pose that an image shows in words, such as `0.8 m left, turned 5° right`; at: index of the row."""
         seen = (-1 if self.mirrored[at] else 1) * np.array([self.offset[at], np.degrees(self.yaw[at])])
         sides = ["left" if value < 0 else "right" for value in seen]
-        return f"{abs(seen[0]):.1f} m {sides[0]}, turned {abs(seen[1]):.0f}° {sides[1]}"
+        weather = light.name_of(int(self.disturbance[at]))
+        return f"{abs(seen[0]):.1f} m {sides[0]}, turned {abs(seen[1]):.0f}° {sides[1]}{weather and f', {weather}'}"
 
 
 @functools.cache

@@ -14,9 +14,11 @@ import torch
 
 from cloning.base.frame import FRAME
 from cloning.network.network import SEEN_SHAPE
+from cloning.road.disturbances import HELD_OUT, KINDS, STRENGTHS, Disturbance, disturb
 from cloning.training import gpu
 from cloning.training.recipe import Recipe
 
+TRAINED = [Disturbance(kind, strength) for kind in KINDS if kind not in HELD_OUT for strength in STRENGTHS]
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour
 WIDTHS, SOFTNESS, RAGGED = (4, 400), (0.3, 4), (0, 25)  # pixels: of a shadow, of its edges' blur, of their displacement
@@ -90,6 +92,26 @@ def relight(image: np.ndarray, colours: np.ndarray, shade: int) -> np.ndarray:
     """Return an image, uint8 (75, 320, 3), in another light; colours: of `tints`; shade: of `sample_shades`."""
     image = cv2.transform(image, colours)
     return image if shade < 0 else cv2.multiply(image, shades()[shade], scale=1 / 255)
+
+
+def sample_disturbances(share: float, rng: np.random.Generator, n: int) -> np.ndarray:
+    """Sample disturbances of kinds that are not held out: int32 (n,), for `disturbed`; -1, none, but for this share."""
+    if not share:
+        return np.full(n, -1, np.int32)
+    return np.where(rng.random(n) < share, rng.integers(len(TRAINED) << 20, size=n), -1).astype(np.int32)
+
+
+def disturbed(image: np.ndarray, disturbance: int) -> np.ndarray:
+    """Return an image, uint8 (75, 320, 3), as it is seen under a disturbance of `sample_disturbances`."""
+    if disturbance < 0:
+        return image
+    which, drive, frame = disturbance >> 20, disturbance >> 15 & 31, disturbance & 0x7FFF
+    return disturb(image, TRAINED[which], drive, frame)
+
+
+def name_of(disturbance: int) -> str:
+    """Return the name of a disturbance of `sample_disturbances`, such as `fog:3`; "" for none."""
+    return "" if disturbance < 0 else str(TRAINED[disturbance >> 20])
 
 
 @functools.cache

@@ -88,8 +88,9 @@ FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
         "steering added to the label of left images, subtracted from that of right ones",
     ),
     "repeats": (number(int, 1, MAX_REPEATS), COPIES),
+    "disturbed": (number(float, 0, 1), "with --robust: share of the images in foul weather, or of a faulty camera"),
 }
-REPORT_ONLY = ("throttle_threshold", "side_correction")
+REPORT_ONLY, ROBUST_ONLY = ("throttle_threshold", "side_correction"), ("disturbed",)
 
 
 def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
@@ -102,9 +103,9 @@ def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
     given = frozenset(values)
     goes_on = values.get("from_model") and recipe_name(values["from_model"]) == robust.name
     recipe = robust if values.pop("robust", goes_on) else report
-    for name in REPORT_ONLY:
-        if recipe is robust and name in given:
-            parser.error(f"{option_name(name)} has no effect with --robust; leave it out")
+    for name in given.intersection(REPORT_ONLY if recipe is robust else ROBUST_ONLY):
+        without = "with" if recipe is robust else "without"
+        parser.error(f"{option_name(name)} has no effect {without} --robust; leave it out")
     recipe = replace(recipe, **{name: values.pop(name) for name in FIGURES if name in values})
     process = Process(**{name: values.pop(name) for name in ("output", "device", "strict", "resume") if name in values})
     if "recordings" in values:

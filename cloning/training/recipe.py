@@ -131,6 +131,7 @@ class Recipe:
     tint: tuple[float, float] = (1.0, 1.0)  # of red, green and blue each,
     dimmed: tuple[float, float] = (1.0, 1.0)  # and of all three
     shaded: float = 0.0  # share of the images with shadows
+    disturbed: float = 0.0  # share of the images in foul weather, or of a dirty or faulty camera
 
     def saved(self) -> dict[str, Any]:
         """Return the recipe as plain values for a checkpoint: functions and augmentations by their names."""
