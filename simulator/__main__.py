@@ -246,6 +246,7 @@ def add_benchmark(commands: "Subparsers") -> None:
         default=Path("benchmark"),
         help="for report.html and benchmark.json (default: %(default)s)",
     )
+    add("--recordings", type=Path, metavar="FOLDER", help="also replay the real recordings of data/README.md in it")
     add_workers(parser)
 
 

@@ -10,6 +10,7 @@ import functools
 import json
 import math
 import re
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import decode
 from cloning.recordings.writer import SampleClock
 from cloning.road.autonomy import autonomy
+from cloning.road.disturbances import Disturbance, Disturber
 from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH
 from cloning.road.track import Track
@@ -45,6 +47,7 @@ WAIT = 60.0  # s for a server's answer
 BUILT_IN = ("straight", "expert")  # drivers that need no camera: steering 0, and the one that drives recordings
 COLOURS = {"RGB": None, "BGR": cv2.COLOR_RGB2BGR, "YUV": cv2.COLOR_RGB2YUV, "HSV": cv2.COLOR_RGB2HSV}
 PREPROCESSING = {"crop": [0, 0], "colour": "RGB", "range": [0, 255]}  # of an ONNX file that says nothing else
+_ALONE = threading.Lock()  # drives of one process share its cameras; a Dask worker may have several threads
 Steering = Callable[[np.ndarray], float]  # -1..1, from a frame, uint8 (160, 320, 3), RGB
 Watch = Callable[[Run, Cameras | None], None]
 
@@ -61,6 +64,7 @@ class Conditions(NamedTuple):
     set_back     after a departure the car is set back onto the lane's centre and goes on, until the time of so many
                  interventions is that of the whole drive; if not, the first departure ends it
     own_throttle a server's throttle counts; if not, the set speed is held as drive.py does it
+    disturbance  of the frames, whose random numbers are the same in each drive; or None
     """
 
     driver: str
@@ -71,6 +75,7 @@ class Conditions(NamedTuple):
     start: tuple[float, float, float] | None = None
     set_back: bool = False
     own_throttle: bool = True
+    disturbance: Disturbance | None = None
 
 
 @dataclass(frozen=True)
@@ -196,6 +201,11 @@ def drive(conditions: Conditions, road: str | PointRoad, watch: Watch | None = N
     A driver is sent the frame, steering, throttle and speed, and not where the car is. watch: called after each physics
     step with the run, and the cameras if the driver needs them.
     """
+    with _ALONE:
+        return _drive_with(conditions, road, watch)
+
+
+def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | None) -> Drive:
     address = server_address(conditions.driver)
     if conditions.driver in BUILT_IN:
         return _drive(conditions, road, None, watch)
@@ -230,13 +240,14 @@ def _cameras() -> list[Cameras]:
 
 
 @functools.lru_cache(maxsize=1)  # of several drives of a road one after another
-def _scene(road: str | PointRoad, look: int) -> Scene:
+def scene_of(road: str | PointRoad, look: int) -> Scene:
+    """Return a road's scene; the same as for the last call, if that was for the same one."""
     return Scene(scenery.build(road, look))
 
 
 def cameras_at(road: str | PointRoad, look: int) -> Cameras:
     """Return this process's cameras, on the car in this scene."""
-    scene, kept = _scene(road, look), _cameras()
+    scene, kept = scene_of(road, look), _cameras()
     if not kept:
         kept.append(Cameras(scene, ("center",)))
     elif kept[0].scene is not scene:
@@ -260,6 +271,7 @@ def _drive(
         run.set_back(offset, conditions.speed * MPH, math.radians(turn))
     cameras = cameras_at(road, conditions.look) if answer else None
     expert = Expert(track, top_speed=conditions.speed * MPH, wander=0) if conditions.driver == "expert" else None
+    disturber = Disturber(conditions.disturbance) if conditions.disturbance else None
     controller, steering, throttle = SpeedController(conditions.speed), 0.0, 0.0
     position = run.car.node.get_pos()
     path = [(position.x, position.y)]
@@ -267,7 +279,11 @@ def _drive(
     while not ended:
         told = Answer()
         if answer and cameras:
-            told = answer(jpeg(cameras.frames(run.car.node.get_transform())[0]), run)
+            frame = cameras.frames(run.car.node.get_transform())[0]
+            if disturber:
+                frame = disturber(frame)
+                cameras.last = frame[None]  # which a film shows
+            told = answer(jpeg(frame), run)
             steering = steering if told.steering is None else told.steering
         throttle = controller.throttle(run.speed_mph) if told.throttle is None else told.throttle
         due = False

@@ -40,21 +40,18 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
         from simulator.record import renderers_context, start_renderer  # needs panda3d
 
         with program.interrupt_deferred():
-            pool = ProcessPoolExecutor(processes, renderers_context(), start_renderer)
-            stack.callback(_end, pool)
+            pool = stack.enter_context(ProcessPoolExecutor(processes, renderers_context(), start_renderer))
             for _ in range(processes):  # each starts a process
                 pool.submit(int)
         try:
             yield pool
         except BrokenExecutor as error:
             raise SimulatorError("a driving process was killed, perhaps for lack of memory") from error
-
-
-def _end(pool: ProcessPoolExecutor) -> None:
-    """End the pool's processes, which after Ctrl-C would drive on to the end of their roads."""
-    for process in multiprocessing.active_children():
-        process.terminate()
-    pool.shutdown(cancel_futures=True)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():  # after Ctrl-C they would drive on to their roads' ends
+                process.terminate()
+            raise
 
 
 def _dask(address: str, stack: ExitStack) -> Executor:

@@ -2,16 +2,16 @@
 
 import argparse
 import functools
-import time
+import hashlib
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cloning.base.outputs import write_json
+from cloning.base.outputs import write_json, write_output
 from cloning.base.progress import progress_bar
 from simulator import driving
-from simulator.benchmark import scores, tasks
+from simulator.benchmark import page, replays, scores, tasks
 from simulator.benchmark.tasks import Task
 from simulator.driving import Drive
 from simulator.workers import started_workers
@@ -38,26 +38,33 @@ def each(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item], 
 
 def run(options: argparse.Namespace) -> None:
     """Drive everything, write the page and the JSON, and print the figures. Raises UserError, OSError."""
-    begin = time.perf_counter()
-    driving.check_driver(options.entry)  # before processes start
-    folder: Path = options.folder
+    entry, folder = options.entry, options.folder
+    driving.check_driver(entry)  # before processes start
+    recordings = replays.folders(options.recordings) if options.recordings else []
     folder.mkdir(parents=True, exist_ok=True)
     chosen = tasks.quick_tasks() if options.quick else tasks.all_tasks()
-    processes = 1 if driving.server_address(options.entry) else options.processes
+    processes = 1 if driving.server_address(entry) else options.processes
     with started_workers(processes, options.scheduler) as pool:
-        done = each(pool, functools.partial(drive, options.entry), chosen, "drive")
-    drives = [scores.driven(task, each) for task, each in zip(chosen, done, strict=True)]
+        done = each(pool, functools.partial(drive, entry), chosen, "drive")
+        drives = [scores.driven(*pair) for pair in zip(chosen, done, strict=True)]
+        clips = each(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film")
+        drives += each(pool, functools.partial(replays.replay, entry), recordings, "recording")
     groups = scores.by_group(drives)
+    file = Path(entry)
     found: dict[str, Any] = {
         "version": tasks.VERSION,
         "quick": options.quick,
-        "entry": options.entry,
+        "entry": file.stem if file.is_file() else entry,
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None,
         "score": scores.score(groups),
         "groups": groups,
         "drives": drives,
     }
     write_json(folder / "benchmark.json", found)
+    write_output(folder / "report.html", page.page(found, clips).encode())
     for group, figures in groups.items():
         print(group, *(f"{name} {value}" for name, value in figures.items()), sep=", ")
-    print(scores.line(Path(options.entry).stem, found))
-    print(f"{time.perf_counter() - begin:.0f} s")
+    if not recordings:
+        print("replays: not run; --recordings names the folder of the recordings")
+    print(f"{folder / 'report.html'}, benchmark.json; the line for LEADERBOARD.md:")
+    print(scores.line(found["entry"], found))

@@ -32,13 +32,18 @@ class Figures(TypedDict):
     mean_m: float
 
 
+def percent(autonomy: float) -> float:
+    """Return the score of a drive, 0..100."""
+    return round(100 * max(0.0, autonomy), DIGITS)
+
+
 def driven(task: Task, drive: Drive) -> Driven:
     """Return what is told of a drive."""
     share = 0.0 if drive.failed else autonomy(len(drive.departures), drive.planned)
     return {
         "group": task.group,
         "name": task.name,
-        "score": round(100 * max(0.0, share), DIGITS),
+        "score": percent(share),
         "departures": [round(departure.time, 2) for departure in drive.departures],
         "ended": drive.ended,
         "mean_m": round(drive.mean, 3),
@@ -65,9 +70,13 @@ def score(groups: dict[str, Figures]) -> float:
     return round(fmean(groups[name]["score"] for name in GROUPS), DIGITS)
 
 
+def away(found: dict[str, Any]) -> float:
+    """Return the mean distance from the lane's centre, m, of all groups alike; found: what the JSON has."""
+    return fmean(found["groups"][group]["mean_m"] for group in GROUPS)
+
+
 def line(name: str, found: dict[str, Any]) -> str:
-    """Return the row of LEADERBOARD.md."""
+    """Return the row of LEADERBOARD.md; found: what the JSON has."""
     groups = found["groups"]
     cells = [f"{groups[group]['score']:.2f}" if group in groups else "-" for group in (*GROUPS, "replays")]
-    away = fmean(groups[group]["mean_m"] for group in GROUPS)
-    return "| " + " | ".join([name, f"**{found['score']:.2f}**", *cells, f"{away:.2f}"]) + " |"
+    return "| " + " | ".join([name, f"**{found['score']:.2f}**", *cells, f"{away(found):.2f}"]) + " |"

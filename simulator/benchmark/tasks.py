@@ -1,10 +1,12 @@
 """What the benchmark drives. Another task, look or limit makes another VERSION, whose scores are not comparable."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from cloning.base.errors import TrackError
+from cloning.road.disturbances import KINDS, STRENGTHS, Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.points import spline_road
 from cloning.road.track import Track
@@ -17,6 +19,7 @@ GROUPS = {
     "roads": "unknown generated roads",
     "splines": "flat roads 8 m wide by the rules of other teams' road tests",
     "off the lane": "starts beside the lane's centre, and turned",
+    "disturbed": "frames disturbed by weather, lens, light, camera and delay",
 }
 # The real recordings, as data/README.md names them, with where they are from
 RECORDINGS = ("lake-ccw", "lake-cw", "jungle", "jungle-shadows")
@@ -38,11 +41,14 @@ class Task(NamedTuple):
     look: int
     metres: float | None = None
     start: tuple[float, float, float] | None = None
+    disturbance: Disturbance | None = None
 
     @property
     def name(self) -> str:
         """What it is called in tables."""
         words = f"{self.road} {self.direction}, {self.speed:g} mph, look {self.look}"
+        if self.disturbance:
+            words += f", {self.disturbance}"
         if self.start:
             s, offset, turn = self.start
             words += f", from {s:.0f} m, {offset:+g} m, {turn:+g}°"
@@ -50,8 +56,8 @@ class Task(NamedTuple):
 
     def conditions(self, driver: str) -> Conditions:
         """Return how a driver drives it: the car is set back after departures, and its speed is held for it."""
-        held = {"set_back": True, "own_throttle": False}
-        return Conditions(driver, self.speed, self.look, self.direction, self.metres, self.start, **held)
+        where = self.speed, self.look, self.direction, self.metres, self.start
+        return Conditions(driver, *where, set_back=True, own_throttle=False, disturbance=self.disturbance)
 
     @property
     def source(self) -> str | PointRoad:
@@ -85,7 +91,7 @@ def all_tasks() -> list[Task]:
     ]
     tasks += [Task("roads", f"road-{n}", way, 15, look_of(n)) for n in range(1, 101) for way in DIRECTIONS]
     tasks += [Task("splines", f"{SPLINE}{n}", "ccw", 15, look_of(n)) for n in range(1, 21)]
-    return tasks + starts(metres=100)
+    return tasks + starts(metres=100) + disturbed(STRENGTHS[2:], metres=400)
 
 
 def quick_tasks() -> list[Task]:
@@ -98,7 +104,7 @@ def quick_tasks() -> list[Task]:
     ]
     tasks += [Task("roads", f"road-{n}", DIRECTIONS[n % 4 // 2], 15, look_of(n), 250) for n in range(3, 100, 13)]
     tasks += [Task("splines", f"{SPLINE}{n}", "ccw", 15, look_of(n)) for n in range(1, 6)]
-    return tasks + starts(metres=60)[::5]
+    return tasks + starts(metres=60)[::5] + disturbed(STRENGTHS[3:4], metres=180)[::3]
 
 
 def starts(metres: float) -> list[Task]:
@@ -109,4 +115,15 @@ def starts(metres: float) -> list[Task]:
         length = Track(road).length
         for i, pose in enumerate(poses):
             tasks.append(Task("off the lane", road, "ccw", 15, look_of(5), metres, (i / len(poses) * length, *pose)))
+    return tasks
+
+
+def disturbed(strengths: Sequence[int], metres: float) -> list[Task]:
+    """Return drives of so many metres with disturbed frames, all around both tracks, for each kind and strength."""
+    every = [Disturbance(kind, strength) for kind in KINDS for strength in strengths]
+    tasks = []
+    for i, disturbance in enumerate(every):
+        for road, way in zip(("lake", "jungle"), DIRECTIONS, strict=True):
+            start = i / len(every) * Track(road).length, 0.0, 0.0
+            tasks.append(Task("disturbed", road, way, 15, look_of(6), metres, start, disturbance))
     return tasks
