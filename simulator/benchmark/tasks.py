@@ -1,5 +1,6 @@
 """What the benchmark drives. Another task, look or limit makes another VERSION, whose scores are not comparable."""
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ from cloning.base.errors import TrackError
 from cloning.road.disturbances import KINDS, STRENGTHS, Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.points import spline_road
-from cloning.road.track import Track
+from cloning.road.track import ROADS, Track
 from simulator.driving import Conditions
 from simulator.scenery.looks import SHADOWED
 
@@ -51,7 +52,7 @@ class Task(NamedTuple):
             words += f", {self.disturbance}"
         if self.start:
             s, offset, turn = self.start
-            words += f", from {s:.0f} m, {offset:+g} m, {turn:+g}°"
+            words += f", from {s:.0f} m" + (f", {offset:+g} m, {turn:+g}°" if offset or turn else "")
         return words + (f", {self.metres:g} m" if self.metres else "")
 
     def conditions(self, driver: str) -> Conditions:
@@ -74,6 +75,12 @@ def unknown_spline(number: int) -> PointRoad:
             return spline_road(np.column_stack([turns, lengths, np.zeros(NODES - 1)]), name=f"{SPLINE}{number}")
         except TrackError:  # it would cross itself
             continue
+
+
+@functools.cache
+def length_of(road: str) -> float:
+    """Return the length of a track, m."""
+    return Track(road).length
 
 
 def look_of(number: int) -> int:
@@ -111,10 +118,10 @@ def starts(metres: float) -> list[Task]:
     """Return drives of so many metres that begin beside the lane's centre, all around both tracks."""
     tasks = []
     poses = [(offset, turn) for offset in OFFSETS for turn in BESIDE]
-    for road in ("lake", "jungle"):
-        length = Track(road).length
+    for road in ROADS:
         for i, pose in enumerate(poses):
-            tasks.append(Task("off the lane", road, "ccw", 15, look_of(5), metres, (i / len(poses) * length, *pose)))
+            start = i / len(poses) * length_of(road), *pose
+            tasks.append(Task("off the lane", road, "ccw", 15, look_of(5), metres, start))
     return tasks
 
 
@@ -123,7 +130,7 @@ def disturbed(strengths: Sequence[int], metres: float) -> list[Task]:
     every = [Disturbance(kind, strength) for kind in KINDS for strength in strengths]
     tasks = []
     for i, disturbance in enumerate(every):
-        for road, way in zip(("lake", "jungle"), DIRECTIONS, strict=True):
-            start = i / len(every) * Track(road).length, 0.0, 0.0
+        for road, way in zip(ROADS, DIRECTIONS, strict=True):
+            start = i / len(every) * length_of(road), 0.0, 0.0
             tasks.append(Task("disturbed", road, way, 15, look_of(6), metres, start, disturbance))
     return tasks
