@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, TypeVar
 
+from cloning.base.errors import UserError
 from cloning.base.outputs import write_json, write_output
 from cloning.base.progress import progress_bar
 from simulator import driving
@@ -40,11 +41,13 @@ def run(options: argparse.Namespace) -> None:
     """Drive everything, write the page and the JSON, and print the figures. Raises UserError, OSError."""
     entry, folder = options.entry, options.folder
     driving.check_driver(entry)  # before processes start
+    server = driving.server_address(entry)
+    if server and options.scheduler:
+        raise UserError(f"{entry}: a server drives one car at a time; leave out --scheduler")
     recordings = replays.folders(options.recordings) if options.recordings else []
     folder.mkdir(parents=True, exist_ok=True)
     chosen = tasks.quick_tasks() if options.quick else tasks.all_tasks()
-    processes = 1 if driving.server_address(entry) else options.processes
-    with started_workers(processes, options.scheduler) as pool:
+    with started_workers(1 if server else options.processes, options.scheduler) as pool:
         done = each(pool, functools.partial(drive, entry), chosen, "drive")
         drives = [scores.driven(*pair) for pair in zip(chosen, done, strict=True)]
         clips = each(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film")
