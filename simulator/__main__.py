@@ -10,6 +10,7 @@ import argparse
 import functools
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloning.base.arguments import MAX_PORT, address, number
@@ -24,6 +25,7 @@ from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.road.points import LAND, MARKING, MAX_WIDTH, MIN_WIDTH, WIDTH, read_road
 from cloning.road.track import ROADS, Track
 from cloning.wire.protocol import PORT
+from simulator.workers import add_workers
 
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -253,13 +255,29 @@ def add_join(commands: "Subparsers") -> None:
     parser.add_argument("-batchmode", action="store_true", help=argparse.SUPPRESS)
 
 
+def add_benchmark(commands: "Subparsers") -> None:
+    """Add `benchmark`."""
+    parser = add_command(commands, run_benchmark, "score a driver on fixed tasks: see LEADERBOARD.md")
+    add = parser.add_argument
+    add("entry", help="model file, .onnx file, HOST:PORT of a server, straight (steering 0) or expert")
+    add("--quick", action="store_true", help="fewer and shorter drives: two minutes on 2 cores, else up to an hour")
+    add(
+        "--folder",
+        type=Path,
+        default=Path("benchmark"),
+        help="for report.html and benchmark.json (default: %(default)s)",
+    )
+    add("--recordings", type=Path, metavar="FOLDER", help="also replay the real recordings of data/README.md in it")
+    add_workers(parser)
+
+
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; its `run` is the command's function."""
     parser = argparse.ArgumentParser(
         prog=program.in_commands("python -m simulator"), description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
-    for add in (add_replay, add_record, add_drive, add_correct, add_window, add_join):
+    for add in (add_replay, add_record, add_drive, add_correct, add_window, add_join, add_benchmark):
         add(commands)
     return parser.parse_args(argv)
 
@@ -406,6 +424,15 @@ def run_join(arguments: argparse.Namespace) -> int:
     if not arguments.launcher:
         return join(arguments, chosen_track(arguments, needs_file=False), given_for_road(arguments))
     write_launcher(arguments)
+    return program.DONE
+
+
+def run_benchmark(arguments: argparse.Namespace) -> int:
+    """Let an entry drive the benchmark's tasks."""
+    with program.loading():
+        from simulator.benchmark import command
+
+    command.run(arguments)
     return program.DONE
 
 

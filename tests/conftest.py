@@ -27,10 +27,14 @@ def pytest_configure():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport():
-    """Where all can be installed, as on GitHub, a skipped test fails unless it lacks recordings or a GPU."""
+    """Where all can be installed, as on GitHub, a skipped test fails unless it lacks recordings, a GPU or Dask."""
     report = yield
     why = str(report.longrepr)
-    if os.environ.get("NO_SKIPS") and report.skipped and real_recordings.MISSING not in why and "a GPU" not in why:
+    if (
+        os.environ.get("NO_SKIPS")
+        and report.skipped
+        and not any(lacking in why for lacking in (real_recordings.MISSING, "a GPU", "'distributed'"))
+    ):
         report.outcome = "failed"
     return report
 

@@ -15,7 +15,7 @@ from real_recordings import FOLDERS, MISSING
 
 from cloning.network.network import SHIPPED_MODEL, load_model
 from cloning.recordings.images import read_frame
-from tools.driving import load_driver
+from simulator.driving import load_driver
 
 
 def run(*arguments, **environment) -> subprocess.CompletedProcess:

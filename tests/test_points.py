@@ -13,7 +13,7 @@ from cloning.lane.known import known_position
 from cloning.recordings.log import read_recording
 from cloning.road.generated import LANDS, MARKINGS, PointRoad
 from cloning.road.motion import MPH
-from cloning.road.points import make_road, read_road
+from cloning.road.points import make_road, read_road, spline_road
 from cloning.road.track import Track
 from simulator import __main__ as simulator
 from simulator import record, report, scenery
@@ -196,3 +196,19 @@ def test_every_marking_and_land_can_be_built():
         road = make_road(BEND, marking=MARKINGS[i % len(MARKINGS)], land=LANDS[i % len(LANDS)])
         assert isinstance(road, PointRoad)
         assert len(scenery.build(road, 10_000 * (i == 1)).meshes) > 4
+
+
+def test_a_spline_road_is_the_catmull_rom_spline_through_its_nodes():
+    steps = np.array([(20, 12, 0.1), (-30, 20, 0), (35, 15, -0.1), (10, 24, 0)], float)
+    points = spline_road(steps).points
+    heading, nodes = 0.0, [np.zeros(3)]
+    for turn, length, grade in steps:
+        heading += np.radians(turn)
+        nodes.append(nodes[-1] + length * np.array([np.cos(heading), np.sin(heading), grade]))
+    assert np.allclose(points[::10], nodes, atol=1e-3)
+    before, first, second, after = nodes[1:5]  # the usual formula, between the third node and the fourth
+    for i in range(11):
+        t = i / 10
+        terms = 2 * first + (second - before) * t + (2 * before - 5 * first + 4 * second - after) * t**2
+        expected = (terms + (3 * first - before - 3 * second + after) * t**3) / 2
+        assert np.allclose(points[20 + i], expected, atol=2e-3)

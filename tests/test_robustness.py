@@ -7,7 +7,8 @@ from rendered import render_recording
 from cloning.network.network import SHIPPED_MODEL
 from cloning.road.disturbances import Disturbance
 from cloning.road.track import Track
-from tools import driving, robustness
+from simulator import driving
+from tools import robustness
 
 
 def test_drives_and_replays_are_measured_once_and_a_run_goes_on(tmp_path, capsys):
@@ -23,8 +24,17 @@ def test_drives_and_replays_are_measured_once_and_a_run_goes_on(tmp_path, capsys
         return next(name for name in found if name.endswith(words))
 
     late = of(" lake cw, 30 mph, look 0, 0.02 laps, late:5")
-    way = ("cw", 0.02 * Track("lake").length, True, Disturbance("late", 5), 1)
-    alone = driving.drive(driving.Conditions(str(SHIPPED_MODEL), 30, 0, *way), "lake")
+    conditions = driving.Conditions(
+        str(SHIPPED_MODEL),
+        30,
+        0,
+        "cw",
+        0.02 * Track("lake").length,
+        set_back=True,
+        disturbance=Disturbance("late", 5),
+        seed=1,
+    )
+    alone = driving.drive(conditions, "lake")
     assert found[late] == {"autonomy": 100, "departures": 0, "distance": round(alone.mean, 3)}
     for course in (" lake cw, 30 mph, look 0, 0.02 laps", f"{folder}"):
         assert found[of(f"{course}, clear")]["distance"] != found[of(f"{course}, late:5")]["distance"]

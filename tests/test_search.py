@@ -10,7 +10,8 @@ from steer_server import STEER, Server
 from cloning.base.program import DONE
 from cloning.network.network import Network, save_model
 from cloning.road.points import make_road, read_road
-from tools import driving, search
+from simulator import driving
+from tools import search
 
 KIND = search.Kind(sharpest=35, steepest=0.2, marking="white", land="meadow")
 

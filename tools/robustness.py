@@ -19,8 +19,7 @@ import itertools
 import json
 import statistics
 from collections.abc import Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
-from contextlib import ExitStack
+from concurrent.futures import Executor, as_completed
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,8 +32,7 @@ import cv2
 import numpy as np
 
 from cloning.base.arguments import number
-from cloning.base.cores import threads
-from cloning.base.errors import SimulatorError, UserError
+from cloning.base.errors import UserError
 from cloning.base.outputs import write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
@@ -47,11 +45,10 @@ from cloning.road.autonomy import LIMITS, autonomy
 from cloning.road.disturbances import HELD_OUT, KINDS, STRENGTHS, Disturbance, Disturber
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
-from simulator.record import renderers_context, start_renderer
+from simulator import driving
 from simulator.run import Run
-from tools import driving
+from simulator.workers import add_workers, started_workers
 from tools.command import command_line, head, row, run_tool
-from tools.search import end
 
 TRACKS, SPEEDS, DIRECTIONS = ("lake", "jungle"), (30.0, 15.0), ("ccw", "cw")  # mph on each
 STAND_IN, REPLAYS = "stand-in simulator", f"replays at {LIMITS[-1]:g} m"
@@ -109,8 +106,17 @@ def measure(drive: Drive) -> Figures:
     """Drive, in any process. Raises UserError."""
     if drive.speed:
         metres = drive.laps * Track(drive.on).length
-        way = (drive.speed, drive.look, drive.direction, metres, True, drive.disturbance, drive.number)
-        driven = driving.drive(driving.Conditions(drive.model, *way), drive.on)
+        conditions = driving.Conditions(
+            drive.model,
+            drive.speed,
+            drive.look,
+            drive.direction,
+            metres,
+            set_back=True,
+            disturbance=drive.disturbance,
+            seed=drive.number,
+        )
+        driven = driving.drive(conditions, drive.on)
         departures = len(driven.departures)
         share = 0.0 if driven.failed else max(0.0, autonomy(departures, driven.planned))
         return Figures(round(100 * share, 2), departures, round(driven.mean, 3))
@@ -123,22 +129,15 @@ def measure(drive: Drive) -> Figures:
     return Figures(metrics["autonomy_percent"], metrics["interventions"], metrics["distance_mean_m"])
 
 
-def measure_all(drives: Sequence[Drive], file: Path, processes: int) -> dict[Drive, Figures]:
+def measure_all(drives: Sequence[Drive], file: Path, workers: Executor) -> dict[Drive, Figures]:
     """Return the figures of all drives; the file gets each as it comes, and may have some. Raises UserError."""
     kept = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
-    with ExitStack() as stack:
-        with program.interrupt_deferred():
-            pool = ProcessPoolExecutor(processes, renderers_context(), start_renderer)
-            stack.callback(end, pool)
-            coming = {pool.submit(measure, drive): str(drive) for drive in drives if str(drive) not in kept}
-        bar = stack.enter_context(progress_bar(len(coming), "drive"))
-        try:
-            for done in as_completed(coming):
-                kept[coming[done]] = done.result()._asdict()
-                write_json(file, dict(sorted(kept.items())))
-                bar.update()
-        except BrokenExecutor as error:
-            raise SimulatorError("a driving process was killed, perhaps for lack of memory; run it again") from error
+    coming = {workers.submit(measure, drive): str(drive) for drive in drives if str(drive) not in kept}
+    with progress_bar(len(coming), "drive") as bar:
+        for done in as_completed(coming):
+            kept[coming[done]] = done.result()._asdict()
+            write_json(file, dict(sorted(kept.items())))
+            bar.update()
     return {drive: Figures(**kept[str(drive)]) for drive in drives}
 
 
@@ -245,7 +244,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--look", type=number(int, 0), default=0, help="light and colours, see README.md (default 0)")
     add("--recordings", nargs="*", default=[], help="to replay, or folders of recordings (default: none)")
     add("--output", type=Path, default=Path("robustness"), help="folder (default: %(default)s)")
-    add("--processes", type=number(int, 1), default=threads(), help="drives at a time (default: cores)")
+    add_workers(parser)
     add("--gallery", metavar="FILE.jpg", help="only write a picture of a frame under all disturbances")
     options = parser.parse_args(argv)
     if options.gallery:
@@ -275,7 +274,8 @@ def main(argv: list[str] | None = None) -> int:
         for file, name, sha256 in models
     ]
     options.output.mkdir(parents=True, exist_ok=True)
-    curves = curves_of(measure_all(drives, options.output / "robustness.json", options.processes))
+    with started_workers(options.processes, options.scheduler) as workers:
+        curves = curves_of(measure_all(drives, options.output / "robustness.json", workers))
     tables = table(curves, kinds, strengths)
     print(tables, end="")
     write_output(options.output / "robustness.md", tables.encode())

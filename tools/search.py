@@ -17,11 +17,8 @@ printed; and failures.png: the roads from above, and where the car left them.
 import functools
 import io
 import itertools
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,23 +30,21 @@ if __name__ == "__main__":
 import numpy as np
 
 from cloning.base.arguments import number
-from cloning.base.cores import threads
-from cloning.base.errors import SimulatorError, TrackError, UserError
+from cloning.base.errors import TrackError, UserError
 from cloning.base.outputs import write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
 from cloning.road.generated import LANDS, MARKINGS, PointRoad
 from cloning.road.motion import TOP_SPEED_MPH
-from cloning.road.points import LAND, MARKING, MAX_GRADE, make_road
+from cloning.road.points import LAND, MARKING, MAX_GRADE, spline_road
 from cloning.road.track import LEFT, RIGHT, Track
-from simulator.record import renderers_context, start_renderer
+from simulator.driving import Conditions, Drive, check_driver, drive
+from simulator.workers import add_workers, started_workers
 from tools.command import command_line, head, row, run_tool
-from tools.driving import Conditions, Drive, check_driver, drive
 
 SEARCHES = ("random", "evolution")
 NODES = (7, 8)  # of a road, with these lengths in m between them, as in maxitwo's and MultiSim's generators
 LENGTHS = (10.0, 25.0)
-PIECE = 10  # points of the spline between two nodes
 POPULATION = 10  # roads that evolution keeps; each has one child in a generation
 MUTATED, MUTATION = 0.3, 1 / 6  # share of a child's nodes that change; standard deviation, as a share of the range
 PLACES = 50  # along a road, at which directions are compared
@@ -77,20 +72,6 @@ class Candidate(NamedTuple):
     road: PointRoad
 
 
-def build(genes: np.ndarray, kind: Kind, name: str) -> PointRoad:
-    """Return the road of these genes. Raises TrackError if it would cross itself or is faulty otherwise."""
-    from scipy.interpolate import CubicHermiteSpline
-
-    turn, length, grade = genes.T
-    heading = np.cumsum(np.radians(turn))
-    steps = length[:, None] * np.column_stack([np.cos(heading), np.sin(heading), grade])
-    nodes = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-    # With these slopes it is the Catmull-Rom spline.
-    spline = CubicHermiteSpline(np.arange(len(nodes)), nodes, np.gradient(nodes, axis=0))
-    points = spline(np.linspace(0, len(steps), PIECE * len(steps) + 1)).round(3)  # mm, as the file has them
-    return make_road(points, marking=kind.marking, land=kind.land, name=name)
-
-
 def make_candidate(rng: np.random.Generator, kind: Kind, name: str, parent: Candidate | None = None) -> Candidate:
     """Return a random road, or a changed parent."""
     least, most = kind.ranges
@@ -103,7 +84,7 @@ def make_candidate(rng: np.random.Generator, kind: Kind, name: str, parent: Cand
             changed = parent.genes + chosen[:, None] * rng.normal(0, 1, parent.genes.shape) * MUTATION * (most - least)
             genes = changed.clip(least, most)
         try:
-            return Candidate(genes, build(genes, kind, name))
+            return Candidate(genes, spline_road(genes, marking=kind.marking, land=kind.land, name=name))
         except TrackError:
             continue
 
@@ -204,13 +185,6 @@ def picture(failures: Sequence[Driven], title: str) -> bytes:
     return image.getvalue()
 
 
-def end(pool: ProcessPoolExecutor) -> None:
-    """End the pool's processes, which after Ctrl-C would drive on to the end of their roads."""
-    for process in multiprocessing.active_children():
-        process.terminate()
-    pool.shutdown(cancel_futures=True)
-
-
 def main(argv: list[str] | None = None) -> int:
     """Search, print a table, and return 1 if a failure was not the same when it was driven again.
 
@@ -230,7 +204,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--look", type=number(int, 0), default=0, help="light and colours, see README.md (default %(default)s)")
     add("--marking", choices=MARKINGS, default=MARKING, help="default: %(default)s")
     add("--land", choices=LANDS, default=LAND, help="default: %(default)s")
-    add("--processes", type=number(int, 1), default=threads(), help="drives at a time (default: cores)")
+    add_workers(parser)
     options = parser.parse_args(argv)
     check_driver(options.driver)  # before processes start
     folder: Path = options.folder
@@ -240,21 +214,13 @@ def main(argv: list[str] | None = None) -> int:
     kind = Kind(options.max_angle, options.hills, options.marking, options.land)
     work = functools.partial(drive, Conditions(options.driver, options.speed, options.look))
     searches, failures = [], []
-    with ExitStack() as stack:
-        with program.interrupt_deferred():
-            pool = ProcessPoolExecutor(options.processes, renderers_context(), start_renderer)
-            stack.callback(end, pool)
-            for _ in range(options.processes):  # each starts a process
-                pool.submit(int)
-        try:
-            for seed, search in itertools.product(options.seeds, options.searches):
-                figures, failed = run_search(
-                    folder, search, seed, options.roads, kind, lambda roads: list(pool.map(work, roads))
-                )
-                searches.append(figures)
-                failures += failed
-        except BrokenExecutor as error:
-            raise SimulatorError("a driving process was killed, perhaps for lack of memory") from error
+    with started_workers(options.processes, options.scheduler) as pool:
+        for seed, search in itertools.product(options.seeds, options.searches):
+            figures, failed = run_search(
+                folder, search, seed, options.roads, kind, lambda roads: list(pool.map(work, roads))
+            )
+            searches.append(figures)
+            failures += failed
     print(head(*searches[0]))
     for figures in searches:
         print(row(*("" if value is None else value for value in figures.values())))

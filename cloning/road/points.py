@@ -37,6 +37,7 @@ SHOULDER = 1.0  # m between the edges of two parts of a road
 SAME_POINT = 0.01  # m: nearer points are one
 LEADS = (30.0, 15.0, 5.0)  # m: an open road goes on so far beyond its ends, if there is room
 MAX_BYTES = 4_000_000  # of a file
+SPLINE_PIECES = 10  # points of a spline between two nodes
 
 
 def make_road(
@@ -85,6 +86,24 @@ def make_road(
     if reason and checked:
         raise TrackError(reason)
     return road
+
+
+def spline_road(steps: np.ndarray, **options: Any) -> PointRoad:
+    """Return an open road whose centre line is a Catmull-Rom spline, as programs of road tests make them.
+
+    steps: float64 (nodes - 1, 3), to each node from that before: the turn in degrees, the distance in m, and the grade;
+    options: of `make_road`, whose errors are raised.
+    """
+    from scipy.interpolate import CubicHermiteSpline
+
+    turn, length, grade = steps.T
+    heading = np.cumsum(np.radians(turn))
+    moves = length[:, None] * np.column_stack([np.cos(heading), np.sin(heading), grade])
+    nodes = np.vstack([np.zeros(3), np.cumsum(moves, axis=0)])
+    # With these slopes it is the Catmull-Rom spline.
+    spline = CubicHermiteSpline(np.arange(len(nodes)), nodes, np.gradient(nodes, axis=0))
+    points = spline(np.linspace(0, len(moves), SPLINE_PIECES * len(moves) + 1))
+    return make_road(points.round(3), **options)  # mm, as files have them
 
 
 def _numbers(points: Iterable[Sequence[float]]) -> np.ndarray:

@@ -1,0 +1,70 @@
+"""The page about a benchmark, one file with everything in it."""
+
+import base64
+import tempfile
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+
+from simulator import driving
+from simulator.benchmark import scores
+from simulator.benchmark.scores import Driven
+from simulator.benchmark.tasks import GROUPS, Task
+from simulator.cameras import Cameras
+from simulator.film import ChaseFilm
+from simulator.run import Run
+
+SHOWN = 4.0  # s before the car leaves the road, in a film
+
+
+class Clip(NamedTuple):
+    """The film of a failure; again: whether the car left the road at the same moment when it was filmed."""
+
+    name: str
+    film: str  # data URI
+    again: bool
+
+
+def failures(tasks: Sequence[Task], drives: Sequence[Driven]) -> list[tuple[Task, float]]:
+    """Return the worst drive of each group in which the car left the road, and after how many s it first did."""
+    worst: dict[str, tuple[Task, Driven]] = {}
+    for task, drive in zip(tasks, drives, strict=True):
+        if drive["departures"] and (task.group not in worst or drive["score"] < worst[task.group][1]["score"]):
+            worst[task.group] = task, drive
+    return [(task, drive["departures"][0]) for task, drive in worst.values()]
+
+
+def film(driver: str, failure: tuple[Task, float]) -> Clip:
+    """Drive a task again until the car leaves the road, and film the last seconds. Raises UserError."""
+    task, until = failure
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "clip.mp4"
+        shown = ChaseFilm(str(path), driving.scene_of(task.source, task.look), start=max(0.0, until - SHOWN))
+
+        def watch(run: Run, cameras: Cameras | None) -> None:
+            shown.cameras = cameras
+            shown.watch(run)
+
+        drive = driving.drive(task.conditions(driver)._replace(set_back=False), task.source, watch)
+        shown.close()
+        data = base64.b64encode(path.read_bytes()).decode()
+    again = [round(departure.time, 2) for departure in drive.departures] == [until]
+    return Clip(task.name, f"data:video/mp4;base64,{data}", again)
+
+
+def page(found: dict[str, Any], clips: Sequence[Clip]) -> str:
+    """Return the page; found: what the JSON has."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
+        autoescape=True,
+        trim_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    style = (resources.files("cloning.server") / "static" / "style.css").read_text(encoding="utf-8")
+    about = {**GROUPS, "replays": "real recordings, replayed; not part of the score"}
+    return environment.get_template("report.html").render(
+        found=found, clips=clips, style=style, about=about, seconds=SHOWN, away=scores.away(found)
+    )

@@ -1,0 +1,312 @@
+"""How a driver drives a road: a model file, an ONNX file or a server, as `simulator drive` does it, or one built in.
+
+An ONNX file whose network does not take the simulator's frames as they are needs a file beside it, of the same name
+with the ending .json, such as `{"crop": [60, 25], "colour": "YUV", "range": [-1, 1]}`: the rows that are cut off at the
+top and the bottom, the colour space, and what 0 and 255 become. Without it, or without one of them, frames are not cut,
+are RGB, and are not scaled. After the cut a frame gets the height and width that the file's input has.
+"""
+
+import functools
+import json
+import math
+import re
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cloning.base.errors import SimulatorError, UserError
+from cloning.base.frame import FRAME
+from cloning.network.compute import one_thread
+from cloning.network.network import load_model, steer
+from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.images import decode
+from cloning.recordings.writer import SampleClock
+from cloning.road.autonomy import autonomy
+from cloning.road.disturbances import Disturbance
+from cloning.road.generated import PointRoad
+from cloning.road.motion import MPH
+from cloning.road.track import Track
+from cloning.server.speed import SpeedController
+from cloning.server.telemetry import format_number
+from cloning.wire.client import Answer, ConnectionLost, telemetry_packet
+from cloning.wire.session import ClientSession
+from simulator import scenery
+from simulator.cameras import Cameras, jpeg
+from simulator.expert import Expert
+from simulator.run import Departure, Run
+from simulator.world import Scene, free_unused
+
+PATIENCE = 30.0  # s that a drive may take beyond twice the time at its set speed
+WAIT = 60.0  # s for a server's answer
+BUILT_IN = ("straight", "expert")  # drivers that need no camera: steering 0, and the one that drives recordings
+COLOURS = {"RGB": None, "BGR": cv2.COLOR_RGB2BGR, "YUV": cv2.COLOR_RGB2YUV, "HSV": cv2.COLOR_RGB2HSV}
+PREPROCESSING = {"crop": [0, 0], "colour": "RGB", "range": [0, 255]}  # of an ONNX file that says nothing else
+_ALONE = threading.Lock()  # drives of one process share its cameras; a Dask worker may have several threads
+Steering = Callable[[np.ndarray], float]  # -1..1, from a frame, uint8 (160, 320, 3), RGB
+Watch = Callable[[Run, Cameras | None], None]
+
+
+class Conditions(NamedTuple):
+    """How a road is driven.
+
+    driver       a model file, an .onnx file, HOST:PORT of a server, or one of BUILT_IN
+    speed, look  mph; see README.md
+    direction    "ccw", "cw", or None for that of the real simulator, or in which the road's points are listed
+    metres       to drive; None: the whole road
+    start        m along the track, m to the right and degrees turned to the right, at which the car starts at its set
+                 speed; None: at rest where the autonomous mode starts
+    set_back     after a departure the car is set back onto the lane's centre and goes on, until the time of so many
+                 interventions is that of the whole drive; if not, the first departure ends it
+    own_throttle a server's throttle counts; if not, the set speed is held as drive.py does it
+    disturbance  of the frames, or None; seed: the same disturbs them in the same way
+    """
+
+    driver: str
+    speed: float
+    look: int
+    direction: str | None = None
+    metres: float | None = None
+    start: tuple[float, float, float] | None = None
+    set_back: bool = False
+    own_throttle: bool = True
+    disturbance: Disturbance | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How a road was driven.
+
+    farthest    m from the lane's centre
+    seconds     simulated, until the car arrived or failed
+    ended       "arrived", "left" or "right" for the side on which the car left the road for good, or "late"
+    along       m along the road where the drive ended
+    path        x, y of the car in m, one for each frame
+    mean        m from the lane's centre, on average
+    planned     s that it would have taken at its set speed
+    departures  from the road
+    """
+
+    farthest: float
+    seconds: float
+    ended: str
+    along: float
+    path: tuple[tuple[float, float], ...]
+    mean: float = 0.0
+    planned: float = 0.0
+    departures: tuple[Departure, ...] = ()
+
+    @property
+    def failed(self) -> bool:
+        """Whether the driver failed."""
+        return self.ended != "arrived"
+
+    def figures(self) -> dict[str, str | float]:
+        """Return what people want to know of it."""
+        rounded = {"farthest_m": self.farthest, "seconds": self.seconds, "along_m": self.along}
+        return {"ended": self.ended} | {name: round(value, 2) for name, value in rounded.items()}
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Drivers
+
+
+@functools.cache
+def load_driver(driver: str) -> Steering:
+    """Return what computes the steering, -1..1, from a frame, uint8 (160, 320, 3). Raises UserError."""
+    if not driver.endswith(".onnx"):
+        one_thread()
+        network = load_model(driver)
+        return lambda frame: float(steer(network, frame))
+    try:
+        import onnxruntime  # an optional library
+    except ImportError as error:
+        raise UserError(f"{error}; pip install onnxruntime") from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    try:
+        session = onnxruntime.InferenceSession(driver, options)
+    except Exception as error:  # onnxruntime has its own, without a common class
+        raise UserError(f"{driver}: {str(error)[:200]}") from None
+    taken = session.get_inputs()[0]
+    prepare = preprocessing(Path(driver).with_suffix(".json"), taken.shape, taken.type == "tensor(uint8)")
+
+    def steering(frame: np.ndarray) -> float:
+        found = session.run(None, {taken.name: prepare(frame)})[0].flat[0]
+        if not np.isfinite(found):
+            raise ArithmeticError("the network's steering is not finite")
+        return float(np.clip(found, -1, 1))
+
+    steering(np.zeros(FRAME, np.uint8))
+    return steering
+
+
+def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray], np.ndarray]:
+    """Return what makes an ONNX network's input of a frame; file: see above, may be missing.
+
+    shape: of the input, (n, rows, columns, 3) or (n, 3, rows, columns); texts or None for sizes that are free; whole:
+    it takes uint8, else float32. Raises UserError.
+    """
+    try:
+        said = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        (top, bottom), colour, (low, high) = ({**PREPROCESSING, **said}[name] for name in PREPROCESSING)
+        conversion, scale = COLOURS[colour], (high - low) / 255
+        last = shape[-1] == 3
+        rows, columns = shape[1:3] if last else shape[2:]
+        size = (columns, rows) if type(rows) is type(columns) is int else None
+        unknown = set(said) - set(PREPROCESSING)
+        if unknown or not 0 <= top < FRAME[0] - bottom <= FRAME[0] or len(shape) != 4 or 3 not in (shape[1], shape[3]):
+            raise ValueError(f"shape {shape}, {said}")
+    except (ValueError, TypeError, KeyError, OSError) as error:
+        wanted = f"it may have {json.dumps(PREPROCESSING)} with other values, and colours {', '.join(COLOURS)}"
+        raise UserError(f"{file}: does not tell how frames become the network's input ({error!r}); {wanted}") from None
+
+    def prepare(frame: np.ndarray) -> np.ndarray:
+        image = frame[top : FRAME[0] - bottom]
+        image = cv2.resize(image, size) if size and size != (image.shape[1], image.shape[0]) else image
+        image = image if conversion is None else cv2.cvtColor(np.ascontiguousarray(image), conversion)
+        image = image if last else image.transpose(2, 0, 1)
+        return np.ascontiguousarray(image if whole else (image * scale + low).astype(np.float32))[None]
+
+    return prepare
+
+
+def server_address(driver: str) -> tuple[str, int] | None:
+    """Return the host and port that a driver is, None if it is a file or built in."""
+    match = re.fullmatch(r"([\w.-]+):(\d{1,5})", driver)
+    return (match[1], int(match[2])) if match else None
+
+
+def check_driver(driver: str) -> None:
+    """Raise UserError if there is no such file or server."""
+    if address := server_address(driver):
+        with closing(ClientSession(*address, WAIT)) as session:
+            session.connect()
+    elif driver not in BUILT_IN:
+        load_driver(driver)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Driving
+
+
+def drive(conditions: Conditions, road: str | PointRoad, watch: Watch | None = None) -> Drive:
+    """Drive a road as `python -m simulator drive` and drive.py do; road: as `Track` takes it. Raises UserError.
+
+    A driver is sent the frame, steering, throttle and speed, and not where the car is. watch: called after each physics
+    step with the run, and the cameras if the driver needs them.
+    """
+    with _ALONE:
+        return _drive_with(conditions, road, watch)
+
+
+def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | None) -> Drive:
+    address = server_address(conditions.driver)
+    if conditions.driver in BUILT_IN:
+        return _drive(conditions, road, None, watch)
+    if address is None:
+        steering = load_driver(conditions.driver)
+
+        def answer(image: bytes, run: Run) -> Answer:
+            return Answer(float(format_number(steering(decode(image)))))
+
+        try:
+            return _drive(conditions, road, answer, watch)
+        except ArithmeticError as error:
+            raise SimulatorError(f"{conditions.driver}: {error}; train the model again") from None
+    with closing(ClientSession(*address, WAIT)) as session:
+
+        def request(image: bytes, run: Run) -> Answer:
+            answer = session.request_answer(telemetry_packet(run.steering, run.throttle, run.speed_mph, image))
+            return answer if conditions.own_throttle else Answer(answer.steering)
+
+        try:
+            session.connect()
+            session.receive_greeting()
+            return _drive(conditions, road, request, watch)
+        except ConnectionLost as error:
+            raise SimulatorError(f"{conditions.driver}: {error}; restart the server") from None
+
+
+@functools.cache
+def _cameras() -> list[Cameras]:
+    """Return the list for this process's cameras, which move from road to road: new ones for each would add up."""
+    return []
+
+
+@functools.lru_cache(maxsize=1)  # of several drives of a road one after another
+def scene_of(road: str | PointRoad, look: int) -> Scene:
+    """Return a road's scene; the same as for the last call, if that was for the same one."""
+    return Scene(scenery.build(road, look))
+
+
+def cameras_at(road: str | PointRoad, look: int) -> Cameras:
+    """Return this process's cameras, on the car in this scene."""
+    scene, kept = scene_of(road, look), _cameras()
+    if not kept:
+        kept.append(Cameras(scene, ("center",)))
+    elif kept[0].scene is not scene:
+        kept[0].move(scene)
+        free_unused()
+    return kept[0]
+
+
+def _drive(
+    conditions: Conditions,
+    road: str | PointRoad,
+    answer: Callable[[bytes, Run], Answer] | None,
+    watch: Watch | None,
+) -> Drive:
+    track = Track(road, conditions.direction)
+    run, clock = Run(track, "autonomous"), SampleClock(1 / SAMPLE_RATE)
+    length = conditions.metres or track.length
+    planned = length / (conditions.speed * MPH)
+    if conditions.start:
+        run.s, offset, turn = conditions.start
+        run.set_back(offset, conditions.speed * MPH, math.radians(turn))
+    cameras = cameras_at(road, conditions.look) if answer else None
+    if cameras:
+        cameras.disturb(conditions.disturbance, conditions.seed)
+    expert = Expert(track, top_speed=conditions.speed * MPH, wander=0) if conditions.driver == "expert" else None
+    controller, steering, throttle = SpeedController(conditions.speed), 0.0, 0.0
+    position = run.car.node.get_pos()
+    path = [(position.x, position.y)]
+    late, ended = PATIENCE + 2 * planned, ""
+    while not ended:
+        told = Answer()
+        if answer and cameras:
+            told = answer(jpeg(cameras.frames(run.car.node.get_transform())[0]), run)
+            steering = steering if told.steering is None else told.steering
+        throttle = controller.throttle(run.speed_mph) if told.throttle is None else told.throttle
+        due = False
+        while not (due or ended):
+            if not run.advance(expert.drive(run)[0] if expert else steering, throttle):
+                if conditions.set_back and autonomy(len(run.departures), planned) > 0:
+                    run.set_back()
+                else:
+                    ended = run.departures[-1].side
+            elif run.travelled >= length:
+                ended = "arrived"
+            elif run.time > late:
+                ended = "late"
+            if watch:
+                watch(run, cameras)
+            due = clock.due(run.time)
+        path.append((run.trajectory.x[-1], run.trajectory.y[-1]))
+    offsets = np.abs(run.trajectory.offset)
+    return Drive(
+        farthest=float(offsets.max()),
+        seconds=run.time,
+        ended=ended,
+        along=float(run.s),
+        path=tuple(path),
+        mean=float(offsets.mean()),
+        planned=planned,
+        departures=tuple(run.departures),
+    )

@@ -1,0 +1,68 @@
+"""Where independent drives run: in processes of this machine, or on many machines as Dask's workers.
+
+Each is a `concurrent.futures` executor. What it runs must give the same result wherever and however often it is run:
+Dask runs again what a worker did not finish that was killed.
+"""
+
+import argparse
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+
+from cloning.base import program
+from cloning.base.arguments import number
+from cloning.base.cores import threads
+from cloning.base.errors import SimulatorError, UserError
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add the options `processes` and `scheduler`, which `started_workers` takes."""
+    parser.add_argument("--processes", type=number(int, 1), default=threads(), help="drives at a time (default: cores)")
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="drive on the workers of Dask's scheduler there, such as 192.168.0.7:8786, instead of in --processes; the "
+        "project is installed, and the driver's file is in the same place, on each",
+    )
+
+
+@contextmanager
+def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Executor]:
+    """A context with an executor; call it in the main thread. At its end, nothing runs there any more.
+
+    Raises SimulatorError if a process was killed, UserError if there is no such scheduler.
+    """
+    with ExitStack() as stack:
+        if scheduler:
+            yield _dask(scheduler, stack)
+            return
+        from simulator.record import renderers_context, start_renderer  # needs panda3d
+
+        with program.interrupt_deferred():
+            pool = stack.enter_context(ProcessPoolExecutor(processes, renderers_context(), start_renderer))
+            for _ in range(processes):  # each starts a process
+                pool.submit(int)
+        try:
+            yield pool
+        except BrokenExecutor as error:
+            raise SimulatorError("a driving process was killed, perhaps for lack of memory") from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():  # after Ctrl-C they would drive on to their roads' ends
+                process.terminate()
+            raise
+
+
+def _dask(address: str, stack: ExitStack) -> Executor:
+    try:
+        from distributed import Client  # an optional library
+    except ImportError as error:
+        raise UserError(f"{error}; pip install distributed") from None
+    try:
+        client = stack.enter_context(Client(address))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{address}: {error}; start one with `dask scheduler`") from None
+    executor = client.get_executor(pure=False)
+    stack.callback(executor.shutdown, wait=False)
+    return executor

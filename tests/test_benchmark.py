@@ -1,0 +1,192 @@
+"""The benchmark: its tasks, its score, its entries, and the same figures wherever its drives run."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+from commands import HERE, ROOT
+from steer_server import STEER, Server
+
+from cloning.base.errors import UserError
+from cloning.base.program import DONE
+from cloning.road.autonomy import INTERVENTION_TIME
+from cloning.road.disturbances import Disturbance
+from cloning.road.motion import MPH
+from cloning.road.track import Track
+from cloning.wire.client import parse_event
+from simulator import __main__, driving
+from simulator.benchmark import scores, tasks
+from simulator.benchmark.command import drive, run
+from simulator.benchmark.tasks import Task
+from simulator.run import Departure
+from simulator.workers import started_workers
+
+TINY = [
+    Task("tracks", "lake", "cw", 30, 10001, 15),
+    Task("roads", "road-1", "ccw", 15, 1, 15),
+    Task("splines", "spline-1", "ccw", 15, 1, 30),
+    Task("off the lane", "lake", "ccw", 15, 1, 40, (700.0, 2.0, 15.0)),
+    Task("disturbed", "lake", "ccw", 15, 1, 10, (100.0, 0.0, 0.0), Disturbance("late", 3)),
+]
+
+
+def test_the_tasks_are_what_the_rules_say():
+    whole, quick = tasks.all_tasks(), tasks.quick_tasks()
+    for chosen in (whole, quick):
+        assert len({task.name for task in chosen}) == len(chosen)
+        assert {task.group for task in chosen} == set(tasks.GROUPS)
+        assert all(1 <= task.look % 10_000 <= 1000 and task.look < 20_000 for task in chosen)  # never trained on
+    unknown = [(task.road, task.direction) for task in whole if task.group == "roads"]
+    assert sorted(unknown) == sorted((f"road-{n}", way) for n in range(1, 101) for way in ("ccw", "cw"))
+    assert sum(task.group == "splines" for task in whole) == 20
+
+
+def test_roads_by_other_teams_rules():
+    """Nodes are 10 to 25 m apart, and from one to the next the road turns by at most 35°."""
+    roads = [tasks.unknown_spline(number) for number in range(1, 21)]
+    assert roads[4] == tasks.unknown_spline(5) and len(set(roads)) == 20
+    for road in roads:
+        nodes = road.points[::10]
+        steps = np.diff(nodes[:, :2], axis=0)
+        turn = np.degrees(np.diff(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))))
+        assert len(nodes) == 8 and np.abs(turn).max() < 35.1 and not road.closed and road.width == 8
+        assert np.linalg.norm(steps, axis=1).min() > 9.9 and np.linalg.norm(steps, axis=1).max() < 25.1
+        assert np.ptp(road.points[:, 2]) == 0
+    assert max(np.abs(Track(road).curvature).max() for road in roads) > 1 / 20
+
+
+def driven(task, departures, planned, ended="arrived"):
+    places = tuple(Departure(float(n), 0, 5, 0, 0, "left") for n in range(departures))
+    return scores.driven(task, driving.Drive(3, planned, ended, 10, (), 0.5, planned, places))
+
+
+def test_the_score_is_the_rules_formula():
+    assert driven(TINY[0], 2, 30)["score"] == 60  # 100 (1 - 2 * 6 s / 30 s)
+    assert driven(TINY[0], 9, 30)["score"] == 0
+    assert driven(TINY[0], 0, 30, "late")["score"] == 0
+    drives = [driven(task, n, 60) for n, task in enumerate(TINY)]  # 100, 90, 80, 70, 60
+    replays = driven(TINY[0]._replace(group="replays"), 10, 60)
+    groups = scores.by_group([*drives, driven(TINY[0], 5, 60), replays])
+    assert groups["tracks"]["score"] == 75 and groups["tracks"]["departures"] == 5
+    assert scores.score(groups) == (75 + 90 + 80 + 70 + 60) / 5
+    row = scores.line("mine", {"groups": groups, "score": scores.score(groups)})
+    assert row == "| mine | **75.00** | 75.00 | 90.00 | 80.00 | 70.00 | 60.00 | 0.00 | 0.50 |"
+    head = next(line for line in (ROOT / "LEADERBOARD.md").read_text(encoding="utf-8").splitlines() if line[:1] == "|")
+    assert row.count("|") == head.count("|")
+
+
+def test_a_drive_goes_on_after_a_departure_until_it_can_score_nothing():
+    task = Task("tracks", "jungle", "cw", 15, 1, 300)
+    done = drive("straight", task)
+    planned = 300 / (15 * MPH)
+    assert done.failed and done.planned == pytest.approx(planned)
+    assert len(done.departures) == np.ceil(planned / INTERVENTION_TIME) and done.seconds < planned
+    assert not drive("expert", task).departures
+
+
+def test_a_server_is_told_no_place_and_its_speed_is_held_for_it():
+    told = []
+
+    def answer(packet, n):
+        told.append(packet)
+        return [STEER % ("0", "0")]
+
+    with Server(answer) as server:
+        done = drive(f"127.0.0.1:{server.port}", TINY[1])
+    assert done.ended == "arrived" and 2 < done.seconds < 8  # 15 m, at first at rest
+    fields = {"steering_angle", "throttle", "speed", "image"}
+    assert {key for packet in told for key in (parse_event(packet) or ("", {}))[1]} == fields
+
+
+def onnx_file(path, shape, axes, kind):
+    """A network that steers by the mean over these axes of its input, of which it returns the first number."""
+    from onnx import TensorProto, helper, save
+
+    nodes = [
+        helper.make_node("Cast", ["frames"], ["numbers"], to=TensorProto.FLOAT),
+        helper.make_node("ReduceMean", ["numbers"], ["steering"], axes=axes, keepdims=0),
+    ]
+    taken = helper.make_tensor_value_info("frames", kind, shape)
+    given = helper.make_tensor_value_info("steering", TensorProto.FLOAT, None)
+    graph = helper.make_graph(nodes, "mean", [taken], [given])
+    save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
+    return str(path)
+
+
+@pytest.mark.parametrize(("shape", "axes"), [((1, 66, 200, 3), [1, 2]), ((None, 3, 66, 200), [2, 3])])
+def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape, axes):
+    """By the definition of YUV: Y of pure red is 0.299 of white's."""
+    file = onnx_file(tmp_path / "keras.onnx", shape, axes, kind=1)
+    about = {"crop": [60, 25], "colour": "YUV", "range": [-1, 1]}
+    (tmp_path / "keras.json").write_text(json.dumps(about), encoding="utf-8")
+    frame = np.full((160, 320, 3), 255, np.uint8)  # white where it is cut off
+    frame[60:135] = (255, 0, 0)
+    assert driving.load_driver(file)(frame) == pytest.approx(2 * 0.299 - 1, abs=0.005)
+    driving.load_driver.cache_clear()
+    for wrong in ('{"crop": [100, 60]}', '{"colour": "CMYK"}', '{"scale": 2}', "[]", "{"):
+        (tmp_path / "keras.json").write_text(wrong, encoding="utf-8")
+        with pytest.raises(UserError, match=r"keras\.json: does not tell"):
+            driving.load_driver(file)
+
+
+def test_without_that_file_frames_are_as_the_simulator_sends_them(tmp_path):
+    file = onnx_file(tmp_path / "own.onnx", (None, 160, 320, 3), [1, 2], kind=2)
+    assert driving.load_driver(file)(np.full((160, 320, 3), (0, 200, 200), np.uint8)) == 0
+    prepare = driving.preprocessing(tmp_path / "none.json", [1, 160, 320, 3], whole=True)
+    frame = np.random.default_rng(0).integers(0, 256, (160, 320, 3), np.uint8)
+    assert np.array_equal(prepare(frame)[0], frame)
+
+
+def test_the_command_scores_the_same_on_one_process_and_on_two(model_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tasks, "quick_tasks", lambda: TINY)
+    written = []
+    for processes in (1, 2):
+        folder = tmp_path / str(processes)
+        words = [str(model_file), "--quick", "--folder", str(folder), "--processes", str(processes)]
+        assert __main__.main(["benchmark", *words]) == DONE
+        printed = capsys.readouterr().out
+        written.append((folder / "benchmark.json").read_bytes())
+    found = json.loads(written[0])
+    assert written[0] == written[1]
+    assert printed.splitlines()[-1] == scores.line("model", found) and "replays: not run" in printed
+    page = (tmp_path / "2" / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:video/mp4") >= 1 and "drove differently" not in page
+    assert all(task.name in page for task in TINY)
+
+
+def test_real_recordings_that_are_missing_are_told_before_anything_is_driven(tmp_path):
+    with pytest.raises(UserError, match=r"lake-ccw: no driving_log\.csv; data/README\.md says where"):
+        run(__main__.parse_arguments(["benchmark", "straight", "--recordings", str(tmp_path)]))
+
+
+def test_drives_give_the_same_on_dasks_workers_of_which_one_is_killed(tmp_path):
+    pytest.importorskip("distributed")
+    file, processes = tmp_path / "scheduler.json", []
+
+    def start(*words):
+        command = [sys.executable, "-m", "dask", *map(str, words), "--scheduler-file", str(file)]
+        processes.append(subprocess.Popen(command, env={**os.environ, **HERE}, stderr=subprocess.DEVNULL))
+
+    try:
+        start("scheduler", "--port", 0, "--no-dashboard")
+        for _ in range(2):
+            start("worker", "--nthreads", 1, "--no-nanny", "--no-dashboard")
+        while not file.exists():
+            time.sleep(0.1)
+        address = json.loads(file.read_text(encoding="utf-8"))["address"]
+        every = [task._replace(look=look) for look in (1, 2, 3) for task in TINY]
+        with started_workers(1, address) as pool:
+            results = pool.map(partial(drive, "straight"), every)
+            done = [next(results)]
+            processes[1].kill()
+            done += results
+        assert done == [drive("straight", task) for task in every]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
