@@ -13,6 +13,7 @@ from browser import LOOKS, chromium, needs_chromium
 from commands import ROOT, log
 
 from cloning.replay.score import YARDSTICKS
+from cloning.report import content
 from cloning.training.summary import csv_bytes
 
 
@@ -72,6 +73,12 @@ def test_the_report_contains_the_run(written, finished):
     assert "The lake : 1138 m at 30 mph, never left the road; 0.07 m from the centre line on average" in text
     assert "//" not in re.sub(r'<style>.*?</style>|"data:[^"]*"', "", page, flags=re.DOTALL), "no outside host"
     assert len(page) < 15e6
+
+
+def test_a_long_film_stays_a_file(written, monkeypatch):
+    monkeypatch.setattr(content, "FILM", 3)
+    lap = content.Lap.of(written / "The lake.png", written.parent)
+    assert lap.film == "my%20run/The%20lake.mp4"
 
 
 def test_the_report_is_written_as_markdown(written):

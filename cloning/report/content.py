@@ -1,10 +1,12 @@
 """What a report contains: figures, tables and pictures of a run, and the page made of them."""
 
 import json
+import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import jinja2
 import numpy as np
@@ -32,6 +34,7 @@ from cloning.training.run_files import RunFiles
 from cloning.training.summary import VERDICTS, duration
 
 EXAMPLES = {"a bend to the left": 0.05, "hardly a bend": 0.5, "a bend to the right": 0.95}  # quantiles of the steering
+FILM = 4_000_000  # bytes of a film that is in the page: a page should have less than 15 MB
 SHOWN = 6  # interventions of each replay that are shown
 DRIVERS = {"network": "the network", **YARDSTICKS, ORACLE: "recovery steering"}  # rows of the table of replays
 PICTURES = ("LRC_", "augmented-")  # of the training: the three cameras' images, and those made from them
@@ -56,7 +59,7 @@ class Lap(NamedTuple):
 
     title          the name of its picture
     figures        in words; "" if its report is not beside the picture
-    picture, film  data URIs; film: "" if it is not beside the picture
+    picture, film  data URIs; film: the address of the file if it is longer than FILM, "" if there is none
     """
 
     title: str
@@ -65,14 +68,20 @@ class Lap(NamedTuple):
     film: str
 
     @classmethod
-    def of(cls, picture: Path) -> "Lap":
-        """Read a lap's picture, and its report and film if they are beside it. Raises UserError, OSError."""
+    def of(cls, picture: Path, folder: Path) -> "Lap":
+        """Read a lap's picture, and its report and film if they are beside it; folder: of the page.
+
+        Raises UserError, OSError.
+        """
         report, film = picture.with_suffix(".json"), picture.with_suffix(".mp4")
         try:
             figures = lap_in_words(json.loads(report.read_bytes())) if report.exists() else ""
         except (ValueError, LookupError, TypeError) as error:
             raise UserError(f"{report}: not a report of `simulator drive` ({error!r}); make it again") from None
-        shown = uri(film.read_bytes(), "video/mp4") if film.exists() else ""
+        shown = ""
+        if film.exists():
+            long = film.stat().st_size > FILM
+            shown = quote(os.path.relpath(film, folder)) if long else uri(film.read_bytes(), "video/mp4")
         return cls(picture.stem, figures, picture_uri(picture), shown)
 
 
@@ -101,7 +110,7 @@ class Report:
         self.network = load_model(self.model)
         self.arguments = files.arguments
         self.recipe = json.loads(self.arguments.read_bytes()).get("recipe")
-        self.laps = [Lap.of(picture) for picture in laps]
+        self.laps = [Lap.of(picture, folder) for picture in laps]
         numbers = self.run["pictures"]
         self.augmentations = [
             (number, *(picture_uri(files.pictures / f"training_generator_{kind}{number}.png") for kind in PICTURES))
