@@ -1,9 +1,8 @@
 """The scoreboard: what is in sample and what the summary pools, by hand; and the command itself."""
 
 import argparse
-import contextlib
 import json
-from queue import SimpleQueue
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,8 +13,10 @@ from drive_process import warm_python
 from rendered import render_recording
 
 from cloning.base.errors import UserError
-from cloning.base.program import DONE, FAILED
+from cloning.base.program import DONE
 from cloning.network.network import Network, save_model
+from cloning.road.track import Track
+from simulator.run import Run
 from tools import score_table, scoreboard
 from tools.score_table import drive_in_sample, replay_in_sample, table
 
@@ -185,7 +186,7 @@ def measure(tmp_path):
 
 
 def test_a_model_drives_a_recording_and_a_road(tmp_path, measure, model_file, monkeypatch):
-    """Without stand-ins: a replay, and two drives at the same time by one drive.py, in the road's own look."""
+    """Without stand-ins: a replay, and two drives at the same time, in the road's own look."""
     monkeypatch.setattr(scoreboard, "python", warm_python)
     recording = render_recording(tmp_path / "lake", rows=32)
     courses = ("--tracks", "road-3", "--looks", "own", "--speeds", "20", "--laps", "0.01")
@@ -194,23 +195,20 @@ def test_a_model_drives_a_recording_and_a_road(tmp_path, measure, model_file, mo
     [line] = [line for line in text.splitlines() if line.startswith("| lake, limit 1 m")]
     assert line.count(" %, ") == 2 and line.endswith("m, in sample |")
     [cell] = cells(text, "20 mph, looks without shadows, held out")
-    assert cell.startswith("1 road: ") and "of 0.02 laps" in cell
+    assert cell.startswith("1 road: 0 of 2 laps"), "an untrained network leaves it for good"
 
 
 @pytest.fixture
 def simulated(monkeypatch):
-    """What stands in for the simulator and drive.py: laps of so many `metres`, or the error if there is one."""
-    answers = SimpleNamespace(metres=1000.0, error="")
+    """What stands in for the drives: laps of so many `metres`."""
+    answers = SimpleNamespace(metres=1000.0)
 
-    def simulate(*words):
-        direction = words[words.index("--direction") + 1]
-        report = lap_report(direction=direction, distance_m=answers.metres)
-        return (None, FAILED, answers.error) if answers.error else (report, DONE, "")
+    def drive_laps(model, mph, laps, on):
+        report = lap_report(direction=on[1], distance_m=answers.metres)
+        return score_table.driven(report, mph, on[2], laps, finished=True)
 
-    ports: SimpleQueue[int] = SimpleQueue()
-    ports.put(4567)
-    monkeypatch.setattr(scoreboard, "simulate", simulate)
-    monkeypatch.setattr(scoreboard, "serving", lambda *_: contextlib.nullcontext(ports))
+    monkeypatch.setattr(scoreboard, "drive_laps", drive_laps)
+    monkeypatch.setattr(scoreboard, "started_workers", lambda *_: ThreadPoolExecutor(1))
     return answers
 
 
@@ -239,19 +237,14 @@ def test_drives_are_kept_by_network_and_replaced_by_course(tmp_path, measure, si
     assert (tmp_path / "table.json").read_bytes() == before
 
 
-def test_a_car_that_stands_still_is_the_models_fault(monkeypatch):
-    report = lap_report(laps=0, ended="stood_still")
-    monkeypatch.setattr(scoreboard, "simulate", lambda *_: (report, FAILED, "simulator: it ended"))
-    ports: SimpleQueue[int] = SimpleQueue()
-    ports.put(1)
-    assert scoreboard.drive_laps(ports, 9, 1.0, ("lake", "cw", 0))["laps"] == 1
-    assert ports.get() == 1
+def test_a_drive_that_does_not_arrive_counts_as_a_lap_left(monkeypatch):
+    def drive(conditions, track, watch):
+        watch(Run(Track(track, conditions.direction)), None)
+        return SimpleNamespace(failed=True)
 
-
-def test_a_drive_without_a_report_is_an_error(measure, model_file, simulated):
-    simulated.error = "simulator: no server"
-    with pytest.raises(UserError, match="lake ccw, 9 mph, look 0: simulator: no server"):
-        measure(model_file, "one", "--trained-on", "lake", "--tracks", "lake", "--speeds", "9", "--looks", "0")
+    monkeypatch.setattr(scoreboard, "drive", drive)
+    result = scoreboard.drive_laps("model.pt", 9, 1.0, ("lake", "cw", 0))
+    assert (result["laps"], result["laps_with_departure"], result["direction"]) == (1, 1, "cw")
 
 
 def test_results_in_another_form_are_left_alone(tmp_path, measure, model_file):

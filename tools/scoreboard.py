@@ -7,8 +7,8 @@
 A run measures one model on the courses that its options select. It adds or replaces these results in
 tools/scoreboard.json, one by one as they come, and writes the tables to tools/scoreboard.md. Git tracks both files, so
 that results can be committed. --table names another table. Recordings are replayed with
-`python -m simulator replay --model`, laps are driven with `python -m simulator drive`, as many at a time as the machine
-has cores, all at one speed by the same drive.py.
+`python -m simulator replay --model`, laps are driven as by `python -m simulator drive` and drive.py, until the time of
+so many interventions as there are departures is that of the whole drive.
 
 What a model was trained on, and so what is in sample, follows from the names of the recordings in its file: rendered
 ones must be named by track, direction and look, such as jungle-cw-look5. --trained-on adds other names.
@@ -20,14 +20,12 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from itertools import product
 from pathlib import Path, PureWindowsPath
-from queue import SimpleQueue
-from typing import Any
 
 from cloning.base import program
 
@@ -42,34 +40,28 @@ from cloning.network.network import load_checkpoint
 from cloning.recordings.log import find_folders
 from cloning.replay.score import ORACLE, DrivingMetrics, ReplayReport
 from cloning.road.generated import road_number
-from cloning.road.track import ROADS, find_points
-from cloning.server.telemetry import MAX_CLIENTS
-from simulator.report import LapReport
+from cloning.road.track import ROADS, Track, find_points
+from simulator.driving import Conditions, drive
+from simulator.report import lap_report
+from simulator.run import Run
+from simulator.workers import add_workers, started_workers
 from tools.command import ROOT, command_line, python, run_tool
 from tools.score_table import Board, Driven, NetworkResults, RealRecording, Replayed, course, driven, table
-from tools.server_process import ServerProcess
 
 DIRECTIONS = ("ccw", "cw")
 UNSEEN_LOOKS = (101, 102)  # no model was trained on looks 101 to 1000
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}  # a process computes with one, because as many run as there are cores
 
 
-def simulate(*command: object) -> tuple[Any, int, str]:
-    """Run a simulator command, and return its report, None if there is none, its exit status and its stderr."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "report.json")
-        words = ("-m", "simulator", *command, "--report", file)
-        done = python(*words, cwd=ROOT, env=os.environ | ONE_THREAD, capture_output=True)
-        report = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
-    return report, done.returncode, done.stderr
-
-
 def replay(model: Path, folder: Path) -> tuple[RealRecording, dict[str, Replayed]]:
     """Replay a recording, and return what all models have in common and this one's results. Raises UserError."""
-    reports, _, errors = simulate("replay", folder.resolve(), "--model", model)
-    if reports is None:
-        raise UserError(f"{folder}: {errors}")
-    report: ReplayReport = reports[0]
+    with tempfile.TemporaryDirectory() as temporary:
+        file = Path(temporary, "report.json")
+        words = ("-m", "simulator", "replay", folder.resolve(), "--model", model, "--report", file)
+        done = python(*words, cwd=ROOT, env=os.environ | ONE_THREAD, capture_output=True)
+        if not file.exists():
+            raise UserError(f"{folder}: {done.stderr}")
+        report: ReplayReport = json.loads(file.read_text(encoding="utf-8"))[0]
 
     def shown(metrics: DrivingMetrics) -> Replayed:
         percent, metres = metrics["autonomy_percent"], metrics["distance_mean_m"]
@@ -83,32 +75,13 @@ def replay(model: Path, folder: Path) -> tuple[RealRecording, dict[str, Replayed
     return recording, {limit: shown(metrics) for limit, metrics in report["limits"].items()}
 
 
-@contextmanager
-def serving(model: Path, mph: int, drives: int) -> Iterator[SimpleQueue[int]]:
-    """Serve a model at a set speed to so many drives at a time: a port for each, of no more servers than they need."""
-    ports: SimpleQueue[int] = SimpleQueue()
-    with ExitStack() as stack:
-        for first in range(0, drives, MAX_CLIENTS):
-            words = (ROOT / "drive.py", model, "--speed", str(mph), "--port", "0")
-            server = stack.enter_context(ServerProcess(*words, environment=os.environ | ONE_THREAD))
-            for _ in range(min(MAX_CLIENTS, drives - first)):
-                ports.put(server.port)
-        yield ports
-
-
-def drive_laps(ports: SimpleQueue[int], mph: int, laps: float, on: tuple[str, str, int]) -> Driven:
-    """Drive laps in the stand-in simulator; ports: of `serving`; on: track, direction, look. Raises UserError."""
-    (track, direction, look), port = on, ports.get()
-    road = ("--track", track, "--direction", direction, "--look", look)
-    try:
-        report: LapReport | None
-        report, status, errors = simulate("drive", *road, "--laps", laps, "--port", port)
-    finally:
-        ports.put(port)
-    # A car that stands still is the model's fault, any other failure is not.
-    if report is None or (status == program.FAILED and report.get("ended") != "stood_still"):
-        raise UserError(f"{track} {direction}, {mph} mph, look {look}: {errors}")
-    return driven(report, mph, look, laps, finished=status != program.FAILED)
+def drive_laps(model: str, mph: int, laps: float, on: tuple[str, str, int]) -> Driven:
+    """Drive laps in the stand-in simulator, in any process; on: track, direction, look. Raises UserError."""
+    (track, direction, look), runs = on, deque[Run](maxlen=1)
+    metres = laps * Track(track, direction).length
+    conditions = Conditions(model, mph, look, direction, metres, set_back=True)
+    done = drive(conditions, track, lambda run, _: runs.append(run))
+    return driven(lap_report(runs[0]), mph, look, laps, finished=not done.failed)
 
 
 def in_words(limit: str, result: Replayed) -> str:
@@ -204,13 +177,18 @@ def measure(options: argparse.Namespace) -> None:
         for folder, (recording, results) in zip(folders, replays, strict=True):
             board["recordings"][folder.name], network["replays"][folder.name] = recording, results
             save(f"{folder.name}: {'; '.join(in_words(limit, result) for limit, result in results.items())}")
-    for mph in options.speeds if courses else ():
-        at_once = min(threads(), len(courses))
-        with serving(options.model, mph, at_once) as ports, ThreadPoolExecutor(at_once) as pool:
-            for result in pool.map(partial(drive_laps, ports, mph, options.laps), courses):
-                others = [drive for drive in network["drives"] if course(drive) != course(result)]
-                network["drives"] = [*others, result]
-                save(lap_in_words(result))
+    if not courses:
+        return
+    with started_workers(options.processes, options.scheduler) as workers:
+        coming = [
+            workers.submit(drive_laps, str(options.model), mph, options.laps, on)
+            for mph in options.speeds
+            for on in courses
+        ]
+        for result in (each.result() for each in as_completed(coming)):
+            others = [drive for drive in network["drives"] if course(drive) != course(result)]
+            network["drives"] = [*others, result]
+            save(lap_in_words(result))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -239,6 +217,7 @@ def main(argv: list[str] | None = None) -> int:
         "(default: tools/scoreboard.md, which git tracks)"
     )
     add("--table", type=Path, default=ROOT / "tools" / "scoreboard.md", help=file)
+    add_workers(parser)
     measure(parser.parse_args(argv))
     return program.DONE
 
