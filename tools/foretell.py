@@ -65,7 +65,7 @@ MAX_DEPARTURES = 4  # in a drive: more are at the same place
 EARLIEST, LATEST = 6.0, 1.0  # s before a departure: an alarm in between foretells it
 WINDOW = EARLIEST - LATEST  # s
 FALSE_ALARMS = 0.05  # share of the windows without a departure, on roads for tuning, in which there is an alarm
-MARGIN = 1.0  # log odds above the greatest risk on ordinary roads for tuning: there a car is stopped
+MARGIN = 0.25  # log odds above the greatest risk on ordinary roads for tuning: there a car is stopped
 DECAY = 3e-2  # of the regression's weights
 
 
