@@ -3,6 +3,7 @@
 python drive.py                       # model.pt, or else the model that comes with the project
 python drive.py model.pt              # then start the simulator in autonomous mode
 python drive.py model.pt run1         # also save each frame in run1/, for `python video.py run1`
+python drive.py --stop-when-lost      # slow down and stop where the network would probably leave the road
 """
 
 from cloning.base import program
@@ -27,6 +28,7 @@ import torch
 from cloning.base.arguments import MAX_PORT, address, number
 from cloning.base.errors import UserError
 from cloning.base.frame import FRAME
+from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
@@ -37,6 +39,7 @@ from cloning.wire.protocol import PORT
 
 KERAS = (".h5", ".hdf5", ".keras")  # endings of files that other projects' drive.py takes
 DEFAULT_MODEL = Path("model.pt")  # that `python model.py` writes
+SLOWEST_MPH = 5.0  # to which risk slows the car down, before it is stopped
 FRAMES_IN_FLIGHT = 3  # that a simulator sends at its start, before it has used an answer
 PATIENCE = 5.0  # s until a simulator that sends nothing more is told of
 log = logging.getLogger("drive")
@@ -53,6 +56,8 @@ class Session(page.Session):
         super().__init__()
         self.server = server
         self.controller = SpeedController(server.set_speed)
+        self.foretell = Foreteller(server.observer, server.limits) if server.observer and server.limits else None
+        self.heeds = server.stop_when_lost  # whether it slows down and stops where the network is lost
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
         self.puzzled = False  # whether `tell_of_silence` has told of it
@@ -68,7 +73,12 @@ class Session(page.Session):
         try:
             self.separator = decimal_separator(message, self.separator)
             telemetry = parse_telemetry(message)
-            self.steering = steer(self.server.network, telemetry.image)
+            place, risk = telemetry.place, None
+            if self.foretell:
+                self.steering, risk = self.foretell(telemetry.image, place.time if place else time.monotonic())
+                self.slow_down(risk)
+            else:
+                self.steering = steer(self.server.network, telemetry.image)
             throttle = self.controller.throttle(telemetry.speed)
         except Exception as error:  # whatever it is: without an answer the car would stand still
             self.unusable += 1
@@ -80,11 +90,11 @@ class Session(page.Session):
         else:
             self.frame = telemetry.image
             self.driven += 1
-            self.place = place = telemetry.place
+            self.place = place
             if self.server.saver and self.server.recording:
                 self.folder = self.folder or self.server.saver.start_session()
                 self.folder.save(telemetry.jpeg, place.time if place else None)
-            where = (place.offset, place.x, place.y) if place else (telemetry.cte, None, None)
+            where = (place.offset, place.x, place.y, risk) if place else (telemetry.cte, None, None, risk)
             latency = (time.perf_counter() - arrived) * 1000
             figures = (time.monotonic(), float(self.steering), telemetry.speed, throttle, latency)
             self.history.append(page.DrivenFrame(*figures, *where))
@@ -92,6 +102,24 @@ class Session(page.Session):
             "steering_angle": format_number(self.steering, self.separator),
             "throttle": format_number(throttle, self.separator),
         }
+
+    def slow_down(self, risk: float) -> None:
+        """Slow the car down from a risk of ALARM on, and stop it for good at that of the network's limits."""
+        limits, before = self.server.limits, self.lost
+        assert limits is not None, "without limits there is no risk"
+        if not self.heeds:
+            self.heeds = self.server.stop_when_lost and risk < ALARM  # again, after a person let it drive on
+            return
+        self.lost = self.lost or risk >= limits.stop
+        if self.lost and not before:
+            log.warning(f"the network is lost (risk {risk:.0%}): the car is stopped")
+        eased = self.server.set_speed * float(np.interp(risk, (ALARM, limits.stop), (1, 0)))
+        self.controller.set_speed = 0.0 if self.lost else min(self.server.set_speed, max(SLOWEST_MPH, eased))
+
+    def drive_at(self, set_speed: float) -> None:
+        """Drive at another set speed, in mph; a car that stopped because it was lost drives on, heeding no risk."""
+        self.controller.set_speed = set_speed  # its sum stays: it is what holds the speed on this slope
+        self.heeds, self.lost = self.heeds and not self.lost, False
 
     def summary(self) -> str:
         """Return a line about the whole session: how many frames, and where they are saved."""
@@ -106,11 +134,20 @@ class Session(page.Session):
 class DriveServer:
     """Serves steering to up to MAX_CLIENTS simulators, and the page to browsers."""
 
-    def __init__(self, network: Network, set_speed: float = SET_SPEED_MPH, model: str = ""):
-        """set_speed: mph; model: the network's name on the page."""
+    def __init__(
+        self,
+        network: Network,
+        set_speed: float = SET_SPEED_MPH,
+        model: str = "",
+        limits: Limits | None = None,
+        stop_when_lost: bool = False,
+    ):
+        """set_speed: mph; model: the network's name on the page; stop_when_lost: needs the network's limits."""
         from cloning.server import server  # here, because it needs the socket libraries
 
         self.network, self.model, self.set_speed = network, model, set_speed
+        self.limits, self.stop_when_lost = limits, stop_when_lost
+        self.observer = Observer(network) if limits else None
         self.saver: saved_frames.FrameSaver | None = None  # saves the frames
         self.recording = False  # whether it does so now
         self.sessions: dict[str, Session] = {}
@@ -171,7 +208,7 @@ class DriveServer:
         """Drive all simulators at another set speed, in mph, from the next frame on; 0 stops them."""
         self.set_speed = set_speed
         for session in self.sessions.values():
-            session.controller.set_speed = set_speed  # its sum stays: it is what holds the speed on this slope
+            session.drive_at(set_speed)
 
     def record(self, on: bool) -> None:
         """Save the frames from now on, each session's in a new folder, or no longer. Raises FolderError."""
@@ -272,6 +309,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--host", type=address, default="127.0.0.1", help=host)
     port = "port to listen on (default %(default)s, which the simulator uses; 0: any free one)"
     add("--port", type=number(int, 0, MAX_PORT), default=PORT, help=port)
+    lost = "slow down and stop the car where the network would probably leave the road"
+    add("--stop-when-lost", action="store_true", help=lost)
     device = "device that runs the network (default %(default)s, which is fast enough)"
     add("--device", default="cpu", choices=["cpu", "cuda"], help=device)
     parsed = parser.parse_intermixed_args(arguments)  # the folder may follow options
@@ -291,10 +330,16 @@ def main() -> int:
 
         model = choose_model(arguments.model, arguments.folder)
         network = load_model(model, arguments.device)
+        limits = load_limits(model, network)
+        if arguments.stop_when_lost and not limits:
+            raise UserError(
+                f"{limits_file(model)}: no such file for this network, so nothing tells when it is lost; "
+                f"`python -m tools.foretell {model}` makes it, or leave out --stop-when-lost"
+            )
         if arguments.folder:
             saved_frames.check_folder(arguments.folder)
         origin = "the model that comes with the project" if model == SHIPPED_MODEL else ""
-        server = DriveServer(network, arguments.speed, origin or str(model))
+        server = DriveServer(network, arguments.speed, origin or str(model), limits, arguments.stop_when_lost)
         listener = connections.claim_port(arguments.host, arguments.port)
         if arguments.folder:
             server.saver, server.recording = saved_frames.FrameSaver(arguments.folder), True  # last: it empties it

@@ -29,6 +29,7 @@ def test_mistakes_are_reported(model_file, tmp_path, monkeypatch, capsys):
         for arguments, words in (
             ((tmp_path / "foreign.pt",), "not a model of this project"),
             ((model_file, tmp_path / "mine"), "thesis.txt"),
+            ((model_file, "--stop-when-lost"), "nothing tells when it is lost"),
             ((model_file, tmp_path / "run1", "--port", other.port), f"can't listen on 127.0.0.1:{other.port}"),
         ):
             monkeypatch.setattr(sys, "argv", ["drive.py", *map(str, arguments)])

@@ -52,6 +52,7 @@ class DrivenFrame(NamedTuple):
     cte: float | None = None  # m from the lane's centre, if the simulator tells; the stand-in's sign is right positive
     x: float | None = None  # m to the east, and to the north, if the simulator tells
     y: float | None = None
+    risk: float | None = None  # 0..1, that the car will leave the road, if the network's limits are known
 
 
 class Session:
@@ -61,6 +62,7 @@ class Session:
         self.started = time.perf_counter()  # tells sessions apart
         self.heard = 0.0  # time.monotonic() of the last telemetry
         self.manual = self.ended = False  # whether a person drove then; whether the connection has ended
+        self.lost = False  # whether drive.py stopped the car because the network is out of its depth
         self.history: deque[DrivenFrame] = deque(maxlen=HISTORY_FRAMES)
         self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
         self.driven = self.unusable = 0  # frames
@@ -235,7 +237,7 @@ def state_of(session: Session | None, now: float) -> str:
         return "manual"
     if not session.history or session.history[-1].time < now - SILENCE:
         return "unusable"
-    return "driving"
+    return "doubtful" if session.lost else "driving"
 
 
 def figures(server: Server, session: Session | None, now: float) -> dict[str, Any]:

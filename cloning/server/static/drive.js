@@ -14,19 +14,21 @@ const WORDS = {
   driving: ["Driving", ""],
   stopping: ["Stopping", "Go drives on."],
   stopped: ["Stopped", "Go drives on. On a slope the car may roll: the simulator has no brake below 5 mph."],
+  doubtful: ["Stopped: the network is lost", "It would probably leave the road. Go drives on, at your own risk."],
   manual: ["A person drives", "drive.py drives again when W and S are released in the simulator."],
   silent: ["The simulator is silent", "It is connected but sends nothing. Is it paused?"],
   unusable: ["No frame can be used", "The car is told to steer as before, without throttle."],
   gone: ["The simulator has gone", "What it sent last is shown. drive.py waits for the next one: see below."],
   lost: ["drive.py does not answer", "It has ended, or too many pages are open. This page tries again by itself."],
 };
-const STEERING = 1, SPEED = 2, THROTTLE = 3, LATENCY = 4, DISTANCE = 5, X = 6, Y = 7; // columns of a row, after its time
+const STEERING = 1, SPEED = 2, THROTTLE = 3, LATENCY = 4, DISTANCE = 5, X = 6, Y = 7, RISK = 8; // columns of a row, after its time
 // least: the scale reaches at least so far; both: as far below 0 as above;
-// isSpeed: the set speed is shown with it.
+// ifKnown: hidden without values; isSpeed: the set speed is shown with it.
 const GRAPHS = [
-  {column: DISTANCE, title: "Distance from the centre", unit: " m", digits: 2, least: 1.2, both: true, isDistance: true},
+  {column: DISTANCE, title: "Distance from the centre", unit: " m", digits: 2, least: 1.2, both: true, isDistance: true, ifKnown: true},
   {column: STEERING, title: "Steering, right positive", unit: "", digits: 2, least: 0.1, both: true},
   {column: SPEED, title: "Speed", unit: " mph", digits: 1, least: 1, isSpeed: true},
+  {column: RISK, title: "Risk of leaving the road", unit: "", digits: 2, least: 1, ifKnown: true},
   {column: THROTTLE, title: "Throttle", unit: "", digits: 2, least: 0.1},
   {column: LATENCY, title: "Time in drive.py", unit: " ms", digits: 1, least: 10},
 ];
@@ -55,8 +57,11 @@ function showNow() {
   element("now-departures").className = departures ? "far" : "";
 }
 
+// Whether drive.py holds the car, so that Go lets it drive.
+const isStopped = () => live.set_speed == 0 || live.state == "doubtful";
+
 function showFigures({rate, frames, unusable, reason, saving, recording, folder, set_speed, state}) {
-  element("rate").textContent = state == "driving" ? rate.toFixed(1) : "–";
+  element("rate").textContent = ["driving", "doubtful"].includes(state) ? rate.toFixed(1) : "–";
   element("frames").textContent = frames ?? "–";
   element("unusable").textContent = unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–";
   element("unusable").className = unusable ? "bad" : "";
@@ -67,7 +72,7 @@ function showFigures({rate, frames, unusable, reason, saving, recording, folder,
   if (element("film").textContent != `python video.py ${folder}`) element("film").textContent = `python video.py ${folder}`;
   element("plots").hidden = !rows.length;
   element("start").hidden = !["waiting", "gone"].includes(state);
-  const stopped = set_speed == 0;
+  const stopped = isStopped();
   element("stop").textContent = stopped ? "Go" : "Stop";
   element("stop").className = stopped ? "go" : "";
   if (!stopped) element("speed").value = set_speed;
@@ -202,7 +207,7 @@ class Graph {
   draw(times, at) {
     const values = rows.map(row => row[this.column]), last = values.at(-1);
     const hidden = this.figure.hidden;
-    this.figure.hidden = this.isDistance && !values.some(value => value != null);
+    this.figure.hidden = this.ifKnown && !values.some(value => value != null);
     if (this.figure.hidden) return;
     if (hidden) this.plot.setSize(this.size());
     this.range = scale(this, values);
@@ -282,7 +287,7 @@ async function post(path, body, words) {
 const setSpeed = speed => post("/set-speed", {set_speed: String(speed)}, speed ? `drives at ${speed} mph` : "stops the car");
 element("speed").onchange = () => setSpeed(Number(element("speed").value));
 element("speed").oninput = () => element("set-speed").textContent = `${element("speed").value} mph`;
-element("stop").onclick = () => setSpeed(live.set_speed == 0 ? Number(element("speed").value) : 0);
+element("stop").onclick = () => setSpeed(isStopped() ? Number(element("speed").value) : 0);
 element("record").onclick = () => post("/record", {recording: !live.recording}, live.recording ? "recording has ended" : "recording");
 element("controls").onsubmit = event => event.preventDefault();
 for (const code of document.querySelectorAll("#start code, #film")) {

@@ -1,0 +1,193 @@
+"""What says that a network is out of its depth: its signs, their fit and measure, its file, and its use in drive.py."""
+
+import numpy as np
+import pytest
+import torch
+from rendered import render_frame
+from scipy.spatial.distance import mahalanobis
+
+import drive
+from cloning.base.errors import ModelError
+from cloning.lane import foretell
+from cloning.lane.foretell import ALARM, Foreteller, Limits, Normal, Observation, Observer, Ordinary, Signs
+from cloning.network.network import Network, steer
+from tools import foretell as tool
+from tools.simulator_client import telemetry
+
+JPEG = drive.page.encode(render_frame(0.3, 0.5, np.random.default_rng(0)), 90)
+
+
+def observations(rng: np.random.Generator, rows: int, strange: float) -> Observation:
+    """What is seen in a drive, ordinary if nothing is strange; as in real ones, the steering follows the lane."""
+    centres = np.cumsum(rng.normal(0, 0.05 * (1 + strange), (rows, 5)), 0)
+    doubt = rng.normal(0, 0.1 * (1 + strange), (rows, 5))
+    steering = centres[:, 2] * 0.1 + rng.normal(0, 0.01, rows)
+    activations, hidden = rng.normal(strange, 1, (rows, 12)), rng.normal(strange, 1, (rows, 96))
+    values = (steering, activations, hidden, centres + doubt, -centres + doubt)
+    return Observation(*(np.asarray(value, np.float32) for value in values))
+
+
+@pytest.fixture(scope="module")
+def ordinary() -> Ordinary:
+    return Ordinary.of(observations(np.random.default_rng(0), 2000, 0))
+
+
+@pytest.fixture(scope="module")
+def network() -> Network:
+    torch.manual_seed(3)
+    return Network().eval()
+
+
+@pytest.fixture
+def limits(network) -> Limits:
+    observer, rng = Observer(network), np.random.default_rng(1)
+    frames = [render_frame(offset, 0.0, rng) for offset in rng.uniform(-1, 1, 12)]
+    seen = Observation(*map(np.stack, zip(*map(observer, frames), strict=True)))
+    return Limits(Ordinary.of(seen), np.linspace(-1, 1, 40, dtype=np.float32), -0.25, 0.875)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Signs
+
+
+def test_the_distance_is_that_of_mahalanobis(ordinary):
+    """Against SciPy's, with the covariance that made the values."""
+    rng = np.random.default_rng(2)
+    mixing = np.eye(6) + 0.3 * rng.normal(size=(6, 6))
+    normal, value = Normal.of(rng.normal(size=(200_000, 6)) @ mixing.T), rng.normal(size=6)
+    wanted = mahalanobis(value, np.zeros(6), np.linalg.inv(mixing @ mixing.T)) / np.sqrt(6)
+    assert normal.distance(value) == pytest.approx(wanted, rel=0.02)
+
+
+def test_signs_are_the_same_at_any_frame_rate(ordinary):
+    """What is seen changes after a second; half a second later the means have come as far at 60 frames/s as at 15."""
+    seen = observations(np.random.default_rng(3), 2, 3.0)
+    before, after = (Observation(*(values[at] for values in seen)) for at in (0, 1))
+    found = []
+    for rate in (15, 60):
+        signs = Signs(ordinary)
+        first = signs(before, 0.0)
+        for frame in range(1, rate + 1):
+            same = signs(before, frame / rate)
+        assert same == pytest.approx(first, abs=1e-4)
+        for frame in range(rate + 1, rate + rate // 2 + 1):
+            last = signs(after, frame / rate)
+        found.append(last)
+    far = np.abs(np.log(np.maximum(np.abs(found[0] - first), 1e-3))) < 20  # all of them
+    assert found[0][far] == pytest.approx(found[1][far], abs=0.35) and np.abs(found[0] - first).max() > 1
+
+
+def test_the_observer_sees_what_the_network_steers_by_and_both_sides_alike(network):
+    observe, frame = Observer(network), render_frame(0.4, 0.0, np.random.default_rng(4))
+    seen = observe(frame)
+    assert seen.steering == steer(network, frame)
+    with torch.inference_mode():  # the last two layers make the same steering of what was kept
+        x = torch.from_numpy(seen.activations)
+        for layer in network.dense[1:]:
+            x = layer(x) if layer is network.dense[-1] else torch.nn.functional.elu(layer(x))
+    assert float(x) == pytest.approx(float(seen.steering), abs=1e-5)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Fit and measure
+
+
+def driven(rng: np.random.Generator, number: int, kind: str, strange: bool) -> tuple[tool.Course, tool.Drive]:
+    """A drive of 30 s; one that is strange departs at its end, and what is seen becomes strange 5 s before."""
+    seen = observations(rng, 450, 0)
+    if strange:
+        late = observations(rng, 75, 1.0)
+        seen = Observation(*(np.concatenate([a[:-75], b]) for a, b in zip(seen, late, strict=True)))
+    course = tool.Course(kind, "lake", number, "fog:5" if kind == tool.DISTURBED else "")
+    return course, tool.Drive(seen, np.arange(450) / 15, np.array([29.95] if strange else []))
+
+
+def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
+    rng = np.random.default_rng(5)
+    kinds = [(tool.ORDINARY, False)] * 6 + [(tool.HARD, False)] * 4 + [(tool.HARD, True), (tool.DISTURBED, True)] * 3
+    kinds += [(tool.DISTURBED, False)]
+    tuning, measuring = ([driven(rng, first + i, *kind) for i, kind in enumerate(kinds)] for first in (2001, 1))
+    limits = tool.fit(tuning, [])
+    assert ALARM < limits.stop < 1
+    lines = tool.table(limits, measuring).splitlines()
+    hard, every = (line.strip("| ").split(" | ") for line in (lines[3], lines[-1]))
+    assert hard[1:3] == ["3", "100 %"] and every[1] == "6" and every[4] == "55", "5 whole windows, 11 drives"
+    assert float(every[5].removesuffix(" %")) < 15 and int(every[3].removesuffix(" %")) < 25
+
+
+def test_an_alarm_counts_from_6_to_1_s_before_a_departure():
+    time = np.arange(0, 20, 1 / 15)
+    part = tool.Part(tool.HARD, np.zeros((len(time), 1)), time, 20.0)
+    for first, last, wanted in ((13.5, 13.9, 0), (14.1, 14.3, 1), (18.8, 18.95, 1), (19.1, 20, 0)):
+        assert tool.windows(part, ((time >= first) & (time <= last)) * 1.0) == [wanted]
+    assert tool.windows(part._replace(departure=None), (time < 0.1) * 1.0) == [1, 0, 0], "whole windows of 5 s"
+    assert tool.windows(tool.Part(tool.HARD, np.zeros((2, 1)), np.array([19.5, 19.6]), 20.0), np.ones(2)) == []
+
+
+def test_what_measures_was_not_tuned_on():
+    tuning, measuring = ([course for course in tool.courses() if course.tunes is tunes] for tunes in (True, False))
+    assert not {course.number for course in measuring} & {course.number for course in tuning}
+    assert not {c.disturbance for c in measuring} & {c.disturbance for c in tuning} - {""}
+    assert len({course.name for course in tool.courses()}) == len(tool.courses())
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The file
+
+
+def test_limits_belong_to_one_network(limits, network, tmp_path):
+    model, frame = tmp_path / "model.pt", render_frame(0.2, 0.3, np.random.default_rng(6))
+    assert foretell.load_limits(model, network) is None, "no file"
+    foretell.save_limits(model, network, limits)
+    read = foretell.load_limits(model, network)
+    assert read
+    risks = [Foreteller(Observer(network), each)(frame, 0.0)[1] for each in (limits, read)]
+    assert risks[0] == risks[1] and (read.bias, read.stop) == (limits.bias, limits.stop)
+    assert foretell.limits_file(model).stat().st_size < 200_000
+    assert foretell.load_limits(model, Network().eval()) is None, "another network has no figure"
+
+
+def test_a_damaged_file_is_refused(limits, network, tmp_path):
+    model = tmp_path / "model.pt"
+    foretell.save_limits(model, network, limits._replace(weights=limits.weights[:-1]))
+    with pytest.raises(ModelError, match=r"model.limits.pt: .*python -m tools.foretell"):
+        foretell.load_limits(model, network)
+    foretell.limits_file(model).write_bytes(b"nothing")
+    with pytest.raises(ModelError, match="damaged"):
+        foretell.load_limits(model, network)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# drive.py
+
+
+def test_a_car_slows_down_and_stops_when_the_network_is_lost_and_a_person_may_let_it_go_on(network, limits):
+    server = drive.DriveServer(network, 20, limits=limits, stop_when_lost=True)
+    session, risks = server.session("sid"), [0.0]
+    session.foretell = lambda image, time: (np.float32(0), risks[0])  # type: ignore[assignment]
+
+    def set_speed(risk: float) -> float:
+        risks[0] = risk
+        session.answer(telemetry(JPEG, speed="15.0000"))
+        assert session.history[-1].risk == risk
+        return session.controller.set_speed
+
+    assert [set_speed(risk) for risk in (0.1, ALARM, 0.6875, 0.86)] == [20, 20, 10, drive.SLOWEST_MPH]
+    assert set_speed(0.2) == 20
+    assert set_speed(0.9) == 0 and set_speed(0.1) == 0, "it stays where it is"
+    assert float(session.answer(telemetry(JPEG, speed="15.0000"))["throttle"]) == -1
+    assert drive.page.state_of(session, session.heard) == "doubtful"
+    server.change_set_speed(12)
+    assert set_speed(0.95) == 12 and drive.page.state_of(session, session.heard) == "driving", "at the person's risk"
+    assert [set_speed(risk) for risk in (0.3, 0.95)] == [12, 0], "until all was well for a moment"
+    server.change_set_speed(0)
+    assert set_speed(0.6) == 0, "a person's stop holds"
+
+
+def test_without_the_option_the_risk_is_only_shown(network, limits):
+    session = drive.DriveServer(network, 20, limits=limits._replace(bias=30.0)).session("sid")
+    session.answer(telemetry(JPEG, speed="15.0000"))
+    assert (session.history[-1].risk or 0) > 0.99 and session.controller.set_speed == 20
+    unknown = drive.DriveServer(network, 20).session("sid")
+    unknown.answer(telemetry(JPEG, speed="15.0000"))
+    assert unknown.history[-1].risk is None

@@ -1,0 +1,325 @@
+"""Find a network's limits: fit what foretells that it will leave the road, and measure how well it does so.
+
+    python -m tools.foretell                                # the network that comes with the project
+    python -m tools.foretell model.pt --recordings data     # with what is ordinary in these recordings, too
+
+The network drives in the stand-in simulator: generated roads and both tracks in foul weather, mountain roads at 25 mph,
+and ordinary roads at 15. Numbers of roads and looks above 2000 and the disturbances of which networks may be trained
+tune the figures; those below 1000 and the other disturbances, on which nothing was tuned, measure them. The figures are
+written beside the network, as model.limits.pt; from then on drive.py shows the risk.
+
+The measure is SelfOracle's (ICSE 2020): a departure is foretold by an alarm 1 to 6 s before it, and false alarms are
+counted in windows of 5 s in drives without a departure. An interrupted run continues when it is started again. A drive
+takes about 5 s on a core.
+"""
+
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple, Self
+
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("foretell")  # also while the libraries below are loaded
+
+import numpy as np
+import torch
+
+from cloning.base.arguments import number
+from cloning.base.files import written_whole
+from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.base.progress import progress_bar
+from cloning.lane.foretell import (
+    ALARM,
+    Limits,
+    Observation,
+    Observer,
+    Ordinary,
+    Signs,
+    fingerprint,
+    limits_file,
+    save_limits,
+)
+from cloning.network.compute import one_thread, threads
+from cloning.network.network import SHIPPED_MODEL, load_model
+from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.images import decode
+from cloning.recordings.log import find_folders, read_recording
+from cloning.recordings.writer import SampleClock
+from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber
+from cloning.road.track import Track
+from cloning.server.speed import SpeedController
+from simulator import scenery
+from simulator.cameras import Cameras, jpeg
+from simulator.run import Run
+from simulator.world import Scene, free_unused
+from tools.command import command_line, head, row, run_tool
+from tools.lane_frames import every_second_shadowed
+
+DISTURBED, HARD, ORDINARY = "disturbed, strength 5, 25 mph", "mountain roads, 25 mph", "ordinary roads, 15 mph"
+MAX_DEPARTURES = 4  # in a drive: more are at the same place
+EARLIEST, LATEST = 6.0, 1.0  # s before a departure: an alarm in between foretells it
+WINDOW = EARLIEST - LATEST  # s
+FALSE_ALARMS = 0.05  # share of the windows without a departure, on roads for tuning, in which there is an alarm
+MARGIN = 0.25  # log odds above the greatest risk on ordinary roads for tuning: there a car is stopped
+DECAY = 3e-2  # of the regression's weights
+
+
+class Course(NamedTuple):
+    """What is driven; number: of the road and its look, and of the random start; disturbance: "" for none."""
+
+    kind: str
+    track: str
+    number: int
+    disturbance: str = ""
+
+    @property
+    def tunes(self) -> bool:
+        """Whether the drive tunes the figures; others measure them."""
+        return self.number > 2000
+
+    @property
+    def name(self) -> str:
+        """The name of its file."""
+        return "-".join([self.track, str(self.number), self.kind[:4], self.disturbance.replace(":", "")])
+
+
+def courses() -> list[Course]:
+    """Return all that is driven, in an order in which any beginning has some of everything."""
+    lists = []
+    for first, kinds in ((2001, [kind for kind in KINDS if kind not in HELD_OUT] * 2), (1, list(HELD_OUT) * 4)):
+        tracks = [("lake", "jungle", f"road-{first + i}")[(i + i // 15) % 3] for i in range(len(kinds))]
+        foul = [Course(DISTURBED, track, first + i, f"{kinds[i]}:5") for i, track in enumerate(tracks)]
+        hard = [Course(HARD, f"mountain-{first + i}", first + i) for i in range(14)]
+        some = [(f"road-{first + i}", "lake", f"road-{first + i}", "jungle")[i % 4] for i in range(100, 116)]
+        lists += [foul, hard, [Course(ORDINARY, track, first + 100 + i) for i, track in enumerate(some)]]
+    return [course for _, course in sorted((i / len(each), course) for each in lists for i, course in enumerate(each))]
+
+
+class Drive(NamedTuple):
+    """What was seen in a drive, and when the car left the road.
+
+    seen        observations, each array with a row for each frame
+    time        float64 (n,): s
+    departures  float64 (k,): s
+    """
+
+    seen: Observation
+    time: np.ndarray
+    departures: np.ndarray
+
+    @classmethod
+    def of(cls, seen: Sequence[Observation], time: Sequence[float], departures: Sequence[float]) -> Self:
+        """Join observations."""
+        return cls(Observation(*map(np.stack, zip(*seen, strict=True))), np.array(time), np.array(departures))
+
+
+@cache
+def observer(model: Path) -> Observer:
+    """Return this process's observer of a network."""
+    one_thread()
+    return Observer(load_model(model))
+
+
+@cache
+def _cameras() -> list[Cameras]:
+    """Return the list for this process's cameras, which move from road to road: new ones for each would add up."""
+    return []
+
+
+def drive(model: Path, course: Course) -> Drive:
+    """Drive a course, from a random start on; after a departure the car is put back on the road."""
+    observe, kept, look = observer(model), _cameras(), every_second_shadowed(course.number)
+    run = Run(Track(course.track, ("ccw", "cw")[course.number // 2 % 2]), "autonomous")
+    scene = Scene(scenery.build(course.track, look))
+    if kept:
+        kept[0].move(scene)
+        free_unused()
+    else:
+        kept.append(Cameras(scene, ("center",)))
+    run.s = float(np.random.default_rng(course.number).uniform(0, run.track.length))
+    run.set_back()
+    disturber = Disturber(Disturbance.parse(course.disturbance), course.number) if course.disturbance else None
+    controller, clock = SpeedController(15 if course.kind == ORDINARY else 25), SampleClock(1 / SAMPLE_RATE)
+    seen, time = [], []
+    while run.time < (30 if disturber else 40) and len(run.departures) < MAX_DEPARTURES:
+        frame = decode(jpeg(kept[0].frames(run.car.node.get_transform())[0]))
+        seen.append(observe(disturber(frame) if disturber else frame))
+        time.append(run.time)
+        throttle, due = controller.throttle(run.speed_mph), False
+        while not due:
+            run.step(float(seen[-1].steering), throttle)
+            due = clock.due(run.time)
+    return Drive.of(seen, time, [departure.time for departure in run.departures])
+
+
+def drive_into(folder: Path, model: Path, course: Course) -> None:
+    """Drive a course, and save what was seen, if that is not there yet. Raises OSError."""
+    path = folder / f"{course.name}.npz"
+    if not path.exists():
+        driven = drive(model, course)
+        with written_whole(path) as unfinished, open(unfinished, "wb") as file:
+            np.savez(file, *driven.seen, driven.time, driven.departures)
+
+
+def load(path: Path) -> Drive:
+    """Return what `drive_into` saved."""
+    with np.load(path) as saved:
+        *seen, time, departures = saved.values()
+    return Drive(Observation(*seen), time, departures)
+
+
+def observe_recording(observe: Observer, folder: Path) -> Drive:
+    """Return what is seen in a recording, every fourth frame. Raises RecordingError."""
+    recording, frame, seen = read_recording(folder), np.zeros(FRAME, np.uint8), []
+    rows = range(0, len(recording), 4)
+    for at in rows:
+        frame[ROAD_ROWS] = recording.road(at)
+        seen.append(observe(frame))
+    return Drive.of(seen, [at / SAMPLE_RATE for at in rows], [])
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Figures
+
+
+class Part(NamedTuple):
+    """A part of a drive without an interruption: signs float32 (n, k), time (n,), when the car left the road then."""
+
+    kind: str
+    signs: np.ndarray
+    time: np.ndarray
+    departure: float | None
+
+    @property
+    def leaves(self) -> bool:
+        """Whether the car left the road at the part's end."""
+        return self.departure is not None
+
+    @property
+    def ahead(self) -> np.ndarray:
+        """Seconds before the departure; 0 in all rows of a part without one."""
+        return np.zeros(len(self.time)) if self.departure is None else self.departure - self.time
+
+
+def parts(ordinary: Ordinary, course: Course, driven: Drive) -> Iterator[Part]:
+    """Yield what comes before each departure of a drive, or all of a drive without one."""
+    for begin, end in pairwise([-1.0, *(driven.departures.tolist() or [np.inf])]):
+        rows, signs = np.flatnonzero((driven.time > begin) & (driven.time <= end)), Signs(ordinary)
+        if len(rows):
+            each = (Observation(*(values[at] for values in driven.seen)) for at in rows)
+            found = np.stack([signs(seen, driven.time[at]) for at, seen in zip(rows, each, strict=True)])
+            yield Part(course.kind, found, driven.time[rows], end if np.isfinite(end) else None)
+
+
+def windows(part: Part, risk: np.ndarray) -> list[float]:
+    """Return the greatest risk in each whole WINDOW of a part, or in the one that foretells its departure."""
+    if part.leaves:
+        before = (part.ahead <= EARLIEST) & (part.ahead >= LATEST)
+        return [risk[before].max()] if before.any() else []
+    number = (part.time - part.time[0]) // WINDOW
+    whole = int((part.time[-1] - part.time[0]) // WINDOW)
+    return [risk[number == k].max() for k in range(whole)]
+
+
+def regress(signs: np.ndarray, leaves: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return the weights (k,) of a logistic regression; leaves: bool (n,), of which both cases count the same.
+
+    share: float (n,), how much a row counts among those of its case.
+    """
+    mean, deviation = signs.mean(0), signs.std(0) + 1e-3
+    inputs, targets = torch.from_numpy((signs - mean) / deviation), torch.from_numpy(leaves.astype(np.float32))
+    shares = torch.from_numpy((share / np.where(leaves, share[leaves].sum(), share[~leaves].sum())).astype(np.float32))
+    weights = torch.zeros(signs.shape[1] + 1, requires_grad=True)
+    optimizer = torch.optim.LBFGS([weights], max_iter=200, line_search_fn="strong_wolfe")
+
+    def loss() -> torch.Tensor:
+        optimizer.zero_grad()
+        logits = inputs @ weights[:-1] + weights[-1]
+        error = torch.nn.functional.binary_cross_entropy_with_logits(logits, targets, shares, reduction="sum")
+        total = error + DECAY * weights[:-1].square().sum()
+        total.backward()
+        return total
+
+    optimizer.step(loss)
+    return weights.detach().numpy()[:-1] / deviation
+
+
+def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Drive]) -> Limits:
+    """Return the limits; driven: what tunes them."""
+    fair = [(course, each) for course, each in driven if not course.disturbance and not len(each.departures)]
+    # Every second one says what is ordinary: in these the networks' activations are nearer to it than in any others.
+    known = {course for course, _ in fair[::2]}
+    seen = [each.seen for course, each in fair if course in known] + [each.seen for each in recordings]
+    ordinary = Ordinary.of(Observation(*map(np.concatenate, zip(*seen, strict=True))))
+    drives = [list(parts(ordinary, course, each)) for course, each in driven if course not in known]
+    tuned = [part for each in drives for part in each]
+    rows = [np.concatenate([part.signs[part.ahead <= EARLIEST] for part in each]) for each in drives]
+    leaves = [np.full(len(found), each[0].leaves) for each, found in zip(drives, rows, strict=True)]
+    share = [np.full(len(found), 1 / len(found)) for found in rows]  # each drive counts the same
+    weights = regress(*map(np.concatenate, (rows, leaves, share)))
+    odds = {kind: risks(tuned, kind, lambda signs: signs @ weights)[1] for kind in (HARD, ORDINARY)}
+    alarm = np.quantile(np.concatenate(list(odds.values())), 1 - FALSE_ALARMS)
+    stop = 1 / (1 + np.exp(alarm - odds[ORDINARY].max() - MARGIN))
+    return Limits(ordinary, weights, -float(alarm), float(stop))
+
+
+def risks(of: Sequence[Part], kind: str, risk: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greatest risks in the windows before departures, and in those of drives without one."""
+    found: tuple[list[float], list[float]] = ([], [])
+    for part in of:
+        if part.kind == kind:
+            found[not part.leaves].extend(windows(part, risk(part.signs)))
+    return np.array(found[0]), np.array(found[1])
+
+
+def table(limits: Limits, driven: Sequence[tuple[Course, Drive]]) -> str:
+    """Return how well departures are foretold, in Markdown; driven: what measures it."""
+    found = [part for course, each in driven for part in parts(limits.ordinary, course, each)]
+    rows = [head("", "departures", "foretold", "by as many alarms at random", "windows without a departure", "alarms")]
+    total: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def add(name: str, before: np.ndarray, without: np.ndarray) -> None:
+        alarms = np.concatenate([before, without]) >= ALARM
+        figures = [f"{100 * values.mean():.0f} %" if len(values) else "" for values in (before >= ALARM, alarms)]
+        rows.append(row(name, len(before), *figures, len(without), f"{100 * (without >= ALARM).mean():.1f} %"))
+
+    for kind in (DISTURBED, HARD, ORDINARY):
+        total.append(risks(found, kind, limits.risk))
+        add(kind, *total[-1])
+    add("**all**", *map(np.concatenate, zip(*total, strict=True)))
+    return "\n".join(rows)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Drive, fit, measure; return the exit status. Raises UserError, OSError."""
+    parser = command_line("foretell", __doc__)
+    add = parser.add_argument
+    add("model", nargs="?", type=Path, default=SHIPPED_MODEL, help="model file (default: the project's own)")
+    add("--recordings", nargs="*", default=[], help="recordings of ordinary driving, or folders of recordings")
+    drives = "how many drives; fewer have some of each kind, too (default %(default)s, which is all)"
+    add("--drives", type=number(int, 20, len(courses())), default=len(courses()), help=drives)
+    add("--folder", type=Path, default=Path("foretell"), help="for what the drives show (default %(default)s)")
+    options = parser.parse_args(argv)
+    observe, chosen = observer(options.model), courses()[: options.drives]
+    folder = options.folder / fingerprint(observe.network)[:8]  # another network drives otherwise
+    folder.mkdir(parents=True, exist_ok=True)
+    recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
+    work = partial(drive_into, folder, options.model)
+    with ProcessPoolExecutor(threads(), mp_context=multiprocessing.get_context("spawn")) as pool:
+        for _ in progress_bar(len(chosen), "drives", iterable=pool.map(work, chosen)):
+            pass  # its errors are raised here
+    driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]
+    limits = fit([each for each in driven if each[0].tunes], recordings)
+    save_limits(options.model, observe.network, limits)
+    print(table(limits, [each for each in driven if not each[0].tunes]))
+    print(f"\n{limits_file(options.model)}: written; a car is better stopped at a risk of {limits.stop:.2f}")
+    return program.DONE
+
+
+if __name__ == "__main__":
+    run_tool(main)
