@@ -218,7 +218,7 @@ def test_the_place_that_the_stand_in_tells_is_shown_and_any_other_ignored(sessio
         assert session.answer({**telemetry(jpeg), "stand_in": told})["steering_angle"] == plain["steering_angle"]
         assert session.place is None and session.history[-1].cte is None and session.unusable == 0
     session.answer({**telemetry(jpeg), "stand_in": place})
-    assert session.place == Place(**place) and session.history[-1][-3:] == (0.25, 1, -2.5)
+    assert session.place == Place(**place) and session.history[-1][-4:] == (0.25, 1, -2.5, None)
 
 
 @pytest.mark.parametrize(
