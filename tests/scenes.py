@@ -48,7 +48,7 @@ def recorded(
     """What the expert drives, and the true lateral offset of each row, m; rendered with this process's own scenes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(record, "ProcessPoolExecutor", Here)
-        patch.setattr(record, "_cameras", cameras)
+        patch.setattr(record, "_cameras", lambda view: cameras(*view[:2]))
         run, _ = record.record(folder, track, laps, speed, seed, look)
     recording = read_recording(folder)
     steps = np.round((recording.time - recording.time[0]) / STEP).astype(int)
