@@ -107,6 +107,11 @@ class Drive:
         """Whether the driver failed."""
         return self.ended != "arrived"
 
+    @property
+    def autonomy(self) -> float:
+        """The share of the planned time without a human's help, 0..1; 0 if the car did not arrive."""
+        return 0.0 if self.failed else max(0.0, autonomy(len(self.departures), self.planned))
+
     def figures(self) -> dict[str, str | float]:
         """Return what people want to know of it."""
         rounded = {"farthest_m": self.farthest, "seconds": self.seconds, "along_m": self.along}

@@ -17,8 +17,7 @@ import drive
 from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
-from cloning.server.server import QUIET
-from cloning.server.telemetry import MAX_CLIENTS
+from cloning.server.server import MAX_CLIENTS, QUIET
 from tools import attack
 from tools.attacks import GET, WEBSOCKET, all_attacks, frame
 from tools.simulator_client import Simulator, telemetry

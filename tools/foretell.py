@@ -13,9 +13,7 @@ counted in windows of 5 s in drives without a departure. An interrupted run cont
 takes about 5 s on a core.
 """
 
-import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -53,10 +51,10 @@ from cloning.recordings.writer import SampleClock
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber
 from cloning.road.track import Track
 from cloning.server.speed import SpeedController
-from simulator import scenery
-from simulator.cameras import Cameras, jpeg
+from simulator.cameras import jpeg
+from simulator.driving import cameras_at
 from simulator.run import Run
-from simulator.world import Scene, free_unused
+from simulator.workers import started_workers
 from tools.command import command_line, head, row, run_tool
 from tools.lane_frames import every_second_shadowed
 
@@ -125,29 +123,17 @@ def observer(model: Path) -> Observer:
     return Observer(load_model(model))
 
 
-@cache
-def _cameras() -> list[Cameras]:
-    """Return the list for this process's cameras, which move from road to road: new ones for each would add up."""
-    return []
-
-
 def drive(model: Path, course: Course) -> Drive:
     """Drive a course, from a random start on; after a departure the car is put back on the road."""
-    observe, kept, look = observer(model), _cameras(), every_second_shadowed(course.number)
+    observe, cameras = observer(model), cameras_at(course.track, every_second_shadowed(course.number))
     run = Run(Track(course.track, ("ccw", "cw")[course.number // 2 % 2]), "autonomous")
-    scene = Scene(scenery.build(course.track, look))
-    if kept:
-        kept[0].move(scene)
-        free_unused()
-    else:
-        kept.append(Cameras(scene, ("center",)))
     run.s = float(np.random.default_rng(course.number).uniform(0, run.track.length))
     run.set_back()
     disturber = Disturber(Disturbance.parse(course.disturbance), course.number) if course.disturbance else None
     controller, clock = SpeedController(15 if course.kind == ORDINARY else 25), SampleClock(1 / SAMPLE_RATE)
     seen, time = [], []
     while run.time < (30 if disturber else 40) and len(run.departures) < MAX_DEPARTURES:
-        frame = decode(jpeg(kept[0].frames(run.car.node.get_transform())[0]))
+        frame = decode(jpeg(cameras.frames(run.car.node.get_transform())[0]))
         seen.append(observe(disturber(frame) if disturber else frame))
         time.append(run.time)
         throttle, due = controller.throttle(run.speed_mph), False
@@ -310,7 +296,7 @@ def main(argv: list[str] | None = None) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
     work = partial(drive_into, folder, options.model)
-    with ProcessPoolExecutor(threads(), mp_context=multiprocessing.get_context("spawn")) as pool:
+    with started_workers(threads()) as pool:
         for _ in progress_bar(len(chosen), "drives", iterable=pool.map(work, chosen)):
             pass  # its errors are raised here
     driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]

@@ -41,7 +41,7 @@ from cloning.recordings.images import decode, encode
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay import replay
 from cloning.replay.score import driving_metrics
-from cloning.road.autonomy import LIMITS, autonomy
+from cloning.road.autonomy import LIMITS
 from cloning.road.disturbances import HELD_OUT, KINDS, STRENGTHS, Disturbance, Disturber
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
@@ -117,9 +117,7 @@ def measure(drive: Drive) -> Figures:
             seed=drive.number,
         )
         driven = driving.drive(conditions, drive.on)
-        departures = len(driven.departures)
-        share = 0.0 if driven.failed else max(0.0, autonomy(departures, driven.planned))
-        return Figures(round(100 * share, 2), departures, round(driven.mean, 3))
+        return Figures(round(100 * driven.autonomy, 2), len(driven.departures), round(driven.mean, 3))
     steering, (recording, lines) = driving.load_driver(drive.model), _recording(drive.on)
 
     def driver(frame: replay.ReplayFrame) -> float:

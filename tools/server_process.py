@@ -4,7 +4,6 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
@@ -17,13 +16,13 @@ class ServerProcess:
     port: that it listens on.
     """
 
-    def __init__(self, *command: str | Path, environment: Mapping[str, str] | None = None):
+    def __init__(self, *command: str | Path):
         """Start it; command: arguments for the Python interpreter. Raises UserError if it ends before it listens.
 
         What it prints afterwards is discarded.
         """
         self.process = subprocess.Popen(
-            [sys.executable, *map(str, command)], env=environment, stderr=subprocess.PIPE, text=True, encoding="utf-8"
+            [sys.executable, *map(str, command)], stderr=subprocess.PIPE, text=True, encoding="utf-8"
         )
         assert self.process.stderr
         printed = []

@@ -9,10 +9,11 @@ from wsgiref.types import StartResponse, WSGIEnvironment
 
 from cloning.server.connections import refuse
 from cloning.server.libraries import engineio, eventlet, socketio
-from cloning.server.telemetry import MAX_CLIENTS, UNREADABLE
+from cloning.server.telemetry import UNREADABLE
 from cloning.server.websocket import WebSocket, WebSocketWSGI
 from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 
+MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 OPENING_INTERVAL = 0.005  # s between two new clients: opening a session costs as much as an answer
 MAX_UNREAD = 64  # packets that wait for a client; the simulator has 3 telemetries in flight

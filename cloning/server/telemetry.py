@@ -11,7 +11,6 @@ import numpy as np
 from cloning.recordings.images import decode
 from cloning.wire.protocol import STAND_IN, Place
 
-MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
 MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
 UNREADABLE = object()  # what the server gives for a telemetry that is too long or not JSON
 NUMERIC_FIELDS = ("steering_angle", "throttle", "speed")  # degrees, -1..1, mph; the first two as applied at the moment

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any, TypedDict
 
-from cloning.road.autonomy import autonomy
 from simulator.benchmark.tasks import GROUPS, Task
 from simulator.driving import Drive
 
@@ -39,11 +38,10 @@ def percent(autonomy: float) -> float:
 
 def driven(task: Task, drive: Drive) -> Driven:
     """Return what is told of a drive."""
-    share = 0.0 if drive.failed else autonomy(len(drive.departures), drive.planned)
     return {
         "group": task.group,
         "name": task.name,
-        "score": percent(share),
+        "score": percent(drive.autonomy),
         "departures": [round(departure.time, 2) for departure in drive.departures],
         "ended": drive.ended,
         "mean_m": round(drive.mean, 3),
