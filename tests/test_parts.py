@@ -81,6 +81,17 @@ def test_a_short_stretch_is_placed_beside_a_certain_one(lake):
     assert np.isnan(placed(recording.take(alone), centres[alone])).all()
 
 
+def test_stretches_too_short_for_a_window_are_placed_together_or_if_long_enough_alone(lake):
+    recording, centres = lake
+    short = np.r_[0:100, 120:190, 210:280, 300:500, 520:590]
+    check(placed(recording.take(short), centres[short]), np.ones(len(short), bool))
+    long, alone = np.r_[300:540], np.r_[300:500]  # 191 m and 159 m
+    check(placed(recording.take(long), centres[long]), np.ones(len(long), bool))
+    assert np.isnan(placed(recording.take(alone), centres[alone])).all()
+    other, seen = driven("road-9", 600)
+    assert np.isnan(placed(other.take(short), seen[short])).all()
+
+
 @pytest.mark.parametrize("rows", [70, 350])
 @pytest.mark.parametrize("pause", [PAUSE, 2.0])
 def test_no_row_of_another_road_is_taken_for_the_track(lake, rows, pause):

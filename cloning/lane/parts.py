@@ -5,6 +5,7 @@ and how the car turns agree with the track. So a car that is stuck, pushed back 
 rows after it are sought near its end, where the car must be.
 """
 
+import copy
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -32,6 +33,12 @@ PROBES = (0, 10, 20, 30, 45, 60, 80, 100, 130, 160, 200, 250)  # rows after a ne
 # At looser limits in the jungle (-0.42, 1.45) most of a generated road fits there in pieces, after a pause.
 EXPECTED = {"lake": (60, -0.05, 0.3), "jungle": (60, -0.25, 0.75)}
 MISHAP = {"lake": (100, -0.04, 0.25), "jungle": (100, -0.2, 0.65)}
+# Stretches far from any part and too short for a window are certain alone with so many metres at these limits, or with
+# so many in several stretches beside each other, of which the longest has as many rows and keeps them. Of 66 windows of
+# 160 to 290 m of generated roads, in either network's detections, those that fit the lake best have (-0.03, 0.48), and
+# those that fit the jungle best (-0.28, 1.0).
+ALONE_ROWS, ALONE_METRES, TOGETHER_METRES = 150, 170.0, 270.0
+ALONE = {"lake": (ALONE_ROWS, -0.03, 0.3), "jungle": (ALONE_ROWS, -0.2, 0.65)}
 PROBE_STEP = 5.0  # m between candidates
 SLACK, SLACK_PER_METRE = 5.0, 0.1  # m, and of the metres driven: where the car should be without a mishap
 BACK, BEYOND = 30.0, 20.0  # m: further back, or further on than it drove, the car is not after a mishap
@@ -66,6 +73,10 @@ class Part:
         found = self.found
         fits = found.log_likelihood > log_likelihood and found.turn_residual < turn_residual
         return fits and self.end - self.start >= rows
+
+    def metres(self) -> float:
+        """Return how far the car drives in the part, m."""
+        return float(self.found.states[-1, 0] - self.found.states[0, 0])
 
     def away_from(self, other: "Part") -> float:
         """Return how far from here another part is placed in the rows of both, across the road, on average, m."""
@@ -184,6 +195,33 @@ class Placing:
                 self.parts.append(found)
         self.parts = self.parts[:: 1 if forward else -1]
 
+    def together(self) -> None:
+        """Place stretches that are far from every part, alone or with those beside them: see ALONE."""
+        placed = {part.stretch for part in self.parts}
+        for index in sorted(range(len(self.followers)), key=lambda i: -len(self.followers[i].stretch)):
+            if index in placed or not (first := self.alone(index)):
+                continue
+            group = copy.copy(self)
+            group.parts = [first]
+            for forward in (True, False):
+                group.spread(forward)
+            new = [part for part in group.parts if part.stretch not in placed]
+            if first.metres() >= ALONE_METRES or sum(part.metres() for part in new) >= TOGETHER_METRES:
+                self.parts = sorted([*self.parts, *new], key=lambda part: (part.stretch, part.start))
+                placed |= {part.stretch for part in new}
+
+    def alone(self, index: int) -> Part | None:
+        """Return the part of a stretch that is at the limits ALONE, or None."""
+        followers = self.followers[index]
+        n, middle = len(followers.stretch), len(followers.stretch) // 2
+        if not ALONE_ROWS <= n < WINDOW:
+            return None
+        found = followed(search(followers.ahead, 0, n), n)
+        track = known_tracks().index(found.track)
+        grown = followers.grow(track, middle, found.states[middle], 0, n)
+        part = Part(index, track, *grown) if grown else None
+        return part if part and part.is_beyond(ALONE[found.track.name]) else None
+
     def next_to(self, part: Part, other: Part | None, forward: bool) -> Part | None:
         """Return the nearest part that is certain between two, or None; other: the next one, as yet, if any."""
         for index, first, end in self.gaps(part, other, forward):
@@ -272,6 +310,7 @@ def certain_parts(
     placing.anchors()
     for forward in (True, False):
         placing.spread(forward)
+    placing.together()
     found = []
     for part in placing.parts:
         whole = stretches[part.stretch].rows.start
