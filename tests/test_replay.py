@@ -153,7 +153,11 @@ def test_a_report_tells_known_rows_from_others(recording, lane):
     text = report_text(report)
     assert text.index("from the lane's centre: autonomy") < text.index("recorded driver's path: autonomy")
     assert text.index("recorded driver's path: autonomy") < text.index("from both: autonomy")
-    assert f"40 rows from {mishap['first']}: not driven" in text and "33.3% of the rows" in text
+    assert f"40 rows from {mishap['first']} to {mishap['last']}: not driven" in text and "33.3% of the rows" in text
+    lines = replay.reference_lines(recording, by_lane=False)
+    asked = replay_report(recording, lines, [replay.drive(recording, lines, 1.0, lambda _: 0.0)], "human")
+    assert asked["rows_placed"] is None and "placed" not in report_text(asked)
+    assert [each["why"].endswith("as asked") for each in asked["unknown"]] == [True]
 
 
 def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, lane):

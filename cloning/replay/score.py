@@ -26,6 +26,7 @@ REFERENCES = {LANE_CENTRE: "from the lane's centre", HUMAN_WAY: "from the record
 # Why the lane's centre is not the reference.
 NOT_DRIVEN = "not driven: standing, or less than two seconds without a break"
 NOT_ON_THE_ROAD = "not driven: off the road, or the car did not move as it was steered"
+AS_ASKED = "measured from the recorded driver's path, as asked"
 NOT_READ = (
     "measured from the recorded driver's path: not placed on a known track, and not read reliably from the frames"
 )
@@ -83,11 +84,11 @@ class Unknown(TypedDict):
 class ReferenceMetrics(TypedDict):
     """What is known of the lane in a recording.
 
-    rows_placed: whose position is that on a known track, or told by the recording itself; unknown: where the lane's
-    centre is not the reference; mean_speed_mph: of the rows driven.
+    rows_placed: whose position is that on a known track, or told by the recording itself; None if the lane was not
+    asked for; unknown: where the lane's centre is not the reference; mean_speed_mph: of the rows driven.
     """
 
-    rows_placed: int
+    rows_placed: int | None
     unknown: list[Unknown]
     mean_speed_mph: float
 
@@ -146,17 +147,19 @@ def drive_metrics(lines: list[ReferenceLine], done: Drive) -> DriveMetrics:
     }
 
 
-def reference_metrics(recording: Recording, lines: list[ReferenceLine]) -> ReferenceMetrics:
-    """Return what is known of the lane in a recording; lines: of `reference_lines`."""
+def reference_metrics(recording: Recording, lines: list[ReferenceLine], asked: str = "lane") -> ReferenceMetrics:
+    """Return what is known of the lane in a recording; lines, asked: as for `replay_report`."""
+    by_lane = asked == "lane"
+    not_by_lane = NOT_READ if by_lane else AS_ASKED
     why, driven = np.full(len(recording), NOT_DRIVEN, object), np.zeros(len(recording), bool)
     for rows in stretch_rows(recording):
         why[rows] = NOT_ON_THE_ROAD
     for line in lines:
-        why[line.rows], driven[line.rows] = "" if line.is_lane_centre else NOT_READ, True
+        why[line.rows], driven[line.rows] = "" if line.is_lane_centre else not_by_lane, True
     edges = np.flatnonzero(why[1:] != why[:-1]) + 1
     runs = itertools.pairwise([0, *edges.tolist(), len(why)])
     return {
-        "rows_placed": sum(line.placed for line in lines),
+        "rows_placed": sum(line.placed for line in lines) if by_lane else None,
         "unknown": [
             {"first": recording.name(start), "last": recording.name(end - 1), "rows": end - start, "why": why[start]}
             for start, end in runs
@@ -224,7 +227,7 @@ def replay_report(
         "rows_driven": rows,
         "stretches": len(lines),
         "seconds": round(sum(drives[0].seconds), 2),
-        **reference_metrics(recording, lines),
+        **reference_metrics(recording, lines, asked),
         "disturbance": None if disturbance is None else str(disturbance),
         "reference_asked": asked,
         "reference": {LANE_CENTRE: by_lane, HUMAN_WAY: rows - by_lane},
@@ -241,13 +244,17 @@ def report_text(report: ReplayReport) -> str:
     stretches, rows = plural(report["stretches"], "stretch", "stretches"), report["rows"]
     lines = [
         f"{report['recording']}: replayed {report['seconds']:.1f} s in {stretches} ({report['rows_driven']} of {rows} "
-        f"rows) at {report['mean_speed_mph']:.1f} mph on average; {report['rows_placed'] / rows:.1%} of the rows are "
-        "placed, on a known track or by the recording itself"
+        f"rows) at {report['mean_speed_mph']:.1f} mph on average"
     ]
+    if report["rows_placed"] is not None:
+        placed = report["rows_placed"] / rows
+        lines[0] += f"; {placed:.1%} of the rows are placed, on a known track or by the recording itself"
     if report["disturbance"]:
         lines.append(f"  disturbance: {report['disturbance']}")
     if report["reference_asked"] == "lane":
-        unknown = [f"{plural(u['rows'], 'row')} from {u['first']}: {u['why']}" for u in report["unknown"]]
+        unknown = [
+            f"{plural(u['rows'], 'row')} from {u['first']} to {u['last']}: {u['why']}" for u in report["unknown"]
+        ]
         lines += [f"  lane's centre unknown in {words}" for words in unknown[:LISTED]]
         if (more := len(unknown) - LISTED) > 0:
             lines.append(f"  … and in {plural(more, 'more place')}")
