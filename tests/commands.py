@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import unittest.mock
-from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +46,6 @@ def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
         except SystemExit as error:  # argparse's
             status = error.code
     return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
-
-
-class Here(Executor):
-    """In place of the processes of `simulator.workers`: it does everything in this one, at once."""
-
-    def submit(self, work, /, *arguments, **more) -> Future:
-        done: Future = Future()
-        done.set_result(work(*arguments, **more))
-        return done
 
 
 def started_run(*arguments, until: str) -> warm.Process:

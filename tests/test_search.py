@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from commands import Here
+from scenes import Here
 from steer_server import STEER, Server
 
 from cloning.base.program import DONE
@@ -29,7 +29,7 @@ def straight(tmp_path_factory):
 
 
 def test_a_search_finds_failures_that_repeat_and_writes_roads_for_others(straight, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(search, "started_workers", lambda *_: Here())
+    monkeypatch.setattr(search, "started_workers", Here)
     folder = tmp_path / "found"
     words = [str(folder), "--driver", straight, "--roads", "2", "--searches", "random"]
     assert search.main(words) == DONE
