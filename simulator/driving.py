@@ -262,10 +262,7 @@ def cameras_at(road: str | PointRoad, look: int) -> Cameras:
 
 
 def _drive(
-    conditions: Conditions,
-    road: str | PointRoad,
-    answer: Callable[[bytes, Run], Answer] | None,
-    watch: Watch | None,
+    conditions: Conditions, road: str | PointRoad, answer: Callable[[bytes, Run], Answer] | None, watch: Watch | None
 ) -> Drive:
     track = Track(road, conditions.direction)
     run, clock = Run(track, "autonomous"), SampleClock(1 / SAMPLE_RATE)
