@@ -38,7 +38,7 @@ from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import write
 from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
-from cloning.network.network import CROP, NETWORKS, SEEN_SHAPE, load_model
+from cloning.network.network import NETWORKS, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.frames import KEPT_FRAMES, FrameCache
@@ -50,10 +50,10 @@ from cloning.training.distributed import FirstRankFailed, Ranks
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
 from cloning.training.muon import OPTIMIZERS
-from cloning.training.observations import CameraViews, Choices, Observations, batch_images, centre_images
+from cloning.training.observations import CameraViews, Choices, Observations, centre_images
 from cloning.training.options import Command, Process, Run
 from cloning.training.pictures import batch_pictures, loss_picture
-from cloning.training.pieces import Batch, SquaredErrors, pieces, predict
+from cloning.training.pieces import Batch, SquaredErrors, predict, start_batch
 from cloning.training.recipe import Augmentation, Recipe, Words
 from cloning.training.robust import robust
 from cloning.training.run_files import RunFiles
@@ -236,36 +236,8 @@ class Generator:
 
     def start_batch(self, number: int) -> Callable[[], Batch]:
         """Start making this process's share of batch `number`; return a function that waits for it and returns it."""
-        choices, augmentations = self.sample(number), self.recipe.augmentations
-        mine = np.arange(self.recipe.batch_size)[self.ranks.share]
-        slots = choices.slots[mine]
-        order = np.sort(slots[slots >= 0])  # the slots of this process's images among those of the whole batch
-        at = np.where(slots < 0, -1, np.searchsorted(order, slots))  # and where they are in its share
-        labels = np.empty(len(order), np.float32)
-        labels[at[at >= 0]] = choices.views.labels[mine][at >= 0]
-        on_gpu = self.observations.gpu is not None
-        images: Any = (
-            batch_images(choices, augmentations, mine, at) if on_gpu else np.empty((len(order), *SEEN_SHAPE), np.uint8)
-        )
-
-        def make(part: slice) -> None:
-            for i, (augmentation, seen) in enumerate(zip(augmentations, choices.views.images(mine[part]), strict=True)):
-                has = at[part, i] >= 0
-                if not has.any():
-                    continue
-                which, seen = (mine[part], seen) if has.all() else (mine[part][has], seen[has])
-                chosen = (column[which] for column in choices.augmenting[i])
-                images[at[part, i][has]] = augmentation.change(seen, CROP[0], *chosen)
-
-        parts = [] if on_gpu else [self.pool.submit(make, piece) for piece in pieces(len(mine))]
-
-        def wait() -> Batch:
-            for part in parts:
-                part.result()
-            keep = None if choices.keep is None else choices.keep[order]
-            return Batch(images, labels, keep, int((choices.slots >= 0).sum()))
-
-        return wait
+        pool = None if self.observations.gpu else self.pool
+        return start_batch(self.sample(number), self.recipe.augmentations, self.ranks.share, pool)
 
     def start_next(self) -> None:
         """Start making one more batch."""

@@ -108,22 +108,13 @@ def add_command(
 def add_record(commands: "Subparsers") -> None:
     """Add `record`."""
     parser = add_command(commands, run_record, "record an expert driver, faster than real time", LAPS, ROAD, DISTURB)
-    parser.add_argument("folder", help="folder for the new recording: IMG/ and driving_log.csv")
-    parser.add_argument(
-        "--speed",
-        type=number(float, 1, TOP_SPEED_MPH),
-        default=TOP_SPEED_MPH,
-        help="set speed in mph, 1 to %(default)s (default %(default)s)",
-    )
-    parser.add_argument(
-        "--recovery", action="store_true", help="record only returns from the sides of the road to the lane centre"
-    )
-    parser.add_argument(
-        "--seed",
-        type=number(int, 0),
-        default=0,
-        help="seed of the expert's random lateral offsets, the dates in the image names, and --disturb (default 0)",
-    )
+    add, mph = parser.add_argument, number(float, 1, TOP_SPEED_MPH)
+    add("folder", help="folder for the new recording: IMG/ and driving_log.csv")
+    text = "set speed in mph, 1 to %(default)s (default %(default)s)"
+    add("--speed", type=mph, default=TOP_SPEED_MPH, help=text)
+    add("--recovery", action="store_true", help="record only returns from the sides of the road to the lane centre")
+    text = "seed of the expert's random lateral offsets, the dates in the image names, and --disturb (default 0)"
+    add("--seed", type=number(int, 0), default=0, help=text)
 
 
 def add_drive(commands: "Subparsers") -> None:
@@ -136,82 +127,58 @@ def add_drive(commands: "Subparsers") -> None:
         epilog="Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if an error ended the drive "
         "or a file could not be written.",
     )
-    parser.add_argument(
-        "--realtime",
-        action="store_true",
-        help="simulated time follows the wall clock; by default it waits for each answer, and a drive is repeatable",
-    )
-    parser.add_argument("--report", metavar="FILE", help="write the lap report as JSON")
-    parser.add_argument("--picture", metavar="FILE.png", help="plot the track from above with the path driven")
-    parser.add_argument(
-        "--film", metavar="FILE.mp4", help="film the drive from behind the car, with what its camera sees"
-    )
+    add = parser.add_argument
+    text = "simulated time follows the wall clock; by default it waits for each answer, and a drive is repeatable"
+    add("--realtime", action="store_true", help=text)
+    add("--report", metavar="FILE", help="write the lap report as JSON")
+    add("--picture", metavar="FILE.png", help="plot the track from above with the path driven")
+    add("--film", metavar="FILE.mp4", help="film the drive from behind the car, with what its camera sees")
 
 
 def add_correct(commands: "Subparsers") -> None:
     """Add `correct`."""
-    parser = add_command(
-        commands,
-        run_correct,
-        "let drive.py drive, and record the expert, who takes over where the car is off the lane's centre",
-        *(LAPS, SERVER, WAIT, ROAD, DISTURB),
-        epilog="Exit status: as that of drive.",
+    text = "let drive.py drive, and record the expert, who takes over where the car is off the lane's centre"
+    shared = LAPS, SERVER, WAIT, ROAD, DISTURB
+    parser = add_command(commands, run_correct, text, *shared, epilog="Exit status: as that of drive.")
+    endings, mph = " or ".join(PROBLEM_AREAS), number(float, 1, TOP_SPEED_MPH)
+    parser.add_argument("folder", help=f"folder for the new recording; its name must end in {endings}")
+    text = (
+        "the expert's set speed in mph, which the car never exceeds: give drive.py the same (default %(default)g, "
+        "as that of drive.py)"
     )
-    parser.add_argument(
-        "folder", help=f"folder for the new recording; its name must end in {' or '.join(PROBLEM_AREAS)}"
-    )
-    parser.add_argument(
-        "--speed",
-        type=number(float, 1, TOP_SPEED_MPH),
-        default=SET_SPEED_MPH,
-        help="the expert's set speed in mph, which the car never exceeds: give drive.py the same (default %(default)g, "
-        "as that of drive.py)",
-    )
+    parser.add_argument("--speed", type=mph, default=SET_SPEED_MPH, help=text)
 
 
 def add_replay(commands: "Subparsers") -> None:
     """Add `replay`."""
-    help_text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
-    parser = add_command(commands, run_replay, help_text, SERVER, WAIT, DISTURB)
-    parser.add_argument("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
-    parser.add_argument("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
-    parser.add_argument(
-        "--limit",
-        type=number(float, 0.01, 1000),
-        nargs="+",
-        default=LIMITS,
-        dest="limits",
-        metavar="LIMIT",
-        help="distance in m from the lane centre at which a human would take over; each limit is a drive of its own "
-        "(default 1, as in NVIDIA's evaluation, and 2.5, where the side of the car is on the edge line)",
+    text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
+    add = add_command(commands, run_replay, text, SERVER, WAIT, DISTURB).add_argument
+    add("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
+    add("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
+    text = (
+        "distance in m from the lane centre at which a human would take over; each limit is a drive of its own "
+        "(default 1, as in NVIDIA's evaluation, and 2.5, where the side of the car is on the edge line)"
     )
-    parser.add_argument(
-        "--reference",
-        choices=("lane", "human"),
-        default="lane",
-        help="measure offsets from the lane centre, estimated from the frames (default), or from the human "
-        "driver's path",
-    )
-    parser.add_argument("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
-    parser.add_argument("--picture", metavar="FILE.png", help="plot lateral offset and steering over time")
-    parser.add_argument("--film", metavar="FILE.mp4", help="film what the model sees in the drives at the last limit")
+    metres = number(float, 0.01, 1000)
+    add("--limit", type=metres, nargs="+", default=LIMITS, dest="limits", metavar="LIMIT", help=text)
+    text = "measure offsets from the lane centre, estimated from the frames (default), or from the human driver's path"
+    add("--reference", choices=("lane", "human"), default="lane", help=text)
+    add("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
+    add("--picture", metavar="FILE.png", help="plot lateral offset and steering over time")
+    add("--film", metavar="FILE.mp4", help="film what the model sees in the drives at the last limit")
 
 
 def add_window(commands: "Subparsers") -> None:
     """Add `window`."""
-    parser = add_command(
-        commands, run_window, "drive and record by hand, or watch drive.py drive", SERVER, ROAD, DISTURB
+    text = "drive and record by hand, or watch drive.py drive"
+    add = add_command(commands, run_window, text, SERVER, ROAD, DISTURB).add_argument
+    text = (
+        "folder for the recording (default data/window-DATE-TIME, or data/window-DATE-TIME-corrections with "
+        "--autonomous)"
     )
-    parser.add_argument(
-        "--folder",
-        help="folder for the recording (default data/window-DATE-TIME, or data/window-DATE-TIME-corrections with "
-        "--autonomous)",
-    )
-    parser.add_argument(
-        "--autonomous",
-        action="store_true",
-        help="let drive.py drive; W or S takes over, and only then is anything recorded",
-    )
+    add("--folder", help=text)
+    text = "let drive.py drive; W or S takes over, and only then is anything recorded"
+    add("--autonomous", action="store_true", help=text)
 
 
 def add_join(commands: "Subparsers") -> None:
@@ -224,35 +191,26 @@ def add_join(commands: "Subparsers") -> None:
         epilog="It ends when the program's server has gone for --wait seconds. Unity's own options, with which such "
         "programs start their simulator, are accepted: -logFile FILE takes the messages, and -batchmode is always so.",
     )
-    parser.add_argument(
-        "--dialect",
-        choices=("measures", "roads", "episodes"),
-        required=True,
-        help="measures: telemetry with cte, laps and so on (SelfOracle, ThirdEye); roads: the program sends roads "
-        "(maxitwo, perturbation-drive, MultiSim); episodes: on named tracks, in weathers (udacity-gym)",
+    add = parser.add_argument
+    text = (
+        "measures: telemetry with cte, laps and so on (SelfOracle, ThirdEye); roads: the program sends roads "
+        "(maxitwo, perturbation-drive, MultiSim); episodes: on named tracks, in weathers (udacity-gym)"
     )
-    parser.add_argument(
-        "--pace",
-        type=number(float, 0, 100),
-        default=0.0,
-        metavar="FACTOR",
-        help="let simulated time follow the wall clock: 1 in real time, 0.5 half as fast; by default it waits for the "
-        "answer to each telemetry, and in the dialect roads for the program's driver",
+    add("--dialect", choices=("measures", "roads", "episodes"), required=True, help=text)
+    text = (
+        "let simulated time follow the wall clock: 1 in real time, 0.5 half as fast; by default it waits for the "
+        "answer to each telemetry, and in the dialect roads for the program's driver"
     )
-    parser.add_argument(
-        "--fps",
-        type=number(float, 1, 1000),
-        default=SAMPLE_RATE,
-        help="telemetries a simulated second, of which there are at most 50 (default %(default)s)",
+    add("--pace", type=number(float, 0, 100), default=0.0, metavar="FACTOR", help=text)
+    text = "telemetries a simulated second, of which there are at most 50 (default %(default)s)"
+    add("--fps", type=number(float, 1, 1000), default=SAMPLE_RATE, help=text)
+    text = (
+        "only write a program that runs this command with these options and its own; programs that start the "
+        "simulator themselves take it for the simulator"
     )
-    parser.add_argument(
-        "--launcher",
-        metavar="NAME.x86_64",
-        help="only write a program that runs this command with these options and its own; programs that start the "
-        "simulator themselves take it for the simulator",
-    )
-    parser.add_argument("-logFile", dest="log", metavar="FILE", help=argparse.SUPPRESS)
-    parser.add_argument("-batchmode", action="store_true", help=argparse.SUPPRESS)
+    add("--launcher", metavar="NAME.x86_64", help=text)
+    add("-logFile", dest="log", metavar="FILE", help=argparse.SUPPRESS)
+    add("-batchmode", action="store_true", help=argparse.SUPPRESS)
 
 
 def add_benchmark(commands: "Subparsers") -> None:
@@ -261,12 +219,8 @@ def add_benchmark(commands: "Subparsers") -> None:
     add = parser.add_argument
     add("entry", help="model file, .onnx file, HOST:PORT of a server, straight (steering 0) or expert")
     add("--quick", action="store_true", help="fewer and shorter drives: two minutes on 2 cores, else up to an hour")
-    add(
-        "--folder",
-        type=Path,
-        default=Path("benchmark"),
-        help="for report.html and benchmark.json (default: %(default)s)",
-    )
+    text = "for report.html and benchmark.json (default: %(default)s)"
+    add("--folder", type=Path, default=Path("benchmark"), help=text)
     add("--recordings", type=Path, metavar="FOLDER", help="also replay the real recordings of data/README.md in it")
     add_workers(parser)
 

@@ -9,7 +9,7 @@ from cloning.base.frame import FRAME
 from cloning.recordings.format import CAMERAS
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, MOUNT_PITCH, VERTICAL_FIELD
 from cloning.road.disturbances import Disturbance, Disturber
-from simulator.world import INSIDE, Scene
+from simulator.world import INSIDE, Scene, free_unused
 
 JPEG_QUALITY = 75  # with colour at half resolution, as the tables in the real simulator's images show
 NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m, as for the real simulator's cameras
@@ -94,6 +94,7 @@ class Cameras:
         self.scene = scene
         for camera in self.mounted:
             camera.reparent_to(scene.car)
+        free_unused()
 
     def frames(self, transform: core.TransformState) -> np.ndarray:
         """Render a drive's next frames: uint8 (cameras, 160, 320, 3), RGB, in the names' order.

@@ -30,7 +30,7 @@ from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
 from simulator.scenery.segments import segments
 from simulator.scenery.weather import FALLING, in_weather
-from simulator.world import Scene, free_unused
+from simulator.world import Scene
 
 SECTOR = 10.0  # m of road that waypoints and sectors count
 AHEAD = 5.0  # m ahead of the car: where `next_cte` is measured, if it goes straight on
@@ -86,7 +86,6 @@ class Dialect:
                 self.views[i].move(Scene(built))
             else:
                 self.views.append(Cameras(Scene(built), ("center",)))
-        free_unused()
         self.restart()
 
     def build(self, source: str | PointRoad) -> list[scenery.Scenery]:

@@ -40,7 +40,7 @@ from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Expert
 from simulator.run import Departure, Run
-from simulator.world import Scene, free_unused
+from simulator.world import Scene
 
 PATIENCE = 30.0  # s that a drive may take beyond twice the time at its set speed
 WAIT = 60.0  # s for a server's answer
@@ -258,15 +258,11 @@ def cameras_at(road: str | PointRoad, look: int) -> Cameras:
         kept.append(Cameras(scene, ("center",)))
     elif kept[0].scene is not scene:
         kept[0].move(scene)
-        free_unused()
     return kept[0]
 
 
 def _drive(
-    conditions: Conditions,
-    road: str | PointRoad,
-    answer: Callable[[bytes, Run], Answer] | None,
-    watch: Watch | None,
+    conditions: Conditions, road: str | PointRoad, answer: Callable[[bytes, Run], Answer] | None, watch: Watch | None
 ) -> Drive:
     track = Track(road, conditions.direction)
     run, clock = Run(track, "autonomous"), SampleClock(1 / SAMPLE_RATE)

@@ -181,7 +181,6 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
             self.cameras.move(scene)
             if self.view:
                 self.view.move(scene)
-            free_unused()
         self.track, self.look = track, look
 
     def _set_on_road(self, options: dict[str, Any]) -> None:

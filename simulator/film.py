@@ -9,7 +9,7 @@ from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import SampleClock
 from simulator.cameras import Buffer, Cameras, lens
 from simulator.run import Run
-from simulator.world import OUTSIDE, Scene
+from simulator.world import OUTSIDE, Scene, free_unused
 
 FILM_ROWS, FILM_COLUMNS = 360, 640
 # bits/s: 9 MB for a lake lap of 284 s, at 9 mph. Without a limit it takes 47 MB, most of them for the asphalt's grain.
@@ -48,6 +48,7 @@ class ChaseView:
         """Look at another scene from now on."""
         self.scene = scene
         self.camera.reparent_to(scene.root)
+        free_unused()
 
     def frame(self, run: Run) -> np.ndarray:
         """Render the view with its caption: uint8 (360, 640, 3), RGB."""

@@ -1,12 +1,12 @@
 """The lap report: the metrics of a drive as JSON and as text, and a picture of the track from above."""
 
-import io
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 import numpy as np
 
+from cloning.base.figure import png
 from cloning.base.outputs import write_output
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH
@@ -160,7 +160,6 @@ def write_picture(path: str | Path, run: Run) -> None:
     Raises OutputError.
     """
     from matplotlib import colors  # here, because loading matplotlib takes long and only this function needs it
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
@@ -168,7 +167,6 @@ def write_picture(path: str | Path, run: Run) -> None:
     wide, high = np.ptp(track.points[:, :2], axis=0) + 2 * MARGIN
     map_inches = min(MAP_INCHES / wide, MAP_INCHES / high) * np.array([wide, high])
     figure = Figure(figsize=(map_inches[0] + 1.6, map_inches[1] + 2.8), layout="constrained")
-    FigureCanvasAgg(figure)
     above, along = figure.subplots(2, 1, height_ratios=[map_inches[1], 1.7])
     above.set_aspect("equal")
     ring = track.wrap(np.arange(round(track.length / track.step) + 1))
@@ -204,9 +202,7 @@ def write_picture(path: str | Path, run: Run) -> None:
     along.set(xlabel="distance driven, m", ylabel="m right of the\ncentre line", ylim=(-1.05 * scale, 1.05 * scale))
     along.set_xlim(0, max(1.0, run.distance))
     along.grid(alpha=0.3)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=130)
-    write_output(path, picture.getvalue())
+    write_output(path, png(figure, 130))
 
 
 def mark_start(axes: "Axes", track: Track) -> None:

@@ -76,6 +76,13 @@ def linked(sample_recording, tmp_path) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def network() -> Network:
+    """A network with random weights."""
+    torch.manual_seed(3)
+    return Network().eval()
+
+
 @pytest.fixture(scope="session")
 def model_file(tmp_path_factory) -> Path:
     """A model file with random weights."""

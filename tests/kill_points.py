@@ -143,13 +143,7 @@ class Watched:
     """A running command whose changes to its files are counted, and the files that it prints and counts in."""
 
     def __init__(
-        self,
-        command: list,
-        folder: Path,
-        *,
-        kill: int | None = None,
-        full: int | None = None,
-        bytes: int | None = None,
+        self, command: list, folder: Path, *, kill: int | None = None, full: int | None = None, bytes: int | None = None
     ):
         """command: as behind `python`; folder: where it runs; kill, full: see `Points`; bytes: the longest file's."""
         self.output, self.trace = folder.with_name("output"), folder.with_name("trace")

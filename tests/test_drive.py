@@ -39,12 +39,6 @@ def jpeg() -> bytes:
     return jpeg_of(render_frame(0.3, 0.5, np.random.default_rng(0)))
 
 
-@pytest.fixture(scope="module")
-def network() -> Network:
-    torch.manual_seed(3)
-    return Network().eval()
-
-
 @pytest.fixture
 def session(network) -> drive.Session:
     return drive.Session(drive.DriveServer(network))

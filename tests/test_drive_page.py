@@ -11,21 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 from browser import LOOKS, decoded, needs_chromium
 from drive_process import ask, serving
 
 import drive
-from cloning.network.network import Network
 from cloning.server import page as drive_page
 from tools import bench_driving
 from tools.simulator_client import Simulator, telemetry
-
-
-@pytest.fixture(scope="module")
-def network() -> Network:
-    torch.manual_seed(3)
-    return Network().eval()
 
 
 @pytest.fixture(scope="module")

@@ -32,12 +32,6 @@ def ordinary() -> Ordinary:
     return Ordinary.of(observations(np.random.default_rng(0), 2000, 0))
 
 
-@pytest.fixture(scope="module")
-def network() -> Network:
-    torch.manual_seed(3)
-    return Network().eval()
-
-
 @pytest.fixture
 def limits(network) -> Limits:
     observer, rng = Observer(network), np.random.default_rng(1)

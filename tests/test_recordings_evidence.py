@@ -97,10 +97,7 @@ def programs(draw, start, is_headed):
     separator, trailing = draw(st.sampled_from([",", ",", ",", ", ", ";", "\t"])), draw(st.sampled_from(["", "", ",,"]))
     mark, quote = draw(st.sampled_from([".", ".", ","])), draw(st.sampled_from(["", "", "", '"']))
     form = draw(st.sampled_from(["{:.7G}", "{:.7G}", "{!r}", "{:.4f}"]))  # C#'s, Python's, fixed
-    folder, end = (
-        draw(st.sampled_from(FOLDERS)),
-        draw(st.sampled_from(["\n", "\n", "\r\n"])),
-    )
+    folder, end = (draw(st.sampled_from(FOLDERS)), draw(st.sampled_from(["\n", "\n", "\r\n"])))
     extras = {name: draw(st.sampled_from(EXTRAS)) for name in order if name.startswith("extra")}
     units: dict[str, tuple[float, float]] = {}
     lines: list[Line] = []

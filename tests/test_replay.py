@@ -30,13 +30,7 @@ from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.processes import CAN_FORK
-from cloning.replay.score import (
-    ReplayFilm,
-    driving_metrics,
-    replay_report,
-    report_text,
-    steering_metrics,
-)
+from cloning.replay.score import ReplayFilm, driving_metrics, replay_report, report_text, steering_metrics
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
 from simulator import __main__ as simulator

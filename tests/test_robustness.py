@@ -3,6 +3,7 @@
 import json
 
 from rendered import render_recording
+from scenes import Here
 
 from cloning.network.network import SHIPPED_MODEL
 from cloning.road.disturbances import Disturbance
@@ -11,9 +12,10 @@ from simulator import driving
 from tools import robustness
 
 
-def test_drives_and_replays_are_measured_once_and_a_run_goes_on(tmp_path, capsys):
+def test_drives_and_replays_are_measured_once_and_a_run_goes_on(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(robustness, "started_workers", Here)
     folder = render_recording(tmp_path / "lake", rows=60)
-    words = ["--kinds", "late", "--strengths", "5", "--tracks", "lake", "--laps", "0.02", "--processes", "1"]
+    words = ["--kinds", "late", "--strengths", "5", "--tracks", "lake", "--laps", "0.02"]
     words += ["--recordings", str(folder), "--output", str(tmp_path / "found")]
     assert robustness.main(words) == 0
     file = tmp_path / "found" / "robustness.json"

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from scenes import Here
 from steer_server import STEER, Server
 
 from cloning.base.program import DONE
@@ -27,9 +28,10 @@ def straight(tmp_path_factory):
     return str(path)
 
 
-def test_a_search_finds_failures_that_repeat_and_writes_roads_that_can_be_driven(straight, tmp_path, capsys):
+def test_a_search_finds_failures_that_repeat_and_writes_roads_for_others(straight, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(search, "started_workers", Here)
     folder = tmp_path / "found"
-    words = [str(folder), "--driver", straight, "--roads", "2", "--searches", "random", "--processes", "1"]
+    words = [str(folder), "--driver", straight, "--roads", "2", "--searches", "random"]
     assert search.main(words) == DONE
     printed, told = capsys.readouterr().out, json.loads((folder / "search.json").read_text(encoding="utf-8"))
     assert "2 of 2 failures were the same" in printed
@@ -50,7 +52,8 @@ def rotation(points):
     return np.array([(east, -north), (north, east)])
 
 
-def test_a_server_drives_until_the_end_of_the_road_or_until_it_is_late():
+def test_a_server_drives_until_the_end_of_the_road_or_until_it_is_late(monkeypatch):
+    monkeypatch.setattr(driving, "PATIENCE", 3.0)  # instead of half a minute, in 450 frames
     road = make_road([(0, 0), (30, 0), (60, 0)])
     ends = {}
     for throttle in ("1", "0"):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from rendered import render_recording
+from scenes import Here
 from test_generator import loaded, observations
 
 from cloning.base.errors import RecordingError, UserError
@@ -131,21 +132,23 @@ def follow(run):
     return float(np.clip(-3 * ((bearing + np.pi) % (2 * np.pi) - np.pi), -1, 1))
 
 
-def test_the_command_measures_and_goes_on(tmp_path, capfd):
+def test_the_command_measures_and_goes_on(tmp_path, capsys, monkeypatch):
+    for pool in ("ProcessPoolExecutor", "ThreadPoolExecutor"):
+        monkeypatch.setattr(study, pool, Here)
     data, folder = tmp_path / "data", tmp_path / "study"
     for seed, name in enumerate(["jungle", "jungle-shadows", "lake-ccw", "lake-cw"]):
         render_recording(data / name, seed=seed)
     command = [str(data), "--folder", str(folder), "--jobs", "1", "--networks", "1"]
     command += ["--images", "30", "--laps", "0.01", "--starts", "1"]
     assert study.main(command) == 0
-    assert "lake-centre-camera-seed-0 is measured" in capfd.readouterr().out
+    assert "lake-centre-camera-seed-0 is measured" in capsys.readouterr().out
     with open(folder / "study.csv", encoding="utf-8", newline="") as file:
         [row] = csv.DictReader(file)
     assert (row["method"], row["recordings"]) == ("centre camera", "lake-ccw")
     assert set(figures.MEASURES) | (set(figures.DRIVING) - {"driving"}) <= set(row)
     assert float(row["recovered"]) in (0, 1)
     assert study.main(command) == 0
-    assert "is measured" not in capfd.readouterr().out, "it was measured before"
+    assert "is measured" not in capsys.readouterr().out, "it was measured before"
     (data / "lake-cw" / "driving_log.csv").rename(data / "lake-cw" / "log.csv")
     with pytest.raises(RecordingError, match="recordings by the names jungle, jungle-shadows, lake-ccw, lake-cw"):
         study.main(command)
@@ -163,7 +166,8 @@ def test_a_killed_process_is_named(tmp_path, monkeypatch):
         study.result(plan()[0], options)
 
 
-def test_the_report_and_the_pictures_show_all_networks():
+def test_the_report_and_the_pictures_show_all_networks(monkeypatch):
+    monkeypatch.setattr(figures, "RESAMPLES", 50)
     rng = np.random.default_rng(0)
     names = set(figures.MEASURES) | set(figures.DRIVING)
     rows = [

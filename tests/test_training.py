@@ -15,9 +15,11 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+import warm
 from commands import HERE, ROOT, SHORT, log, run_here, run_model, same, weights
 from PIL import Image
 from rendered import render_recording
+from steer_server import unused_port
 
 import model
 from cloning.base.errors import RecordingError
@@ -300,6 +302,14 @@ def two_processes(sample_recording, tmp_path_factory) -> tuple[subprocess.Comple
     return done, folder
 
 
+def run_ranks(*arguments) -> None:
+    """model.py in two processes, as torchrun starts them."""
+    environment = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(unused_port())}
+    command = [sys.executable, str(ROOT / "model.py"), *map(str, arguments)]
+    ranks = [warm.Popen(command, env={**os.environ, **environment, "RANK": str(rank)}) for rank in range(2)]
+    assert [rank.wait(300) for rank in ranks] == [0, 0]
+
+
 def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
     """Adam moves a weight by up to 1e-4 a step, of which there were 12 or more."""
     a, b = weights(one), weights(other)
@@ -325,8 +335,7 @@ def test_two_processes_continue_with_the_runs_own_arguments(finished, two_proces
     )
     more = ("--resume", "--epochs", 3)
     assert run_here("--output", one / "model.pt", *more).returncode == 0
-    done = run_model("--output", two / "model.pt", *more, command=TORCHRUN)
-    assert done.returncode == 0, done.stderr
+    run_ranks("--output", two / "model.pt", *more)
     assert [row["epoch"] for row in log(two)] == ["1", "2", "3"]
     assert_equal_up_to_rounding(one / "model.pt", two / "model.pt")
 

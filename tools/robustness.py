@@ -14,7 +14,6 @@ same options give the same results, on any number of processes. The folder gets 
 
 import functools
 import hashlib
-import io
 import itertools
 import json
 import statistics
@@ -33,6 +32,7 @@ import numpy as np
 
 from cloning.base.arguments import number
 from cloning.base.errors import UserError
+from cloning.base.figure import png
 from cloning.base.outputs import write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
@@ -179,13 +179,11 @@ def table(curves: Curves, kinds: Sequence[str], strengths: Sequence[int]) -> str
 
 def picture(curves: Curves, kinds: Sequence[str], strengths: Sequence[int]) -> bytes:
     """Return a PNG with autonomy by strength, 0 for none, a panel for each kind."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = min(6, len(kinds))
     rows = -(-len(kinds) // columns)
     figure = Figure(figsize=(max(6, 2.3 * columns), 1.9 * rows + 0.8), layout="constrained")
-    FigureCanvasAgg(figure)
     grid = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
     for axes in grid[len(kinds) :]:
         axes.axis("off")
@@ -201,9 +199,7 @@ def picture(curves: Curves, kinds: Sequence[str], strengths: Sequence[int]) -> b
     figure.supxlabel("strength, 0 without a disturbance")
     figure.supylabel("autonomy, %")
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper center", fontsize=8)
-    image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=100)
-    return image.getvalue()
+    return png(figure, 100)
 
 
 def gallery() -> bytes:

@@ -15,7 +15,6 @@ printed; and failures.png: the roads from above, and where the car left them.
 """
 
 import functools
-import io
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -31,6 +30,7 @@ import numpy as np
 
 from cloning.base.arguments import number
 from cloning.base.errors import TrackError, UserError
+from cloning.base.figure import png
 from cloning.base.outputs import write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
@@ -157,13 +157,11 @@ def run_search(
 
 def picture(failures: Sequence[Driven], title: str) -> bytes:
     """Return a PNG of roads on which the driver failed, from above, with the car's path and where it ended."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = min(6, len(failures))
     rows = -(-len(failures) // columns)
     figure = Figure(figsize=(max(6, 2.6 * columns), 2.6 * rows + 0.5), layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle(title)
     grid = list(figure.subplots(rows, columns, squeeze=False).flat)
     for axes in grid[len(failures) :]:
@@ -180,9 +178,7 @@ def picture(failures: Sequence[Driven], title: str) -> bytes:
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_title(f"{road.name}\n{driven.ended}, {driven.along:.0f} m along", fontsize=8)
         axes.tick_params(labelsize=6)
-    image = io.BytesIO()
-    figure.savefig(image, format="png", dpi=110)
-    return image.getvalue()
+    return png(figure, 110)
 
 
 def main(argv: list[str] | None = None) -> int:

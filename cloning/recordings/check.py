@@ -53,10 +53,7 @@ def check_images(
             reasons[image] = f"{error}; {COPY_OR_DELETE}"
 
     title, hidden = f"checking images of {recording.folder.name}", not show_progress or not len(todo)
-    with (
-        ThreadPoolExecutor(threads) as pool,
-        progress_bar(len(todo), "image", hidden, desc=title, leave=False) as bar,
-    ):
+    with ThreadPoolExecutor(threads) as pool, progress_bar(len(todo), "image", hidden, desc=title, leave=False) as bar:
         remaining = iter(todo.tolist())
         while part := list(islice(remaining, 4096)):  # a future takes memory, and there may be millions of images
             for _ in pool.map(examine, part):

@@ -1,12 +1,12 @@
 """Replay metrics, as a report, as text, as a plot and as a film."""
 
-import io
 import itertools
 from typing import TypedDict
 
 import cv2
 import numpy as np
 
+from cloning.base.figure import png
 from cloning.base.film import DriveFilm, frame_rate
 from cloning.base.outputs import plural
 from cloning.recordings.format import SAMPLE_RATE
@@ -319,10 +319,8 @@ def plot(recording: Recording, drives: list[Drive]) -> bytes:
     axes[-1].set(xlabel="s", ylabel="steering")
     for ax in axes:
         ax.legend(loc="upper right", fontsize=8)
-    file = io.BytesIO()
     figure.suptitle(recording.folder.name)
-    figure.savefig(file, format="png", dpi=90)
-    return file.getvalue()
+    return png(figure, 90)
 
 
 class ReplayFilm(DriveFilm):

@@ -28,7 +28,7 @@ from cloning.replay.score import ORACLE, YARDSTICKS, captioned, plot, replay_rep
 from cloning.report.pictures import epochs_chart, frame_uri, picture_uri, steering_chart, uri
 from cloning.road.autonomy import LIMITS
 from cloning.road.overlay import overlay
-from cloning.server.site import STYLE
+from cloning.server.template import whole_page
 from cloning.training.pictures import panel
 from cloning.training.run_files import RunFiles
 from cloning.training.summary import VERDICTS, duration
@@ -222,17 +222,13 @@ class Report:
         best = next((row["val_drift"] for row in run["history"] if row["epoch"] == run["best"]["epoch"]), None)
         verdict = next((words for limit, words in VERDICTS if best is not None and best <= limit), "")
         counts = np.sum([each["histogram"] for each in self.recordings], axis=0, dtype=int)
-        environment = jinja2.Environment(
-            loader=jinja2.FileSystemLoader(folder), autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined
-        )
         losses = {"loss": "training, augmented", "val_loss": "validation"}
-        page = environment.get_template("report.html")
         try:
-            return page.render(
+            return whole_page(
+                folder,
                 report=self,
                 run=run,
                 recipe=self.recipe,
-                style=STYLE.read_text(encoding="utf-8"),
                 examples=self.examples(),
                 duration=duration(sum(row["seconds"] for row in run["history"])),
                 layers=layer_table(self.network),

@@ -6,14 +6,7 @@ import cv2
 import numpy as np
 
 from cloning.base.frame import FRAME, ROAD_ROWS
-from cloning.road.camera import (
-    CAMERA_MATRIX,
-    FAR_SLOPE,
-    FIRST_BONNET_ROW,
-    FROM_PIXELS,
-    camera_position,
-    homographies,
-)
+from cloning.road.camera import CAMERA_MATRIX, FAR_SLOPE, FIRST_BONNET_ROW, FROM_PIXELS, camera_position, homographies
 from cloning.road.motion import components, forward_vector
 
 FIRST_GROUND_ROW, FIRST_ROW_WITHOUT_SKY = 57, 66  # the first row with any ground, and the first without sky

@@ -1,10 +1,6 @@
 """What every page has in common: its style, the library that draws its curves, and what a browser may do with it."""
 
-from pathlib import Path
-
 import flask
-
-STYLE = Path(__file__).with_name("static") / "style.css"  # of every page
 
 
 def prepare(app: flask.Flask, *sources: str) -> None:

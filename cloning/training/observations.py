@@ -14,13 +14,13 @@ import torch
 from cloning.base.errors import RecordingError
 from cloning.base.frame import ROAD_ROWS
 from cloning.base.table import Column, Table
-from cloning.network.network import CROP, SEEN_ROWS
+from cloning.network.network import SEEN_ROWS
 from cloning.recordings.format import CAMERAS, DRIVE_GAP, PROBLEM_AREAS
 from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.log import CheckedRecording, Recording
-from cloning.training.gpu import GpuFrames, to_device
+from cloning.training.gpu import GpuFrames
 from cloning.training.lanes import Lanes
-from cloning.training.recipe import Augmentation, Recipe
+from cloning.training.recipe import Recipe
 
 
 class ValidationSet(NamedTuple):
@@ -86,22 +86,6 @@ class Choices(NamedTuple):
     keep: np.ndarray | None
     augmenting: list[tuple[np.ndarray, ...]]
     views: Views
-
-
-def batch_images(
-    choices: Choices, augmentations: Sequence[Augmentation], mine: np.ndarray, at: np.ndarray
-) -> torch.Tensor:
-    """Return a process's share of a batch's images: uint8 (k, 75, 320, 3).
-
-    mine: int (n,), the observations of its share; at: int (n, augmentations), where in it each image is, -1 if it is
-    not made.
-    """
-    kinds = zip(augmentations, choices.views.images(mine), choices.augmenting, strict=True)
-    changed: list[Any] = [
-        kind.change(seen, CROP[0], *(column[mine] for column in chosen)) for kind, seen, chosen in kinds
-    ]
-    order = np.argsort(at.ravel())[(at < 0).sum() :]
-    return torch.stack(changed, dim=1).flatten(0, 1)[to_device(order, changed[0].device)]
 
 
 @dataclass(frozen=True)

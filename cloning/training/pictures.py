@@ -5,6 +5,7 @@ import io
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from cloning.base.figure import png
 from cloning.recordings.format import CAMERAS
 from cloning.road.motion import FULL_LOCK
 from cloning.training.observations import Choices
@@ -99,6 +100,4 @@ def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:
         axes.plot([], [], "s--", color="tab:green", label=label)  # for the one legend
     figure.legend(loc="outside lower center")
     axes.grid(alpha=0.3)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=DPI)
-    return file.getvalue()
+    return png(figure, DPI)

@@ -1,10 +1,10 @@
-"""Batches; loss, gradients and predictions, on a CPU in pieces of a batch that fit its cache."""
+"""Batches, from the choices for them; loss, gradients and predictions, on a CPU in pieces that fit its cache."""
 
 import copy
 import functools
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -14,6 +14,10 @@ import torch
 from torch import nn
 
 from cloning.network.compute import Graphed, in_precision
+from cloning.network.network import CROP, SEEN_SHAPE
+from cloning.training.gpu import to_device
+from cloning.training.observations import Choices
+from cloning.training.recipe import Augmentation
 
 GPU_PIECE = 512  # images at most that a GPU predicts together
 GPU_SIZES = 16  # of batches on a GPU are multiples of this, because each size is recorded: see Graphed
@@ -51,6 +55,45 @@ def pieces(images: int, most: int = PIECE) -> list[slice]:
     count = min(images, 2 * math.ceil(images / (2 * most)))
     edges = [images * piece // count for piece in range(count + 1)] if count else [0]
     return [slice(*ends) for ends in itertools.pairwise(edges)]
+
+
+def start_batch(
+    choices: Choices, augmentations: Sequence[Augmentation], share: slice, pool: ThreadPoolExecutor | None
+) -> Callable[[], Batch]:
+    """Start making a process's share of a batch; return a function that waits for it and returns it.
+
+    share: of the batch's observations; pool: its threads make the images; None: a GPU does, which has the frames.
+    """
+    mine = np.arange(len(choices.observation))[share]
+    slots = choices.slots[mine]
+    order = np.sort(slots[slots >= 0])  # the slots of the share's images among those of the whole batch
+    at = np.where(slots < 0, -1, np.searchsorted(order, slots))  # and where they are in the share
+    labels = np.empty(len(order), np.float32)
+    labels[at[at >= 0]] = choices.views.labels[mine][at >= 0]
+    images: Any = np.empty((len(order), *SEEN_SHAPE), np.uint8) if pool else None
+
+    def changed(i: int, seen: Any, which: np.ndarray) -> Any:
+        return augmentations[i].change(seen, CROP[0], *(column[which] for column in choices.augmenting[i]))
+
+    def make(part: slice) -> None:
+        for i, seen in enumerate(choices.views.images(mine[part])):
+            has = at[part, i] >= 0
+            if has.any():
+                images[at[part, i][has]] = changed(i, seen if has.all() else seen[has], mine[part][has])
+
+    if pool is None:
+        every = [changed(i, seen, mine) for i, seen in enumerate(choices.views.images(mine))]
+        made = np.argsort(at.ravel())[(at < 0).sum() :]
+        images = torch.stack(every, dim=1).flatten(0, 1)[to_device(made, every[0].device)]
+    parts = [pool.submit(make, piece) for piece in pieces(len(mine))] if pool else []
+
+    def wait() -> Batch:
+        for part in parts:
+            part.result()
+        keep = None if choices.keep is None else choices.keep[order]
+        return Batch(images, labels, keep, int((choices.slots >= 0).sum()))
+
+    return wait
 
 
 def converted(network: Module, precision: torch.dtype) -> Module:

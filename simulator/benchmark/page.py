@@ -3,12 +3,10 @@
 import base64
 import tempfile
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jinja2
-
+from cloning.server.template import whole_page
 from simulator import driving
 from simulator.benchmark import scores
 from simulator.benchmark.scores import Driven
@@ -57,14 +55,6 @@ def film(driver: str, failure: tuple[Task, float]) -> Clip:
 
 def page(found: dict[str, Any], clips: Sequence[Clip]) -> str:
     """Return the page; found: what the JSON has."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
-        autoescape=True,
-        trim_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    style = (resources.files("cloning.server") / "static" / "style.css").read_text(encoding="utf-8")
     about = {**GROUPS, "replays": "real recordings, replayed; not part of the score"}
-    return environment.get_template("report.html").render(
-        found=found, clips=clips, style=style, about=about, seconds=SHOWN, away=scores.away(found)
-    )
+    templates, away = Path(__file__).with_name("templates"), scores.away(found)
+    return whole_page(templates, found=found, clips=clips, about=about, seconds=SHOWN, away=away)

@@ -14,17 +14,7 @@ from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
 from simulator.scenery import lake_terrain, looks, planting, textures
 from simulator.scenery.looks import Look, Palette
 from simulator.scenery.parts import Haze, Scenery, assemble
-from simulator.scenery.shapes import (
-    Light,
-    Material,
-    Mesh,
-    distances,
-    illuminate,
-    ribbon,
-    roadside,
-    surface,
-    wall,
-)
+from simulator.scenery.shapes import Light, Material, Mesh, distances, illuminate, ribbon, roadside, surface, wall
 from simulator.scenery.textures import Line
 
 ROAD = ROADS["lake"]

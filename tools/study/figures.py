@@ -1,12 +1,12 @@
 """What the study found: rank correlations of each measure with driving, tables and pictures."""
 
-import io
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
+from cloning.base.figure import png
 from cloning.road.motion import MPH
 from tools import command
 from tools.study.measures import RECOVERY_SECONDS, RECOVERY_SPEED
@@ -130,13 +130,6 @@ def recovery(rows: Sequence[Row]) -> dict[str, list[float]]:
     return {method: shares for method, shares in found.items() if shares}
 
 
-def png(figure: Figure) -> bytes:
-    """Return a picture as PNG."""
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=DPI)
-    return file.getvalue()
-
-
 def correlation_picture(rows: Sequence[Row]) -> bytes:
     """Return bars of each measure's correlation with driving, in each group, with their intervals."""
     compared, figure = groups(rows), Figure((12, 4.6), layout="constrained")
@@ -153,7 +146,7 @@ def correlation_picture(rows: Sequence[Row]) -> bytes:
     every_axes[0].set_yticks(range(len(MEASURES)), [title for title, _ in MEASURES.values()])
     every_axes[0].invert_yaxis()
     figure.supxlabel("rank correlation with driving: 1 is perfect foresight")
-    return png(figure)
+    return png(figure, DPI)
 
 
 def recovery_picture(rows: Sequence[Row]) -> bytes:
@@ -166,4 +159,4 @@ def recovery_picture(rows: Sequence[Row]) -> bytes:
     axes.set(xticks=range(len(found)), xticklabels=list(found), ylim=(0, 105), ylabel="% of starts")
     axes.set_title(f"back in the lane within {RECOVERY_SECONDS:g} s")
     axes.grid(axis="y", alpha=0.3)
-    return png(figure)
+    return png(figure, DPI)

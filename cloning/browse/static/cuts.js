@@ -99,6 +99,7 @@ async function change(kind, method, cuts, what, from = "") {
       method, headers: {"Content-Type": "application/json"}, body: JSON.stringify(cuts),
     });
     if (page.open != now) return;
+    now.orders += 1;
     const changed = details.changed.map(({first, last, reason}) => ({first, last, reason}));
     now[from == "done" ? "undone" : "done"].push({kind, method: OPPOSITE[method], cuts: changed});
     if (!from) now.undone = [];

@@ -63,8 +63,8 @@ export async function showRecording(id, row, shown) {
   const count = columns.seconds.length, marks = (shown.get("mark") ?? "").split("-");
   const [first, last] = marks.map(at => at ? Math.min(Number(at), count - 1) : undefined);
   const now = page.open = {
-    id, details, columns, count, marks: {first, last}, ...changes(id), row: 0, playing: 0, jumps: {...details.jumps},
-    limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
+    id, details, columns, count, marks: {first, last}, ...changes(id), row: 0, playing: 0, orders: 0,
+    jumps: {...details.jumps}, limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
     condition: shown.get("find") ?? "", paths: shown.get("paths") != "0",
     query: () => now.limit ? `?limit=${now.limit}` : "",
     column: name => column(id, details.version, name),
@@ -127,8 +127,9 @@ async function update(details) {
 
 async function refresh(now, known) {
   try {
-    const details = known ?? await ask(`/${now.id}/details${now.query()}`);
+    const {orders} = now, details = known ?? await ask(`/${now.id}/details${now.query()}`);
     if (page.open != now) return;
+    if (now.orders != orders) return refresh(now); // asked before the last change, so it may not tell of it
     if (now.lost) {
       notice();
       now.frames.show(now.row);

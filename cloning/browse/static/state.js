@@ -2,7 +2,7 @@
 import {ask, element, make, notice, onClick} from "./common.js";
 
 // Its details and columns, its frames and curves, marks, and the row; undefined while none is shown. recording.js
-// makes it; `update(details)` shows what the server answers.
+// makes it; `update(details)` shows what the server answers, and `orders` counts the changes that it has answered.
 export const page = {open: undefined};
 
 export function say(text) {
@@ -37,6 +37,7 @@ export async function order(method, path) {
   const now = page.open;
   try {
     const details = await ask(`/${now.id}/${path}${now.query()}`, {method});
+    now.orders += 1;
     if (page.open == now) await now.update(details);
   } catch (error) {
     notice(error.message);
