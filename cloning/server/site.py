@@ -4,6 +4,7 @@ from pathlib import Path
 
 import flask
 
+BROWSE_HOST, BROWSE_PORT = "127.0.0.1", 4568  # of the browser of recordings: next to the port of drive.py
 STYLE = Path(__file__).with_name("static") / "style.css"  # of every page
 
 
