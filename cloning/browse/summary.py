@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 
 from cloning.browse.analyses import Result
-from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.format import BINS, SAMPLE_RATE
 from cloning.recordings.log import SHOWN_REJECTED, Recording
 from cloning.road.motion import MAX_GAP
 
-BINS = 41  # of the histogram of steering, from -1 to 1; the middle one is around 0
 PATH_POINTS = 500  # of a drive on the map
 AT_STOP = 0.999  # |steering| from which the wheels are at their stop
 JUMPS = 20  # rows to jump to, for each reason
