@@ -153,7 +153,7 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     page.wait("document.querySelectorAll('.replayed').length == 2")
     needed = "[...document.querySelectorAll('#said, #where, #scrub, #condition, #plots, #cameras')]"
     assert max(page.run(f"{needed}.map(each => each.getBoundingClientRect().bottom)")) <= 768
-    bare = f"{CONTROLS}.filter(each => !each.title && each.id != 'scrub' && !each.closest('#replays, #notes')).length"
+    bare = f"{CONTROLS}.filter(each => !each.title && !each.closest('#replays, #notes')).length"
     assert page.run(bare) == 0, "tooltips"
     assert now(page, "plots.plots[3].axes[1]._splits") == [0, -1, 1, -2.5, 2.5], "metres from the lane's centre"
     assert -0.6 < now(page, "plots.plots[0].scales.y.min") < -0.2, "the steering's own scale"
@@ -330,6 +330,10 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.wait("document.querySelectorAll('#losses .uplot').length == 2")
         assert page.run("document.title").startswith("stopped: ")
         assert "Drift" in page.text("#losses section") and "within the epoch" in page.text("#losses")
+        page.shows("#run-figures", f"not written yet: python -m cloning.report {tmp_path / 'a'}")
+        files.report.write_text("<p>What it learned", encoding="utf-8")
+        page.shows("#run-figures a", "report.html")
+        assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<p>What it learned"
         page.click("#run-others button")
         page.shows("#losses", "b drift")
         assert page.run("location.hash") == "#/run/0?with=1"
