@@ -27,10 +27,10 @@ def driven_seconds(time: np.ndarray) -> np.ndarray:
 
 
 def largest(values: np.ndarray, count: int = JUMPS, apart: int = APART) -> list[int]:
-    """Return the rows with the largest absolute values, ascending: at most `count`, at least `apart` from each other.
+    """Return the rows with the largest absolute values, in this order: at most `count`, at least `apart` rows apart.
 
-    The largest is taken first, then the largest of those far enough away from it, and so on. values: float (n,),
-    nan where there is none.
+    After the largest comes the largest of those far enough away from it, and so on. values: float (n,), nan where there
+    is none.
     """
     size = np.where(np.isnan(values), -1.0, np.abs(values))
     rows: list[int] = []
@@ -38,7 +38,7 @@ def largest(values: np.ndarray, count: int = JUMPS, apart: int = APART) -> list[
         row = int(size.argmax())
         rows.append(row)
         size[max(0, row - apart + 1) : row + apart] = -1
-    return sorted(rows)
+    return rows
 
 
 def at_stop(steering: np.ndarray) -> list[int]:
