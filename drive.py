@@ -93,7 +93,8 @@ class Session(page.Session):
             self.place = place
             if self.server.saver and self.server.recording:
                 self.folder = self.folder or self.server.saver.start_session()
-                self.folder.save(telemetry.jpeg, place.time if place else None)
+                driven = float(self.steering), throttle, telemetry.speed
+                self.folder.save(telemetry.jpeg, driven, place.time if place else None)
             where = (place.offset, place.x, place.y, risk) if place else (telemetry.cte, None, None, risk)
             latency = (time.perf_counter() - arrived) * 1000
             figures = (time.monotonic(), float(self.steering), telemetry.speed, throttle, latency)

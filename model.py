@@ -406,7 +406,8 @@ def run(command: Command, ranks: Ranks) -> None:
     training_run = TrainingRun(ranks.from_first(lambda: prepare(command)), command.process, ranks)
     if ranks.first:
         print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks))
-        training_run.checkpoint.begin(training_run.progress, training_run.precision)
+        labels = training_run.training.steering
+        training_run.checkpoint.begin(training_run.progress, training_run.precision, labels)
     try:
         with training_run.stop:
             training_run.train()

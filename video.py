@@ -51,7 +51,7 @@ def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
         # A link that leads nowhere is a frame that is lost; a folder or a pipe is none.
         if time and (path.is_file() or (path.is_symlink() and not path.exists())):
             frames.append((time, path))
-        else:
+        elif path.name != saved_frames.DRIVEN:
             others.append(path.name)
     if not frames:
         raise FilmError(f"{folder}: no frames (files with names like 2018_07_16_17_11_43_382.jpg); {remedy}")

@@ -40,9 +40,9 @@ def test_jumps_are_to_rows_that_are_not_cut():
     steering[[5, 70]] = 1, -1
     offset, models = np.linspace(0, 3, 90, dtype=np.float32), [np.full(90, 0.1), np.full(90, np.nan)]
     nothing_cut = summary.jumps(steering, offset, models, np.zeros(90, bool))
-    assert nothing_cut == {"stop": [5, 70], "offset": [29, 59, 89], "difference": [5, 35, 70]}
+    assert nothing_cut == {"stop": [5, 70], "offset": [89, 59, 29], "difference": [70, 5, 35]}
     cut = summary.jumps(steering, offset, models, np.arange(90) >= 60)
-    assert cut == {"stop": [5], "offset": [29, 59], "difference": [5, 35]}
+    assert cut == {"stop": [5], "offset": [59, 29], "difference": [5, 35]}
     assert summary.jumps(steering, None, [], np.zeros(90, bool)) == {"stop": [5, 70]}
     assert summary.at_stop(np.array([1, 1, 0.5, -1, 1, 0, -0.9, -1, -1, 0], np.float32)) == [0, 3, 4, 7]
 

@@ -46,7 +46,7 @@ LATE = """const own = fetch; late = {asked: 0}; fetch = async (...what) => {
 
 
 def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
-    placed(linked, np.where(np.arange(60) == 44, -2.5, 0))
+    placed(linked, np.select([np.arange(60) == 44, np.arange(60) == 8], [-2.5, 1.0]))
     with browsing(linked) as server:
         page.open(server.base)
         page.wait("document.querySelector('article .road')")
@@ -62,8 +62,8 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         at(page, 0)
         assert page.run("getComputedStyle(document.querySelector('#replaying')).display") == "none", "without a model"
         for key, shift, row in (("ArrowRight", False, 1), ("ArrowRight", True, 16), ("ArrowLeft", True, 1),
-                                ("End", False, 59), ("f", False, 44), ("Home", False, 0), ("PageDown", False, 59),
-                                ("PageUp", False, 0), ("F", True, 44)):  # fmt: skip
+                                ("End", False, 59), ("f", False, 44), ("f", False, 8), ("Home", False, 0),
+                                ("PageDown", False, 59), ("PageUp", False, 0), ("F", True, 44)):  # fmt: skip
             page.press(key, shift)
             at(page, row)
         captions = "[...document.querySelectorAll('#plots figcaption')].map(each => each.textContent)"
@@ -167,7 +167,7 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     page.wait("document.querySelectorAll('.replayed').length == 2")
     needed = "[...document.querySelectorAll('#said, #where, #scrub, #condition, #plots, #cameras')]"
     assert max(page.run(f"{needed}.map(each => each.getBoundingClientRect().bottom)")) <= 768
-    bare = f"{CONTROLS}.filter(each => !each.title && each.id != 'scrub' && !each.closest('#replays, #notes')).length"
+    bare = f"{CONTROLS}.filter(each => !each.title && !each.closest('#replays, #notes')).length"
     assert page.run(bare) == 0, "tooltips"
     assert now(page, "plots.plots[3].axes[1]._splits") == [0, -1, 1, -2.5, 2.5], "metres from the lane's centre"
     assert -0.6 < now(page, "plots.plots[0].scales.y.min") < -0.2, "the steering's own scale"
@@ -344,6 +344,10 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.wait("document.querySelectorAll('#losses .uplot').length == 2")
         assert page.run("document.title").startswith("stopped: ")
         assert "Drift" in page.text("#losses section") and "within the epoch" in page.text("#losses")
+        page.shows("#run-figures", f"not written yet: python -m cloning.report {tmp_path / 'a'}")
+        files.report.write_text("<p>What it learned", encoding="utf-8")
+        page.shows("#run-figures a", "report.html")
+        assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<p>What it learned"
         page.click("#run-others button")
         page.shows("#losses", "b drift")
         assert page.run("location.hash") == "#/run/0?with=1"

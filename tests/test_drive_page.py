@@ -247,6 +247,9 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             page.press(" ")
             page.shows("#saving", "frames saved in run1-2")
             page.shows("#film", "python video.py run1-2")
+            page.shows(
+                "#browse", "cloning.lerobot run1-2 --output run1-2-recording && python -m cloning.browse run1-2-"
+            )
             for key in ("Tab", " "):
                 page.press(key)
             page.wait("document.querySelector('#attention').checked")

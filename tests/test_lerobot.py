@@ -1,4 +1,4 @@
-"""Recordings as LeRobot's data sets and back, and donkeycar's tubs as recordings."""
+"""Recordings as LeRobot's data sets and back; donkeycar's tubs, and drives that drive.py saved, as recordings."""
 
 import json
 import runpy
@@ -17,8 +17,9 @@ from commands import ROOT
 from rendered import render_frame, render_recording
 
 from cloning.recordings.check import check_images
-from cloning.recordings.images import read_frame
+from cloning.recordings.images import encode, read_frame
 from cloning.recordings.log import CheckedRecording, read_recording
+from cloning.recordings.saved_frames import FrameSaver
 
 CENTER = "observation.images.center"
 
@@ -258,3 +259,29 @@ def test_the_environment_for_lerobot(written):
     assert info["final_info"]["is_success"].tolist() == [False]
     assert drive.call("task_description") == ("Follow the road.",) and drive.call("_max_episode_steps") == (9000,)
     drive.close()
+
+
+def test_a_drive_that_was_saved_becomes_a_recording(tmp_path):
+    """One frame is lost, and the disk was full in the middle of a row: the next row follows it in its line."""
+    saver, rng, drive = FrameSaver(tmp_path / "run1"), np.random.default_rng(0), tmp_path / "run1"
+    session, frames = saver.start_session(), [render_frame(0, 0, rng) for _ in range(5)]
+    for n, frame in enumerate(frames):
+        session.save(encode(frame, 95), (n / 10 - 0.2, 0.25 - n / 10, 9 + n), 100 + n / 20)
+    saver.close()
+    sorted(drive.glob("*.jpg"))[2].unlink()
+    rows = (drive / "driven.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    half = f"{rows[4][:30]}{rows[4]}"
+    (drive / "driven.csv").write_text("".join([*rows[:4], half, rows[5], rows[5][:-2]]), encoding="utf-8")
+    done = run(drive, "--output", tmp_path / "recording")
+    assert done.returncode == 0, done.stderr
+    for told in ("cut short is left out (1 time)", "missing or damaged is left out (1 time)", "below 0 is written"):
+        assert told in done.stdout
+    recording, kept = checked(tmp_path / "recording"), np.array([0, 1, 3, 4])
+    np.testing.assert_array_equal(recording.steering, np.float32(kept / 10 - 0.2))
+    np.testing.assert_array_equal(recording.speed, 9 + kept)
+    np.testing.assert_allclose(recording.throttle - recording.brake, 0.25 - kept / 10, atol=1e-6)
+    np.testing.assert_allclose(recording.time - recording.time[0], kept / 20, atol=2e-3)
+    assert cv2.absdiff(read_frame(recording.path(2)), read_frame(sorted(drive.glob("*.jpg"))[2])).mean() < 2
+    (drive / "driven.csv").write_text("name,angle\n", encoding="utf-8")
+    done = run(drive, "--output", tmp_path / "again")
+    assert done.returncode == 2 and "driven.csv: line 1: not frame,steering" in done.stderr

@@ -1,5 +1,6 @@
 """The report of a training run: what it contains, and that it needs nothing else."""
 
+import base64
 import json
 import re
 import shutil
@@ -67,6 +68,10 @@ def test_the_report_contains_the_run(written, finished):
     assert f"python drive.py &#39;{written / 'model-best.pt'}&#39;" in text and "my run/robust/model.pt" in text
     for driver in ("the network", *YARDSTICKS.values(), "recovery steering"):
         assert text.count(f" {driver} ") >= 2, f"{driver}, at both limits"
+    encoded = re.findall(r'srcset="data:image/svg\+xml;base64,([^"]*)', page)
+    charts = [base64.b64decode(each).decode() for each in encoded]
+    resampled = re.search(r"([\d,]+) observations after resampling", printed)
+    assert "60 rows as driven" in charts[0] and resampled and f"{resampled[1]} for training, resampled" in charts[0]
     named = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)
     assert len(named) >= 3 * 2 + 2 + 6 + 4, "three charts twice, examples, augmentations, drive, laps and a film"
     assert all(address.startswith(("data:image/", "data:video/mp4;base64,ZmlsbQ==")) for address in named)

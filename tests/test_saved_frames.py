@@ -28,8 +28,8 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
     monkeypatch.setattr(Path, "write_bytes", fails_for_the_second_session)
     first, second = saver.start_session(), saver.start_session()
     for n in range(20):
-        first.save(b"saved")
-        second.save(b"lost" if n < 5 else b"saved")
+        first.save(b"saved", (0, 0, 0))
+        second.save(b"lost" if n < 5 else b"saved", (0, 0, 0))
     for session in (first, second):
         session.when_written(partial(tell, session))
     reason = "No space left on device" if isinstance(trouble, OSError) else "ValueError: a bug"
@@ -39,7 +39,7 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
         f"driven frames saved in {tmp_path / 'run1'}",
         f"15 frames saved in {tmp_path / 'run1-2'}, 5 LOST ({reason})",
     ]
-    assert len(list((tmp_path / "run1-2").iterdir())) == 15
+    assert len(list((tmp_path / "run1-2").glob("*.jpg"))) == 15
 
 
 def test_a_folder_that_disappears_while_driving_is_made_again_or_its_frames_are_counted(tmp_path):
@@ -48,7 +48,7 @@ def test_a_folder_that_disappears_while_driving_is_made_again_or_its_frames_are_
     for gone, lost in ((tmp_path / "new" / "run1", 0), (tmp_path / "new", 1)):
         shutil.rmtree(gone)
         written = threading.Event()
-        session.save(b"frame")
+        session.save(b"frame", (0, 0, 0))
         session.when_written(written.set)
         assert written.wait(20) and session.lost == lost
     with pytest.raises(frames.FolderError, match="1 of 2 frames were not saved"):
@@ -60,8 +60,8 @@ def test_frames_are_named_by_the_simulators_own_time_where_it_tells_it(tmp_path)
     saver = frames.FrameSaver(tmp_path / "run1")
     session = saver.start_session()
     for time in (100.0, 100.5, 101.0, 0.0, 0.25):
-        session.save(b"frame", time)
+        session.save(b"frame", (0, 0, 0), time)
     saver.close()
-    times = [frames.taken_at(path.name) for path in sorted((tmp_path / "run1").iterdir())]
+    times = [frames.taken_at(path.name) for path in sorted((tmp_path / "run1").glob("*.jpg"))]
     seconds = [(time - times[0]).total_seconds() for time in times if time and times[0]]
     assert seconds == pytest.approx([0, 0.5, 1, 1, 1.25], abs=0.0021)

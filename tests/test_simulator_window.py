@@ -1,5 +1,6 @@
 """The driver's controls against the original's, with a fake gamepad, and the window with real key presses."""
 
+import copy
 import math
 import os
 import shutil
@@ -36,21 +37,43 @@ def test_at_rest_keys_steer_a_twentieth_a_step_and_let_go_as_fast():
 REACTION, LOOK = 17, 8  # steps of 0.02 s: 0.34 s until a key follows what is seen, and a look six times a second
 
 
-def test_a_person_with_keys_alone_drives_three_laps_at_20_mph():
-    """A scripted person of moderate reaction, who looks 0.9 s ahead and presses left, right or nothing."""
-    run, controls, held, pressed = Run(Track("lake")), Controls(), {"w"}, [{"w"}] * REACTION
+def simple(controls: Controls, _: list[set[str]], wanted: float, __: float) -> set[str]:
+    """The keys of a person who looks at where the wheels are now, and lets go if they are turned too far."""
+    back = abs(wanted) < abs(controls.steering) and wanted * controls.steering >= 0
+    more = wanted - controls.steering
+    return {"w"} if back or abs(more) < 0.06 else {"w", "d" if more > 0 else "a"}
+
+
+def anticipating(controls: Controls, pressed: list[set[str]], wanted: float, speed: float) -> set[str]:
+    """The keys of a person who knows what the keys pressed before will do, and holds a bend by tapping."""
+    after = copy.copy(controls)
+    for held in pressed:
+        after.step(held, speed=speed)
+
+    def miss(key: str) -> float:
+        soon, turned = copy.copy(after), 0.0
+        for _ in range(LOOK):
+            soon.step({"w", key}, speed=speed)
+            turned += soon.steering / LOOK
+        return abs(turned - wanted)
+
+    return {"w", min("wad", key=miss)}
+
+
+@pytest.mark.parametrize(("track", "seconds", "person"), [("lake", 0.9, simple), ("jungle", 1.1, anticipating)])
+def test_a_person_with_keys_alone_drives_three_laps_at_20_mph(track, seconds, person):
+    """A scripted person of moderate reaction, who looks so far ahead and presses left, right or nothing."""
+    run, controls, held, pressed = Run(Track(track)), Controls(), {"w"}, [{"w"}] * REACTION
     run.s = run.track.straight(STRAIGHT)
     run.set_back()
     run.car.speed_limit = 20 * MPH
-    for step in range(25_000):
+    for step in range(30_000):
         if step % LOOK == 0:
-            position, ahead = run.car.node.get_pos(), 2 + 0.9 * run.car.speed
+            position, ahead = run.car.node.get_pos(), 2 + seconds * run.car.speed
             goal = run.track.at((run.s + ahead) % run.track.length)
             bearing = run.car.heading - math.atan2(goal.y - position.y, goal.x - position.x)
             wanted = math.degrees(math.atan(2 * WHEELBASE * math.sin(bearing) / ahead)) / FULL_LOCK
-            back = abs(wanted) < abs(run.steering) and wanted * run.steering >= 0
-            more = wanted - run.steering
-            held = {"w"} if back or abs(more) < 0.06 else {"w", "d" if more > 0 else "a"}
+            held = person(controls, pressed, wanted, run.speed_mph)
         pressed.append(held)
         controls.step(pressed.pop(0), speed=run.speed_mph)
         run.step(controls.steering, controls.throttle)

@@ -23,8 +23,7 @@ from cloning.browse.page import create_app
 from cloning.browse.runs import Runs
 from cloning.recordings.log import find_folders
 from cloning.server import terminal
-
-HOST, PORT = "127.0.0.1", 4568  # this machine only; next to the port of drive.py
+from cloning.server.site import BROWSE_HOST, BROWSE_PORT
 
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -42,7 +41,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     runs = "folders into which model.py writes (default: the current one); alone, without recordings"
     add("--run", nargs="+", type=Path, metavar="FOLDER", help=runs)
     port = "port to listen on, on this machine only (default %(default)s; 0: any free one)"
-    add("--port", type=number(int, 0, MAX_PORT), default=PORT, help=port)
+    add("--port", type=number(int, 0, MAX_PORT), default=BROWSE_PORT, help=port)
     return parser.parse_intermixed_args(arguments)
 
 
@@ -59,7 +58,7 @@ def main() -> int:
         for folder in arguments.run or []:
             if not folder.is_dir():
                 raise UserError(f"{folder}: no such folder; name one that `python model.py` writes to")
-        listener = connections.claim_port(HOST, arguments.port)
+        listener = connections.claim_port(BROWSE_HOST, arguments.port)
     except (UserError, OSError) as error:
         return program.failed(error)
     stopped = connections.noted_signals()
@@ -67,7 +66,7 @@ def main() -> int:
     library, runs = Library(folders, arguments.model), Runs(arguments.run or [])
     print(
         f"{len(folders)} recording{'s' * (len(folders) != 1)}. "
-        f"Open http://{HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.",
+        f"Open http://{BROWSE_HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.",
         flush=True,
     )
     try:

@@ -33,14 +33,14 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     `matches?condition=` has the stretches that meet a condition, `compared?limit=` the models' figures, and POST begins
     what they need. `export` writes a recording, {"rows", "name"}; `film.mp4?rows=` is one: rows are "first-end,…".
     What depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/analyses`: DELETE
-    pauses them, POST goes on. `/runs` and `/runs/N` tell of training runs, and `/runs/N/NAME` is a picture of one. An
-    error is {"message"}.
+    pauses them, POST goes on. `/runs` and `/runs/N` tell of training runs, `/runs/N/NAME` is a picture of one, and
+    `/runs/N/report.html` its report. An error is {"message"}.
     """
     from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
 
     eventlet.tpool.setup()  # now, since it fails for good if there are no file handles
     app = flask.Flask(__name__)
-    site.prepare(app, "img-src 'self' data:")
+    site.prepare(app, "img-src 'self' data:", "media-src data:")
 
     def shown(identifier: str) -> ShownRecording:
         # Its methods work in threads, so that others are answered while a long log is read.
@@ -144,6 +144,10 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     @app.get("/runs/<int:index>")
     def run(index: int) -> dict[str, Any]:
         return runs.run(index)
+
+    @app.get("/runs/<int:index>/report.html")
+    def run_report(index: int) -> flask.Response:
+        return flask.Response(runs.report(index), mimetype="text/html")
 
     @app.get("/runs/<int:index>/<name>")
     def run_picture(index: int, name: str) -> flask.Response:

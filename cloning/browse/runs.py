@@ -65,6 +65,13 @@ class Runs:
             raise RunError(f"{path}: not a PNG")
         return png
 
+    def report(self, index: int) -> bytes:
+        """Return the report that `cloning.report` has written about a run, a page. Raises UnknownError, OSError."""
+        path = self._files(index).report
+        if not path.is_file():
+            raise UnknownError(f"{path}: not written yet; `python -m cloning.report {path.parent}` writes it")
+        return path.read_bytes()
+
     def _files(self, index: int) -> RunFiles:
         if index >= len(self.files):
             raise UnknownError(f"no run {index} here; go back to the list")
@@ -78,7 +85,7 @@ def overview(files: RunFiles) -> dict[str, Any]:
     finished epoch; epochs, samples_per_epoch; images and loss so far in this epoch, with their age in s; rate in
     images/s, and left, s of training from there on, None if unknown; pictures: numbers of observations, ascending;
     trail: [epochs done, loss] within the epochs; best: the epoch whose model is model-best.pt, and by which metric;
-    options: what the run was given, by name.
+    options: what the run was given, by name; has_report: whether its report is written.
     Raises RunError, OSError.
     """
     if not files.arguments.exists():
@@ -119,6 +126,7 @@ def overview(files: RunFiles) -> dict[str, Any]:
         "trail": _trail(progress, finished + min(1.0, images / samples)),
         "best": _best(history, options),
         "options": _flat(options),
+        "has_report": files.report.is_file(),
         "pictures": _pictures(files, progress["batches"] * options["batch_size"] if progress else math.inf),
     }
 

@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 
 from cloning.browse.analyses import Result
-from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.format import BINS, SAMPLE_RATE
 from cloning.recordings.log import SHOWN_REJECTED, Recording
 from cloning.road.motion import MAX_GAP
 
-BINS = 41  # of the histogram of steering, from -1 to 1; the middle one is around 0
 PATH_POINTS = 500  # of a drive on the map
 AT_STOP = 0.999  # |steering| from which the wheels are at their stop
 JUMPS = 20  # rows to jump to, for each reason
@@ -28,10 +27,10 @@ def driven_seconds(time: np.ndarray) -> np.ndarray:
 
 
 def largest(values: np.ndarray, count: int = JUMPS, apart: int = APART) -> list[int]:
-    """Return the rows with the largest absolute values, ascending: at most `count`, at least `apart` from each other.
+    """Return the rows with the largest absolute values, in this order: at most `count`, at least `apart` rows apart.
 
-    The largest is taken first, then the largest of those far enough away from it, and so on. values: float (n,),
-    nan where there is none.
+    After the largest comes the largest of those far enough away from it, and so on. values: float (n,), nan where there
+    is none.
     """
     size = np.where(np.isnan(values), -1.0, np.abs(values))
     rows: list[int] = []
@@ -39,7 +38,7 @@ def largest(values: np.ndarray, count: int = JUMPS, apart: int = APART) -> list[
         row = int(size.argmax())
         rows.append(row)
         size[max(0, row - apart + 1) : row + apart] = -1
-    return sorted(rows)
+    return rows
 
 
 def at_stop(steering: np.ndarray) -> list[int]:

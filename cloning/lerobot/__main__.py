@@ -1,8 +1,9 @@
-"""Carry data between this project and LeRobot or donkeycar.
+"""Carry data between this project and LeRobot or donkeycar; make a recording of a drive that drive.py saved.
 
     python -m cloning.lerobot data/lake-ccw data/lake-cw --output lake    # recordings -> a data set for LeRobot
     python -m cloning.lerobot lake --output data/lake                     # LeRobot's data set -> a recording
     python -m cloning.lerobot mycar/data --output data/mycar              # donkeycar's tub -> a recording
+    python -m cloning.lerobot run1 --output run1-recording                # a drive that drive.py saved -> a recording
 
 What does not fit into a recording is told. Parquet needs pyarrow: pip install pyarrow
 """
@@ -19,11 +20,13 @@ from pathlib import Path
 from cloning.base.arguments import number
 from cloning.base.errors import OutputError, RecordingError, UserError
 from cloning.base.outputs import plural
+from cloning.lerobot.driven import read_driven
 from cloning.lerobot.source import write_recording
 from cloning.lerobot.tub import MANIFEST, read_tub
 from cloning.recordings.check import check_images
 from cloning.recordings.format import LANE_FILE
 from cloning.recordings.log import find_folders, print_findings, read_recording
+from cloning.recordings.saved_frames import DRIVEN
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -33,7 +36,8 @@ def parse_arguments() -> argparse.Namespace:
         description=program.in_commands(__doc__ or ""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("source", nargs="+", help="recordings, or folders with recordings; or one data set or tub")
+    source = "recordings, or folders with recordings; or one data set, tub or drive"
+    parser.add_argument("source", nargs="+", help=source)
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="new folder to write")
     parser.add_argument("--camera", metavar="NAME", help="of a data set or tub: the camera that looks ahead")
     parser.add_argument("--steering", metavar="NAME", help="of a data set: the number that is the steering")
@@ -58,9 +62,12 @@ def main() -> int:
     try:
         if output.exists():
             raise OutputError(f"{output}: exists already; name another folder, or delete this one")
-        if (is_tub or is_data_set) and len(arguments.source) > 1:
-            raise UserError(f"{source} is a {'tub' if is_tub else 'data set'}: name it alone")
-        if is_tub:
+        is_drive = (source / DRIVEN).is_file()
+        if (is_tub or is_data_set or is_drive) and len(arguments.source) > 1:
+            raise UserError(f"{source} is a {'tub' if is_tub else 'drive' if is_drive else 'data set'}: name it alone")
+        if is_drive:
+            samples = read_driven(source, notes)
+        elif is_tub:
             samples = read_tub(source, arguments.camera, notes)
         else:
             with program.loading():

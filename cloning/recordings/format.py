@@ -12,6 +12,7 @@ NUMBERS = ("steering", "throttle", "brake", "speed")
 COLUMNS = (*CAMERAS, *NUMBERS)
 # Of the numbers that the simulator writes: only steering has a sign. The car reaches 30 mph, on a slope a little more.
 RANGES = {"steering": (-1, 1), "throttle": (0, 1), "brake": (0, 1), "speed": (0, 100)}
+BINS = 41  # of a histogram of steering, from -1 to 1; the middle one is around 0
 SAMPLE_RATE = 15  # rows a second
 DRIVE_GAP = 1.0  # s: rows further apart are of different drives
 # Training repeats a recording whose name ends like this, as the report does with problem areas.

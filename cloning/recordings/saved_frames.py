@@ -1,4 +1,7 @@
-"""Save the frames of a drive in a folder, named yyyy_MM_dd_HH_mm_ss_fff.jpg as by Udacity's original drive.py."""
+"""Save the frames of a drive in a folder, named yyyy_MM_dd_HH_mm_ss_fff.jpg as by Udacity's original drive.py.
+
+Beside them `driven.csv` tells how the car was driven: each frame's name, steering, throttle and speed.
+"""
 
 import itertools
 import logging
@@ -17,6 +20,8 @@ from cloning.recordings.format import parse_time_stamp, time_stamp
 
 # The prefix is that of a recording's centre frames, which video.py films, too.
 FRAME_NAME = re.compile(r"(?:center_)?(\d{4}(?:_\d\d){5}_\d{3})\.jpg")
+DRIVEN = "driven.csv"
+DRIVEN_COLUMNS = ("frame", "steering", "throttle", "speed (mph)")
 MAX_QUEUED = 2000  # frames, about 30 MB; with more waiting in memory, driving waits for the disk
 Jobs = queue.Queue[Callable[[], None] | None]  # what the saving thread does next; None ends it
 log = logging.getLogger("drive")  # the log of drive.py
@@ -38,6 +43,8 @@ def check_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise FolderError(f"{folder}: not a folder; name a folder for the frames")
     for entry in folder.iterdir():
+        if entry.name == DRIVEN:
+            continue
         temporary = TEMPORARY_NAME.fullmatch(entry.name)  # of a frame that a killed process was writing
         name = temporary[1] if temporary else entry.name
         is_saved_frame = taken_at(name) and not name.startswith("center_")  # a recording's frame is never deleted
@@ -121,10 +128,11 @@ class SessionFolder:
         self._zero: datetime | None = None  # of the simulator's clock
         self._simulated = 0.0  # s, of the last frame
 
-    def save(self, jpeg: bytes, simulated: float | None = None) -> None:
+    def save(self, jpeg: bytes, driven: tuple[float, float, float], simulated: float | None = None) -> None:
         """Queue a frame for writing; wait only while the queue is full.
 
-        simulated: seconds by the simulator's own clock, 0 to 1e6, if it tells them.
+        driven: the answer's steering and throttle, -1..1, and the frame's speed, mph; simulated: seconds by the
+        simulator's own clock, 0 to 1e6, if it tells them.
         """
         now = datetime.now(UTC)
         if simulated is not None:
@@ -133,7 +141,7 @@ class SessionFolder:
             self._simulated, now = simulated, self._zero + timedelta(seconds=simulated)
         now -= timedelta(microseconds=now.microsecond % 1000)
         self._last = max(now, self._last + timedelta(milliseconds=1))
-        self._queue.put(partial(self._write, self.path / f"{time_stamp(self._last)}.jpg", jpeg))
+        self._queue.put(partial(self._write, self.path / f"{time_stamp(self._last)}.jpg", jpeg, driven))
 
     def when_written(self, report: Callable[[], None]) -> None:
         """Have the thread call `report` when all frames that were queued are written or lost."""
@@ -148,9 +156,12 @@ class SessionFolder:
         """Return where the frames are, and how many are lost so far."""
         return self.progress() if self.lost else f"driven frames saved in {self.path}"
 
-    def _write(self, path: Path, jpeg: bytes) -> None:
+    def _write(self, path: Path, jpeg: bytes, driven: tuple[float, float, float]) -> None:
         try:
             path.parent.mkdir(exist_ok=True)
+            with open(path.with_name(DRIVEN), "ab", buffering=0) as rows:
+                header = "" if rows.tell() else ",".join(DRIVEN_COLUMNS) + "\n"
+                rows.write((header + ",".join([path.name, *(f"{value:.6g}" for value in driven)]) + "\n").encode())
             with written_whole(path) as temporary:
                 temporary.write_bytes(jpeg)
             self.saved += 1

@@ -21,6 +21,7 @@ from cloning.base.outputs import check_folders, write_output
 from cloning.recordings.log import find_folders
 from cloning.report.content import Report
 from cloning.report.markdown import write_markdown
+from cloning.training.run_files import RunFiles
 
 
 def main() -> int:
@@ -38,7 +39,7 @@ def main() -> int:
     add("--lap", nargs="+", type=Path, default=[], metavar="FILE.png", help=lap)
     add("--markdown", action="store_true", help="also write report.md, with its pictures in report/")
     arguments = parser.parse_args()
-    output = arguments.run / "report.html"
+    output = RunFiles(str(arguments.run / "model.pt")).report
     try:
         report = Report(arguments.run, arguments.lap)
         check_folders(str(output))

@@ -109,7 +109,8 @@ class Report:
         one_thread()  # as drive.py does; replays run at the same time
         self.network = load_model(self.model)
         self.arguments = files.arguments
-        self.recipe = json.loads(self.arguments.read_bytes()).get("recipe")
+        arguments = json.loads(self.arguments.read_bytes())
+        self.recipe, self.labels = arguments.get("recipe"), arguments.get("training", {}).get("labels")
         self.laps = [Lap.of(picture, folder) for picture in laps]
         numbers = self.run["pictures"]
         self.augmentations = [
@@ -221,7 +222,10 @@ class Report:
         run, folder = self.run, Path(__file__).with_name("templates")
         best = next((row["val_drift"] for row in run["history"] if row["epoch"] == run["best"]["epoch"]), None)
         verdict = next((words for limit, words in VERDICTS if best is not None and best <= limit), "")
-        counts = np.sum([each["histogram"] for each in self.recordings], axis=0, dtype=int)
+        driven = np.sum([each["histogram"] for each in self.recordings], axis=0, dtype=int)
+        counts = {f"{sum(driven):,} rows as driven": driven} if self.recordings else {}
+        if self.labels and not run["robust"]:  # whose labels depend on the position from which a row is seen
+            counts[f"{sum(self.labels):,} for training, resampled"] = self.labels
         losses = {"loss": "training, augmented", "val_loss": "validation"}
         try:
             return whole_page(
@@ -232,7 +236,7 @@ class Report:
                 examples=self.examples(),
                 duration=duration(sum(row["seconds"] for row in run["history"])),
                 layers=layer_table(self.network),
-                steering=steering_chart(counts) if self.recordings else None,
+                steering=steering_chart(counts) if counts else None,
                 drift=epochs_chart(run, {"val_drift": "drift"}, "m") if best is not None else None,
                 losses=epochs_chart(run, losses, "mean squared error"),
                 verdict=verdict.format(remedy="see what to do next, at the end"),

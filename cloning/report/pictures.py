@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from cloning.base.errors import UserError
-from cloning.browse.summary import BINS
+from cloning.recordings.format import BINS
 from cloning.recordings.images import encode
 
 QUALITY = 85  # of JPEGs
@@ -54,29 +55,31 @@ def picture_uri(source: Path | Image.Image) -> str:
     return uri(file.getvalue(), "image/jpeg")
 
 
-def chart(draw: Callable[[Axes], object]) -> Chart:
-    """Return what a function draws on axes, without text or background of its own colour."""
+def chart(*draws: Callable[[Axes], object]) -> Chart:
+    """Return what functions draw on axes side by side, without text or background of its own colour."""
     drawn = []
     for style in ("default", "dark_background"):
         with matplotlib.style.context([style, CLEAR, TEXT]):
             figure = Figure(figsize=(7, 3), layout="constrained")
-            axes = figure.add_subplot()
-            draw(axes)
-            axes.grid(alpha=0.3)
+            for axes, draw in zip(figure.subplots(1, len(draws), squeeze=False)[0], draws, strict=True):
+                draw(axes)
+                axes.grid(alpha=0.3)
             file = io.BytesIO()
             figure.savefig(file, format="svg", metadata={"Date": None})
             drawn.append(uri(file.getvalue(), "image/svg+xml"))
     return Chart(*drawn)
 
 
-def steering_chart(counts: np.ndarray) -> Chart:
-    """Return a histogram of steering; counts: int (BINS,), rows from -1 to 1."""
+def steering_chart(counts: dict[str, np.ndarray]) -> Chart:
+    """Return histograms of steering, on one scale; counts: title -> int (BINS,), rows from -1 to 1."""
+    most = 1.5 * max(max(each) for each in counts.values())
 
-    def draw(axes: Axes) -> None:
-        axes.stairs(counts, np.linspace(-1, 1, BINS + 1), fill=True)
-        axes.set(xlabel="steering, -1 left to 1 right", ylabel="rows", yscale="log", xlim=(-1, 1), ylim=(0.7, None))
+    def draw(title: str, axes: Axes) -> None:
+        axes.stairs(counts[title], np.linspace(-1, 1, BINS + 1), fill=True)
+        scale = {"yscale": "log", "xlim": (-1, 1), "ylim": (0.7, most)}
+        axes.set(title=title, xlabel="steering, -1 left to 1 right", ylabel="rows", **scale)
 
-    return chart(draw)
+    return chart(*(partial(draw, title) for title in counts))
 
 
 def epochs_chart(run: dict[str, Any], names: dict[str, str], ylabel: str) -> Chart:

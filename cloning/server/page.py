@@ -107,6 +107,7 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
         constants = {"seconds": SHOWN_SECONDS, "top_speed": TOP_SPEED_MPH, "limits": LIMITS}
         port = flask.request.host.rpartition(":")[2]
         option = "" if port == str(PORT) or not port.isdecimal() else f" --port {port}"
+        constants["browse"] = f"http://{site.BROWSE_HOST}:{site.BROWSE_PORT}/"
         return flask.render_template("drive.html", model=server.model, option=option, **constants)
 
     @app.get("/live")

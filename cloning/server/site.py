@@ -2,6 +2,8 @@
 
 import flask
 
+BROWSE_HOST, BROWSE_PORT = "127.0.0.1", 4568  # of the browser of recordings: next to the port of drive.py
+
 
 def prepare(app: flask.Flask, *sources: str) -> None:
     """Serve `cloning/server/static/` at /site/, and give all answers the headers that keep other sites out.

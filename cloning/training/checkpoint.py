@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from cloning.base.errors import ModelError
@@ -36,6 +37,7 @@ from cloning.network.network import (
     versions,
 )
 from cloning.network.tensors import matching, shown
+from cloning.recordings.format import BINS
 from cloning.training.adam import Adam
 from cloning.training.observations import Observations
 from cloning.training.options import Command, Process, Run
@@ -281,13 +283,18 @@ class Checkpoint:
         self.files, self.fingerprint = RunFiles(process.output), data_fingerprint
         self.resumed = False  # whether `restore` found a state of this run
 
-    def begin(self, progress: Progress, precision: torch.dtype) -> None:
-        """Write training_arguments.json and, first, unless the run is resumed, its first state."""
+    def begin(self, progress: Progress, precision: torch.dtype, labels: np.ndarray) -> None:
+        """Write training_arguments.json and, first, unless the run is resumed, its first state.
+
+        labels: float32 (n,), the steering of the observations for training, whose histogram is written, too.
+        """
         if not self.resumed:
             if self.files.resume.exists() and _contents(self.files.resume).get("history") != []:
                 self.set_aside(self.files.resume)
             self.save(progress)
         settings = {**self.run.saved(), **asdict(self.process), "precision": str(precision), "versions": versions()}
+        counts, _ = np.histogram(labels, np.linspace(-1, 1, BINS + 1))
+        settings["training"] = {"labels": counts.tolist()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if self.resumed:
             self._write_progress(progress)  # a killed run may not have come so far

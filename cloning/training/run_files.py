@@ -45,6 +45,7 @@ class RunFiles:
         self.progress = self.last.with_name("training_progress.json")
         self.rejected = self.last.with_name("rejected_rows.csv")
         self.pictures = self.last.with_name("diagnostic_images")
+        self.report = self.last.with_name("report.html")
 
     @contextlib.contextmanager
     def claimed(self, ranks: "Ranks") -> Iterator[None]:

@@ -5,11 +5,11 @@ import {page, remember, say} from "./state.js";
 
 const PAUSE = 0.07; // s that the last frame is shown before they are played again
 
-// The reasons to jump to a row: what such rows are, and why there are none.
+// The reasons to jump to a row: what such rows are, why there are none, and whether they are in order of their size.
 export const JUMPS = {
-  offset: ["rows with the largest offset", "The lateral offset is not known yet."],
+  offset: ["rows with the largest offset", "The lateral offset is not known yet.", true],
   stop: ["rows with the wheels at full lock", "The wheels are nowhere at full lock."],
-  difference: ["rows where a model differs most", "No model's steering is there: start with --model, or wait for it."],
+  difference: ["rows where a model differs most", "No model's steering is there: start with --model, or wait for it.", true],
   intervention: ["interventions", "No intervention: there is no replay, or the car stayed within its limit."],
   match: ["stretches that match", "Nothing matches: write a condition first, such as abs(steering) > 0.8."],
 };
@@ -90,10 +90,11 @@ export function setLoop(loop) {
 element("speed").onchange = () => setSpeed(element("speed").value);
 
 export function jump(reason, back) {
-  const now = page.open, rows = now.jumps[reason] ?? [], [name, none] = JUMPS[reason];
+  const now = page.open, rows = now.jumps[reason] ?? [], [name, none, bySize] = JUMPS[reason];
   if (!rows.length) return say(none);
   const others = back ? rows.filter(row => row < now.row).reverse() : rows.filter(row => row > now.row);
-  const row = others[0] ?? (back ? rows.at(-1) : rows[0]);
+  const from = rows.indexOf(now.row), next = from < 0 ? 0 : (from + (back ? rows.length - 1 : 1)) % rows.length;
+  const row = bySize ? rows[next] : others[0] ?? (back ? rows.at(-1) : rows[0]);
   seek(row);
-  say(`${rows.indexOf(row) + 1} of the ${rows.length} ${name}`);
+  say(`${rows.indexOf(row) + 1} of the ${rows.length} ${name}${bySize ? ", the largest first" : ""}`);
 }

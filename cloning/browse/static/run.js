@@ -95,8 +95,10 @@ function update({all, runs}) {
     "last epoch": !last ? "none finished yet" : `drift ${metres(last.val_drift)}, ` +
       `validation loss ${loss(last.val_loss)}, training loss ${loss(last.loss)}`,
     trained: `${run.robust ? "with --robust" : "as in the report"}, in ${run.folder}`,
+    report: run.has_report ? make("a", "report.html", {href: `/runs/${run.id}/report.html`, target: "_blank"})
+      : `not written yet: python -m cloning.report ${run.folder}`,
   });
-  element("run-figures").replaceChildren(...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)]));
+  element("run-figures").replaceChildren(...lines.flatMap(([term, value]) => [make("dt", term), make("dd", "", {}, value)]));
   element("run-read").hidden = !run.recordings.length;
   element("run-count").textContent = many(run.recordings.length, "recording");
   renew(element("run-recordings"), run.recordings, () => run.recordings.map(folder => make("li", folder)));

@@ -69,7 +69,8 @@ function showFigures({rate, frames, unusable, reason, saving, recording, folder,
   element("record").setAttribute("aria-pressed", recording);
   element("record").textContent = recording ? "Stop recording" : "Record";
   for (const each of document.querySelectorAll(".saved")) each.hidden = !folder;
-  if (element("film").textContent != `python video.py ${folder}`) element("film").textContent = `python video.py ${folder}`;
+  const commands = {film: `python video.py ${folder}`, browse: `python -m cloning.lerobot ${folder} --output ${folder}-recording && python -m cloning.browse ${folder}-recording`};
+  for (const [id, command] of Object.entries(commands)) if (element(id).textContent != command) element(id).textContent = command;
   element("plots").hidden = !rows.length;
   element("start").hidden = !["waiting", "gone"].includes(state);
   const stopped = isStopped();
@@ -290,7 +291,7 @@ element("speed").oninput = () => element("set-speed").textContent = `${element("
 element("stop").onclick = () => setSpeed(isStopped() ? Number(element("speed").value) : 0);
 element("record").onclick = () => post("/record", {recording: !live.recording}, live.recording ? "recording has ended" : "recording");
 element("controls").onsubmit = event => event.preventDefault();
-for (const code of document.querySelectorAll("#start code, #film")) {
+for (const code of document.querySelectorAll("#start code, .saved code")) {
   const copy = make("button", "Copy", {type: "button"});
   copy.onclick = async () => {
     await navigator.clipboard.writeText(code.textContent);
