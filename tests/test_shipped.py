@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scenes import Here
 
 from cloning.base.errors import RecordingError
 from cloning.base.program import DONE, INCOMPLETE
@@ -42,8 +43,10 @@ CHOSEN = [Lap("road-1001", "ccw", 0, 0.02), Lap("road-1001", "cw", 10_000, 0.02)
 NAMES = ["road-1001-ccw-look0", "road-1001-cw-look10000", "mountain-1001-ccw-look1"]
 
 
-def test_rendering_goes_on_where_it_was_interrupted(tmp_path, capsys):
-    assert render(tmp_path, CHOSEN[:1]) == [tmp_path / NAMES[0]]
+def test_rendering_goes_on_where_it_was_interrupted(tmp_path, capsys, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(shipped, "ProcessPoolExecutor", Here)
+        assert render(tmp_path, CHOSEN[:1]) == [tmp_path / NAMES[0]]
     (tmp_path / "unfinished" / NAMES[1]).mkdir(parents=True)  # as a killed run leaves it
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / NAMES[0]).rglob("*")}
     assert render(tmp_path, CHOSEN) == [tmp_path / name for name in NAMES]
