@@ -1,6 +1,6 @@
 """Rebuild other people's public networks for the leaderboard: train them as they did, all on the same recordings.
 
-    python -m tools.public_networks data/lake-ccw data/lake-cw data/jungle      # about half an hour on 2 cores
+    python -m tools.public_networks data/lake-ccw data/lake-cw data/jungle      # about 10 minutes on 2 cores
     python -m simulator benchmark public/naokishibuya.onnx --quick
 
 PUBLISHED names each repository. Layers, preprocessing, augmentation and training have the figures that were read there;
