@@ -1,9 +1,10 @@
 """How a driver drives a road: a model file, an ONNX file or a server, as `simulator drive` does it, or one built in.
 
 An ONNX file whose network does not take the simulator's frames as they are needs a file beside it, of the same name
-with the ending .json, such as `{"crop": [60, 25], "colour": "YUV", "range": [-1, 1]}`: the rows that are cut off at the
-top and the bottom, the colour space, and what 0 and 255 become. Without it, or without one of them, frames are not cut,
-are RGB, and are not scaled. After the cut a frame gets the height and width that the file's input has.
+with the ending .json, such as `{"crop": [60, 25, 0, 0], "colour": "YUV", "range": [-1, 1]}`: the rows and columns that
+are cut off at the top, the bottom, the left and the right, the colour space, and what 0 and 255 become. Without it, or
+without one of them, frames are not cut, are RGB, and are not scaled. After the cut a frame gets the height and width
+that the file's input has.
 """
 
 import functools
@@ -13,7 +14,7 @@ import re
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ import numpy as np
 
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.frame import FRAME
+from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, load_limits
 from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
 from cloning.recordings.format import SAMPLE_RATE
@@ -46,7 +48,7 @@ PATIENCE = 30.0  # s that a drive may take beyond twice the time at its set spee
 WAIT = 60.0  # s for a server's answer
 BUILT_IN = ("straight", "expert")  # drivers that need no camera: steering 0, and the one that drives recordings
 COLOURS = {"RGB": None, "BGR": cv2.COLOR_RGB2BGR, "YUV": cv2.COLOR_RGB2YUV, "HSV": cv2.COLOR_RGB2HSV}
-PREPROCESSING = {"crop": [0, 0], "colour": "RGB", "range": [0, 255]}  # of an ONNX file that says nothing else
+PREPROCESSING = {"crop": [0, 0, 0, 0], "colour": "RGB", "range": [0, 255]}  # of an ONNX file that says nothing else
 _ALONE = threading.Lock()  # drives of one process share its cameras; a Dask worker may have several threads
 Steering = Callable[[np.ndarray], float]  # -1..1, from a frame, uint8 (160, 320, 3), RGB
 Watch = Callable[[Run, Cameras | None], None]
@@ -65,6 +67,7 @@ class Conditions(NamedTuple):
                  interventions is that of the whole drive; if not, the first departure ends it
     own_throttle a server's throttle counts; if not, the set speed is held as drive.py does it
     disturbance  of the frames, or None; seed: the same disturbs them in the same way
+    foretell     a model whose limits are known foretells its departures
     """
 
     driver: str
@@ -77,6 +80,7 @@ class Conditions(NamedTuple):
     own_throttle: bool = True
     disturbance: Disturbance | None = None
     seed: int = 0
+    foretell: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,7 @@ class Drive:
     mean        m from the lane's centre, on average
     planned     s that it would have taken at its set speed
     departures  from the road
+    alarms      s, of the frames at which the model foretold a departure; None if it doesn't
     """
 
     farthest: float
@@ -101,6 +106,7 @@ class Drive:
     mean: float = 0.0
     planned: float = 0.0
     departures: tuple[Departure, ...] = ()
+    alarms: tuple[float, ...] | None = None
 
     @property
     def failed(self) -> bool:
@@ -152,6 +158,16 @@ def load_driver(driver: str) -> Steering:
     return steering
 
 
+@functools.cache
+def load_limits_of(driver: str) -> tuple[Observer, Limits] | None:
+    """Return what foretells that a model leaves the road, None if its limits are not known. Raises UserError."""
+    if driver.endswith(".onnx"):
+        return None
+    network = load_model(driver)
+    limits = load_limits(Path(driver), network)
+    return (Observer(network), limits) if limits else None
+
+
 def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray], np.ndarray]:
     """Return what makes an ONNX network's input of a frame; file: see above, may be missing.
 
@@ -160,20 +176,22 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
     """
     try:
         said = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
-        (top, bottom), colour, (low, high) = ({**PREPROCESSING, **said}[name] for name in PREPROCESSING)
+        crop, colour, (low, high) = ({**PREPROCESSING, **said}[name] for name in PREPROCESSING)
+        top, bottom, left, right = crop if len(crop) == 4 else (*crop, 0, 0)  # rows alone are enough
         conversion, scale = COLOURS[colour], (high - low) / 255
         last = shape[-1] == 3
         rows, columns = shape[1:3] if last else shape[2:]
         size = (columns, rows) if type(rows) is type(columns) is int else None
         unknown = set(said) - set(PREPROCESSING)
-        if unknown or not 0 <= top < FRAME[0] - bottom <= FRAME[0] or len(shape) != 4 or 3 not in (shape[1], shape[3]):
+        whole_cut = not (0 <= top < FRAME[0] - bottom <= FRAME[0] and 0 <= left < FRAME[1] - right <= FRAME[1])
+        if unknown or whole_cut or len(shape) != 4 or 3 not in (shape[1], shape[3]):
             raise ValueError(f"shape {shape}, {said}")
     except (ValueError, TypeError, KeyError, OSError) as error:
         wanted = f"it may have {json.dumps(PREPROCESSING)} with other values, and colours {', '.join(COLOURS)}"
         raise UserError(f"{file}: does not tell how frames become the network's input ({error!r}); {wanted}") from None
 
     def prepare(frame: np.ndarray) -> np.ndarray:
-        image = frame[top : FRAME[0] - bottom]
+        image = frame[top : FRAME[0] - bottom, left : FRAME[1] - right]
         image = cv2.resize(image, size) if size and size != (image.shape[1], image.shape[0]) else image
         image = image if conversion is None else cv2.cvtColor(np.ascontiguousarray(image), conversion)
         image = image if last else image.transpose(2, 0, 1)
@@ -216,13 +234,20 @@ def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | No
     if conditions.driver in BUILT_IN:
         return _drive(conditions, road, None, watch)
     if address is None:
-        steering = load_driver(conditions.driver)
+        steering, known = load_driver(conditions.driver), conditions.foretell and load_limits_of(conditions.driver)
+        foretell, alarms = Foreteller(*known) if known else None, list[float]()
 
         def answer(image: bytes, run: Run) -> Answer:
-            return Answer(float(format_number(steering(decode(image)))))
+            if not foretell:
+                return Answer(float(format_number(steering(decode(image)))))
+            found, risk = foretell(decode(image), run.time)
+            if risk >= ALARM:
+                alarms.append(run.time)
+            return Answer(float(format_number(float(found))))
 
         try:
-            return _drive(conditions, road, answer, watch)
+            done = _drive(conditions, road, answer, watch)
+            return replace(done, alarms=tuple(alarms)) if foretell else done
         except ArithmeticError as error:
             raise SimulatorError(f"{conditions.driver}: {error}; train the model again") from None
     with closing(ClientSession(*address, WAIT)) as session:

@@ -14,8 +14,9 @@ from steer_server import STEER, Server
 
 from cloning.base.errors import UserError
 from cloning.base.program import DONE
+from cloning.network.network import SHIPPED_MODEL
 from cloning.road.autonomy import INTERVENTION_TIME
-from cloning.road.disturbances import Disturbance
+from cloning.road.disturbances import KINDS, Disturbance
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from cloning.wire.client import parse_event
@@ -42,8 +43,10 @@ def test_the_tasks_are_what_the_rules_say():
         assert len({task.name for task in chosen}) == len(chosen)
         assert {task.group for task in chosen} == set(tasks.GROUPS)
         assert all(1 <= task.look % 10_000 <= 1000 and task.look < 20_000 for task in chosen)  # never trained on
-    unknown = [(task.road, task.direction) for task in whole if task.group == "roads"]
-    assert sorted(unknown) == sorted((f"road-{n}", way) for n in range(1, 101) for way in ("ccw", "cw"))
+    driven = {(task.road, task.direction, task.speed) for task in whole if task.group == "roads"}
+    roads = [(f"road-{n}", 15) for n in range(1, 101)] + [(f"mountain-{n}", 25) for n in range(1, 7)]
+    assert driven == {(road, way, speed) for road, speed in roads for way in ("ccw", "cw")}
+    assert sorted(str(task.disturbance) for task in quick if task.disturbance) == sorted(f"{kind}:5" for kind in KINDS)
     assert sum(task.group == "splines" for task in whole) == 20
 
 
@@ -79,6 +82,25 @@ def test_the_score_is_the_rules_formula():
     assert row == "| mine | **75.00** | 75.00 | 90.00 | 80.00 | 70.00 | 60.00 | 0.00 | 0.50 |"
     head = next(line for line in (ROOT / "LEADERBOARD.md").read_text(encoding="utf-8").splitlines() if line[:1] == "|")
     assert row.count("|") == head.count("|")
+
+
+def test_alarms_count_in_windows_as_selforacle_counts_them():
+    """An alarm foretells a departure 1 to 6 s ahead, after the last one; without a departure, each 5 s count."""
+    assert scores.alarmed([10.0, 30.0], [4.1, 29.5], 40) == (1, 2)
+    assert scores.alarmed([10.0, 10.5], [], 40) == (0, 1)  # nobody foretells the second, half a second after the first
+    assert scores.alarmed([10.0, 13.0], [9.5, 11.0], 40) == (1, 2)
+    assert scores.alarmed([], [1.0, 2.0, 12.0, 17.0], 17.5) == (2, 3)
+    drives = [driven(TINY[0], n, 60) | {"alarms": (n, 3)} for n in (0, 1, 2)]
+    told = scores.foretelling(drives)
+    assert told and told.startswith("of 6 departures, 3 were foretold 1 to 6 s ahead; false alarms in 0 of 3 times 5 s")
+    assert scores.foretelling([driven(TINY[0], 1, 60)]) is None
+
+
+def test_the_shipped_network_foretells_while_it_drives_as_without():
+    conditions = TINY[1].conditions(str(SHIPPED_MODEL))
+    done = driving.drive(conditions, TINY[1].source)
+    plain = driving.drive(conditions._replace(foretell=False), TINY[1].source)
+    assert done.alarms == () and plain.alarms is None and done.path == plain.path
 
 
 def test_a_drive_goes_on_after_a_departure_until_it_can_score_nothing():
@@ -123,13 +145,21 @@ def onnx_file(path, shape, axes, kind):
 def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape, axes):
     """By the definition of YUV: Y of pure red is 0.299 of white's."""
     file = onnx_file(tmp_path / "keras.onnx", shape, axes, kind=1)
-    about = {"crop": [60, 25], "colour": "YUV", "range": [-1, 1]}
+    about = {"crop": [60, 25, 20, 20], "colour": "YUV", "range": [-1, 1]}
     (tmp_path / "keras.json").write_text(json.dumps(about), encoding="utf-8")
     frame = np.full((160, 320, 3), 255, np.uint8)  # white where it is cut off
-    frame[60:135] = (255, 0, 0)
+    frame[60:135, 20:300] = (255, 0, 0)
     assert driving.load_driver(file)(frame) == pytest.approx(2 * 0.299 - 1, abs=0.005)
     driving.load_driver.cache_clear()
-    for wrong in ('{"crop": [100, 60]}', '{"colour": "CMYK"}', '{"scale": 2}', "[]", "{"):
+    for wrong in (
+        '{"crop": [100, 60]}',
+        '{"crop": [0, 0, 320, 0]}',
+        '{"crop": [1, 2, 3]}',
+        '{"colour": "CMYK"}',
+        '{"scale": 2}',
+        "[]",
+        "{",
+    ):
         (tmp_path / "keras.json").write_text(wrong, encoding="utf-8")
         with pytest.raises(UserError, match=r"keras\.json: does not tell"):
             driving.load_driver(file)

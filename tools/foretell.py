@@ -33,6 +33,9 @@ from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.base.progress import progress_bar
 from cloning.lane.foretell import (
     ALARM,
+    EARLIEST,
+    LATEST,
+    WINDOW,
     Limits,
     Observation,
     Observer,
@@ -60,8 +63,6 @@ from tools.lane_frames import every_second_shadowed
 
 DISTURBED, HARD, ORDINARY = "disturbed, strength 5, 25 mph", "mountain roads, 25 mph", "ordinary roads, 15 mph"
 MAX_DEPARTURES = 4  # in a drive: more are at the same place
-EARLIEST, LATEST = 6.0, 1.0  # s before a departure: an alarm in between foretells it
-WINDOW = EARLIEST - LATEST  # s
 FALSE_ALARMS = 0.05  # share of the windows without a departure, on roads for tuning, in which there is an alarm
 MARGIN = 0.25  # log odds above the greatest risk on ordinary roads for tuning: there a car is stopped
 DECAY = 3e-2  # of the regression's weights

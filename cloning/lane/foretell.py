@@ -32,6 +32,8 @@ MEAN_TIMES = np.array([0.3, 1.5], np.float32)  # s, of the signs' exponential me
 MAX_STEP = 1.0  # s: a longer pause counts as this
 LEAST = 0.01  # added to a sign before its logarithm is taken
 ALARM = 0.5  # the risk from which it is an alarm: the file's figures are shifted so
+EARLIEST, LATEST = 6.0, 1.0  # s before a departure: an alarm in between foretells it
+WINDOW = EARLIEST - LATEST  # s of a drive without a departure, in which false alarms count once
 
 
 class Observation(NamedTuple):

@@ -61,12 +61,15 @@ def run(options: argparse.Namespace) -> None:
         "sha256": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None,
         "score": scores.score(groups),
         "groups": groups,
+        "foretelling": scores.foretelling(drives),
         "drives": drives,
     }
     write_json(folder / "benchmark.json", found)
     write_output(folder / "report.html", page.page(found, clips).encode())
     for group, figures in groups.items():
         print(group, *(f"{name} {value}" for name, value in figures.items()), sep=", ")
+    if found["foretelling"]:
+        print(found["foretelling"])
     if not recordings:
         print("replays: not run; --recordings names the folder of the recordings")
     print(f"{folder / 'report.html'}, benchmark.json; the line for LEADERBOARD.md:")

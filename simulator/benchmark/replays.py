@@ -42,6 +42,7 @@ def replay(driver: str, folder: Path) -> Driven:
         "ended": "arrived",
         "mean_m": round(float(offset.mean()), 3),
         "farthest_m": round(float(offset.max()), 3),
+        "alarms": None,
     }
 
 

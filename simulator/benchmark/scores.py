@@ -1,9 +1,11 @@
 """How drives become a score: one formula, of which LEADERBOARD.md tells what it means."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from statistics import fmean
 from typing import Any, TypedDict
 
+from cloning.lane.foretell import EARLIEST, LATEST, WINDOW
 from simulator.benchmark.tasks import GROUPS, Task
 from simulator.driving import Drive
 
@@ -20,6 +22,7 @@ class Driven(TypedDict):
     ended: str
     mean_m: float
     farthest_m: float
+    alarms: tuple[int, int] | None  # in so many of so many windows, see `alarmed`; None: the entry foretells nothing
 
 
 class Figures(TypedDict):
@@ -36,16 +39,45 @@ def percent(autonomy: float) -> float:
     return round(100 * max(0.0, autonomy), DIGITS)
 
 
+def alarmed(departures: Sequence[float], alarms: Sequence[float], seconds: float) -> tuple[int, int]:
+    """Return in how many windows there was an alarm, and how many there are, as SelfOracle counts them.
+
+    In a drive with departures these are the seconds in which an alarm foretells one, otherwise the whole drive is cut
+    into windows. All are s after the start.
+    """
+    before = ((max(last, each - EARLIEST), each - LATEST) for last, each in pairwise([0.0, *departures]))
+    whole = ((k * WINDOW, (k + 1) * WINDOW) for k in range(int(seconds // WINDOW)))
+    windows = [(begin, end) for begin, end in (before if departures else whole) if begin < end]
+    return sum(any(begin <= alarm < end for alarm in alarms) for begin, end in windows), len(windows)
+
+
+def foretelling(drives: Sequence[Driven]) -> str | None:
+    """Return how well departures were foretold, in words; None if they were not."""
+    sums = [[0, 0], [0, 0]]
+    for drive in drives:
+        for i, count in enumerate(drive["alarms"] or ()):
+            sums[bool(drive["departures"])][i] += count
+    (false, ordinary), (foretold, departures) = sums
+    if not ordinary + departures:
+        return None
+    return (
+        f"of {departures} departures, {foretold} were foretold {LATEST:g} to {EARLIEST:g} s ahead; false alarms in "
+        f"{false} of {ordinary} times {WINDOW:g} s of drives without a departure"
+    )
+
+
 def driven(task: Task, drive: Drive) -> Driven:
     """Return what is told of a drive."""
+    departures = [round(departure.time, 2) for departure in drive.departures]
     return {
         "group": task.group,
         "name": task.name,
         "score": percent(drive.autonomy),
-        "departures": [round(departure.time, 2) for departure in drive.departures],
+        "departures": departures,
         "ended": drive.ended,
         "mean_m": round(drive.mean, 3),
         "farthest_m": round(drive.farthest, 3),
+        "alarms": None if drive.alarms is None else alarmed(departures, drive.alarms, drive.seconds),
     }
 
 

@@ -9,15 +9,16 @@ import numpy as np
 from cloning.base.errors import TrackError
 from cloning.road.disturbances import KINDS, STRENGTHS, Disturbance
 from cloning.road.generated import PointRoad
+from cloning.road.motion import MPH
 from cloning.road.points import spline_road
 from cloning.road.track import ROADS, Track
 from simulator.driving import Conditions
 from simulator.scenery.looks import SHADOWED
 
-VERSION = 1
+VERSION = 2
 GROUPS = {
     "tracks": "lake and jungle in unknown looks, with and without shadows",
-    "roads": "unknown generated roads",
+    "roads": "unknown generated roads, of which mountain roads with hairpins at 25 mph",
     "splines": "flat roads 8 m wide by the rules of other teams' road tests",
     "off the lane": "starts beside the lane's centre, and turned",
     "disturbed": "frames disturbed by weather, lens, light, camera and delay",
@@ -26,6 +27,8 @@ GROUPS = {
 RECORDINGS = ("lake-ccw", "lake-cw", "jungle", "jungle-shadows")
 DIRECTIONS = ("ccw", "cw")
 COURSES = (("lake", 15), ("lake", 30), ("jungle", 15))  # and mph
+MOUNTAIN = 25  # mph on the roads that are as winding and steep as the jungle
+FOUL = (("lake", "ccw", 30), ("jungle", "cw", 15))  # where frames are disturbed
 SPLINE, SPLINE_SEED = "spline-", 2  # the names of roads by other teams' rules, and the seed before their numbers
 # Turn at a node in degrees, and distance in m from that before, least and greatest: maxitwo's and MultiSim's
 NODES, TURNS, LENGTHS = 8, (-35, 35), (10, 25)
@@ -58,7 +61,8 @@ class Task(NamedTuple):
     def conditions(self, driver: str) -> Conditions:
         """Return how a driver drives it: the car is set back after departures, and its speed is held for it."""
         where = self.speed, self.look, self.direction, self.metres, self.start
-        return Conditions(driver, *where, set_back=True, own_throttle=False, disturbance=self.disturbance)
+        foul = self.disturbance
+        return Conditions(driver, *where, set_back=True, own_throttle=False, disturbance=foul, foretell=True)
 
     @property
     def source(self) -> str | PointRoad:
@@ -97,21 +101,24 @@ def all_tasks() -> list[Task]:
         for direction in DIRECTIONS
     ]
     tasks += [Task("roads", f"road-{n}", way, 15, look_of(n)) for n in range(1, 101) for way in DIRECTIONS]
+    tasks += [Task("roads", f"mountain-{n}", way, MOUNTAIN, look_of(n)) for n in range(1, 7) for way in DIRECTIONS]
     tasks += [Task("splines", f"{SPLINE}{n}", "ccw", 15, look_of(n)) for n in range(1, 21)]
-    return tasks + starts(metres=100) + disturbed(STRENGTHS[2:], metres=400)
+    return tasks + starts(metres=100) + disturbed(STRENGTHS[2:], seconds=60)
 
 
 def quick_tasks() -> list[Task]:
-    """Return the tasks of the quick benchmark, which are the whole one's, but shorter and fewer."""
+    """Return the tasks of the quick benchmark: the whole one's, but shorter, fewer, and only the worst disturbances."""
     tasks = [
         Task("tracks", "jungle", "cw", 15, look_of(1), 700),
         Task("tracks", "jungle", "ccw", 15, look_of(2), 400),
         Task("tracks", "lake", "cw", 30, look_of(3), 700),
         Task("tracks", "lake", "ccw", 15, look_of(4), 300),
     ]
-    tasks += [Task("roads", f"road-{n}", DIRECTIONS[n % 4 // 2], 15, look_of(n), 250) for n in range(3, 100, 13)]
+    tasks += [Task("roads", f"road-{n}", DIRECTIONS[n % 4 // 2], 15, look_of(n), 250) for n in range(3, 100, 19)]
+    tasks += [Task("roads", f"mountain-{n}", DIRECTIONS[n % 2], MOUNTAIN, look_of(n), 400) for n in range(1, 5)]
     tasks += [Task("splines", f"{SPLINE}{n}", "ccw", 15, look_of(n)) for n in range(1, 6)]
-    return tasks + starts(metres=60)[::5] + disturbed(STRENGTHS[3:4], metres=180)[::3]
+    foul = disturbed(STRENGTHS[4:], seconds=20)
+    return tasks + starts(metres=60)[::5] + foul[::4] + foul[3::4]  # each kind on one of the two tracks
 
 
 def starts(metres: float) -> list[Task]:
@@ -125,12 +132,13 @@ def starts(metres: float) -> list[Task]:
     return tasks
 
 
-def disturbed(strengths: Sequence[int], metres: float) -> list[Task]:
-    """Return drives of so many metres with disturbed frames, all around both tracks, for each kind and strength."""
+def disturbed(strengths: Sequence[int], seconds: float) -> list[Task]:
+    """Return drives of so many seconds with disturbed frames, all around both tracks, for each kind and strength."""
     every = [Disturbance(kind, strength) for kind in KINDS for strength in strengths]
     tasks = []
     for i, disturbance in enumerate(every):
-        for road, way in zip(ROADS, DIRECTIONS, strict=True):
+        for road, way, speed in FOUL:
             start = i / len(every) * length_of(road), 0.0, 0.0
-            tasks.append(Task("disturbed", road, way, 15, look_of(6), metres, start, disturbance))
+            metres = round(seconds * speed * MPH)
+            tasks.append(Task("disturbed", road, way, speed, look_of(6), metres, start, disturbance))
     return tasks
