@@ -122,13 +122,16 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     page.open(f"{served.base}{served.hash('lake sample')}/0")
     at(page, 0)
     page.press("l")
-    page.wait("document.querySelectorAll('#replay-list .where').length == 2")
+    page.wait("document.querySelectorAll('#replay-list .interventions').length == 2")
     for words in ("one.pt at 1 m", "two.pt at 1 m", "90.0 %", "mean 0.25 m", "1.20 m to the right"):
         assert words in page.text()
     for key, row in (("n", 29), ("n", 39), ("n", 49), ("N", 39)):
         page.press(key, key == "N")
         at(page, row)
-    page.run("document.querySelectorAll('#replay-list .where button')[1].click()")
+    page.run("document.querySelector('#replay-list .unknown button').click()")
+    at(page, 0)
+    page.shows("#said", "the lane is not known in 5 frames: not driven")
+    page.run("document.querySelectorAll('#replay-list .interventions button')[1].click()")
     at(page, 49)
     page.shows("#said", "one.pt was 1.10 m to the left")
     page.press("N", shift=True)

@@ -129,7 +129,8 @@ def replayed(recording: Recording, analysis: Analysis) -> Result:
 
     The columns are offset and human, the cars' lateral offset in m from the reference line, right positive; right and
     yaw, the pose of `ReplayedCar`; steering, the model's, -1..1; line, the index of the reference line. about has the
-    metrics, and the interventions as [index in the columns, offset in m].
+    metrics; the interventions as [index in the columns, offset in m]; and where the lane is not known, as [the first
+    row's centre image, rows, why].
     """
     one_thread()
     lines = reference_lines(recording)
@@ -152,9 +153,12 @@ def replayed(recording: Recording, analysis: Analysis) -> Result:
         "steering": np.array(done.steering),
         "line": np.repeat(np.arange(len(lines)), [len(line.stretch) for line in lines]),
     }
+    known = reference_metrics(recording, lines)
+    image_of = {recording.name(row): int(image) for row, image in enumerate(recording.images[:, 0])}
     about = {
         **drive_metrics(lines, done),
-        **reference_metrics(recording, lines),
+        **known,
+        "unknown": [[image_of[each["first"]], each["rows"], each["why"]] for each in known["unknown"]],
         "human_mean_m": round(float(np.abs(columns["human"]).mean()), 3),
         "where": [[at, round(metres, 2)] for at, metres in done.interventions.items()],
         "by_lane": sum(len(line.stretch) for line in lines if line.is_lane_centre),

@@ -4,6 +4,7 @@ import {seek} from "./moving.js";
 import {MODEL_COLOURS} from "./plots.js";
 import {order, orderButton, page, remember, say} from "./state.js";
 
+const LISTED = 10;  // parts in which the lane is not known
 export const LIMITS = [...document.querySelectorAll("[data-limit]")].map(button => button.dataset.limit);
 
 // The pictures to show: the cameras, or the centre camera beside what each replayed car sees.
@@ -105,17 +106,27 @@ function section(replay, index) {
   });
   const made = make("section", "", {}, heading,
     make("dl", "", {}, ...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)])));
-  if (replay.where.length) {
-    made.append(make("ol", "", {class: "where"}, ...replay.where.map(([row, offset]) => {
+  const places = (kind, what, all) => {
+    if (!all.length) return;
+    made.append(make("ol", "", {class: `where ${kind}`}, ...all.map(([row, words, told]) => {
       const time = clock(page.open.columns.seconds[row]);
-      const go = make("button", time, {"aria-label": `Go to the intervention at ${time}`});
+      const go = make("button", time, {"aria-label": `Go to the ${what} at ${time}`});
       onClick(go, () => {
         seek(row);
-        say(`Here ${name} was ${metres(offset)}, and was set back.`);
+        say(told);
       });
-      return make("li", "", {}, go, ` ${metres(offset)}`);
+      return make("li", "", {}, go, ` ${words}`);
     })));
-  }
+  };
+  places("interventions", "intervention", replay.where.map(([row, offset]) =>
+    [row, metres(offset), `Here ${name} was ${metres(offset)}, and was set back.`]));
+  if (replay.unknown.length) made.append(make("p", "Where the lane is not known:"));
+  places("unknown", "frames without a lane", replay.unknown.slice(0, LISTED).map(([row, rows, why]) => {
+    const words = `${many(rows, "frame")}: ${why}`;
+    return [row, words, `From here on, the lane is not known in ${words}.`];
+  }));
+  const more = replay.unknown.length - LISTED;
+  if (more > 0) made.append(make("p", `And ${more} more.`));
   return made;
 }
 
