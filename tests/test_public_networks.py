@@ -13,7 +13,7 @@ from simulator.driving import load_driver
 from tools import public_networks
 from tools.public_networks import PUBLISHED, augment
 
-# By the tables in naokishibuya's and ksakmann's README.md, xslittlegrass's, and students' reports of comma.ai's network
+# By the tables in the README.md of three of them; comma.ai's has none, so this is by its layers.
 PARAMETERS = {"naokishibuya": 252_219, "commaai": 6_621_809, "ksakmann": 416_481, "xslittlegrass": 63}
 
 

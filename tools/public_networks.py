@@ -1,6 +1,6 @@
 """Rebuild other people's public networks for the leaderboard: train them as they did, all on the same recordings.
 
-    python -m tools.public_networks data/lake-ccw data/lake-cw data/jungle      # about 10 minutes on 2 cores
+    python -m tools.public_networks data/lake-ccw data/lake-cw data/jungle      # some 20 minutes on 2 cores
     python -m simulator benchmark public/naokishibuya.onnx --quick
 
 PUBLISHED names each repository. Layers, preprocessing, augmentation and training have the figures that were read there;
@@ -128,7 +128,7 @@ def xslittlegrass() -> nn.Sequential:
 
 PUBLISHED = {
     "naokishibuya": Published(
-        "naokishibuya/car-behavioral-cloning @ 0cb1f7d, without a licence",
+        "naokishibuya/car-behavioral-cloning @ 0cb1f7d, no licence found",
         naokishibuya,
         (66, 200),
         {"crop": [60, 25], "colour": "YUV", "range": [-1, 1]},
@@ -154,7 +154,7 @@ PUBLISHED = {
         epochs=10,
     ),
     "ksakmann": Published(
-        "ksakmann/CarND-BehavioralCloning @ 26caf5b, without a licence",
+        "ksakmann/CarND-BehavioralCloning @ 26caf5b, no licence found",
         ksakmann,
         (64, 64),
         {"crop": [60, 24, 20, 20], "range": [-1, 1]},
@@ -169,7 +169,7 @@ PUBLISHED = {
         border=cv2.BORDER_REPLICATE,
     ),
     "xslittlegrass": Published(
-        "xslittlegrass/CarND-Behavioral-Cloning @ c235b40, without a licence",
+        "xslittlegrass/CarND-Behavioral-Cloning @ c235b40, no licence found",
         xslittlegrass,
         (16, 32),
         {"colour": "HSV", "range": [-1, 1]},
