@@ -98,7 +98,8 @@ def replayed(folder: Path, model: Path, limit: float, offset: np.ndarray, where:
     still = np.zeros(len(offset))
     columns = {"offset": offset, "human": still, "right": offset, "yaw": still, "steering": -offset, "line": still}
     metrics = {"autonomy_percent": 90.0, "interventions": len(where), "distance_mean_m": 0.25, "distance_p95_m": 0.48}
-    known = {"by_reference": {"lane_centre": metrics}, "rows_placed": len(offset), "unknown": [[0, 5, "not driven"]]}
+    unknown = [[int(read_recording(folder).images[7, 0]), 5, "not driven"]]
+    known = {"by_reference": {"lane_centre": metrics}, "rows_placed": len(offset), "unknown": unknown}
     driven = {"mean_speed_mph": 15.0, "steering_roughness_per_s": 0.2, "by_lane": len(offset)}
     about = {**metrics, **known, **driven, "human_mean_m": 0.0, "where": where}
     written(folder, Analysis("replay", str(model), limit), columns, **about)

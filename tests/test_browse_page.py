@@ -129,7 +129,7 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
         page.press(key, key == "N")
         at(page, row)
     page.run("document.querySelector('#replay-list .unknown button').click()")
-    at(page, 0)
+    at(page, 7)
     page.shows("#said", "the lane is not known in 5 frames: not driven")
     page.run("document.querySelectorAll('#replay-list .interventions button')[1].click()")
     at(page, 49)
