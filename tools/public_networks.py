@@ -11,8 +11,6 @@ What is different: rows are drawn at random in place of shuffled passes over all
 theirs overflows; and commaai, made for real roads, is trained for 10 of its 200 epochs.
 """
 
-import logging
-import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,12 +28,13 @@ import numpy as np
 import torch
 from torch import nn
 
+from cloning.base.cores import threads
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME
 from cloning.base.outputs import write_json
 from cloning.base.progress import progress_bar
-from cloning.network.compute import choose_precision, in_precision, threads
-from cloning.network.export import OPSET
+from cloning.network.compute import choose_precision, in_precision
+from cloning.network.export import onnx_program
 from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
@@ -266,12 +265,7 @@ def stacked(examples: Sequence[tuple[np.ndarray, float]]) -> tuple[torch.Tensor,
 
 def save(network: nn.Sequential, how: Published, file: Path) -> None:
     """Write a network as an ONNX file. Raises OSError."""
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports its steps as warnings
-    with program.loading(), warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 warns of its own code
-        image = (torch.zeros(1, 3, *how.size),)
-        exported = torch.onnx.export(network, image, dynamo=True, opset_version=OPSET, verbose=False)
-    assert exported, "torch returns the program with dynamo=True"
+    exported = onnx_program(network, torch.zeros(1, 3, *how.size))
     with written_whole(file) as temporary:
         exported.save(temporary)
 

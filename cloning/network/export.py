@@ -16,9 +16,11 @@ import argparse
 import logging
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from cloning.base.errors import ModelError, UserError
 from cloning.base.files import written_whole
@@ -44,20 +46,9 @@ def export(network: Network, path: Path) -> None:
     except ImportError as error:
         raise UserError(f"{error}; pip install onnx onnxscript onnxruntime") from None
     frames = check_frames()
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports its steps as warnings
-    with program.loading(), warnings.catch_warnings():  # torch's exporter loads more
-        warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 warns of its own code
-        exported = torch.onnx.export(
-            network,
-            (torch.from_numpy(frames[:2]),),
-            dynamo=True,
-            input_names=["frames"],
-            output_names=["steering"],
-            dynamic_shapes=({0: torch.export.Dim("n", min=1)},),
-            opset_version=OPSET,
-            verbose=False,
-        )
-    assert exported, "torch returns the program with dynamo=True"
+    shapes = ({0: torch.export.Dim("n", min=1)},)
+    names = {"input_names": ["frames"], "output_names": ["steering"]}
+    exported = onnx_program(network, torch.from_numpy(frames[:2]), **names, dynamic_shapes=shapes)
     with torch.inference_mode():
         expected = network(torch.from_numpy(frames)).numpy()
     with written_whole(path) as temporary:
@@ -67,6 +58,16 @@ def export(network: Network, path: Path) -> None:
         worst = float(np.abs(steering - expected).max())
         if not worst <= TOLERANCE:
             raise ModelError(f"{path}: its steering differs by {worst:.1e} from the model's; nothing was written")
+
+
+def onnx_program(network: nn.Module, images: torch.Tensor, **options: Any) -> torch.onnx.ONNXProgram:
+    """Return a network as an ONNX program, quietly; images: an example of its input; options: more of torch's."""
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports its steps as warnings
+    with program.loading(), warnings.catch_warnings():  # torch's exporter loads more
+        warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 warns of its own code
+        exported = torch.onnx.export(network, (images,), dynamo=True, opset_version=OPSET, verbose=False, **options)
+    assert exported, "torch returns the program with dynamo=True"
+    return exported
 
 
 def check_frames() -> np.ndarray:
