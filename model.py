@@ -376,10 +376,12 @@ class TrainingRun:
 
     def summary(self) -> str:
         """Return a table of the errors of the last and the best epoch's models, and in words how they will drive."""
-        labels, mean, models = self.validation.steering, self.training.steering.mean(), {}
-        for path in (self.files.last, self.files.best):
-            network = load_model(path, self.device)
-            models[path] = self.predict(network, self.validation.center, np.arange(len(labels)))
+        labels, mean = self.validation.steering, self.training.steering.mean()
+        last, best = self.files.last, self.files.best
+        guess = functools.partial(self.predict, images=self.validation.center, rows=np.arange(len(labels)))
+        models = {last: guess(self.network)}
+        is_last = last.read_bytes() == best.read_bytes()
+        models[best] = models[last] if is_last else guess(load_model(best, self.device))
         table = summary.error_table(labels, mean, models, self.recipe)
         return table + summary.driving(self.progress.history, self.recipe, still_drifts(self.held_out), self.files)
 

@@ -1,5 +1,6 @@
 """The network against the report's table and plain arithmetic, its gradient in pieces, and the model file."""
 
+import functools
 import copy
 import random
 import re
@@ -13,8 +14,8 @@ import torch
 from torch import nn
 
 from cloning.base.errors import ModelError
-from cloning.network import fast_conv, tensors
-from cloning.network.fast_conv import OverPairs
+from cloning.network import fast_layers, tensors
+from cloning.network.fast_layers import OverPairs
 from cloning.network.layer_table import layer_table
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, save_model, steer
 from cloning.recordings.images import decode
@@ -71,7 +72,7 @@ def test_forward_is_the_reports(network, frames):
 
 
 def in_blocks(x, weight, bias):
-    return nn.functional.conv2d(fast_conv.InBlocks.apply(x), fast_conv.in_blocks(weight), bias)
+    return nn.functional.conv2d(fast_layers.InBlocks.apply(x), fast_layers.in_blocks(weight), bias)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +96,22 @@ def test_a_fast_convolution_and_its_gradients_are_torchs(fast, shape):
         torch.testing.assert_close(got, wanted, rtol=1e-12, atol=1e-11)
     padded = fast is in_blocks and (shape[2] % 2 or shape[3] % 2)  # what was padded is cut off, without a copy
     assert padded or gradients[0].is_contiguous(memory_format=torch.channels_last)
+
+
+@pytest.mark.parametrize("has_table", [True, False])
+def test_elu_of_every_bfloat16_and_its_gradient_are_torchs(monkeypatch, has_table):
+    monkeypatch.setattr(fast_layers, "elu_table", fast_layers.elu_table if has_table else lambda: None)
+    every = torch.arange(1 << 16, dtype=torch.int32).to(torch.uint16).view(torch.bfloat16)
+    x = every.reshape(2, 16, 64, 32).contiguous(memory_format=torch.channels_last)
+    results = []
+    for elu in (functools.partial(nn.functional.elu, inplace=True), fast_layers.elu):
+        leaf = x.clone().requires_grad_()
+        out = elu(leaf * 1)
+        (gradient,) = torch.autograd.grad(out, leaf, torch.full_like(x, 0.7))
+        results.append((out.detach(), gradient))
+    for expected, got in zip(*results, strict=True):
+        assert got.is_contiguous(memory_format=torch.channels_last)
+        torch.testing.assert_close(got, expected, rtol=0, atol=0, equal_nan=True)
 
 
 def test_dropout_keeps_what_is_given_and_doubles_it(network, frames):
@@ -147,7 +164,7 @@ def test_the_gradient_is_that_of_the_loss_and_the_value_the_squared_errors(netwo
 @pytest.mark.parametrize("amx", [False, True])
 def test_bfloat16_steps_where_float32_does(network, monkeypatch, amx):
     """Some processors only emulate it; the gradient's direction shows that it is the same function."""
-    monkeypatch.setattr(fast_conv, "has_amx", lambda: amx)
+    monkeypatch.setattr(fast_layers, "has_amx", lambda: amx)
     gradients = []
     with ThreadPoolExecutor(1) as pool:
         for precision in (torch.float32, torch.bfloat16):

@@ -13,7 +13,7 @@ from cloning.base import program
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME
 from cloning.network import tensors
-from cloning.network.fast_conv import BlockConv2d
+from cloning.network.fast_layers import BlockConv2d, elu
 
 FORMAT, VERSION = "behavioral-cloning", 1  # of the model file
 SHIPPED_MODEL = Path(__file__).with_name("shipped.pt")  # comes with the project
@@ -64,12 +64,12 @@ class Network(nn.Module):
         x = frames.permute(0, 3, 1, 2).float().div_(self.scale).sub_(self.offset)  # in memory still channels last
         x = x.to(next(self.parameters()).dtype)
         for convolution in self.convolutions:
-            x = nn.functional.elu(convolution(x), inplace=True)
+            x = elu(convolution(x))
         x = x.flatten(1)
         if keep is not None:
             x = x * keep.to(x.dtype).mul_(2)
         for layer in self.dense[:-1]:
-            x = nn.functional.elu(layer(x), inplace=True)
+            x = elu(layer(x))
         return self.dense[-1](x).squeeze(1).float()
 
 

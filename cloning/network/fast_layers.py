@@ -1,7 +1,10 @@
-"""A convolution of NVIDIA's network, with the same results, that trains faster in bfloat16 on a CPU."""
+"""Layers of NVIDIA's network that compute the same in less time, for its training in bfloat16 on a CPU."""
 
+import functools
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 from torch import nn
 from torch.nn.grad import conv2d_input, conv2d_weight
@@ -83,3 +86,41 @@ class BlockConv2d(nn.Conv2d):
             if x.shape[3] % 2 == 0:
                 return OverPairs.apply(x, self.weight, self.bias)
         return super().forward(x)
+
+
+@functools.cache
+def elu_table() -> np.ndarray | None:
+    """Return ELU of each bfloat16, as bits: uint16 (1, 65536); None if OpenCV looks nothing up in so large a table."""
+    every = torch.arange(1 << 16, dtype=torch.int32).to(torch.uint16).view(torch.bfloat16)
+    table = nn.functional.elu(every).view(torch.uint16).numpy()[None]
+    try:
+        cv2.LUT(table, table)
+    except cv2.error:  # before OpenCV 5
+        return None
+    return table
+
+
+class EluByTable(torch.autograd.Function):
+    """ELU of a bfloat16 tensor, in its place: to look it up takes a quarter of the time, and gives the same bits."""
+
+    @staticmethod
+    def forward(context: Any, x: torch.Tensor) -> torch.Tensor:
+        """Return ELU of x, (N, C, rows, columns), channels last in memory."""
+        bits = x.detach().permute(0, 2, 3, 1).view(torch.uint16).numpy().reshape(-1, x.shape[1])
+        cv2.LUT(bits, elu_table(), bits)
+        context.mark_dirty(x)
+        context.save_for_backward(x)
+        return x
+
+    @staticmethod
+    def backward(context: Any, gradient: torch.Tensor) -> torch.Tensor:
+        """Return the gradient of x."""
+        return torch.ops.aten.elu_backward(gradient, 1, 1, 1, True, *context.saved_tensors)
+
+
+def elu(x: torch.Tensor) -> torch.Tensor:
+    """Return ELU of the output of a layer, in its place, as torch's."""
+    by_table = x.dtype == torch.bfloat16 and x.device.type == "cpu" and x.dim() == 4
+    if by_table and x.is_contiguous(memory_format=torch.channels_last) and elu_table() is not None:
+        return EluByTable.apply(x)
+    return nn.functional.elu(x, inplace=True)
