@@ -1,7 +1,7 @@
 """The network against the report's table and plain arithmetic, its gradient in pieces, and the model file."""
 
-import functools
 import copy
+import functools
 import random
 import re
 import zipfile
