@@ -17,9 +17,11 @@ from cloning.road.track import Track
 PAUSE = 0.0714  # s between rows
 
 
-def driven(name: str, rows: int, start: float = 30.0, mph: float = 25) -> tuple[Recording, np.ndarray]:
+def driven(
+    name: str, rows: int, start: float = 30.0, mph: float = 25, direction: str | None = None
+) -> tuple[Recording, np.ndarray]:
     """A drive along a track's centre, and what a network detects on it to 0.15 m: float32 (n, 3, 5)."""
-    track, recording = Track(name), without_files(rows, seconds=PAUSE, speed=mph)
+    track, recording = Track(name, direction), without_files(rows, seconds=PAUSE, speed=mph)
     along = start + np.cumsum(np.r_[0, np.full(rows - 1, mph * MPH * PAUSE)])
     bends = [track.curvature[track.index(s + YAW_LAG * mph * MPH)] for s in along]
     recording.steering[:] = steering_for(np.array(bends))
@@ -43,6 +45,16 @@ def placed(recording: Recording, centres: np.ndarray) -> np.ndarray:
 def check(offset: np.ndarray, undamaged: np.ndarray) -> None:
     assert np.mean(~np.isnan(offset[undamaged])) > 0.98
     assert np.nanmean(np.abs(offset[undamaged])) < 0.12  # measured: 0.03 to 0.09
+
+
+def test_an_s_bend_after_a_pause_is_not_driven_the_wrong_way():
+    """From both of its ends it looks the same; by itself, the other direction was the likelier one."""
+    recording, centres = driven("jungle", 701, 128, 10, "cw")
+    recording = recording.take(slice(None), time=recording.time + 3 * (np.arange(701) >= 400))
+    found = [
+        (part.rows, each.track.direction) for part, each in certain_parts(recording, stretches(recording), centres)
+    ]
+    assert found == [(slice(0, 400), "cw"), (slice(400, 701), "cw")]
 
 
 @pytest.fixture(scope="module")

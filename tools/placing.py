@@ -234,8 +234,9 @@ class Source:
 
     def joined(self, other: "Source") -> "Source":
         """Return this recording and another one in one."""
-        both = copy.copy(self)
-        both.recording = Recording.joined([self.recording, other.recording])
+        both, log = copy.copy(self), other.recording
+        later = log.take(slice(None), time=log.time - log.time[0] + self.recording.time[-1] + PAUSE)
+        both.recording = Recording.joined([self.recording, later])
         for name in ("strips", "is_driven", "road", "true"):
             setattr(both, name, np.concatenate([getattr(self, name), getattr(other, name)]))
         both.detected = {key: np.concatenate([found, other.detected[key]]) for key, found in self.detected.items()}

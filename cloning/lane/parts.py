@@ -7,7 +7,7 @@ rows after it are sought near its end, where the car must be.
 
 import copy
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,7 @@ FIT_SCALE, TURN_SCALE = {"lake": 0.15, "jungle": 1.0}, {"lake": 1.2, "jungle": 3
 ALARM = 15.0  # a fall of the sum of the scores by so much ends a part, at the rows before the fall
 SEED_COVARIANCE = np.diag([1.0, 0.1, 0.003])  # of the state at which a part begins to grow; as `INITIAL_COVARIANCE`
 START_COVARIANCE = np.diag([4.0, 0.5, 0.01])  # of its first row's state, once it has grown
+FARTHEST_START = np.array([np.inf, 3.0, 0.3])  # that state at most: further off, its rows may leave the road
 LENIENCE = 0.7  # added to the scores to find where a fall begins: rows before a mishap may agree less, as at a brow
 PROBE, FIRST_PROBE = 40, 15  # rows over which candidates near a neighbour are followed
 KEPT = 4  # candidates that are followed over all of PROBE
@@ -43,7 +44,8 @@ PROBE_STEP = 5.0  # m between candidates
 SLACK, SLACK_PER_METRE = 5.0, 0.1  # m, and of the metres driven: where the car should be without a mishap
 BACK, BEYOND = 30.0, 20.0  # m: further back, or further on than it drove, the car is not after a mishap
 MAX_REACH, MAX_PAUSE = 200.0, 10.0  # m, s: after more, it may be anywhere
-AMBIGUOUS, SAME_OFFSET = 0.8, 0.3  # share of the best part's quality, and m: see `Placing.near`
+AMBIGUOUS = 0.8  # share of the best part's quality: a part as good as this, but elsewhere, leaves it uncertain
+SAME_OFFSET, SAME_PLACE = 0.3, 10.0  # m across and along the road: what is further apart is elsewhere
 
 
 @dataclass(frozen=True)
@@ -78,13 +80,24 @@ class Part:
         """Return how far the car drives in the part, m."""
         return float(self.found.states[-1, 0] - self.found.states[0, 0])
 
-    def away_from(self, other: "Part") -> float:
-        """Return how far from here another part is placed in the rows of both, across the road, on average, m."""
+    def overlaps(self, other: "Part") -> bool:
+        """Return whether the parts have rows in common."""
+        return self.stretch == other.stretch and self.start < other.end and other.start < self.end
+
+    def away_from(self, other: "Part", axis: int = 1) -> float:
+        """Return how far from here another part is placed in the rows of both, on average, m.
+
+        axis: 1 across the road, 0 along it; inf on another track or in its other direction, or without a common row.
+        """
         start, end = max(self.start, other.start), min(self.end, other.end)
-        if start >= end:
+        if start >= end or self.track != other.track:
             return np.inf
-        here, there = (part.found.states[start - part.start : end - part.start, 1] for part in (self, other))
+        here, there = (part.found.states[start - part.start : end - part.start, axis] for part in (self, other))
         return float(np.abs(here - there).mean())
+
+    def along_from(self, other: "Part") -> float:
+        """Return how far from here another part is placed along the road, as `away_from`."""
+        return self.away_from(other, 0)
 
 
 class Followers:
@@ -113,6 +126,7 @@ class Followers:
         earlier = n - follow_while_certain(back, n - first)
         begin = back.filtered[seed - earlier][0]
         while later - earlier >= MIN_STRETCH_ROWS:
+            begin = np.clip(begin, -FARTHEST_START, FARTHEST_START)
             whole = Candidate(self.ahead[track], begin, earlier, START_COVARIANCE)
             found = followed(whole, later)
             turns = np.r_[0, whole.turns(found.states)]
@@ -131,6 +145,15 @@ def is_anchor(found: Localisation) -> bool:
     metres = found.states[-1, 0] - found.states[0, 0]
     limit = np.interp(metres, *ANCHOR_TURN_RESIDUAL[found.track.name])
     return found.is_certain() and found.turn_residual < limit
+
+
+def unrivalled(grown: list[Part], distance: Callable[[Part, Part], float], same: float) -> Part | None:
+    """Return the best part; None if another one is nearly as good, and elsewhere, by a distance above `same`, m."""
+    best = max(grown, key=Part.quality, default=None)
+    if not best:
+        return None
+    rivals = [other for other in grown if other.quality() > AMBIGUOUS * best.quality()]
+    return None if any(distance(best, other) > same for other in rivals) else best
 
 
 def score(name: str, fits: np.ndarray | float, turns: np.ndarray | float = 0.0) -> np.ndarray:
@@ -173,16 +196,35 @@ class Placing:
         for index, followers in enumerate(self.followers):
             n, at, free = len(followers.stretch), 0, 0
             while at + WINDOW <= n:
-                candidate = search(followers.ahead, at, at + WINDOW)
-                window = followed(candidate, at + WINDOW)
-                if is_anchor(window):
-                    track, middle = known_tracks().index(window.track), WINDOW // 2
-                    grown = followers.grow(track, at + middle, window.states[middle], free, n)
-                    if grown and grown[1] - grown[0] >= WINDOW and is_anchor(grown[2]):
-                        self.parts.append(Part(index, track, *grown))
-                        at = free = grown[1]
-                        continue
+                grown = []
+                for candidate in search(followers.ahead, at, at + WINDOW):
+                    window, seed = followed(candidate, at + WINDOW), at + WINDOW // 2
+                    if is_anchor(window):
+                        track = known_tracks().index(window.track)
+                        rows = followers.grow(track, seed, window.states[WINDOW // 2], free, n)
+                        if rows and rows[1] - rows[0] >= WINDOW and is_anchor(rows[2]):
+                            grown.append(Part(index, track, *rows))
+                if found := unrivalled(grown, Part.along_from, SAME_PLACE):
+                    self.parts.append(found)
+                    at = free = found.end
+                    continue
                 at = at + WINDOW_STEP if at + WINDOW == n else min(at + WINDOW_STEP, n - WINDOW)
+
+    def correct(self, forward: bool) -> None:
+        """Replace parts by one next to their neighbour, if that agrees about as well with the rows, or better.
+
+        An S-bend looks the same from both ends: by itself, a part there may be in the wrong direction.
+        """
+        parts, self.parts = self.parts[:: 1 if forward else -1], []
+        while parts:
+            self.parts.append(parts.pop(0))
+            while found := self.next_to(self.parts[-1], None, forward):
+                rivals = [part for part in parts if found.overlaps(part)]
+                if not rivals or found.quality() <= AMBIGUOUS * sum(part.quality() for part in rivals):
+                    break
+                parts = [part for part in parts if part not in rivals]
+                self.parts.append(found)
+        self.parts = self.parts[:: 1 if forward else -1]
 
     def spread(self, forward: bool) -> None:
         """Place what is left, from the ends of the parts that there are on, or from their starts back."""
@@ -216,7 +258,7 @@ class Placing:
         n, middle = len(followers.stretch), len(followers.stretch) // 2
         if not ALONE_ROWS <= n < WINDOW:
             return None
-        found = followed(search(followers.ahead, 0, n), n)
+        found = followed(search(followers.ahead, 0, n)[0], n)
         track = known_tracks().index(found.track)
         grown = followers.grow(track, middle, found.states[middle], 0, n)
         part = Part(index, track, *grown) if grown else None
@@ -275,13 +317,12 @@ class Placing:
             found = self.best_of(positions, part.track, index, rows)
             if found and found.is_beyond(limits[found.found.track.name]):
                 return found
+            if found and limits is EXPECTED and found.metres() >= ALONE_METRES and is_anchor(found.found):
+                return found
         return None
 
     def best_of(self, positions: np.ndarray, track: int, index: int, rows: tuple[int, int, int]) -> Part | None:
-        """Return the part that grows best from one of these positions.
-
-        None if from another one it grows nearly as well elsewhere across the road. rows: as for `near`.
-        """
+        """Return the part that grows best from one of these positions, if it is `unrivalled`; rows: as for `near`."""
         (start, first, end), followers = rows, self.followers[index]
         candidates = [Candidate(followers.ahead[track], np.array([s, 0.0, 0.0]), start) for s in positions]
         for until in (start + FIRST_PROBE, start + PROBE):
@@ -292,11 +333,7 @@ class Placing:
             state = candidate.smooth()[PROBE // 2]
             if found := followers.grow(track, start + PROBE // 2, state, first, end):
                 grown.append(Part(index, track, *found))
-        best = max(grown, key=Part.quality, default=None)
-        if not best:
-            return None
-        rivals = [other for other in grown if other.quality() > AMBIGUOUS * best.quality()]
-        return None if any(best.away_from(other) > SAME_OFFSET for other in rivals) else best
+        return unrivalled(grown, Part.away_from, SAME_OFFSET)
 
 
 def certain_parts(
@@ -308,6 +345,8 @@ def certain_parts(
     """
     placing = Placing(recording, stretches, centres)
     placing.anchors()
+    for forward in (True, False):
+        placing.correct(forward)
     for forward in (True, False):
         placing.spread(forward)
     placing.together()

@@ -69,8 +69,8 @@ def candidate_positions(follower: TrackFilter, first: int = 0) -> list[tuple[flo
     return [(float(deviation[i]), i * PROFILE_STEP) for i in np.flatnonzero(minima)]
 
 
-def search(filters: list[TrackFilter], first: int, end: int) -> Candidate:
-    """Return the best candidate for the rows from `first` to `end` of a stretch, followed over some of them."""
+def search(filters: list[TrackFilter], first: int, end: int) -> list[Candidate]:
+    """Return the best candidates for the rows from `first` to `end` of a stretch, two at most, the best one first."""
     found = [
         (badness, Candidate(each, np.array([s, 0.0, 0.0]), first))
         for each in filters
@@ -81,7 +81,7 @@ def search(filters: list[TrackFilter], first: int, end: int) -> Candidate:
     for count, rows in SEARCH:
         best = sorted(found, key=lambda candidate: candidate[0])[:count]
         found = [(-candidate.follow(min(first + rows, end)), candidate) for _, candidate in best]
-    return min(found, key=lambda candidate: candidate[0])[1]
+    return [candidate for _, candidate in sorted(found, key=lambda candidate: candidate[0])]
 
 
 def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
@@ -90,7 +90,7 @@ def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
     centres: float32 (n, 3, 5): of `reader.detect_centres`, in the stretch's rows.
     """
     found = search([TrackFilter(stretch, centres, track) for track in known_tracks()], 0, len(stretch))
-    return followed(found, len(stretch))
+    return followed(found[0], len(stretch))
 
 
 def followed(candidate: Candidate, end: int) -> Localisation:
