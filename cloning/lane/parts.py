@@ -218,7 +218,7 @@ class Placing:
         parts, self.parts = self.parts[:: 1 if forward else -1], []
         while parts:
             self.parts.append(parts.pop(0))
-            while found := self.next_to(self.parts[-1], None, forward):
+            while parts and (found := self.next_to(self.parts[-1], None, forward)):
                 rivals = [part for part in parts if found.overlaps(part)]
                 if not rivals or found.quality() <= AMBIGUOUS * sum(part.quality() for part in rivals):
                     break
