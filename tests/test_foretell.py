@@ -113,9 +113,9 @@ def test_an_alarm_counts_from_6_to_1_s_before_a_departure():
     time = np.arange(0, 20, 1 / 15)
     part = tool.Part(tool.HARD, np.zeros((len(time), 1)), time, 20.0)
     for first, last, wanted in ((13.5, 13.9, 0), (14.1, 14.3, 1), (18.8, 18.95, 1), (19.1, 20, 0)):
-        assert tool.windows(part, ((time >= first) & (time <= last)) * 1.0) == [wanted]
-    assert tool.windows(part._replace(departure=None), (time < 0.1) * 1.0) == [1, 0, 0], "whole windows of 5 s"
-    assert tool.windows(tool.Part(tool.HARD, np.zeros((2, 1)), np.array([19.5, 19.6]), 20.0), np.ones(2)) == []
+        assert tool.greatest(part, ((time >= first) & (time <= last)) * 1.0) == [wanted]
+    assert tool.greatest(part._replace(departure=None), (time < 0.1) * 1.0) == [1, 0, 0], "whole windows of 5 s"
+    assert tool.greatest(tool.Part(tool.HARD, np.zeros((2, 1)), np.array([19.5, 19.6]), 20.0), np.ones(2)) == []
 
 
 def test_what_measures_was_not_tuned_on():

@@ -34,8 +34,6 @@ from cloning.base.progress import progress_bar
 from cloning.lane.foretell import (
     ALARM,
     EARLIEST,
-    LATEST,
-    WINDOW,
     Limits,
     Observation,
     Observer,
@@ -54,6 +52,7 @@ from cloning.recordings.writer import SampleClock
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber
 from cloning.road.track import Track
 from cloning.server.speed import SpeedController
+from simulator.benchmark.scores import windows
 from simulator.cameras import jpeg
 from simulator.driving import cameras_at
 from simulator.run import Run
@@ -203,14 +202,12 @@ def parts(ordinary: Ordinary, course: Course, driven: Drive) -> Iterator[Part]:
             yield Part(course.kind, found, driven.time[rows], end if np.isfinite(end) else None)
 
 
-def windows(part: Part, risk: np.ndarray) -> list[float]:
-    """Return the greatest risk in each whole WINDOW of a part, or in the one that foretells its departure."""
-    if part.leaves:
-        before = (part.ahead <= EARLIEST) & (part.ahead >= LATEST)
-        return [risk[before].max()] if before.any() else []
-    number = (part.time - part.time[0]) // WINDOW
-    whole = int((part.time[-1] - part.time[0]) // WINDOW)
-    return [risk[number == k].max() for k in range(whole)]
+def greatest(part: Part, risk: np.ndarray) -> list[float]:
+    """Return the greatest risk in each whole window of a part, or in the one that foretells its departure."""
+    time = part.time - part.time[0]
+    departures = [part.departure - part.time[0]] if part.departure is not None else []
+    found = [risk[(begin <= time) & (time < end)] for begin, end in windows(departures, time[-1])]
+    return [each.max() for each in found if len(each)]
 
 
 def regress(signs: np.ndarray, leaves: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -260,7 +257,7 @@ def risks(of: Sequence[Part], kind: str, risk: Callable[[np.ndarray], np.ndarray
     found: tuple[list[float], list[float]] = ([], [])
     for part in of:
         if part.kind == kind:
-            found[not part.leaves].extend(windows(part, risk(part.signs)))
+            found[not part.leaves].extend(greatest(part, risk(part.signs)))
     return np.array(found[0]), np.array(found[1])
 
 

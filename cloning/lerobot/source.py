@@ -27,8 +27,8 @@ NOT_THERE = {
     "speed": "no speed in mph: 0 is written; --robust and replays, which follow the car's path, can't do without it",
 }
 SIDES_MADE = (
-    "only one camera: the left and right images are made of its, as the simulator's side cameras would see a flat road "
-    "if it were the simulator's own"
+    "only one camera: the left and right images are made from its images, as the simulator's side cameras would see a "
+    "flat road if it were the simulator's centre camera"
 )
 
 

@@ -39,16 +39,21 @@ def percent(autonomy: float) -> float:
     return round(100 * max(0.0, autonomy), DIGITS)
 
 
-def alarmed(departures: Sequence[float], alarms: Sequence[float], seconds: float) -> tuple[int, int]:
-    """Return in how many windows there was an alarm, and how many there are, as SelfOracle counts them.
+def windows(departures: Sequence[float], seconds: float) -> list[tuple[float, float]]:
+    """Return where the windows of a drive begin and end in which alarms are counted, as SelfOracle counts them.
 
     In a drive with departures these are the seconds in which an alarm foretells one, otherwise the whole drive is cut
     into windows. All are s after the start.
     """
     before = ((max(last, each - EARLIEST), each - LATEST) for last, each in pairwise([0.0, *departures]))
     whole = ((k * WINDOW, (k + 1) * WINDOW) for k in range(int(seconds // WINDOW)))
-    windows = [(begin, end) for begin, end in (before if departures else whole) if begin < end]
-    return sum(any(begin <= alarm < end for alarm in alarms) for begin, end in windows), len(windows)
+    return [(begin, end) for begin, end in (before if departures else whole) if begin < end]
+
+
+def alarmed(departures: Sequence[float], alarms: Sequence[float], seconds: float) -> tuple[int, int]:
+    """Return in how many of a drive's windows there was an alarm, and how many there are."""
+    found = windows(departures, seconds)
+    return sum(any(begin <= alarm < end for alarm in alarms) for begin, end in found), len(found)
 
 
 def foretelling(drives: Sequence[Driven]) -> str | None:
