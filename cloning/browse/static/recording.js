@@ -63,19 +63,18 @@ export async function showRecording(id, row, shown) {
   const count = columns.seconds.length, marks = (shown.get("mark") ?? "").split("-");
   const [first, last] = marks.map(at => at ? Math.min(Number(at), count - 1) : undefined);
   const now = page.open = {
-    id, details, columns, count, marks: {first, last}, ...changes(id), row: 0, playing: 0, orders: 0,
+    id, details, columns, count, marks: {first, last}, ...changes(id), row: Math.min(row, count - 1), playing: 0, orders: 0,
     jumps: {...details.jumps}, limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
     condition: shown.get("find") ?? "", paths: shown.get("paths") != "0",
     query: () => now.limit ? `?limit=${now.limit}` : "",
     column: name => column(id, details.version, name),
   };
   now.plots = new Plots(columns, details.models.map(({name}) => name), seek);
-  now.frames = new Frames(id, details.version, count, cameras());
+  now.frames = new Frames(id, details.version, count, cameras(), now.row);
   element("title").textContent = `/ ${details.name}`;
   document.title = details.name;
   element("scrub").max = count - 1;
   say("");
-  now.row = Math.min(row, count - 1);
   now.plots.setZoom(...(shown.get("zoom") ?? `0-${count - 1}`).split("-").map(Number));
   setSpeed(shown.get("speed") ?? 1);
   setLoop(shown.get("loop") == "1");
