@@ -173,6 +173,9 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     bare = f"{CONTROLS}.filter(each => !each.title && !each.closest('#replays, #notes')).length"
     assert page.run(bare) == 0, "tooltips"
     assert now(page, "plots.plots[3].axes[1]._splits") == [0, -1, 1, -2.5, 2.5], "metres from the lane's centre"
+    page.run("import('/static/state.js').then(({page: {open}}) => open.plots.setZoom(40, 59))")
+    assert page.fits(), "with the row outside of what the curves show"
+    page.press("0")
     assert -0.6 < now(page, "plots.plots[0].scales.y.min") < -0.2, "the steering's own scale"
     assert "one.pt driving 0." in page.text("#plots"), "how the replayed car is steered"
     recording = read_recording(sample_recording)
@@ -371,6 +374,8 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.shows("#run-figures", "the least drift, 0.60 m, is that of epoch 3")
         assert page.run("document.querySelector('#run-bar').value") == 1
         assert page.run("document.querySelector('#run-read').open"), "after it has refreshed itself"
+        page.run("location.hash = '#/run/1'")
+        page.shows("#losses section", "Not known: no two seconds")
         assert page.complaints() == []
 
 
