@@ -259,7 +259,7 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         assert [entry for entry in page.complaints() if "condition=" not in entry] == []
 
 
-def test_curves_are_zoomed_with_wheel_and_window(served, page):
+def test_curves_are_zoomed_with_wheel_window_and_fingers(served, page):
     page.look(1280, 900)
     page.open(f"{served.base}{served.hash('lake sample')}/30")
     at(page, 30)
@@ -285,6 +285,11 @@ def test_curves_are_zoomed_with_wheel_and_window(served, page):
     page.drag("#stretches .mark b:last-child", 0.5, 20)
     page.until(lambda: now(page, "marks.last") > 35)
     assert now(page, "marks.first") == 30
+    page.swipe("#plots .u-over", (0.4, 0.2), (0.6, 0.8))
+    low, high = now(page, "plots.zoom")
+    assert high - low == pytest.approx(59 / 3, rel=0.1), "two fingers"
+    page.swipe("#histogram .u-over", (0.5, 0.9))
+    page.shows("#matches", "frames in ")
     assert page.complaints() == []
 
 

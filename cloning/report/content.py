@@ -125,7 +125,7 @@ class Report:
                 recording = read_recording(folder)
                 figures = summary.figures(recording, np.zeros(len(recording), bool))
                 cut = sum(rows for _, rows in recording.cuts)
-                self.recordings.append({**figures, "name": str(folder), "cut_frames": cut})
+                self.recordings.append({**figures, "folder": str(folder), "name": folder.name, "cut_frames": cut})
                 self.looked_at = self.looked_at or recording
         except (UserError, OSError) as error:
             self.missing.append(message_of(error))
@@ -155,7 +155,7 @@ class Report:
             self.replays.append(
                 {
                     **report,
-                    "trained_on": folder.resolve() in [Path(each["name"]).resolve() for each in self.recordings],
+                    "trained_on": folder.resolve() in [Path(each["folder"]).resolve() for each in self.recordings],
                     "table": rows,
                     "plot": uri(plot(recording, drives), "image/png"),
                     "interventions": len(where),

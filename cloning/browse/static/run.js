@@ -169,8 +169,9 @@ function draw() {
     }
     const usual = values => values.toSorted((a, b) => a - b)[Math.ceil(LOSSES * values.length) - 1] ?? 0;
     const most = curves.flatMap(([[, values], {label}]) => label.endsWith(WITHIN) ? usual(values) : values);
-    const plot = new uPlot({
+    return new uPlot({
       width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
+      hooks: {ready: [plot => setTimeout(() => plot.setLegend({idx: plot.data[0].length - 1}))]}, // till the mouse points
       scales: {x: {time: false, range: [0, Math.max(...runs.map(({epochs}) => epochs))]},
         y: {range: [0, Math.max(...most, 0) * 1.08 || 0.1]}},
       axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font,
@@ -179,8 +180,6 @@ function draw() {
         ...curves.map(([, looks]) => ({...looks, spanGaps: true,
           value: (_, value) => value == null ? "–" : value.toFixed(digits) + unit}))],
     }, uPlot.join(curves.map(([values]) => values), curves.map(() => [0, 1])), holder);
-    plot.setLegend({idx: plot.data[0].length - 1}); // until the mouse points at another epoch
-    return plot;
   }).filter(Boolean);
 }
 
