@@ -213,9 +213,9 @@ class Graph {
     return {width, height: Math.min(MOST, Math.max(LEAST, Math.floor(height)))};
   }
 
-  // times: of the rows, seconds before now; at: index of the row at each time, undefined in a gap.
-  draw(times, at) {
-    const values = rows.map(row => row[this.column]), last = values.at(-1);
+  // times: seconds before now; groups: the rows there, none in a gap.
+  draw(times, groups) {
+    const values = groups.map(group => furthest(group, this.column)), last = rows.at(-1)?.[this.column];
     const hidden = this.figure.hidden;
     this.figure.hidden = this.ifKnown && !values.some(value => value != null);
     if (this.figure.hidden) return;
@@ -223,8 +223,8 @@ class Graph {
     this.range = scale(this, values);
     const [low, high] = this.range, clip = value => value == null ? null : Math.min(high, Math.max(low, value));
     const lines = this.marks().map(([, value]) => times.map(() => value == null || value < low || value > high ? null : value));
-    this.plot.setData([times, at.map(row => clip(values[row])), ...lines]);
-    const largest = values.reduce((most, value) => Math.abs(value) > Math.abs(most) ? value : most, 0);
+    this.plot.setData([times, values.map(clip), ...lines]);
+    const largest = furthest(rows, this.column);
     this.value.textContent = last == null ? "–" : rounded(last, this.digits) + this.unit;
     this.note.textContent = [
       this.isSpeed && live.set_speed ? `dashed: set speed ${live.set_speed} mph` : "",
@@ -234,17 +234,28 @@ class Graph {
   }
 }
 
+// The value of a column that is furthest from 0, undefined if there is none.
+const furthest = (some, column) => some.reduce((most, {[column]: value}) =>
+  value == null || Math.abs(value) <= Math.abs(most) ? most : value, undefined);
+
+// A curve has a point for each tenth of a second: to draw every frame takes hundreds of MB of the browser's memory.
 function draw() {
-  const times = [], at = [];
-  rows.forEach(([time], row) => {
-    if (row && time - rows[row - 1][0] > GAP) {
-      times.push((time + rows[row - 1][0]) / 2 - live.now);
-      at.push(undefined);
+  const times = [], groups = [];
+  let tenth;
+  rows.forEach((row, at) => {
+    const [time] = row, before = rows[at - 1]?.[0], isGap = time - before > GAP;
+    if (isGap) {
+      times.push((time + before) / 2 - live.now);
+      groups.push([]);
     }
-    times.push(time - live.now);
-    at.push(row);
+    if (isGap || Math.floor(time * 10) != tenth) {
+      tenth = Math.floor(time * 10);
+      times.push(time - live.now);
+      groups.push([]);
+    }
+    groups.at(-1).push(row);
   });
-  for (const graph of graphs) graph.draw(times, at);
+  for (const graph of graphs) graph.draw(times, groups);
 }
 
 const graphs = GRAPHS.map(graph => new Graph(graph));
