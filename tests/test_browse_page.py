@@ -121,8 +121,10 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     here = served.recordings()["lake sample"]
     page.open(f"{served.base}{served.hash('lake sample')}/0")
     at(page, 0)
+    top = page.run("plots.getBoundingClientRect().top")
     page.press("l")
     page.wait("document.querySelectorAll('#replay-list .interventions').length == 2")
+    assert page.run("plots.getBoundingClientRect().top") == top, "the curves stay where they are"
     for words in ("one.pt at 1 m", "two.pt at 1 m", "90.0 %", "mean 0.25 m", "1.20 m to the right"):
         assert words in page.text()
     for key, row in (("n", 29), ("n", 39), ("n", 49), ("N", 39)):

@@ -277,6 +277,7 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
         assert not page.run("document.querySelector('#camera').hidden")
         assert page.complaints() == []
         assert all(address.startswith((own, "data:", "about:")) for address in page.addresses()), "no outside host"
+        assert not any(address.startswith("data:image") for address in page.addresses()), "the browser would keep them"
         status, body, _ = ask(server.port, "/browse")
         assert (status, b"does not run" in body) in ((503, True), (302, False)), "a browser of recordings may run here"
     page.shows("#state", "drive.py does not answer")

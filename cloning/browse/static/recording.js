@@ -5,7 +5,7 @@ import {askToExport, find, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
 import {changeSpeed, goTo, jump, JUMPS, play, seek, setLoop, setSpeed} from "./moving.js";
 import {Plots} from "./plots.js";
-import {cameras, nextAttention, nextLimit, showReplays} from "./replays.js";
+import {cameras, nextAttention, nextLimit, offerModels, showReplays} from "./replays.js";
 import {orderButton, note, page, remember, say} from "./state.js";
 
 const SECOND = 15; // rows, of the larger step
@@ -60,6 +60,8 @@ export async function showRecording(id, row, shown) {
   names.forEach((name, at) => columns[name] = parts[at]);
   leaveRecording();
   element("recording").hidden = false;
+  offerModels(details);
+  for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
   const count = columns.seconds.length, marks = (shown.get("mark") ?? "").split("-");
   const [first, last] = marks.map(at => at ? Math.min(Number(at), count - 1) : undefined);
   const now = page.open = {
@@ -183,7 +185,6 @@ function buttons() {
     const button = element(`jump-${reason}`);
     if (button) button.disabled = !page.open.jumps[reason]?.length;
   }
-  for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
