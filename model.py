@@ -14,7 +14,6 @@ in diagnostic_images/. From a program: `train(replace(REPORT, flip=0.0), ["data"
 """
 
 from cloning.base import program
-from cloning.base.progress import progress_bar
 
 if __name__ == "__main__":
     program.end_on_interrupt("model.py")  # also while the libraries below are loaded
@@ -37,6 +36,7 @@ from torch import channels_last, manual_seed, nn
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import write
+from cloning.base.progress import progress_bar
 from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
 from cloning.network.network import NETWORKS, load_model
 from cloning.recordings.check import check_images

@@ -8,7 +8,6 @@ Exit status: 0 if the film shows every frame, 1 if unreadable ones were left out
 """
 
 from cloning.base import program
-from cloning.base.progress import progress_bar
 
 if __name__ == "__main__":
     program.end_on_interrupt("video.py", "stopped; no film was written")  # also while the libraries below are loaded
@@ -25,6 +24,7 @@ import numpy as np
 from cloning.base.arguments import number, ratio
 from cloning.base.errors import UserError
 from cloning.base.film import FilmWriter, frame_rate
+from cloning.base.progress import progress_bar
 from cloning.recordings import saved_frames
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import decode, read_jpeg

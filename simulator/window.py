@@ -174,6 +174,7 @@ class Window(ShowBase):
         """Let the texts fit the window's shape."""
         width = 2 * self.get_aspect_ratio() if self.get_aspect_ratio() > 1 else 2.0
         self.text.setWordwrap((width - 2 * MARGIN - 3 * LETTERS) / LETTERS)
+        self.message.setWordwrap((width - 4 * MARGIN) / LETTERS)
         size = min(LETTERS, (width - 4 * MARGIN) / 34)  # the help's lines have at most 60 letters of half its height
         self.help.setScale(size)
         self.help.setPos(-17 * size, 0.55 * size / LETTERS)

@@ -136,6 +136,19 @@ class Page:
             self.send("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **place)
             self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")  # moves are late
 
+    def swipe(self, selector: str, *fingers: tuple[float, float]) -> None:
+        """Move fingers over an element, each from one share of its width to another."""
+        self.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=len(fingers))
+        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
+        left, width, middle = self.run(f"(({{x, y, width, height}}) => [x, width, y + height / 2])({box})")
+        for kind, share in (("touchStart", 0.0), ("touchMove", 0.3), ("touchMove", 1.0)):
+            across = [left + width * (begin + share * (end - begin)) for begin, end in fingers]
+            points = [{"x": x, "y": middle, "id": finger} for finger, x in enumerate(across)]
+            self.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+            self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        self.send("Emulation.setTouchEmulationEnabled", enabled=False)
+
     def wheel(self, selector: str, pixels: float) -> None:
         """Turn the mouse's wheel over the middle of an element."""
         box = f"document.querySelector({selector!r}).getBoundingClientRect()"

@@ -121,8 +121,10 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     here = served.recordings()["lake sample"]
     page.open(f"{served.base}{served.hash('lake sample')}/0")
     at(page, 0)
+    top = page.run("plots.getBoundingClientRect().top")
     page.press("l")
     page.wait("document.querySelectorAll('#replay-list .interventions').length == 2")
+    assert page.run("plots.getBoundingClientRect().top") == top, "the curves stay where they are"
     for words in ("one.pt at 1 m", "two.pt at 1 m", "90.0 %", "mean 0.25 m", "1.20 m to the right"):
         assert words in page.text()
     for key, row in (("n", 29), ("n", 39), ("n", 49), ("N", 39)):
@@ -173,6 +175,9 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     bare = f"{CONTROLS}.filter(each => !each.title && !each.closest('#replays, #notes')).length"
     assert page.run(bare) == 0, "tooltips"
     assert now(page, "plots.plots[3].axes[1]._splits") == [0, -1, 1, -2.5, 2.5], "metres from the lane's centre"
+    page.run("import('/static/state.js').then(({page: {open}}) => open.plots.setZoom(40, 59))")
+    assert page.fits(), "with the row outside of what the curves show"
+    page.press("0")
     assert -0.6 < now(page, "plots.plots[0].scales.y.min") < -0.2, "the steering's own scale"
     assert "one.pt driving 0." in page.text("#plots"), "how the replayed car is steered"
     recording = read_recording(sample_recording)
@@ -256,7 +261,7 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         assert [entry for entry in page.complaints() if "condition=" not in entry] == []
 
 
-def test_curves_are_zoomed_with_wheel_and_window(served, page):
+def test_curves_are_zoomed_with_wheel_window_and_fingers(served, page):
     page.look(1280, 900)
     page.open(f"{served.base}{served.hash('lake sample')}/30")
     at(page, 30)
@@ -282,6 +287,11 @@ def test_curves_are_zoomed_with_wheel_and_window(served, page):
     page.drag("#stretches .mark b:last-child", 0.5, 20)
     page.until(lambda: now(page, "marks.last") > 35)
     assert now(page, "marks.first") == 30
+    page.swipe("#plots .u-over", (0.4, 0.2), (0.6, 0.8))
+    low, high = now(page, "plots.zoom")
+    assert high - low == pytest.approx(59 / 3, rel=0.1), "two fingers"
+    page.swipe("#histogram .u-over", (0.5, 0.9))
+    page.shows("#matches", "frames in ")
     assert page.complaints() == []
 
 
@@ -371,6 +381,8 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.shows("#run-figures", "the least drift, 0.60 m, is that of epoch 3")
         assert page.run("document.querySelector('#run-bar').value") == 1
         assert page.run("document.querySelector('#run-read').open"), "after it has refreshed itself"
+        page.run("location.hash = '#/run/1'")
+        page.shows("#losses section", "Not known: no two seconds")
         assert page.complaints() == []
 
 

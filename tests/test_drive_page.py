@@ -260,6 +260,7 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             page.shows("#now-distance", "1.20 m right of the lane's centre")
             page.shows("#now-departures", "2 departures")
             assert page.run("document.querySelector('#now-distance').className") == "off"
+            page.shows("#plots", "dashed: 1 and 2.5 m")
             page.wait("document.querySelector('#map .road').getAttribute('d')?.length > 1000")
             feeder.message = {**usual, "stand_in": {**PLACE, "offset": -2.6, "track": "nowhere"}}
             page.shows("#now-distance", "2.60 m left of")
@@ -276,6 +277,9 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
         assert not page.run("document.querySelector('#camera').hidden")
         assert page.complaints() == []
         assert all(address.startswith((own, "data:", "about:")) for address in page.addresses()), "no outside host"
+        assert not any(address.startswith("data:image") for address in page.addresses()), "the browser would keep them"
+        status, body, _ = ask(server.port, "/browse")
+        assert (status, b"does not run" in body) in ((503, True), (302, False)), "a browser of recordings may run here"
     page.shows("#state", "drive.py does not answer")
     page.click("#stop")
     page.shows("#answer", "drive.py does not answer")
@@ -315,5 +319,8 @@ def test_the_page_fits_every_screen_and_bars_nobody(server, jpegs, page, width, 
         page.shows("#state", "Driving")
         page.wait(f"{PLOTS} == 5")
         assert page.fits() and page.has_colours(dark) and page.barriers() == []
-        right = "[...document.querySelectorAll('#plots figure')].map(each => each.getBoundingClientRect().right)"
-        assert page.run(f"Math.max(...{right}) / innerWidth") > 0.93, "the whole width is used"
+        figures = "[...document.querySelectorAll('#plots figure')]"
+        high = f"Math.max(...{figures}.map(each => each.getBoundingClientRect().bottom))"
+        assert width < 900 or page.run(high) <= 900, "all curves on one screen"
+        right = f"Math.max(...{figures}.map(each => each.getBoundingClientRect().right))"
+        assert page.run(f"{right} / innerWidth") > 0.93, "the whole width is used"

@@ -76,11 +76,22 @@ def test_a_missing_library_is_told_in_one_sentence(tmp_path, program, library, c
     assert done.stderr.startswith(f"{program.split()[0]}")
 
 
+@pytest.mark.parametrize(
+    "command",
+    [["model.py"], ["drive.py"], ["video.py", "run1"], *(["-m", name] for name in ("simulator", "cloning.browse"))],
+)
+def test_a_forgotten_environment_is_told_in_one_sentence(command):
+    done = subprocess.run([sys.executable, "-S", *command], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (FAILED, 1), done.stderr
+    assert "is missing: activate the environment" in done.stderr
+
+
 def test_an_old_python_is_told_in_one_sentence():
-    old = "import runpy, sys; sys.version_info = (3, 10, 4); runpy.run_path('model.py', run_name='__main__')"
+    version = "import sys; sys.version_info, sys.hexversion = (3, 10, 4), 0x30A04F0"
+    old = f"{version}; import runpy; runpy.run_path('model.py', run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", old], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == FAILED and done.stderr.count("\n") == 1
-    assert "needs Python 3.11 or later, and" in done.stderr and "is Python 3.10.4" in done.stderr
+    assert "Python 3.11 or later is needed, and" in done.stderr and "is Python 3.10.4" in done.stderr
 
 
 def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys):

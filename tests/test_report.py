@@ -1,6 +1,7 @@
 """The report of a training run: what it contains, and that it needs nothing else."""
 
 import base64
+import io
 import json
 import re
 import shutil
@@ -8,13 +9,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 import warm
 from browser import LOOKS, chromium, needs_chromium
 from commands import ROOT, log
 
+from cloning.base.errors import UserError
+from cloning.base.film import FilmWriter
 from cloning.replay.score import YARDSTICKS
-from cloning.report import content
+from cloning.report.pictures import film_uri
 from cloning.training.summary import csv_bytes
 
 
@@ -80,10 +85,21 @@ def test_the_report_contains_the_run(written, finished):
     assert len(page) < 15e6
 
 
-def test_a_long_film_stays_a_file(written, monkeypatch):
-    monkeypatch.setattr(content, "FILM", 3)
-    lap = content.Lap.of(written / "The lake.png", written.parent)
-    assert lap.film == "my%20run/The%20lake.mp4"
+def test_a_long_film_is_made_small(tmp_path):
+    film, noise = tmp_path / "lap.mp4", np.random.default_rng(0).integers(0, 256, (41, 180, 320, 3), np.uint8)
+    writer = FilmWriter(film, 10)
+    for frame in noise:
+        writer.add(frame)
+    writer.close()
+    assert base64.b64decode(film_uri(film, 10**7).partition(",")[2]) == film.read_bytes()
+    most = film.stat().st_size // 10
+    small = base64.b64decode(film_uri(film, most).partition(",")[2])
+    with av.open(io.BytesIO(small)) as opened:
+        assert (opened.streams.video[0].frames, opened.streams.video[0].average_rate) == (21, 5)
+    assert 0.5 * most < len(small) < 1.3 * most
+    film.write_bytes(film.read_bytes()[:1000])
+    with pytest.raises(UserError, match=r"lap.mp4: not a whole film"):
+        film_uri(film, 10)
 
 
 def test_the_report_is_written_as_markdown(written):

@@ -204,11 +204,12 @@ window.finish()
 for size in ((960, 540), (960, 600), (500, 620)):
     properties = core.WindowProperties.size(*size)
     window.win.request_properties(properties)
+    window.tell("too slow for the picture " * 4)
     for _ in range(3):
         window.task_mgr.step()
     window.do_help()
     width = max(1, window.get_aspect_ratio())
-    for text in (window.text, window.help):
+    for text in (window.text, window.help, window.message):
         low, high = text.get_tight_bounds(window.aspect2d)
         assert -width <= low.x < high.x <= width, (size, low, high)
     window.do_help()

@@ -108,7 +108,8 @@ def test_a_diagnostic_picture_names_the_pose_that_its_image_shows():
     assert [title.split(",")[0] for title in titles] == ["0.8 m right", "0.8 m left", "1.1 m left", "1.1 m right"]
     assert [" m right," in title for title in titles] == [steering < 0 for steering in poses.steering]
     turned = Poses.of(Lanes.unknown(2), np.zeros(2), np.radians([5, 5]), np.zeros(2, int), mirrored[:2])
-    assert [turned.title(at).split(", ")[1] for at in range(2)] == ["turned 5° right", "turned 5° left"]
+    assert [turned.title(at) for at in range(2)] == [f"in the middle, turned 5° {side}" for side in ("right", "left")]
+    assert titles[0].endswith(", not turned")
 
 
 def test_what_a_run_leaves(finished):

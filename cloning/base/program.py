@@ -4,14 +4,22 @@ A command calls `end_on_interrupt` before it imports large libraries, and `run` 
 is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C).
 """
 
-from __future__ import annotations  # so that an old Python comes as far as the sentence about it
+import os
+import sys
+
+if sys.hexversion < 0x30B0000:  # told before all that an older one does not understand
+    version = ".".join(map(str, sys.version_info[:3]))
+    print(
+        f"Python 3.11 or later is needed, and {sys.executable} is Python {version}: "
+        "name another, such as python3.12, or activate the environment",
+        file=sys.stderr,
+    )
+    os._exit(2)
 
 import atexit
 import functools
 import io
-import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -20,7 +28,6 @@ from typing import NoReturn
 
 from cloning.base.errors import UserError, message_of
 
-OLDEST_PYTHON = (3, 11)
 OWN_PACKAGES = ("cloning", "simulator", "tools")
 PACKAGES = {"cv2": "opencv-python-headless", "PIL": "pillow", "direct": "panda3d", "socketio": "python-socketio"}
 DONE = 0
@@ -55,14 +62,10 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
     """Name the command, and make Ctrl-C print this message and end the process at once, with status 130.
 
     An exception would not do: libraries that are interrupted while they load turn it into errors of their own. Also
-    end it, with a sentence instead of a traceback, if Python is too old or a library is missing.
+    end it, with a sentence instead of a traceback, if a library is missing.
     """
     global name, end_at_once
     name = program
-    if sys.version_info < OLDEST_PYTHON:
-        version = ".".join(map(str, sys.version_info[:3]))
-        print(f"{program}: needs Python 3.11 or later, and {sys.executable} is Python {version}", file=sys.stderr)
-        os._exit(FAILED)
     sys.excepthook = functools.partial(_tell, sys.excepthook)
 
     def stop(signal_number: int, _: FrameType | None) -> None:

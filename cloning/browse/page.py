@@ -2,6 +2,7 @@
 
 import math
 import re
+from pathlib import Path
 from typing import Any
 
 import flask
@@ -42,6 +43,8 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     app = flask.Flask(__name__)
     site.prepare(app, "img-src 'self' data:", "media-src data:")
 
+    scripts = sorted(path.name for path in Path(app.static_folder or "").glob("*.js"))  # all are asked for at once
+
     def shown(identifier: str) -> ShownRecording:
         # Its methods work in threads, so that others are answered while a long log is read.
         return eventlet.tpool.Proxy(library[identifier])
@@ -61,9 +64,8 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     def index() -> str:
         camera = {"matrix": CAMERA_MATRIX.tolist(), "height": CAMERA_HEIGHT}
         camera |= {"lock": math.radians(FULL_LOCK), "wheelbase": WHEELBASE}
-        return flask.render_template(
-            "browse.html", limits=[f"{each:g}" for each in LIMITS], speeds=SPEEDS, camera=camera
-        )
+        limits = [f"{each:g}" for each in LIMITS]
+        return flask.render_template("browse.html", limits=limits, speeds=SPEEDS, camera=camera, scripts=scripts)
 
     @app.get("/recordings")
     def recordings() -> list[dict[str, str]]:

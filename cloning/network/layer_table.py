@@ -1,4 +1,4 @@
-"""The table of the network's layers that a training run prints, in the format of the report's Keras summary."""
+"""The table of the network's layers that a training run prints, with the columns and names of the report's."""
 
 import torch
 from torch import nn
@@ -28,7 +28,7 @@ def layer_table(network: Network) -> str:
             previous = name
     title = f"{'Layer (type)':32} {'Output Shape':22} {'Param #':11} Connected to"
     total = f"Total params: {_parameters(network):,}"
-    return "\n".join(["_" * 90, title, "=" * 90, f"\n{'_' * 90}\n".join(rows), "=" * 90, total])
+    return "\n".join(["_" * 90, title, "=" * 90, *rows, "=" * 90, total])
 
 
 def _parameters(module: nn.Module) -> int:

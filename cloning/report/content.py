@@ -1,12 +1,10 @@
 """What a report contains: figures, tables and pictures of a run, and the page made of them."""
 
 import json
-import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import jinja2
 import numpy as np
@@ -25,7 +23,7 @@ from cloning.replay.command import drive_at_limits
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import Drive, ReplayFrame, load_recording, reference_lines
 from cloning.replay.score import ORACLE, YARDSTICKS, captioned, plot, replay_report
-from cloning.report.pictures import epochs_chart, frame_uri, picture_uri, steering_chart, uri
+from cloning.report.pictures import epochs_chart, film_uri, frame_uri, picture_uri, steering_chart, uri
 from cloning.road.autonomy import LIMITS
 from cloning.road.overlay import overlay
 from cloning.server.template import whole_page
@@ -34,7 +32,7 @@ from cloning.training.run_files import RunFiles
 from cloning.training.summary import VERDICTS, duration
 
 EXAMPLES = {"a bend to the left": 0.05, "hardly a bend": 0.5, "a bend to the right": 0.95}  # quantiles of the steering
-FILM = 4_000_000  # bytes of a film that is in the page: a page should have less than 15 MB
+FILMS = 9_000_000  # bytes of all films in the page, which should have less than 15 MB
 SHOWN = 6  # interventions of each replay that are shown
 DRIVERS = {"network": "the network", **YARDSTICKS, ORACLE: "recovery steering"}  # rows of the table of replays
 PICTURES = ("LRC_", "augmented-")  # of the training: the three cameras' images, and those made from them
@@ -59,7 +57,7 @@ class Lap(NamedTuple):
 
     title          the name of its picture
     figures        in words; "" if its report is not beside the picture
-    picture, film  data URIs; film: the address of the file if it is longer than FILM, "" if there is none
+    picture, film  data URIs; film: "" if there is none
     """
 
     title: str
@@ -68,8 +66,8 @@ class Lap(NamedTuple):
     film: str
 
     @classmethod
-    def of(cls, picture: Path, folder: Path) -> "Lap":
-        """Read a lap's picture, and its report and film if they are beside it; folder: of the page.
+    def of(cls, picture: Path, most: int) -> "Lap":
+        """Read a lap's picture, and its report and film if they are beside it; most: bytes of the film.
 
         Raises UserError, OSError.
         """
@@ -78,11 +76,7 @@ class Lap(NamedTuple):
             figures = lap_in_words(json.loads(report.read_bytes())) if report.exists() else ""
         except (ValueError, LookupError, TypeError) as error:
             raise UserError(f"{report}: not a report of `simulator drive` ({error!r}); make it again") from None
-        shown = ""
-        if film.exists():
-            long = film.stat().st_size > FILM
-            shown = quote(os.path.relpath(film, folder)) if long else uri(film.read_bytes(), "video/mp4")
-        return cls(picture.stem, figures, picture_uri(picture), shown)
+        return cls(picture.stem, figures, picture_uri(picture), film_uri(film, most) if film.exists() else "")
 
 
 def lap_in_words(report: dict[str, Any]) -> str:
@@ -111,7 +105,7 @@ class Report:
         self.arguments = files.arguments
         arguments = json.loads(self.arguments.read_bytes())
         self.recipe, self.labels = arguments.get("recipe"), arguments.get("training", {}).get("labels")
-        self.laps = [Lap.of(picture, folder) for picture in laps]
+        self.laps = [Lap.of(picture, FILMS // len(laps)) for picture in laps]
         numbers = self.run["pictures"]
         self.augmentations = [
             (number, *(picture_uri(files.pictures / f"training_generator_{kind}{number}.png") for kind in PICTURES))
@@ -131,7 +125,7 @@ class Report:
                 recording = read_recording(folder)
                 figures = summary.figures(recording, np.zeros(len(recording), bool))
                 cut = sum(rows for _, rows in recording.cuts)
-                self.recordings.append({**figures, "name": str(folder), "cut_frames": cut})
+                self.recordings.append({**figures, "folder": str(folder), "name": folder.name, "cut_frames": cut})
                 self.looked_at = self.looked_at or recording
         except (UserError, OSError) as error:
             self.missing.append(message_of(error))
@@ -161,7 +155,7 @@ class Report:
             self.replays.append(
                 {
                     **report,
-                    "trained_on": folder.resolve() in [Path(each["name"]).resolve() for each in self.recordings],
+                    "trained_on": folder.resolve() in [Path(each["folder"]).resolve() for each in self.recordings],
                     "table": rows,
                     "plot": uri(plot(recording, drives), "image/png"),
                     "interventions": len(where),

@@ -3,8 +3,10 @@
 import base64
 import io
 from collections.abc import Callable
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import matplotlib.style
@@ -15,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from cloning.base.errors import UserError
+from cloning.base.film import FilmWriter
 from cloning.recordings.format import BINS
 from cloning.recordings.images import encode
 
@@ -53,6 +56,32 @@ def picture_uri(source: Path | Image.Image) -> str:
     file = io.BytesIO()
     picture.save(file, "JPEG", quality=QUALITY)
     return uri(file.getvalue(), "image/jpeg")
+
+
+def film_uri(film: Path, most: int) -> str:
+    """Return a data URI of an mp4 film; one of more than `most` bytes becomes about as small, with half the frames.
+
+    Raises UserError if such a film cannot be read, OSError.
+    """
+    if film.stat().st_size <= most:
+        return uri(film.read_bytes(), "video/mp4")
+    import av  # slow to import, and not needed for a short film
+
+    with TemporaryDirectory() as folder:
+        small = Path(folder, "film.mp4")
+        try:
+            with av.open(str(film)) as opened:
+                stream = opened.streams.video[0]
+                seconds = Fraction(opened.duration or 0, av.time_base)
+                rate = Fraction(stream.average_rate or 0) / 2
+                writer = FilmWriter(small, rate, quality=28, max_bits=int(8 * most / seconds))
+                for number, frame in enumerate(opened.decode(stream)):
+                    if number % 2 == 0:
+                        writer.add(frame.to_ndarray(format="rgb24"))
+                writer.close()
+            return uri(small.read_bytes(), "video/mp4")
+        except (av.FFmpegError, FileNotFoundError, IndexError, ZeroDivisionError):  # unreadable; no frame, stream, time
+            raise UserError(f"{film}: not a whole film; make it again") from None
 
 
 def chart(*draws: Callable[[Axes], object]) -> Chart:

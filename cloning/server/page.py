@@ -37,6 +37,7 @@ SILENCE = 2.0  # s without a telemetry, or without a usable one, after which the
 MAX_PAGES = 64  # open at once
 MAX_BODY = 200  # bytes of a request; more could be JSON that is nested too deeply to read
 JPEG_QUALITY = 80  # of the pictures
+BROWSE_SECONDS = 0.5  # in which the browser of recordings must answer
 speed_argument = number(float, 0, TOP_SPEED_MPH)  # mph: a set speed; 0 stops the car
 Pause = Callable[[float], None]  # waits for so many seconds, while others work
 
@@ -93,9 +94,10 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     """Return the web application; pause: the server's.
 
     `/` is the page, `/live` its figures and pictures as server-sent events, `/road` the centre line of the road that
-    the stand-in simulator names: [[x, y], …] in m. POST to `/set-speed` changes the set speed: {"set_speed": text,
-    mph}; the answer is {"set_speed": number}. POST to `/record` saves frames or does no longer: {"recording": true or
-    false}; the answer is the same. Both answer {"message"} with 400 to what can't be done.
+    the stand-in simulator names: [[x, y], …] in m. `/browse` leads to the browser of recordings, if it runs. POST to
+    `/set-speed` changes the set speed: {"set_speed": text, mph}; the answer is {"set_speed": number}. POST to `/record`
+    saves frames or does no longer: {"recording": true or false}; the answer is the same. Both answer {"message"} with
+    400 to what can't be done.
     """
     app = flask.Flask(__name__, static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
@@ -107,7 +109,6 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
         constants = {"seconds": SHOWN_SECONDS, "top_speed": TOP_SPEED_MPH, "limits": LIMITS}
         port = flask.request.host.rpartition(":")[2]
         option = "" if port == str(PORT) or not port.isdecimal() else f" --port {port}"
-        constants["browse"] = f"http://{site.BROWSE_HOST}:{site.BROWSE_PORT}/"
         return flask.render_template("drive.html", model=server.model, option=option, **constants)
 
     @app.get("/live")
@@ -121,6 +122,19 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     def road() -> list[list[float]]:
         session = server.watched_session()
         return road_on_map(session.place.track) if session and session.place else []
+
+    @app.get("/browse")
+    def browse() -> Any:
+        from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
+
+        where = f"http://{site.BROWSE_HOST}:{site.BROWSE_PORT}/"
+        try:
+            with eventlet.Timeout(BROWSE_SECONDS):
+                eventlet.connect((site.BROWSE_HOST, site.BROWSE_PORT)).close()
+        except (OSError, eventlet.Timeout):
+            why = f"The browser of recordings does not run at {where} yet: type the command beside the link first.\n"
+            return flask.Response(why, 503, mimetype="text/plain")
+        return flask.redirect(where)
 
     @app.post("/set-speed")
     def change_set_speed() -> tuple[dict[str, Any], int]:

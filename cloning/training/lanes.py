@@ -5,6 +5,7 @@ Poses and the lane's frame are those of `cloning/lane/recovery.py`.
 
 import functools
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Self
@@ -174,10 +175,16 @@ class Poses(Table):
 
     def title(self, at: int) -> str:
         """Return the pose that an image shows in words, such as `0.8 m left, turned 5° right`; at: index of the row."""
-        seen = (-1 if self.mirrored[at] else 1) * np.array([self.offset[at], np.degrees(self.yaw[at])])
-        sides = ["left" if value < 0 else "right" for value in seen]
+        sign = -1 if self.mirrored[at] else 1
+        metres, degrees = sign * round(float(self.offset[at]), 1), sign * round(math.degrees(self.yaw[at]))
+        side = f"{abs(metres):.1f} m {_side(metres)}" if metres else "in the middle"
+        turn = f"turned {abs(degrees)}° {_side(degrees)}" if degrees else "not turned"
         weather = light.name_of(int(self.disturbance[at]))
-        return f"{abs(seen[0]):.1f} m {sides[0]}, turned {abs(seen[1]):.0f}° {sides[1]}{weather and f', {weather}'}"
+        return f"{side}, {turn}{weather and f', {weather}'}"
+
+
+def _side(value: float) -> str:
+    return "left" if value < 0 else "right"
 
 
 @functools.cache

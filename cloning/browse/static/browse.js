@@ -39,9 +39,13 @@ function help() {
 
 for (const [keys, what] of KEYS) {
   const shown = keys.split(" ").map(key => make("kbd", key)).flatMap(key => [key, " "]);
-  element("keys").append(make("tr", "", {}, make("td", "", {}, ...shown), make("td", what)));
+  element("keys").append(make("div", "", {}, make("dt", "", {}, ...shown), make("dd", what)));
 }
 element("help-button").onclick = help;
+// After a choice with the mouse, the keys are again those of the page.
+let byMouse = false;
+for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => byMouse = kind == "pointerdown", true);
+addEventListener("change", ({target}) => byMouse && target.matches("select") && target.blur());
 addEventListener("hashchange", () => route());
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || document.querySelector("dialog[open]")) return;

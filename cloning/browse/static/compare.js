@@ -2,6 +2,11 @@
 import {ask, element, make, many, notice, onClick, renew} from "./common.js";
 import {LIMITS} from "./replays.js";
 
+const COLUMNS = { // of each model, and what they mean
+  "steering error": "Root mean square of the difference from the human's steering, in all frames",
+  autonomy: "Share of the time without an intervention, each of which counts as 6 s",
+  "mean distance": "From the lane's centre, while the model drives",
+};
 const AGAIN = 2000; // ms until recordings whose analyses are not done are asked for again
 let open; // {limit, ids, found, timer}
 
@@ -43,11 +48,12 @@ element("compare-all").onclick = () => refresh(open, "POST").catch(error => noti
 
 function table(found, limit) {
   const names = found.find(({models}) => models)?.models.map(({name}) => name) ?? [];
-  const each = ["steering error", "autonomy", "mean distance"];
+  const each = Object.entries(COLUMNS);
   const head = make("tr", "", {},
     ...["recording", "minutes", "road", "human's distance"].map(text => make("th", text, {rowspan: 2, scope: "col"})),
     ...names.map(name => make("th", name, {colspan: each.length, scope: "colgroup"})));
-  const below = make("tr", "", {}, ...names.flatMap(() => each.map(text => make("th", text, {scope: "col"}))));
+  const below = make("tr", "", {}, ...names.flatMap(() =>
+    each.map(([text, title]) => make("th", text, {scope: "col", title}))));
   const rows = found.map(recording => row(recording, names.length * each.length, limit));
   return [make("thead", "", {}, head, below), make("tbody", "", {}, ...rows)];
 }
@@ -61,14 +67,14 @@ function row({id, name, message, seconds, roads, offset, models}, columns, limit
     replay.state == "ready" ? replay.autonomy_percent : waits(replay),
     replay.state == "ready" ? replay.distance_mean_m : waits(replay),
   ]);
-  const best = [Math.min, Math.max, Math.min].map((choose, at) =>
-    choose(...figures.map(each => each[at]).filter(Number.isFinite)));
   const written = [value => value.toFixed(3), value => `${value.toFixed(1)} %`, value => `${value.toFixed(2)} m`];
+  const best = [Math.min, Math.max, Math.min].map((choose, at) => // as it is written: equal figures are equally good
+    written[at](choose(...figures.map(each => each[at]).filter(Number.isFinite))));
   return make("tr", "", {}, heading, make("td", (seconds / 60).toFixed(1)),
     make("td", roads?.map(([name]) => name).filter((name, at, all) => all.indexOf(name) == at).join(", ") || "–"),
     make("td", offset ? `${offset[0].toFixed(2)} m` : "–"),
     ...figures.flatMap(values => values.map((value, at) => !Number.isFinite(value) ? make("td", value)
-      : make("td", written[at](value), {class: models.length > 1 && value == best[at] ? "best" : ""}))));
+      : make("td", written[at](value), {class: models.length > 1 && written[at](value) == best[at] ? "best" : ""}))));
 }
 
 const waits = ({state, progress}) => state == "running" ? `${(100 * progress).toFixed(0)} %`

@@ -10,7 +10,7 @@ let asked; // the cuts that the dialog asks a reason for, without it: [first, ro
 export function showCuts() {
   const now = page.open, {details} = now;
   showStretches();
-  for (const [kind, word, none] of [["cuts", "cut", "Mark a stretch, then cut it."], ["tags", "tag", "Cut has a button for it."]]) {
+  for (const [kind, word, none] of [["cuts", "cut", "Mark a stretch, then cut it."], ["tags", "tag", "Mark a stretch, press Cut, then Tag."]]) {
     const some = details[kind].map(cut => ({...cut, begin: cut.stretches[0]?.[0] ?? 0})).sort((a, b) => a.begin - b.begin);
     const item = ({begin, frames, first, last, reason}) => {
       const time = clock(now.columns.seconds[begin]);

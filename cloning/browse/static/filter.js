@@ -91,6 +91,13 @@ export function showHistogram() {
   }, [counts.map((_, bin) => from + (bin + 0.5) * wide), counts], holder);
 }
 
+// uPlot knows the mouse alone: a finger that drags over the histogram is one.
+const MOUSE = {pointerdown: "mousedown", pointermove: "mousemove", pointerup: "mouseup"};
+for (const [pointer, mouse] of Object.entries(MOUSE)) {
+  element("histogram").addEventListener(pointer, event => event.pointerType == "touch" && plot?.over.dispatchEvent(
+    new MouseEvent(mouse, {clientX: event.clientX, clientY: event.clientY, movementX: 1, bubbles: true})));
+}
+
 // The condition for a range of values, in place of an earlier one of the same column.
 function brush(name, low, high) {
   const others = page.open.condition.split(" and ").filter(part => part && !part.includes(` <= ${name} <= `));

@@ -26,8 +26,8 @@ function drawPath(context, steering, colour) {
 export class Frames {
   // pictures: {canvas, caption(row), path, looks, has?(row), paths}; looks: numbers of the models whose attention lies
   // over it; paths: {values, colour} of the steerings drawn on it
-  constructor(id, version, count, pictures) {
-    Object.assign(this, {id, version, count, pictures, closed: false, row: 0});
+  constructor(id, version, count, pictures, row) {
+    Object.assign(this, {id, version, count, pictures, closed: false, row});
     this.wanted = undefined; // the row to load next
     this.asked = this.drawn = this.loading = 0; // numbers of the last question and of the one drawn, and how many load
     this.loaded = new Map(); // row -> promise of its pictures, the oldest first

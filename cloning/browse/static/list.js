@@ -3,6 +3,7 @@ import {ask, element, make, many, notice, onClick, renew, request} from "./commo
 import {stateOf} from "./run.js";
 
 const AGAIN = 3000; // ms until a recording that cannot be read, or whose lane is being analysed, is asked for again
+const HEIGHT = 64; // px of a histogram
 const PENDING = ["waiting", "running", "paused"];
 const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
 let shown = 0; // counted up when the list is left, so that answers that come later are dropped
@@ -87,6 +88,8 @@ function arrange() {
   });
 }
 
+new ResizeObserver(() => histograms.forEach(plot =>
+  plot.setSize({width: widthOf(plot.root.parentNode), height: HEIGHT}))).observe(element("cards"));
 element("query").oninput = element("sort").onchange = arrange;
 element("compare").onclick = () => {
   const all = [...known].filter(([card]) => !card.hidden);
@@ -152,7 +155,7 @@ function draw(overview, card) {
   const lines = [
     `${(overview.seconds / 60).toFixed(1)} minutes, ${many(overview.frames, "frame")}; ${road(overview)}`,
     mean == undefined ? "all of it is cut"
-      : `${mean.toFixed(1)} mph, at most ${most.toFixed(1)}; steering 0 in ${(100 * overview.zeros).toFixed(0)} %`,
+      : `${mean.toFixed(1)} mph, at most ${most.toFixed(1)}; steering 0 in ${(100 * overview.zeros).toFixed(0)}\u00a0%`,
   ];
   if (overview.offset) {
     const [mean, most] = overview.offset.map(metres => metres.toFixed(2));
@@ -201,14 +204,16 @@ function map({outline, path}) {
   return [svg];
 }
 
+const widthOf = holder => Math.max(120, holder.clientWidth);
+
 function bars(counts, holder) {
-  const colours = getComputedStyle(document.body), width = Math.max(120, holder.clientWidth);
+  const colours = getComputedStyle(document.body);
   const steering = counts.map((_, bin) => (bin + 0.5) / counts.length * 2 - 1);
   holder.setAttribute("role", "img");
   holder.setAttribute("aria-label", "Histogram of steering, on a square-root scale");
   holder.title = "How many frames have which steering, on a square-root scale";
   return new uPlot({
-    width, height: 64, legend: {show: false}, cursor: {show: false}, padding: [4, 8, 0, 8],
+    width: widthOf(holder), height: HEIGHT, legend: {show: false}, cursor: {show: false}, padding: [4, 8, 0, 8],
     scales: {x: {time: false, range: [-1, 1]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
       range: (plot, low, high) => [0, Math.max(1, high)]}},
     axes: [{stroke: colours.getPropertyValue("--quiet"), size: 18, gap: 2, grid: {show: false}, ticks: {show: false},

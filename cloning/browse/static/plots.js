@@ -9,6 +9,7 @@ const LEAST = 15; // rows that a zoom shows
 const LEFT = 56, RIGHT = 12; // px; browse.css has them for the bar
 const TIMES = 20; // px of the times below the last plot
 const ROOM = 310, PLOTS = 440, MOST = 1.8; // px of a window's height for all else, and of the plots; how far they grow
+const LABEL = 16; // px between two labels
 const LIMITS = [1, 2.5], OFF = 6; // m: where a human would take over, and the edge line of the lake; the offset's axis
 const STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 1800, 3600], TIME_SPACE = 70; // s between two times; px
 
@@ -62,7 +63,8 @@ export class Plots {
     const drivers = this.replays.map((replay, index) => replay &&
       ({...models[index], name: `${models[index].name} driving`, values: replay.driver})).filter(Boolean);
     const human = {name: "human", values: steering, colour: colours.getPropertyValue("--line")};
-    const taught = label ? [{name: "label", values: label, colour: colours.getPropertyValue("--label")}] : [];
+    const taught = label ? [{name: "label", values: label, colour: colours.getPropertyValue("--label"),
+      title: "The recovery steering, which model.py --robust learns"}] : [];
     this.steerings = {human, taught, models};
     const graphs = [
       {title: "Steering", unit: "", digits: 3, tall: 96,
@@ -89,7 +91,7 @@ export class Plots {
       curve.colour ??= colour("--line");
       const named = curve.name ? [make("i", "", {style: `background: ${curve.colour}`}), `${curve.name} `] : [];
       const value = make("b");
-      caption.append(make("span", "", {}, ...named, value));
+      caption.append(make("span", "", curve.title ? {title: curve.title} : {}, ...named, value));
       this.shown.push({value, unit, digits, values: curve.values});
     }
     figure.append(caption, holder);
@@ -97,7 +99,8 @@ export class Plots {
     const here = make("div", "", {class: "here"}), limits = lines.flatMap(metres => [-metres, metres]);
     const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif",
       grid: {stroke: colour("--edge"), width: 0.5}, ticks: {show: false}};
-    const metres = {splits: () => [0, ...limits], values: (_, at) => at.map(each => each ? `${each} m` : "0")};
+    const fits = (plot, metres, [low, high]) => metres / (high - low) * (plot.height - TIMES) > LABEL;
+    const metres = {splits: (plot, _, ...scale) => [0, ...limits.filter(limit => fits(plot, Math.abs(limit), scale))], values: (_, at) => at.map(each => each ? `${each} m` : "0")};
     const plot = new uPlot({
       ...this.size({tall, isLast}), legend: {show: false}, padding: [6, RIGHT, isLast ? 0 : 6, 0],
       cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},

@@ -5,7 +5,7 @@ import {askToExport, find, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
 import {changeSpeed, goTo, jump, JUMPS, play, seek, setLoop, setSpeed} from "./moving.js";
 import {Plots} from "./plots.js";
-import {cameras, nextAttention, nextLimit, showReplays} from "./replays.js";
+import {cameras, nextAttention, nextLimit, offerModels, showReplays} from "./replays.js";
 import {orderButton, note, page, remember, say} from "./state.js";
 
 const SECOND = 15; // rows, of the larger step
@@ -60,22 +60,23 @@ export async function showRecording(id, row, shown) {
   names.forEach((name, at) => columns[name] = parts[at]);
   leaveRecording();
   element("recording").hidden = false;
+  offerModels(details);
+  for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
   const count = columns.seconds.length, marks = (shown.get("mark") ?? "").split("-");
   const [first, last] = marks.map(at => at ? Math.min(Number(at), count - 1) : undefined);
   const now = page.open = {
-    id, details, columns, count, marks: {first, last}, ...changes(id), row: 0, playing: 0, orders: 0,
+    id, details, columns, count, marks: {first, last}, ...changes(id), row: Math.min(row, count - 1), playing: 0, orders: 0,
     jumps: {...details.jumps}, limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
     condition: shown.get("find") ?? "", paths: shown.get("paths") != "0",
     query: () => now.limit ? `?limit=${now.limit}` : "",
     column: name => column(id, details.version, name),
   };
   now.plots = new Plots(columns, details.models.map(({name}) => name), seek);
-  now.frames = new Frames(id, details.version, count, cameras());
+  now.frames = new Frames(id, details.version, count, cameras(), now.row);
   element("title").textContent = `/ ${details.name}`;
   document.title = details.name;
   element("scrub").max = count - 1;
   say("");
-  now.row = Math.min(row, count - 1);
   now.plots.setZoom(...(shown.get("zoom") ?? `0-${count - 1}`).split("-").map(Number));
   setSpeed(shown.get("speed") ?? 1);
   setLoop(shown.get("loop") == "1");
@@ -184,7 +185,6 @@ function buttons() {
     const button = element(`jump-${reason}`);
     if (button) button.disabled = !page.open.jumps[reason]?.length;
   }
-  for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
 }
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -36,10 +36,19 @@ export function cameras() {
   return [centre, ...views];
 }
 
+// Show the buttons for models, if there are any: at once, so that nothing moves later.
+export function offerModels({models}) {
+  element("replaying").hidden = element("watching").hidden = !models.length;
+  renew(element("attention"), models.map(({name}) => name), () => models.map(({name}, index) => {
+    const button = make("button", name, {title: `Show in magenta what ${name} looks at (A)`});
+    onClick(button, () => watch(page.open.attention == index ? null : index));
+    return button;
+  }));
+}
+
 // Show the replays at the chosen limit as far as they are: curves, pictures, figures, interventions.
 export async function showReplays() {
   const now = page.open, {details} = now;
-  element("replaying").hidden = element("watching").hidden = !details.models.length;
   if (details.limit == now.limit) {
     const replays = await Promise.all(details.replays.map((replay, index) => load(now, replay, index)));
     if (page.open != now || details.limit != now.limit) return;
@@ -54,11 +63,6 @@ export async function showReplays() {
   for (const button of document.querySelectorAll("[data-limit]")) {
     button.setAttribute("aria-pressed", button.dataset.limit == now.limit);
   }
-  renew(element("attention"), details.models.map(({name}) => name), () => details.models.map(({name}, index) => {
-    const button = make("button", name, {title: `Show in magenta what ${name} looks at (A)`});
-    onClick(button, () => watch(page.open.attention == index ? null : index));
-    return button;
-  }));
   [...element("attention").children].forEach((button, index) =>
     button.setAttribute("aria-pressed", now.attention == index));
   element("replays").hidden = !now.limit;

@@ -6,6 +6,7 @@ import {MODEL_COLOURS} from "./plots.js";
 const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is asked for again
 const PICTURES = ["LRC_", "augmented-"]; // of pictures, in the order of the page
 const HEIGHT = 260; // px of a plot
+const UNKNOWN = "Not known: no two seconds of driving were kept for validation.";
 const WITHIN = "within the epoch"; // ends the label of such losses
 const LOSSES = 0.98; // share of the losses within the epochs that the plot shows: the first ones are far higher
 // {id, run, runs, others, at, plots, timer}; at: observations of the picture that was chosen, undefined for the latest
@@ -162,10 +163,15 @@ function draw() {
   open.plots = [[drift, 2, " m"], [losses, 4, ""]].map(([curves, digits, unit], at) => {
     const holder = element("losses").children[at].lastElementChild;
     holder.replaceChildren();
+    if (!curves.some(([[, values]]) => values.some(value => value != null))) {
+      holder.textContent = runs.some(({history}) => history.length) ? UNKNOWN : "No epoch is finished yet.";
+      return undefined;
+    }
     const usual = values => values.toSorted((a, b) => a - b)[Math.ceil(LOSSES * values.length) - 1] ?? 0;
     const most = curves.flatMap(([[, values], {label}]) => label.endsWith(WITHIN) ? usual(values) : values);
     return new uPlot({
       width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
+      hooks: {ready: [plot => setTimeout(() => plot.setLegend({idx: plot.data[0].length - 1}))]}, // till the mouse points
       scales: {x: {time: false, range: [0, Math.max(...runs.map(({epochs}) => epochs))]},
         y: {range: [0, Math.max(...most, 0) * 1.08 || 0.1]}},
       axes: [{...axis, label: "epoch", size: 26, labelSize: 20, labelFont: axis.font,
@@ -174,7 +180,7 @@ function draw() {
         ...curves.map(([, looks]) => ({...looks, spanGaps: true,
           value: (_, value) => value == null ? "–" : value.toFixed(digits) + unit}))],
     }, uPlot.join(curves.map(([values]) => values), curves.map(() => [0, 1])), holder);
-  });
+  }).filter(Boolean);
 }
 
 function showPictures() {

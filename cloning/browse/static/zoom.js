@@ -4,6 +4,8 @@ import {mark, showStretches} from "./cuts.js";
 import {page, remember} from "./state.js";
 
 const WHEEL = 1.002; // by which a pixel of the wheel zooms
+const HOW = matchMedia("(pointer: coarse)").matches ? "Pinch in the curves to zoom."
+  : "Drag or turn the wheel in the curves to zoom.";
 
 // Show on the strip and in words which part of the recording the curves show.
 export function showWindow({zoom, count, columns: {seconds}}) {
@@ -13,7 +15,7 @@ export function showWindow({zoom, count, columns: {seconds}}) {
   box.style.width = `${100 * (high + 1 - low) / count}%`;
   const [from, to] = [Math.ceil(low), Math.floor(high)].map(row => clock(seconds[row]));
   element("zoomed").textContent =
-    zoom ? `The curves show ${from} to ${to}.` : "Drag, turn the wheel or pinch in the curves to zoom.";
+    zoom ? `The curves show ${from} to ${to}.` : HOW;
   if (page.open) remember();
 }
 

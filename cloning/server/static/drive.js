@@ -6,7 +6,8 @@ const SECONDS = Number(seconds), TOP_SPEED = Number(topSpeed), LIMITS = JSON.par
 const AGAIN = 1000; // ms until a page that lost drive.py asks again
 const STILL = 0.5; // mph: a car that is slower stands
 const GAP = 1; // s without a frame that interrupt a curve
-const WIDE = 1800, HEIGHT = 97, WIDE_HEIGHT = 210, LEFT = 64, RIGHT = 16; // px of a plot; drive.css has its margins for the captions
+const LEFT = 64, RIGHT = 16; // px of a plot; drive.css has them for the captions
+const LEAST = 84, MOST = 260, ABOVE = 125, CAPTION = 24; // px of a plot's height, of what stands above all, of a caption
 const SPIKES = 3; // frames at least that a scale may leave out
 const LIMIT = 1e6; // beyond which nothing is drawn to scale
 const WORDS = {
@@ -25,7 +26,7 @@ const STEERING = 1, SPEED = 2, THROTTLE = 3, LATENCY = 4, DISTANCE = 5, X = 6, Y
 // least: the scale reaches at least so far; both: as far below 0 as above;
 // ifKnown: hidden without values; isSpeed: the set speed is shown with it.
 const GRAPHS = [
-  {column: DISTANCE, title: "Distance from the centre", unit: " m", digits: 2, least: 1.2, both: true, isDistance: true, ifKnown: true},
+  {column: DISTANCE, title: "Distance from the centre", unit: " m", digits: 2, least: 3, both: true, isDistance: true, ifKnown: true},
   {column: STEERING, title: "Steering, right positive", unit: "", digits: 2, least: 0.1, both: true},
   {column: SPEED, title: "Speed", unit: " mph", digits: 1, least: 1, isSpeed: true},
   {column: RISK, title: "Risk of leaving the road", unit: "", digits: 2, least: 1, ifKnown: true},
@@ -112,8 +113,9 @@ function smooth(points) {
 
 // Draws a picture; as the source of an image element, the browser would keep every one.
 async function show(base64) {
-  const jpeg = new Blob([Uint8Array.from(atob(base64), character => character.charCodeAt(0))]);
-  const picture = await createImageBitmap(jpeg), canvas = element("image");
+  const characters = atob(base64), bytes = new Uint8Array(characters.length);
+  for (let at = 0; at < bytes.length; at++) bytes[at] = characters.charCodeAt(at);
+  const picture = await createImageBitmap(new Blob([bytes])), canvas = element("image");
   canvas.getContext("2d").drawImage(picture, 0, 0, canvas.width, canvas.height);
   picture.close();
   element("camera").hidden = false;
@@ -128,6 +130,7 @@ function hear(event) {
   const last = rows.at(-1)?.[0] ?? 0; // after a reconnection the server sends the last minute again
   rows = rows.concat((live.rows ?? []).filter(row => row[0] > last)).filter(row => row[0] > live.now - SECONDS);
   if (live.image) show(live.image);
+  if (live.state == "gone" && before.state != "gone") answer("");
   const stops = live.state == "driving" && live.set_speed == 0;
   say(stops ? rows.at(-1)?.[SPEED] > STILL ? "stopping" : "stopped" : live.state);
   showNow();
@@ -148,7 +151,7 @@ function round(value) {
 // How far a scale reaches: not to spikes, which would make all else flat. Spikes are twice as high as 99 of 100 values,
 // or, in the first seconds, as all but three.
 function reach(values, least) {
-  const sorted = values.map(value => Math.min(value, LIMIT)).sort((a, b) => a - b), most = sorted.at(-1) ?? 0;
+  const sorted = Float64Array.from(values, value => Math.min(value, LIMIT)).sort(), most = sorted.at(-1) ?? 0;
   const usual = Math.max(least, sorted[Math.min(Math.floor(0.99 * sorted.length), sorted.length - SPIKES) - 1] ?? 0);
   return round(most > 2 * usual ? usual : Math.max(usual, most));
 }
@@ -187,7 +190,9 @@ class Graph {
       scales: {x: {time: false, range: [-SECONDS, 0]}, y: {range: () => this.range}},
       axes: [
         {...axis, size: 24, gap: 8, space: 64, incrs: [5, 10, 15, 30, 60], values: (_, times) => times.map(time => `${time} s`)},
-        {...axis, size: LEFT, space: 20, values: (_, values) => values.map(value => `${value}${this.unit}`)},
+        {...axis, size: LEFT, space: 20, values: (_, values) => values.map(value => `${value}${this.unit}`),
+          ...this.isDistance && {splits: (_, at, low, high) => [0, LIMITS.at(-1), ...high > 2 * LIMITS.at(-1) ? [high] : []]
+            .flatMap(metres => metres ? [-metres, metres] : 0)}},
       ],
       series: [{}, {...curve, stroke: colour("--line")}, ...this.marks().map(([name]) => ({...curve, stroke: colour(name), dash: [6, 4]}))],
     }, [[], [], ...this.marks().map(() => [])], this.holder);
@@ -200,13 +205,17 @@ class Graph {
     return LIMITS.flatMap((limit, at) => [1, -1].map(side => [at ? "--cut" : "--mark", side * limit]));
   }
 
+  // As high as all of them fit into the window below one another, or in columns.
   size() {
-    return {width: Math.max(200, this.figure.clientWidth), height: innerWidth < WIDE ? HEIGHT : WIDE_HEIGHT};
+    const width = Math.max(200, this.figure.clientWidth), columns = Math.round(element("plots").clientWidth / width);
+    const shown = element("plots").querySelectorAll("figure:not([hidden])").length;
+    const height = (innerHeight - ABOVE) / Math.ceil(shown / columns) - CAPTION;
+    return {width, height: Math.min(MOST, Math.max(LEAST, Math.floor(height)))};
   }
 
-  // times: of the rows, seconds before now; at: index of the row at each time, undefined in a gap.
-  draw(times, at) {
-    const values = rows.map(row => row[this.column]), last = values.at(-1);
+  // times: seconds before now; groups: the rows there, none in a gap.
+  draw(times, groups) {
+    const values = groups.map(group => furthest(group, this.column)), last = rows.at(-1)?.[this.column];
     const hidden = this.figure.hidden;
     this.figure.hidden = this.ifKnown && !values.some(value => value != null);
     if (this.figure.hidden) return;
@@ -214,32 +223,45 @@ class Graph {
     this.range = scale(this, values);
     const [low, high] = this.range, clip = value => value == null ? null : Math.min(high, Math.max(low, value));
     const lines = this.marks().map(([, value]) => times.map(() => value == null || value < low || value > high ? null : value));
-    this.plot.setData([times, at.map(row => clip(values[row])), ...lines]);
-    const largest = values.reduce((most, value) => Math.abs(value) > Math.abs(most) ? value : most, 0);
+    this.plot.setData([times, values.map(clip), ...lines]);
+    const largest = furthest(rows, this.column);
     this.value.textContent = last == null ? "–" : rounded(last, this.digits) + this.unit;
     this.note.textContent = [
       this.isSpeed && live.set_speed ? `dashed: set speed ${live.set_speed} mph` : "",
-      this.isDistance ? `${live.track ? "right positive" : "sign as sent"}; dashed: ${LIMITS.filter(limit => limit <= high).join(" and ")} m` : "",
+      this.isDistance ? `${live.track ? "" : "sign as sent; "}dashed: ${LIMITS.filter(limit => limit <= high).join(" and ")} m` : "",
       clip(largest) != largest ? `beyond the scale: ${rounded(largest, this.digits)}${this.unit}` : "",
     ].filter(Boolean).join("; ");
   }
 }
 
+// The value of a column that is furthest from 0, undefined if there is none.
+const furthest = (some, column) => some.reduce((most, {[column]: value}) =>
+  value == null || Math.abs(value) <= Math.abs(most) ? most : value, undefined);
+
+// A curve has a point for each tenth of a second: to draw every frame takes hundreds of MB of the browser's memory.
 function draw() {
-  const times = [], at = [];
-  rows.forEach(([time], row) => {
-    if (row && time - rows[row - 1][0] > GAP) {
-      times.push((time + rows[row - 1][0]) / 2 - live.now);
-      at.push(undefined);
+  const times = [], groups = [];
+  let tenth;
+  rows.forEach((row, at) => {
+    const [time] = row, before = rows[at - 1]?.[0], isGap = time - before > GAP;
+    if (isGap) {
+      times.push((time + before) / 2 - live.now);
+      groups.push([]);
     }
-    times.push(time - live.now);
-    at.push(row);
+    if (isGap || Math.floor(time * 10) != tenth) {
+      tenth = Math.floor(time * 10);
+      times.push(time - live.now);
+      groups.push([]);
+    }
+    groups.at(-1).push(row);
   });
-  for (const graph of graphs) graph.draw(times, at);
+  for (const graph of graphs) graph.draw(times, groups);
 }
 
 const graphs = GRAPHS.map(graph => new Graph(graph));
-new ResizeObserver(() => graphs.forEach(graph => graph.plot.setSize(graph.size()))).observe(element("plots"));
+const fit = () => graphs.forEach(graph => graph.plot.setSize(graph.size()));
+new ResizeObserver(fit).observe(element("plots"));
+addEventListener("resize", fit);
 element("attention").addEventListener("change", () => element("magenta").hidden = !element("attention").checked);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   graphs.forEach(graph => graph.build());
