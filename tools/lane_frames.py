@@ -5,9 +5,7 @@ nor the road is one that the network knows. Roads below FIRST_ROAD and looks fro
 """
 
 import itertools
-import multiprocessing
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +20,7 @@ from cloning.road.track import Track
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.scenery.looks import SHADOWED
+from simulator.workers import started_workers
 from simulator.world import Scene
 
 FRAME_SHARES = {"lake": 1, "jungle": 2}  # relative: hills and narrow bends are harder
@@ -101,7 +100,7 @@ def render_strips(scene: RenderedScene, seed: int) -> tuple[np.ndarray, np.ndarr
 
 
 def render_all(chosen: Iterable[RenderedScene], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run `render_strips` for several scenes, in several processes, and return all frames."""
-    with ProcessPoolExecutor(threads(), mp_context=multiprocessing.get_context("spawn")) as pool:
+    """Run `render_strips` for several scenes, in several processes, and return all frames. Raises SimulatorError."""
+    with started_workers(threads()) as pool:
         strips, centres = zip(*pool.map(render_strips, chosen, itertools.repeat(seed)), strict=True)
     return np.concatenate(strips), np.concatenate(centres)
