@@ -10,15 +10,19 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from multiprocessing.context import BaseContext
+from typing import TypeVar
 
 from cloning.base import program
 from cloning.base.arguments import number
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError, UserError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
@@ -54,6 +58,15 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
             for process in multiprocessing.active_children():  # after Ctrl-C they would drive on to their roads' ends
                 process.terminate()
             raise
+
+
+def results(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Return the results of all items in their order.
+
+    As `pool.map`, but for Ctrl-C: that would cancel what runs, and Python 3.11 fails on it when its processes end.
+    """
+    coming = [pool.submit(work, item) for item in items]
+    return (each.result() for each in coming)
 
 
 def _context() -> BaseContext:

@@ -288,12 +288,12 @@ def test_ctrl_c_while_rendering_processes_are_started_leaves_no_recording(tmp_pa
 DRIVING = """
 import os, signal, threading, time
 from cloning.base import program
-from simulator.workers import started_workers
+from simulator.workers import results, started_workers
 program.end_on_interrupt("test")
 def main():
     with started_workers(2) as pool:
         threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
-        pool.submit(time.sleep, 60).result()
+        list(results(pool, time.sleep, [60, 60, 60]))
 program.run(main)
 """
 

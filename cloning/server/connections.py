@@ -37,7 +37,7 @@ class Listener:
     def accept(self) -> tuple[Any, Any]:
         """Return the next connection and the client's address."""
         while True:
-            eventlet.sleep(0)  # so that others work, however many come
+            eventlet.sleep(0)  # without, a car's answer takes 7.2 ms instead of 4.7 beside three processes that connect
             try:
                 client, address = self.sock.accept()
             except OSError as error:
@@ -66,23 +66,18 @@ class Protocol(eventlet.wsgi.HttpProtocol):
 
     one_at_a_time = eventlet.semaphore.Semaphore()
 
-    @classmethod
-    def take_turn(cls) -> None:
-        """Wait until the connections with clients had their turn, and no other request has this one.
-
-        eventlet goes round all connections that have something to do: beside a hundred busy ones, a car would wait for
-        each of them, several times for each telemetry.
-        """
-        with cls.one_at_a_time:
-            eventlet.sleep(0)
-
     def log_message(self, *_: Any) -> None:
         """Log that a request is no HTTP, without what the client sent."""
         log.warning("a request can't be read")
 
     def parse_request(self) -> bool:
-        """Read the headers."""
-        self.take_turn()
+        """Read the headers, when the connections with clients had their turn, and no other request has this one.
+
+        eventlet goes round all connections that have something to do: beside a hundred busy ones, a car would wait for
+        each of them, several times for each telemetry.
+        """
+        with self.one_at_a_time:
+            eventlet.sleep(0)
         return super().parse_request()
 
     def finish(self) -> None:
@@ -104,7 +99,6 @@ def whole_requests(app: WSGIApplication, listener: Listener) -> WSGIApplication:
             return refuse(start_response, "413 Content Too Large", text)
         environ["wsgi.input"] = io.BytesIO(environ["wsgi.input"].read(length))
         listener.idle.pop(environ["eventlet.input"].get_socket(), None)
-        Protocol.take_turn()
         return app(environ, start_response)
 
     return read

@@ -34,19 +34,11 @@ class QuickSocket:
             eventlet.sleep(0)  # eventlet does not let others work while there is something to read
             self.since = time.perf_counter()
         if self.at == len(self.buffer):
-            self.buffer, self.at = self._read(), 0
+            self.buffer, self.at = self.sock.recv(65536), 0
             if QUICKACK is not None:
                 self.sock.setsockopt(socket.IPPROTO_TCP, QUICKACK, 1)
         start, self.at = self.at, min(self.at + size, len(self.buffer))
         return self.buffer[start : self.at]
-
-    def _read(self) -> bytes:
-        try:
-            return self.sock.fd.recv(65536)
-        except BlockingIOError:
-            data = self.sock.recv(65536)  # waits, while others work
-            self.since = time.perf_counter()
-            return data
 
 
 class WebSocket(eventlet.websocket.RFC6455WebSocket):
@@ -73,7 +65,6 @@ class WebSocket(eventlet.websocket.RFC6455WebSocket):
 
     def __init__(self, sock: Any, *args: Any, **options: Any):
         super().__init__(QuickSocket(sock), *args, **options)
-        self.max_frame_length = float("inf")  # Message limits the length
 
     def wait(self) -> str | None:
         """Return the next packet that python-engineio can read, or None at the end of the connection."""
