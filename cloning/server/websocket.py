@@ -110,3 +110,6 @@ class WebSocketWSGI(engineio.async_drivers.eventlet.WebSocketWSGI):
         plain = super()._handle_hybi_request(environ)
         environ["drive.client"].websocket = WebSocket(plain.socket, environ, plain.version, protocol=plain.protocol)
         return environ["drive.client"].websocket
+
+    def _negotiate_permessage_deflate(self, extensions: Any) -> None:
+        """Decline compression. Without: JavaScript's clients compress, and a WebSocket made as above refuses them."""
