@@ -367,7 +367,7 @@ def run_window(arguments: argparse.Namespace) -> int:
         opened.run()
     finally:
         opened.finish()
-    return program.DONE
+    raise KeyboardInterrupt  # panda3d has caught it: every other end is a SystemExit
 
 
 def run_join(arguments: argparse.Namespace) -> int:

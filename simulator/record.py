@@ -1,22 +1,15 @@
 """Record laps that the expert drives, faster than real time."""
 
 import functools
-import multiprocessing
-import os
-import signal
-import sys
-import threading
 from collections import deque
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack
 from datetime import timedelta
-from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any
 
 from panda3d.core import TransformState
 
-from cloning.base import program
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError
 from cloning.base.progress import progress_bar
@@ -29,33 +22,10 @@ from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Expert, Recovery
 from simulator.run import Run
+from simulator.workers import started_workers
 from simulator.world import Scene
 
 MAX_RENDERERS = 3  # processes; each uses one core and 50 MB
-
-
-def renderers_context() -> BaseContext:
-    """Return how rendering processes are started: on Linux as copies of one that has only imported this module.
-
-    A copy of this process could wait for ever for a lock that one of its threads held at that moment, as torch's and
-    OpenCV's do.
-    """
-    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else None)
-    context.set_forkserver_preload([__name__])
-    return context
-
-
-def start_renderer() -> None:
-    """Make a rendering process ignore Ctrl-C, and end together with the recording process, even if that is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-
-    def end_with_parent() -> None:
-        if parent:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 _View = tuple[str | PointRoad, int, Disturbance | None, int]  # road, look, disturbance and its seed
@@ -120,11 +90,10 @@ def record(
     renderers = 1 if disturbance else min(MAX_RENDERERS, threads())
     pending: deque[tuple[Future[list[bytes]], dict[str, Any]]] = deque()  # images being rendered, and their samples
     with ExitStack() as stack:
-        with program.interrupt_deferred():
-            recording = stack.enter_context(RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)))
-            pool = stack.enter_context(ProcessPoolExecutor(renderers, renderers_context(), start_renderer))
-            for _ in range(renderers):  # each starts a process
-                pool.submit(_prepare, view)
+        recording = stack.enter_context(RecordingWriter(folder, DEFAULT_START + timedelta(days=seed % 10_000)))
+        pool = stack.enter_context(started_workers(renderers))
+        for _ in range(renderers):
+            pool.submit(_prepare, view)
         bar = stack.enter_context(progress_bar(round(laps * track.length), "m", unit_scale=True))
 
         def write() -> None:

@@ -6,14 +6,23 @@ Dask runs again what a worker did not finish that was killed.
 
 import argparse
 import multiprocessing
-from collections.abc import Iterator
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from multiprocessing.context import BaseContext
+from typing import TypeVar
 
 from cloning.base import program
 from cloning.base.arguments import number
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError, UserError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
@@ -37,21 +46,51 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
         if scheduler:
             yield _dask(scheduler, stack)
             return
-        from simulator.record import renderers_context, start_renderer  # needs panda3d
-
-        with program.interrupt_deferred():
-            pool = stack.enter_context(ProcessPoolExecutor(processes, renderers_context(), start_renderer))
-            for _ in range(processes):  # each starts a process
-                pool.submit(int)
         try:
+            with program.interrupt_deferred():
+                pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
+                for _ in range(processes):  # each starts a process
+                    pool.submit(int)
             yield pool
         except BrokenExecutor as error:
             raise SimulatorError("a driving process was killed, perhaps for lack of memory") from error
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():  # after Ctrl-C they would drive on to their roads' ends
                 process.terminate()
             raise
+
+
+def results(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Return the results of all items in their order.
+
+    As `pool.map`, but for Ctrl-C: that would cancel what runs, and Python 3.11 fails on it when its processes end.
+    """
+    coming = [pool.submit(work, item) for item in items]
+    return (each.result() for each in coming)
+
+
+def _context() -> BaseContext:
+    """Return how the processes are started: on Linux as copies of one that has only imported what renders.
+
+    A copy of this process could wait for ever for a lock that one of its threads held at that moment, as torch's and
+    OpenCV's do.
+    """
+    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else None)
+    context.set_forkserver_preload(["simulator.record"])
+    return context
+
+
+def _begin() -> None:
+    """Make a process ignore Ctrl-C, and end together with the one that started it, even if that is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def end_with_parent() -> None:
+        if parent:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def _dask(address: str, stack: ExitStack) -> Executor:

@@ -47,7 +47,7 @@ def recorded(
 ) -> tuple[Recording, np.ndarray]:
     """What the expert drives, and the true lateral offset of each row, m; rendered with this process's own scenes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record, "ProcessPoolExecutor", Here)
+        patch.setattr(record, "started_workers", Here)
         patch.setattr(record, "_cameras", lambda view: cameras(*view[:2]))
         run, _ = record.record(folder, track, laps, speed, seed, look)
     recording = read_recording(folder)

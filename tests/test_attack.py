@@ -63,6 +63,7 @@ def test_a_client_that_reads_nothing_is_disconnected(server):
         stranger.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         stranger.connect(("127.0.0.1", server.port))
         stranger.sendall(WEBSOCKET % b"")
+        assert stranger.recv(13) == b"HTTP/1.1 101 "
         with pytest.raises(ConnectionError):
             for _ in range(10_000):
                 stranger.sendall(frame(b'42["telemetry",0]') * 100)

@@ -230,7 +230,7 @@ def test_real_recordings_are_trusted(folder):
 
 def test_training_leaves_weights_that_load(tmp_path, sample_recording, monkeypatch, capsys):
     shipped = reader.SHIPPED_WEIGHTS.read_bytes()
-    monkeypatch.setattr(lane_frames, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(lane_frames, "started_workers", Here)
     monkeypatch.setattr(train_lane, "one_thread", lambda: None)  # other tests have theirs
     monkeypatch.chdir(tmp_path)
     assert train_lane.main([str(sample_recording), *SHORT_TRAINING]) == 0

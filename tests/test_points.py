@@ -165,7 +165,7 @@ def test_every_lap_of_an_open_road_starts_at_rest_at_its_start_and_ends_at_its_e
 
 
 def test_the_command_records_an_open_road_with_a_drive_a_lap_and_its_lane(tmp_path, monkeypatch):
-    monkeypatch.setattr(record, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(record, "started_workers", Here)
     (tmp_path / "road.json").write_text(json.dumps({"road_points": BEND[:2], "marking": "kerb"}))
     folder, road = str(tmp_path / "recording"), str(tmp_path / "road.json")
     assert simulator.main(["record", folder, "--road", road, "--laps", "2", "--land", "desert"]) == 0

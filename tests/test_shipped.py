@@ -45,7 +45,7 @@ NAMES = ["road-1001-ccw-look0", "road-1001-cw-look10000", "mountain-1001-ccw-loo
 
 def test_rendering_goes_on_where_it_was_interrupted(tmp_path, capsys, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(shipped, "ProcessPoolExecutor", Here)
+        patch.setattr(shipped, "started_workers", Here)
         assert render(tmp_path, CHOSEN[:1]) == [tmp_path / NAMES[0]]
     (tmp_path / "unfinished" / NAMES[1]).mkdir(parents=True)  # as a killed run leaves it
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / NAMES[0]).rglob("*")}

@@ -21,7 +21,7 @@ from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.writer import csharp_number
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
-from simulator import record
+from simulator import record, workers
 from simulator.__main__ import main
 from simulator.car import STEP
 from simulator.expert import Expert
@@ -225,7 +225,7 @@ def test_recordings_are_as_the_simulators(tmp_path, capsys):
 def test_recordings_are_the_same_where_processes_cannot_fork_or_there_is_only_one(tmp_path, monkeypatch):
     """macOS and Windows start every process with a fresh interpreter. The look has shadows."""
     record.record(tmp_path / "default", Track("jungle"), laps=0.003, look=10_000)
-    monkeypatch.setattr(record, "renderers_context", lambda: multiprocessing.get_context("spawn"))
+    monkeypatch.setattr(workers, "_context", lambda: multiprocessing.get_context("spawn"))
     monkeypatch.setattr(record, "MAX_RENDERERS", 1)
     record.record(tmp_path / "spawn", Track("jungle"), laps=0.003, look=10_000)
     assert len(list((tmp_path / "spawn" / "IMG").iterdir())) > 20
@@ -283,6 +283,25 @@ def test_ctrl_c_while_rendering_processes_are_started_leaves_no_recording(tmp_pa
     )
     assert (done.returncode, done.stderr) == (130, "simulator: stopped; the files that it has written are complete\n")
     assert not any(tmp_path.iterdir())
+
+
+DRIVING = """
+import os, signal, threading, time
+from cloning.base import program
+from simulator.workers import results, started_workers
+program.end_on_interrupt("test")
+def main():
+    with started_workers(2) as pool:
+        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+        list(results(pool, time.sleep, [60, 60, 60]))
+program.run(main)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
+def test_ctrl_c_ends_workers_with_what_they_do_and_one_message():
+    done = subprocess.run([sys.executable, "-c", DRIVING], cwd=ROOT, capture_output=True, text=True, timeout=50)
+    assert (done.returncode, done.stderr) == (130, "test: stopped\n")
 
 
 def test_a_frame_depends_on_the_pose_alone():

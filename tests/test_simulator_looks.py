@@ -108,7 +108,7 @@ def test_recovery_records_only_the_returns():
 
 
 def test_a_recovery_recording_has_a_pause_between_the_returns(tmp_path, monkeypatch):
-    monkeypatch.setattr(record, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(record, "started_workers", Here)
     monkeypatch.setattr(record, "_render", lambda *_: [b"a JPEG"] * 3)
     run, rows = record.record(tmp_path / "recovery", Track("lake"), laps=0.2, recovery=True)
     assert rows < 0.7 * run.time * SAMPLE_RATE

@@ -4,6 +4,7 @@ import copy
 import math
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -239,9 +240,9 @@ def test_the_window_tells_of_a_departure_and_of_recording_and_fits_every_shape(s
     assert "No definition" not in done.stderr, "the font has every letter of the help"
 
 
-@pytest.mark.parametrize("drives", [True, False])
-def test_the_window_is_driven_and_records(screen, tmp_path, drives):
-    """R and Esc before the car has driven leave no recording."""
+@pytest.mark.parametrize("drives, status", [(True, 0), (False, 130)])
+def test_the_window_is_driven_and_records(screen, tmp_path, drives, status):
+    """R, and Ctrl-C before the car has driven, leave no recording."""
     folder = tmp_path / "driven"
     command = [sys.executable, "-m", "simulator", "window", "--folder", str(folder)]
     window = subprocess.Popen(command, env=screen, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
@@ -268,9 +269,12 @@ def test_the_window_is_driven_and_records(screen, tmp_path, drives):
             xdotool("keydown", "w", "keydown", "d")
             until(lambda: row()[0] > 0.1 and row()[1] == 1 and row()[3] > 0.1)
             xdotool("keyup", "w", "keyup", "d")
-        xdotool("key", "Escape")
+        if status:
+            window.send_signal(signal.SIGINT)
+        else:
+            xdotool("key", "Escape")
         errors = window.communicate(timeout=20)[1]
-        assert (window.returncode, "Traceback" in errors) == (0, False)
+        assert (window.returncode, "Traceback" in errors) == (status, False)
         assert folder.exists() == drives
     finally:
         window.kill()

@@ -4,6 +4,7 @@ import os
 import sys
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -144,6 +145,21 @@ def test_a_full_disk_is_a_clear_error_and_leaves_nothing(run, tmp_path, room):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert status == 2 and error.startswith("video.py: run1.mp4: File too large")
     assert [path.name for path in tmp_path.iterdir()] == ["run1"]
+
+
+def test_ctrl_c_in_the_first_frame_leaves_no_film(tmp_path, monkeypatch):
+    writer = FilmWriter(tmp_path / "none.mp4", 15)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    frame = SimpleNamespace(from_ndarray=interrupted)
+    monkeypatch.setattr(writer, "av", SimpleNamespace(VideoFrame=frame, FFmpegError=av.FFmpegError))
+    with pytest.raises(KeyboardInterrupt):
+        writer.add(red_frame(1))
+    monkeypatch.undo()
+    writer.close()
+    assert not any(tmp_path.iterdir())
 
 
 def test_odd_sizes_lose_a_row_and_a_column(tmp_path):

@@ -112,8 +112,17 @@ def flooding(opening: bytes, data: bytes = b"", **options: Any) -> Attack:
 
 
 def websockets(data: bytes, **options: Any) -> Attack:
-    """Return the attack that floods an open websocket with frames."""
+    """Return the attack that floods an open websocket with frames.
+
+    What comes before the server's answer may be lost, and the rest not be understood: `then` comes after it.
+    """
     return flooding(WEBSOCKET % b"", data, **options)
+
+
+def _compressed(message: bytes) -> bytes:
+    """Return a message as in a compressed frame."""
+    pressed = zlib.compressobj(wbits=-zlib.MAX_WBITS)
+    return (pressed.compress(message) + pressed.flush(zlib.Z_SYNC_FLUSH))[:-4]
 
 
 def bad_frames(port: int, until: float) -> None:
@@ -147,12 +156,14 @@ def frames(count: int = 8) -> list[bytes]:
 def all_attacks() -> dict[str, Attack]:
     """Return the attacks by name."""
     driving = b"".join(fragments(telemetry_message(frames(1)[0])))
+    bomb = frame(_compressed(b"4" + bytes(8_000_000)), 0xC1)
+    nested = b'42["telemetry",' + b"[]," * 300_000 + b"0]"
     names = b"".join(frame(b"40/%d," % n) for n in range(50_000))
     return {
         # Answers that nobody reads
         "unread_pongs": websockets(frame(b"2" + b"x" * 1_000_000), connections=4),
         "unread_small_pongs": websockets(frame(b"2") * 1000),
-        "unread_answers": websockets(driving),
+        "unread_answers": websockets(driving, then=driving),
         "unread_pages": flooding(b"", GET % b"/live?attention", connections=20),
         "connect_again": websockets(frame(b"40") * 1000),
         "namespaces": websockets(names, read=True),
@@ -160,13 +171,11 @@ def all_attacks() -> dict[str, Attack]:
         "websocket_pings": websockets(frame(b"x" * 125, 0x89) * 1000),
         "websocket_pings_read": websockets(frame(b"", 0x89) * 1000, connections=8, read=True),
         # Messages that cost more than they should
-        "cars": websockets(driving, connections=30, read=True),
-        "attachments": websockets(
-            frame(b"\x04" + bytes(100_000), 0x82), then=frame(b'4599999999-["telemetry"]'), read=True
-        ),
-        "compressed": websockets(frame(zlib.compress(b"4" + bytes(1 << 26))[2:-4], 0xC1), connections=4, read=True),
+        "cars": websockets(driving, then=driving, connections=30, read=True),
+        "attachments": websockets(frame(b"4" + b"x" * 100_000), then=frame(b'4599999999-["telemetry"]'), read=True),
+        "compressed": websockets(bomb, then=bomb, connections=4, read=True),
         "garbage": websockets(frame(b"42[") + frame(b"4b") + frame(b"b!") + frame(b"\0") + frame(b"7"), read=True),
-        "json": websockets(frame(b'42["telemetry",' + b"[]," * 300_000 + b"0]"), connections=8, read=True),
+        "json": websockets(frame(nested), connections=8, read=True),
         "empty_fragments": websockets(frame(b"", 0x00) * 10_000, then=frame(b"4", 0x01), connections=8),
         "endless_fragments": websockets(frame(b"x" * 1000, 0x00) * 100, then=frame(b"4", 0x01)),
         "endless_frame": websockets(bytes(1 << 20), then=frame(b"4", length=1 << 40), connections=8),

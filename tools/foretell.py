@@ -56,7 +56,7 @@ from simulator.benchmark.scores import windows
 from simulator.cameras import jpeg
 from simulator.driving import cameras_at
 from simulator.run import Run
-from simulator.workers import started_workers
+from simulator.workers import results, started_workers
 from tools.command import command_line, head, row, run_tool
 from tools.lane_frames import every_second_shadowed
 
@@ -295,7 +295,7 @@ def main(argv: list[str] | None = None) -> int:
     recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
     work = partial(drive_into, folder, options.model)
     with started_workers(threads()) as pool:
-        for _ in progress_bar(len(chosen), "drives", iterable=pool.map(work, chosen)):
+        for _ in progress_bar(len(chosen), "drives", iterable=results(pool, work, chosen)):
             pass  # its errors are raised here
     driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]
     limits = fit([each for each in driven if each[0].tunes], recordings)

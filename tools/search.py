@@ -39,7 +39,7 @@ from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.points import LAND, MARKING, MAX_GRADE, spline_road
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.driving import Conditions, Drive, check_driver, drive
-from simulator.workers import add_workers, started_workers
+from simulator.workers import add_workers, results, started_workers
 from tools.command import command_line, head, row, run_tool
 
 SEARCHES = ("random", "evolution")
@@ -213,7 +213,7 @@ def main(argv: list[str] | None = None) -> int:
     with started_workers(options.processes, options.scheduler) as pool:
         for seed, search in itertools.product(options.seeds, options.searches):
             figures, failed = run_search(
-                folder, search, seed, options.roads, kind, lambda roads: list(pool.map(work, roads))
+                folder, search, seed, options.roads, kind, lambda roads: list(results(pool, work, roads))
             )
             searches.append(figures)
             failures += failed

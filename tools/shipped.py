@@ -13,7 +13,7 @@ what came out.
 
 import shutil
 import time
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +25,7 @@ if __name__ == "__main__":
 
 from cloning.base.arguments import number
 from cloning.base.cores import threads
-from cloning.base.errors import RecordingError, SimulatorError
+from cloning.base.errors import RecordingError
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE, PROBLEM_AREAS
 from cloning.recordings.log import find_folders
@@ -34,9 +34,10 @@ from cloning.road.track import ROADS, Track
 from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.expert import LATERAL_ACCELERATION, Expert
-from simulator.record import renderers_context, start_renderer, write_row
+from simulator.record import write_row
 from simulator.run import Run
 from simulator.scenery.looks import SHADOWED
+from simulator.workers import started_workers
 from simulator.world import Scene
 from tools.command import ROOT, command_line, python, run_tool
 from tools.lane_frames import FIRST_ROAD, every_second_shadowed
@@ -117,22 +118,17 @@ def render(folder: Path, chosen: list[Lap]) -> list[Path]:
     wanted = [folder / lap.name for lap in chosen]
     shutil.rmtree(unfinished := folder / "unfinished", ignore_errors=True)
     begin = time.perf_counter()
-    with ProcessPoolExecutor(threads(), renderers_context(), start_renderer) as pool:
+    with started_workers(threads()) as pool:
         driven = {
             pool.submit(drive_lap, unfinished / recording.name, lap, seed): recording
             for seed, (recording, lap) in enumerate(zip(wanted, chosen, strict=True))
             if not recording.exists()
         }
-        try:
-            for i, lap in enumerate(as_completed(driven), 1):
-                rows, recording = lap.result(), driven[lap]
-                (unfinished / recording.name).rename(recording)
-                state = f"{rows} rows, {time.perf_counter() - begin:.0f} s since the start"
-                print(f"{i}/{len(driven)} {recording.name}: {state}", flush=True)
-        except BrokenExecutor as error:
-            raise SimulatorError("a rendering process was killed, perhaps for lack of memory; start again") from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+        for i, lap in enumerate(as_completed(driven), 1):
+            rows, recording = lap.result(), driven[lap]
+            (unfinished / recording.name).rename(recording)
+            state = f"{rows} rows, {time.perf_counter() - begin:.0f} s since the start"
+            print(f"{i}/{len(driven)} {recording.name}: {state}", flush=True)
     shutil.rmtree(unfinished, ignore_errors=True)
     return wanted
 

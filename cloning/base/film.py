@@ -61,6 +61,7 @@ class FilmWriter:
         if key_frames:
             self.options["g"] = str(key_frames)
         self.stream: VideoStream | None = None
+        self.frames = 0
         self._renaming = contextlib.ExitStack()  # renames the temporary file when it is closed
         self.temporary = self._renaming.enter_context(written_whole(path))
         try:
@@ -78,10 +79,11 @@ class FilmWriter:
                 self.stream = self.container.add_stream("libx264", self.rate, options=self.options)
                 self.stream.pix_fmt, self.stream.height, self.stream.width = "yuv420p", *frame.shape[:2]
             self.container.mux(self.stream.encode(self.av.VideoFrame.from_ndarray(frame, "rgb24")))
+        self.frames += 1
 
     def close(self) -> None:
         """Finish the film and move it to its path; write no film if there is no frame. Raises OSError."""
-        if self.stream is None:
+        if self.stream is None or not self.frames:  # Ctrl-C may have come between the stream and its first frame
             self.discard()
             return
         with self._discarded_on_error():

@@ -1,4 +1,9 @@
-"""The connections of a server: how many there may be, what a request may take, and which sites it may come from."""
+"""The connections of a server: how many there may be, what a request may take, and which sites it may come from.
+
+Here and in the two other modules that override what libraries do, a comment says what is worse without it, as the
+attacks of tools/attacks.py show; a time is that of the server's processor in a car's round trip, of which 99 of 100 are
+shorter: 4.9 ms alone.
+"""
 
 import errno
 import io
@@ -37,7 +42,7 @@ class Listener:
     def accept(self) -> tuple[Any, Any]:
         """Return the next connection and the client's address."""
         while True:
-            eventlet.sleep(0)  # so that others work, however many come
+            eventlet.sleep(0)  # without, a car's answer takes 7.2 ms instead of 4.7 beside three processes that connect
             try:
                 client, address = self.sock.accept()
             except OSError as error:
@@ -66,23 +71,20 @@ class Protocol(eventlet.wsgi.HttpProtocol):
 
     one_at_a_time = eventlet.semaphore.Semaphore()
 
-    @classmethod
-    def take_turn(cls) -> None:
-        """Wait until the connections with clients had their turn, and no other request has this one.
-
-        eventlet goes round all connections that have something to do: beside a hundred busy ones, a car would wait for
-        each of them, several times for each telemetry.
-        """
-        with cls.one_at_a_time:
-            eventlet.sleep(0)
-
+    # Without: http.server prints two lines with what the client sent, for each of any number of requests.
     def log_message(self, *_: Any) -> None:
         """Log that a request is no HTTP, without what the client sent."""
         log.warning("a request can't be read")
 
+    # Without: 17 ms beside page_requests instead of 11, and 15 beside long_headers instead of 8.
     def parse_request(self) -> bool:
-        """Read the headers."""
-        self.take_turn()
+        """Read the headers, when the connections with clients had their turn, and no other request has this one.
+
+        eventlet goes round all connections that have something to do: beside a hundred busy ones, a car would wait for
+        each of them, several times for each telemetry.
+        """
+        with self.one_at_a_time:
+            eventlet.sleep(0)
         return super().parse_request()
 
     def finish(self) -> None:
@@ -91,7 +93,7 @@ class Protocol(eventlet.wsgi.HttpProtocol):
         try:
             super().finish()
         finally:
-            self.rfile.close()  # which keeps the socket open if the client did not read its last answer
+            self.rfile.close()  # without: 270 sockets stay open after 3 s of reconnections
 
 
 def whole_requests(app: WSGIApplication, listener: Listener) -> WSGIApplication:
@@ -104,7 +106,6 @@ def whole_requests(app: WSGIApplication, listener: Listener) -> WSGIApplication:
             return refuse(start_response, "413 Content Too Large", text)
         environ["wsgi.input"] = io.BytesIO(environ["wsgi.input"].read(length))
         listener.idle.pop(environ["eventlet.input"].get_socket(), None)
-        Protocol.take_turn()
         return app(environ, start_response)
 
     return read

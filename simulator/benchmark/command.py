@@ -15,7 +15,7 @@ from simulator import driving
 from simulator.benchmark import page, replays, scores, tasks
 from simulator.benchmark.tasks import Task
 from simulator.driving import Drive
-from simulator.workers import started_workers
+from simulator.workers import results, started_workers
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,12 +29,7 @@ def drive(driver: str, task: Task) -> Drive:
 def each(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item], unit: str) -> list[Result]:
     """Return the results of all items, and show how far they are."""
     items = list(items)
-    with progress_bar(len(items), unit) as bar:
-        results = []
-        for result in pool.map(work, items):
-            results.append(result)
-            bar.update()
-    return results
+    return list(progress_bar(len(items), unit, iterable=results(pool, work, items)))
 
 
 def run(options: argparse.Namespace) -> None:
