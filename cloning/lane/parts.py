@@ -7,7 +7,7 @@ rows after it are sought near its end, where the car must be.
 
 import copy
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +45,8 @@ SLACK, SLACK_PER_METRE = 5.0, 0.1  # m, and of the metres driven: where the car 
 BACK, BEYOND = 30.0, 20.0  # m: further back, or further on than it drove, the car is not after a mishap
 MAX_REACH, MAX_PAUSE = 200.0, 10.0  # m, s: after more, it may be anywhere
 AMBIGUOUS = 0.8  # share of the best part's quality: a part as good as this, but elsewhere, leaves it uncertain
-SAME_OFFSET, SAME_PLACE = 0.3, 10.0  # m across and along the road: what is further apart is elsewhere
+ALONG, ACROSS = 0, 1  # the road: columns of `Localisation.states`
+SAME_PLACE = {ALONG: 10.0, ACROSS: 0.3}  # m: what is further apart is elsewhere
 
 
 @dataclass(frozen=True)
@@ -84,20 +85,16 @@ class Part:
         """Return whether the parts have rows in common."""
         return self.stretch == other.stretch and self.start < other.end and other.start < self.end
 
-    def away_from(self, other: "Part", axis: int = 1) -> float:
+    def away_from(self, other: "Part", axis: int) -> float:
         """Return how far from here another part is placed in the rows of both, on average, m.
 
-        axis: 1 across the road, 0 along it; inf on another track or in its other direction, or without a common row.
+        axis: ALONG or ACROSS the road; inf on another track or in its other direction, or without a common row.
         """
-        start, end = max(self.start, other.start), min(self.end, other.end)
-        if start >= end or self.track != other.track:
+        if self.track != other.track or not self.overlaps(other):
             return np.inf
+        start, end = max(self.start, other.start), min(self.end, other.end)
         here, there = (part.found.states[start - part.start : end - part.start, axis] for part in (self, other))
         return float(np.abs(here - there).mean())
-
-    def along_from(self, other: "Part") -> float:
-        """Return how far from here another part is placed along the road, as `away_from`."""
-        return self.away_from(other, 0)
 
 
 class Followers:
@@ -147,13 +144,13 @@ def is_anchor(found: Localisation) -> bool:
     return found.is_certain() and found.turn_residual < limit
 
 
-def unrivalled(grown: list[Part], distance: Callable[[Part, Part], float], same: float) -> Part | None:
-    """Return the best part; None if another one is nearly as good, and elsewhere, by a distance above `same`, m."""
+def unrivalled(grown: list[Part], axis: int) -> Part | None:
+    """Return the best part; None if another one is nearly as good, and elsewhere; axis: ALONG or ACROSS the road."""
     best = max(grown, key=Part.quality, default=None)
     if not best:
         return None
     rivals = [other for other in grown if other.quality() > AMBIGUOUS * best.quality()]
-    return None if any(distance(best, other) > same for other in rivals) else best
+    return None if any(best.away_from(other, axis) > SAME_PLACE[axis] for other in rivals) else best
 
 
 def score(name: str, fits: np.ndarray | float, turns: np.ndarray | float = 0.0) -> np.ndarray:
@@ -204,7 +201,7 @@ class Placing:
                         rows = followers.grow(track, seed, window.states[WINDOW // 2], free, n)
                         if rows and rows[1] - rows[0] >= WINDOW and is_anchor(rows[2]):
                             grown.append(Part(index, track, *rows))
-                if found := unrivalled(grown, Part.along_from, SAME_PLACE):
+                if found := unrivalled(grown, ALONG):
                     self.parts.append(found)
                     at = free = found.end
                     continue
@@ -317,6 +314,7 @@ class Placing:
             found = self.best_of(positions, part.track, index, rows)
             if found and found.is_beyond(limits[found.found.track.name]):
                 return found
+            # Where the car should be, a long part needs no more than what would be certain anywhere.
             if found and limits is EXPECTED and found.metres() >= ALONE_METRES and is_anchor(found.found):
                 return found
         return None
@@ -333,7 +331,7 @@ class Placing:
             state = candidate.smooth()[PROBE // 2]
             if found := followers.grow(track, start + PROBE // 2, state, first, end):
                 grown.append(Part(index, track, *found))
-        return unrivalled(grown, Part.away_from, SAME_OFFSET)
+        return unrivalled(grown, ACROSS)
 
 
 def certain_parts(
