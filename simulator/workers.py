@@ -53,7 +53,7 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
                     pool.submit(int)
             yield pool
         except BrokenExecutor as error:
-            raise SimulatorError("a driving process was killed, perhaps for lack of memory") from error
+            raise SimulatorError("a driving process was killed, perhaps for lack of memory; start again") from error
         except BaseException:
             for process in multiprocessing.active_children():  # after Ctrl-C they would drive on to their roads' ends
                 process.terminate()
