@@ -21,7 +21,7 @@ from simulator.client import MAX_CATCH_UP
 from simulator.dialects import DIALECTS, Dialect, Stage
 
 ASK_AGAIN = 5.0  # s without an answer, after which the telemetry is sent again: programs drop some
-SETTLE = 0.2  # s without a word from the server, after which its greeting is over
+SETTLE = 0.2  # s without a word from the server, after which its greeting is over, and the start of an episode
 STILL = 1 / 15  # s of real time between two telemetries while simulated time stands still
 # How long a driver in another thread than the program's answers is waited for, s: until one is known to be there, and
 # then. Commands may be constant, and drivers in the same thread, so after so many vain attempts it is not waited for.
@@ -139,11 +139,13 @@ class Joined(ClientSession):
 
     def _await_answer(self) -> bool:
         """Return whether the telemetry was answered; if not, it has to be sent again."""
-        until = time.monotonic() + ASK_AGAIN
+        run, until = self.dialect.run, time.monotonic() + ASK_AGAIN
         while (left := until - time.monotonic()) > 0:
             if self._listen(min(left, STEP) if self.pace else left):
                 self.progressed()
                 return True
+            if self.dialect.run is not run:  # a program may begin an episode instead of an answer, or before one
+                run, until = self.dialect.run, time.monotonic() + SETTLE
             if self.pace:
                 self._catch_up()
         return False

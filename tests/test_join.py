@@ -257,6 +257,26 @@ class EpisodeProgram:
         self.server.server_close()
 
 
+def test_an_episode_may_begin_instead_of_an_answer(monkeypatch):
+    monkeypatch.setattr("simulator.join.ASK_AGAIN", 30.0)
+    began = []
+
+    def plan(program):
+        program.start("lake")
+        yield
+        program.act()
+        yield
+        for _ in range(2):
+            began.append(time.monotonic())
+            program.start("lake")
+            yield
+        began.append(time.monotonic())
+
+    with EpisodeProgram(plan) as program:
+        assert join("episodes", program) == 0
+    assert began[2] - began[0] < 15
+
+
 def test_episodes_have_weather_pauses_metrics_and_segments():
     seen = {}
 
