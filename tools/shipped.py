@@ -43,6 +43,7 @@ from tools.command import ROOT, command_line, python, run_tool
 from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 
 REPEATS = 16  # how often each real recording counts, because the rendered ones are many
+EPOCH = 60_000  # images
 DISTURBED = 0.4  # share of the images in foul weather, or of a faulty camera
 LEARNING_RATE = 2e-3  # half of --robust's: this training is longer
 DIRECTIONS = ("ccw", "cw")
@@ -164,7 +165,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--fast", type=number(int, 0, 100), default=8, help="fast laps of the jungle (default %(default)s)")
     add("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
     add("--mountains", type=number(int, 0, 1000), default=100, help="generated mountain roads (default %(default)s)")
-    add("--epochs", type=number(int, 1), default=22, help="of 60,000 images (default %(default)s)")
+    add("--epochs", type=number(int, 1), default=22, help=f"of {EPOCH:,} images (default %(default)s)")
     add("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
     add("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
     options = parser.parse_args(argv)
@@ -172,7 +173,7 @@ def main(argv: list[str] | None = None) -> int:
     real = repeat(options.folder / "real", find_folders(options.recordings))  # first, since rendering takes long
     number_of = {"road": options.roads, "mountain": options.mountains}
     rendered = render(options.folder / "rendered", laps(options.looks, options.fast, number_of))
-    length = ("--epochs", options.epochs, "--learning-rate", LEARNING_RATE)
+    length = ("--epochs", options.epochs, "--samples-per-epoch", EPOCH, "--learning-rate", LEARNING_RATE)
     training = ("--robust", *length, "--repeats", REPEATS, "--disturbed", DISTURBED, "--seed", options.seed, "--resume")
     # By name, since the folders may also hold what an earlier run with other options left there.
     status = python(ROOT / "model.py", *real, *rendered, "--output", model, *training).returncode
