@@ -7,6 +7,7 @@ from panda3d import core
 from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
 from cloning.recordings.format import CAMERAS
+from cloning.recordings.images import encode
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, MOUNT_PITCH, VERTICAL_FIELD
 from cloning.road.disturbances import Disturbance, Disturber
 from simulator.world import INSIDE, Scene, free_unused
@@ -29,12 +30,7 @@ def lens(rows: int = ROWS, columns: int = COLUMNS) -> core.PerspectiveLens:
 
 def jpeg(frame: np.ndarray) -> bytes:
     """Encode a frame, uint8 (rows, columns, 3) RGB, like the real simulator."""
-    sampling = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420)
-    options = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, *sampling)
-    encoded, data = cv2.imencode(".jpg", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), options)
-    if not encoded:
-        raise ValueError("OpenCV cannot encode the frame as JPEG")
-    return data.tobytes()
+    return encode(frame, JPEG_QUALITY)
 
 
 class Buffer:

@@ -97,9 +97,9 @@ def _pixels(jpeg: bytes) -> np.ndarray:
 
 
 def encode(frame: np.ndarray, quality: int) -> bytes:
-    """Encode a frame, uint8 (rows, columns, 3), RGB, as JPEG; quality: 0..100."""
-    bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    """Encode a frame, uint8 (rows, columns, 3), RGB, as JPEG with colour at half the resolution; quality: 0..100."""
+    options = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_QUALITY, quality
+    return cv2.imencode(".jpg", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), options)[1].tobytes()
 
 
 def compressed_rows(rows: slice) -> slice:
