@@ -17,10 +17,10 @@ from browser import LOOKS, chromium, needs_chromium
 from commands import ROOT, log
 
 from cloning.base.errors import UserError
+from cloning.base.files import csv_bytes
 from cloning.base.film import FilmWriter
 from cloning.replay.score import YARDSTICKS
 from cloning.report.pictures import film_uri
-from cloning.training.summary import csv_bytes
 
 
 def report(*arguments) -> subprocess.CompletedProcess:
@@ -38,7 +38,7 @@ def written(finished, sample_recording, tmp_path_factory):
     epochs = log(folder)
     for row, drift in zip(epochs, ("0.5", "0.7"), strict=True):
         row["val_drift"] = drift
-    (folder / "training_log.csv").write_bytes(csv_bytes(epochs[0], [row.values() for row in epochs]))
+    (folder / "training_log.csv").write_bytes(csv_bytes([epochs[0], *(row.values() for row in epochs)]))
     lap = Path(shutil.copy(folder / "training_loss.png", folder / "The lake.png"))
     figures = {
         "distance_m": 1137.9,

@@ -4,14 +4,16 @@ This holds for a process that is killed anywhere. After a power cut it holds for
 disk; films, saved frames and recordings do not wait, so the ones of the last seconds may then be empty or missing.
 """
 
+import csv
 import errno
 import functools
+import io
 import os
 import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -81,6 +83,13 @@ def folder_written_whole(path: str | Path) -> Iterator[Path]:
         if isinstance(error, OSError) and error.filename and str(error.filename).startswith(str(temporary)):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def csv_bytes(rows: Iterable[Iterable[object]]) -> bytes:
+    """Return a csv file's contents, in UTF-8; names of files in it may hold any bytes."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode(errors="surrogateescape")
 
 
 def write(path: str | Path, data: bytes) -> None:

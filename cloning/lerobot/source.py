@@ -10,11 +10,10 @@ import cv2
 import numpy as np
 
 from cloning.base.errors import RecordingError
-from cloning.base.files import folder_written_whole, write
+from cloning.base.files import csv_bytes, folder_written_whole, write
 from cloning.base.frame import FRAME
 from cloning.recordings.format import CAMERAS, COLUMNS, DRIVE_GAP, DRIVING_LOG, IMAGE_FOLDER, NUMBERS, time_stamp
 from cloning.recordings.images import encode
-from cloning.recordings.part import csv_bytes
 from cloning.road.camera import CAMERA_OFFSETS
 from cloning.road.warp import warp
 

@@ -1,7 +1,6 @@
 """Write some rows of a recording as a recording of its own, whose images are hard links to the same files."""
 
 import csv
-import io
 import os
 import shutil
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.errors import RecordingError
-from cloning.base.files import write
+from cloning.base.files import csv_bytes, write
 from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, IMAGE_FOLDER, LANE_COLUMNS, LANE_FILE, NUMBERS
 from cloning.recordings.log import Recording
 
@@ -57,10 +56,3 @@ def _link(source: Path, copy: Path) -> None:
         raise
     except OSError:
         shutil.copyfile(source, copy)
-
-
-def csv_bytes(rows: list[list[str]]) -> bytes:
-    """Return a csv file's contents; names of files in it may hold any bytes."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode(errors="surrogateescape")

@@ -1,7 +1,5 @@
 """Make the tables that a training run prints and logs: recordings, epochs and errors."""
 
-import csv
-import io
 import itertools
 import math
 import time
@@ -14,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 from cloning.base.errors import RecordingError
-from cloning.base.files import write
+from cloning.base.files import csv_bytes, write
 from cloning.base.outputs import plural
 from cloning.network.compute import threads
 from cloning.network.layer_table import layer_table
@@ -86,20 +84,13 @@ def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> 
         path, line, _, detail = rejected[0]
         raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {len(rejected)} unusable rows)")
     if rejected:
-        write(file, csv_bytes(("file", "line", "finding", "detail"), rejected))
+        write(file, csv_bytes([("file", "line", "finding", "detail"), *rejected]))
         print(f"{len(rejected)} unusable rows are left out; {file} lists them")
-
-
-def csv_bytes(header: Iterable[str], rows: Iterable[Iterable[object]]) -> bytes:
-    """Return a csv file in UTF-8; bytes of file names that are not UTF-8 are kept."""
-    text = io.StringIO()
-    csv.writer(text).writerows([header, *rows])
-    return text.getvalue().encode(errors="surrogateescape")
 
 
 def history_csv(history: list[EpochMetrics]) -> bytes:
     """Return the contents of training_log.csv: a line for each finished epoch; a figure that is unknown is empty."""
-    return csv_bytes(history[0], [["" if math.isnan(value) else value for value in row.values()] for row in history])
+    return csv_bytes([history[0], *(["" if math.isnan(x) else x for x in row.values()] for row in history)])
 
 
 def run_header(network: Network, device: torch.device, precision: torch.dtype, ranks: Ranks) -> str:

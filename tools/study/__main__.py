@@ -14,8 +14,6 @@ driving, and pictures. An interrupted study continues when it is started again w
 """
 
 import argparse
-import csv
-import io
 import json
 import multiprocessing
 import shutil
@@ -32,6 +30,7 @@ if __name__ == "__main__":
 from cloning.base.arguments import number
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
+from cloning.base.files import csv_bytes
 from cloning.base.outputs import write_json, write_output
 from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
@@ -66,11 +65,7 @@ def prepare(options: argparse.Namespace) -> None:
 
 def write_study(rows: list[Row], folder: Path) -> None:
     """Write the table, the report and the pictures of the networks measured so far. Raises OutputError."""
-    text = io.StringIO(newline="")
-    table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    write_output(folder / "study.csv", text.getvalue().encode())
+    write_output(folder / "study.csv", csv_bytes([rows[0], *(network.values() for network in rows)]))
     write_output(folder / "study.md", report(rows).encode())
     for picture in (correlation_picture, recovery_picture):
         write_output(folder / f"study_{picture.__name__.removesuffix('_picture')}.png", picture(rows))
