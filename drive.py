@@ -212,7 +212,7 @@ class DriveServer:
             session.drive_at(set_speed)
 
     def record(self, on: bool) -> None:
-        """Save the frames from now on, each session's in a new folder, or no longer. Raises FolderError."""
+        """Save the frames from now on, each session's in a new folder, or no longer. Raises UserError."""
         if on and not self.recording:
             self.saver = self.saver or saved_frames.FrameSaver(Path(f"run-{datetime.now():%Y%m%d-%H%M%S}"))
             for session in self.sessions.values():

@@ -35,15 +35,11 @@ FPS_RANGE = 0.01, 1000.0  # frames/s that can be given
 Overlay = Callable[[np.ndarray], np.ndarray]  # from a frame to the film's picture, both uint8 (rows, columns, 3), RGB
 
 
-class FilmError(UserError):
-    """A film that cannot be made; the message names the folder and the remedy."""
-
-
 def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
-    """Return the folder's frames and their times, sorted by time. Raises FilmError if there are none."""
+    """Return the folder's frames and their times, sorted by time. Raises UserError if there are none."""
     remedy = f"`python drive.py model.pt {folder}` saves frames in it"
     if not folder.is_dir():
-        raise FilmError(f"{folder}: no such folder; {remedy}")
+        raise UserError(f"{folder}: no such folder; {remedy}")
     frames: list[tuple[datetime, Path]] = []
     others: list[str] = []
     for path in folder.iterdir():
@@ -54,7 +50,7 @@ def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
         elif path.name != saved_frames.DRIVEN:
             others.append(path.name)
     if not frames:
-        raise FilmError(f"{folder}: no frames (files with names like 2018_07_16_17_11_43_382.jpg); {remedy}")
+        raise UserError(f"{folder}: no frames (files with names like 2018_07_16_17_11_43_382.jpg); {remedy}")
     if others:
         print_note(f"left out, not frames: {abbreviated(sorted(others))}")
     return sorted(frames)
@@ -74,7 +70,7 @@ def make_film(folder: Path, fps: Fraction | None = None, draw: Overlay | None = 
     """Write `folder`.mp4 next to the folder, and return how many unreadable frames were left out.
 
     fps: frames/s; None: from the frames' times. draw: makes each frame's picture; all pictures must have one size.
-    A frame is readable if training could read it: a whole JPEG of 320x160 pixels. Raises FilmError, OSError.
+    A frame is readable if training could read it: a whole JPEG of 320x160 pixels. Raises UserError, OSError.
     """
     frames = find_frames(folder)
     fps = fps or frame_rate([(time - frames[0][0]).total_seconds() for time, _ in frames], SAMPLE_RATE)
@@ -97,7 +93,7 @@ def make_film(folder: Path, fps: Fraction | None = None, draw: Overlay | None = 
     finally:
         writer.discard()
     if len(unreadable) == len(frames):
-        raise FilmError(
+        raise UserError(
             f"{folder}: none of its {len(frames)} frames is readable (the first: {reason}); save new ones with drive.py"
         )
     if unreadable:
@@ -120,7 +116,7 @@ def load_overlay(model_file: Path) -> Overlay:
         try:
             return overlay(frame, *visual_backprop(network, frame))
         except ArithmeticError as error:
-            raise FilmError(f"{model_file}: {error}; train the model again with `python model.py`") from None
+            raise UserError(f"{model_file}: {error}; train the model again with `python model.py`") from None
 
     return picture
 

@@ -13,10 +13,10 @@ import pytest
 from browse_process import opened
 from drive_process import awaited
 
-from cloning.base.errors import RecordingError, message_of
+from cloning.base.errors import RecordingError, UserError, message_of
 from cloning.browse import analyse, analyses, library, summary
 from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
-from cloning.browse.filter import ConditionError, matching
+from cloning.browse.filter import matching
 from cloning.browse.library import UnknownError
 from cloning.lane.search import Localisation
 from cloning.network.network import load_model, steer
@@ -124,7 +124,7 @@ def test_rows_are_found_by_a_condition(condition, rows):
     ],
 )
 def test_a_condition_without_meaning_is_refused(condition, words):
-    with pytest.raises(ConditionError, match=words):
+    with pytest.raises(UserError, match=words):
         matching(condition, NUMBERS.__getitem__, list(NUMBERS))
 
 

@@ -19,6 +19,7 @@ from PIL import Image
 from rendered import render_frame
 
 import drive
+from cloning.base.errors import UserError
 from cloning.network import attention
 from cloning.network.network import Network
 from cloning.recordings import saved_frames as frames
@@ -360,11 +361,11 @@ def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
     for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "center_2018_07_16_17_11_43_382.jpg"):
         (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
         (folder / foreign).write_bytes(b"mine")
-        with pytest.raises(frames.FolderError, match=foreign):
+        with pytest.raises(UserError, match=foreign):
             frames.empty_folder(folder)
         assert len(list(folder.iterdir())) == 2
         (folder / foreign).unlink()
-    with pytest.raises(frames.FolderError, match="not a folder"):
+    with pytest.raises(UserError, match="not a folder"):
         frames.empty_folder(Path(__file__))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from cloning.base.errors import UserError
 from cloning.recordings import saved_frames as frames
 
 
@@ -33,7 +34,7 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
     for session in (first, second):
         session.when_written(partial(tell, session))
     reason = "No space left on device" if isinstance(trouble, OSError) else "ValueError: a bug"
-    with pytest.raises(frames.FolderError, match=rf"run1: 5 of 40 frames were not saved \({reason}\); free"):
+    with pytest.raises(UserError, match=rf"run1: 5 of 40 frames were not saved \({reason}\); free"):
         saver.close()
     assert reports == [
         f"driven frames saved in {tmp_path / 'run1'}",
@@ -51,7 +52,7 @@ def test_a_folder_that_disappears_while_driving_is_made_again_or_its_frames_are_
         session.save(b"frame", (0, 0, 0))
         session.when_written(written.set)
         assert written.wait(20) and session.lost == lost
-    with pytest.raises(frames.FolderError, match="1 of 2 frames were not saved"):
+    with pytest.raises(UserError, match="1 of 2 frames were not saved"):
         saver.close()
 
 

@@ -18,10 +18,6 @@ class ModelError(UserError):
     """A model file that cannot be used or resumed."""
 
 
-class FolderError(UserError):
-    """A folder in which frames cannot be saved."""
-
-
 class SimulatorError(UserError):
     """The stand-in simulator, its window or its connection cannot continue."""
 

@@ -18,16 +18,12 @@ OPERATORS: dict[type, Callable] = {
 }
 
 
-class ConditionError(UserError):
-    """A condition that has no meaning."""
-
-
 def matching(condition: str, column: Callable[[str], np.ndarray], names: list[str]) -> np.ndarray:
     """Return the rows for which a condition is true: bool (n,).
 
     It has numbers, columns, + - * /, comparisons, abs, min, max, and, or, not and parentheses, as in Python. A row in
     which a value that it names is unknown does not match. column: returns the column of one of `names`, float (n,).
-    Raises ConditionError, and the errors of `column`.
+    Raises UserError, and the errors of `column`.
     """
     unknown: np.ndarray | bool = False
 
@@ -40,7 +36,7 @@ def matching(condition: str, column: Callable[[str], np.ndarray], names: list[st
                 unknown |= np.isnan(column(name))
                 return column(name)
             case ast.Name(id=name):
-                raise ConditionError(f"condition: there is no {name[:40]} here; there are {', '.join(names)}")
+                raise UserError(f"condition: there is no {name[:40]} here; there are {', '.join(names)}")
             case ast.BinOp(left, op, right) if type(op) in OPERATORS:
                 return OPERATORS[type(op)](value(left), value(right))
             case ast.UnaryOp(ast.Not(), operand):
@@ -56,23 +52,23 @@ def matching(condition: str, column: Callable[[str], np.ndarray], names: list[st
                 return np.logical_and.reduce([OPERATORS[type(op)](one, two) for op, one, two in pairs])
             case ast.Call(ast.Name(id=name), args, []) if name in FUNCTIONS and len(args) == 1 + (name != "abs"):
                 return FUNCTIONS[name](*map(value, args))
-        raise ConditionError(f"condition: {ast.unparse(node)[:40]} has no meaning; for example abs(steering) > 0.8")
+        raise UserError(f"condition: {ast.unparse(node)[:40]} has no meaning; for example abs(steering) > 0.8")
 
     if len(condition) > MAX_LENGTH:
-        raise ConditionError(f"condition: longer than {MAX_LENGTH} characters; use fewer")
+        raise UserError(f"condition: longer than {MAX_LENGTH} characters; use fewer")
     try:
         with np.errstate(all="ignore"):
             found = truth(value(ast.parse(condition.strip(), mode="eval").body))
     except (SyntaxError, TypeError, ValueError, RecursionError, MemoryError, OverflowError):
-        raise ConditionError("condition: not complete; for example abs(steering) > 0.8 and speed < 5") from None
+        raise UserError("condition: not complete; for example abs(steering) > 0.8 and speed < 5") from None
     return found & ~unknown
 
 
 def truth(found: np.ndarray | float) -> np.ndarray:
-    """Return the outcome of comparisons: bool (n,). Raises ConditionError if it is none."""
+    """Return the outcome of comparisons: bool (n,). Raises UserError if it is none."""
     found = np.asarray(found)
     if found.dtype != bool or not found.ndim:
-        raise ConditionError("condition: compares no column with a number; for example speed < 5")
+        raise UserError("condition: compares no column with a number; for example speed < 5")
     return found
 
 

@@ -195,7 +195,7 @@ class ShownRecording:
 
         A stretch is [first row, row after the last, the names of the first's and the last's centre image]. Columns are
         called as on the page: model1, driver1 and replay1 belong to the first model, the last two at a replay's limit.
-        Raises ConditionError, UnknownError, RecordingError.
+        Raises UserError.
         """
         recording = self.read(version)
         names = {"offset": "offset", "label": "label"} | {name: name for name in COLUMNS}

@@ -20,10 +20,6 @@ PROGRESS = {"finished": int, "batches": int, "images": int, "seconds": (int, flo
 OPTIONS = {"epochs": int, "samples_per_epoch": int, "batch_size": int}
 
 
-class RunError(UserError):
-    """A file of a run that cannot be read."""
-
-
 class Runs:
     """The runs in the given folders, each by its index."""
 
@@ -50,19 +46,19 @@ class Runs:
         return shown
 
     def run(self, index: int) -> dict[str, Any]:
-        """Return what the page shows of a run. Raises UnknownError, RunError, OSError."""
+        """Return what the page shows of a run. Raises UserError, OSError."""
         files = self._files(index)
         return {"id": index, "folder": str(files.last.parent.resolve()), **overview(files)}
 
     def picture(self, index: int, name: str) -> bytes:
-        """Return a diagnostic picture, a PNG. Raises UnknownError, RunError, OSError."""
+        """Return a diagnostic picture, a PNG. Raises UserError, OSError."""
         files = self._files(index)
         path = files.pictures / name
         if not (PICTURE.fullmatch(name) and path.is_file()):
             raise UnknownError(f"no picture {name[:60]}")
         png = path.read_bytes()
         if not png.startswith(SIGNATURE):  # a link to something else
-            raise RunError(f"{path}: not a PNG")
+            raise UserError(f"{path}: not a PNG")
         return png
 
     def report(self, index: int) -> bytes:
@@ -86,11 +82,11 @@ def overview(files: RunFiles) -> dict[str, Any]:
     images/s, and left, s of training from there on, None if unknown; pictures: numbers of observations, ascending;
     trail: [epochs done, loss] within the epochs; best: the epoch whose model is model-best.pt, and by which metric;
     options: what the run was given, by name; has_report: whether its report is written.
-    Raises RunError, OSError.
+    Raises UserError, OSError.
     """
     if not files.arguments.exists():
         command = f"`python model.py --output {files.last}`"
-        raise RunError(f"{files.last.parent}: no training run in this folder yet; {command} begins one")
+        raise UserError(f"{files.last.parent}: no training run in this folder yet; {command} begins one")
     options, progress = _json(files.arguments, OPTIONS, 1, "recipe"), {}
     history = _history(files.log)
     if files.progress.exists():
@@ -167,23 +163,23 @@ def _finite(value: float) -> float | None:
 def _json(path: Path, kinds: dict[str, Any], least: int, within: str = "") -> dict[str, Any]:
     """Return a JSON object with values of these types, numbers from `least` on; they may also be in its part `within`.
 
-    Raises RunError, OSError.
+    Raises UserError, OSError.
     """
     try:
         found = json.loads(path.read_bytes())
     except ValueError as error:
-        raise RunError(f"{path}: not JSON ({error}); `python model.py` writes it anew") from None
+        raise UserError(f"{path}: not JSON ({error}); `python model.py` writes it anew") from None
     if isinstance(found, dict) and isinstance(found.get(within), dict):  # an earlier version's has no such part
         found |= found[within]
     for name, kind in kinds.items():
         value = found.get(name) if isinstance(found, dict) else None
         if isinstance(value, bool) or not isinstance(value, kind) or (value is not None and not least <= value < 1e12):
-            raise RunError(f"{path}: {name} is {str(value)[:40]}; `python model.py` writes it anew")
+            raise UserError(f"{path}: {name} is {str(value)[:40]}; `python model.py` writes it anew")
     return found
 
 
 def _history(path: Path) -> list[dict[str, float]]:
-    """Return the finished epochs' metrics in training_log.csv, none if there is no file. Raises RunError, OSError."""
+    """Return the finished epochs' metrics in training_log.csv, none if there is no file. Raises UserError, OSError."""
     if not path.exists():
         return []
     rows = list(csv.DictReader(path.read_text(encoding="utf-8", errors="replace").splitlines()))
@@ -194,7 +190,7 @@ def _history(path: Path) -> list[dict[str, float]]:
             for row in rows
         ]
     except (KeyError, TypeError, ValueError):
-        raise RunError(f"{path}: not a log of epochs; `python model.py` writes it anew") from None
+        raise UserError(f"{path}: not a log of epochs; `python model.py` writes it anew") from None
 
 
 def _pictures(files: RunFiles, observations: float) -> list[int]:

@@ -14,7 +14,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
-from cloning.base.errors import FolderError
+from cloning.base.errors import UserError
 from cloning.base.files import TEMPORARY_NAME, written_whole
 from cloning.recordings.format import parse_time_stamp, time_stamp
 
@@ -37,11 +37,11 @@ def taken_at(name: str) -> datetime | None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise FolderError if the folder contains anything but saved frames, or is not a folder."""
+    """Raise UserError if the folder contains anything but saved frames, or is not a folder."""
     if not folder.exists():
         return
     if not folder.is_dir():
-        raise FolderError(f"{folder}: not a folder; name a folder for the frames")
+        raise UserError(f"{folder}: not a folder; name a folder for the frames")
     for entry in folder.iterdir():
         if entry.name == DRIVEN:
             continue
@@ -49,21 +49,21 @@ def check_folder(folder: Path) -> None:
         name = temporary[1] if temporary else entry.name
         is_saved_frame = taken_at(name) and not name.startswith("center_")  # a recording's frame is never deleted
         if not entry.is_file() or not is_saved_frame:
-            raise FolderError(
+            raise UserError(
                 f"{folder}: contains {entry.name}, which is not a saved frame, so the folder is not emptied; "
                 "name another folder, or move that file away"
             )
 
 
 def empty_folder(folder: Path) -> None:
-    """Make the folder if it does not exist, and delete the saved frames in it. Raises FolderError."""
+    """Make the folder if it does not exist, and delete the saved frames in it. Raises UserError."""
     check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for entry in folder.iterdir():
             entry.unlink()
     except OSError as error:
-        raise FolderError(f"{folder}: cannot be made or emptied ({error.strerror}); name another folder") from error
+        raise UserError(f"{folder}: cannot be made or emptied ({error.strerror}); name another folder") from error
 
 
 class FrameSaver:
@@ -74,7 +74,7 @@ class FrameSaver:
     """
 
     def __init__(self, path: Path):
-        """Empty the folder and start the thread. Raises FolderError."""
+        """Empty the folder and start the thread. Raises UserError."""
         empty_folder(path)
         self._path = path
         named = path if path.name not in ("", "..") else path.resolve()  # "." has no name
@@ -94,13 +94,13 @@ class FrameSaver:
         return self._sessions[-1]
 
     def close(self) -> None:
-        """Wait until all frames are written, and end the thread. Raises FolderError if frames were lost."""
+        """Wait until all frames are written, and end the thread. Raises UserError if frames were lost."""
         self._queue.put(None)
         self._thread.join()
         if lost := sum(session.lost for session in self._sessions):
             frames = lost + sum(session.saved for session in self._sessions)
             reason = next(session.error for session in self._sessions if session.lost)
-            raise FolderError(
+            raise UserError(
                 f"{self._path}: {lost} of {frames} frames were not saved ({reason}); "
                 "free some disk space, or name a folder that can be written"
             )

@@ -12,7 +12,7 @@ import numpy as np
 from cloning.base import program
 from cloning.base.errors import ModelError, UserError, message_of
 from cloning.browse import summary
-from cloning.browse.runs import RunError, overview
+from cloning.browse.runs import overview
 from cloning.network.attention import visual_backprop
 from cloning.network.compute import one_thread
 from cloning.network.layer_table import layer_table
@@ -94,12 +94,12 @@ class Report:
     """The report of one run."""
 
     def __init__(self, folder: Path, laps: Sequence[Path] = ()):
-        """Read a run; laps: pictures to show. Raises RunError, ModelError, UserError, OSError."""
+        """Read a run; laps: pictures to show. Raises UserError, OSError."""
         files = RunFiles(str(folder / "model.pt"))
         self.run, self.name = overview(files), folder.resolve().name
         self.model = files.best if files.best.exists() else files.last
         if not self.run["best"] or not self.model.exists():
-            raise RunError(f"{folder}: no epoch is finished, so there is nothing to report; let model.py go on")
+            raise UserError(f"{folder}: no epoch is finished, so there is nothing to report; let model.py go on")
         one_thread()  # as drive.py does; replays run at the same time
         self.network = load_model(self.model)
         self.arguments = files.arguments
@@ -212,7 +212,7 @@ class Report:
         return [(why, program.in_commands(shlex.join(map(str, command)))) for why, command in steps]
 
     def page(self) -> str:
-        """Return the page, which needs no other file. Raises ModelError, RecordingError, RunError."""
+        """Return the page, which needs no other file. Raises UserError."""
         run, folder = self.run, Path(__file__).with_name("templates")
         best = next((row["val_drift"] for row in run["history"] if row["epoch"] == run["best"]["epoch"]), None)
         verdict = next((words for limit, words in VERDICTS if best is not None and best <= limit), "")
@@ -236,4 +236,4 @@ class Report:
                 verdict=verdict.format(remedy="see what to do next, at the end"),
             )
         except jinja2.UndefinedError as error:
-            raise RunError(f"{self.arguments}: of another version ({error}); train again with this one") from None
+            raise UserError(f"{self.arguments}: of another version ({error}); train again with this one") from None
