@@ -305,11 +305,11 @@ def _drive(
     path = [(position.x, position.y)]
     late, ended = PATIENCE + 2 * planned, ""
     while not ended:
-        told = Answer()
+        command = Answer()
         if answer and cameras:
-            told = answer(jpeg(cameras.frames(run.car.node.get_transform())[0]), run)
-            steering = steering if told.steering is None else told.steering
-        throttle = controller.throttle(run.speed_mph) if told.throttle is None else told.throttle
+            command = answer(jpeg(cameras.frames(run.car.node.get_transform())[0]), run)
+            steering = steering if command.steering is None else command.steering
+        throttle = controller.throttle(run.speed_mph) if command.throttle is None else command.throttle
         due = False
         while not (due or ended):
             if not run.advance(expert.drive(run)[0] if expert else steering, throttle):

@@ -252,10 +252,10 @@ def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Drive]) -> 
     return Limits(ordinary, weights, -float(alarm), float(stop))
 
 
-def risks(of: Sequence[Part], kind: str, risk: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def risks(among: Sequence[Part], kind: str, risk: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the greatest risks in the windows before departures, and in those of drives without one."""
     found: tuple[list[float], list[float]] = ([], [])
-    for part in of:
+    for part in among:
         if part.kind == kind:
             found[not part.leaves].extend(greatest(part, risk(part.signs)))
     return np.array(found[0]), np.array(found[1])

@@ -123,7 +123,10 @@ def explore(search: str, seed: int, roads: int, kind: Kind, drive_all: DriveAll)
 def run_search(
     folder: Path, search: str, seed: int, roads: int, kind: Kind, drive_all: DriveAll
 ) -> tuple[dict[str, Any], list[Driven]]:
-    """Search, print each failure and write its file, then drive it again; return figures, and the failures."""
+    """Search, print each failure and write its file, then drive it again; return figures, and the failures.
+
+    degrees_between: of `diversity`.
+    """
     begin, first_failure = time.perf_counter(), ""
     driven: list[Driven] = []
     failures: list[Driven] = []
@@ -146,12 +149,12 @@ def run_search(
         "seed": seed,
         "roads": roads,
         "failures": len(failures),
-        "first failure": first_failure,
-        "same again": same,
-        "diversity of failures, °": diversity([road for road, _ in failures]),
-        "of all roads, °": diversity([road for road, _ in driven]),
-        "farthest, m": round(max(drive.farthest for _, drive in driven), 2),
-        "s": round(seconds),
+        "first_failure": first_failure,
+        "same_again": same,
+        "degrees_between_failures": diversity([road for road, _ in failures]),
+        "degrees_between_roads": diversity([road for road, _ in driven]),
+        "farthest_m": round(max(drive.farthest for _, drive in driven), 2),
+        "seconds": round(seconds),
     }, failures
 
 
@@ -217,14 +220,14 @@ def main(argv: list[str] | None = None) -> int:
             )
             searches.append(figures)
             failures += failed
-    print(head(*searches[0]))
+    print(head(*(name.replace("_", " ") for name in searches[0])))
     for figures in searches:
         print(row(*("" if value is None else value for value in figures.values())))
     write_json(folder / "search.json", {"options": vars(options) | {"folder": str(folder)}, "searches": searches})
     if failures:
         title = f"{len(failures)} failures" + f", the first {SHOWN}" * (len(failures) > SHOWN)
         write_output(folder / "failures.png", picture(failures[:SHOWN], title))
-    same = sum(figures["same again"] for figures in searches)
+    same = sum(figures["same_again"] for figures in searches)
     print(f"{same} of {len(failures)} failures were the same, to the last digit, when they were driven again")
     return program.DONE if same == len(failures) else program.INCOMPLETE
 
