@@ -7,7 +7,6 @@ const AGAIN = {running: 2000, stopped: 5000, finished: 5000}; // ms until it is 
 const PICTURES = ["LRC_", "augmented-"]; // of pictures, in the order of the page
 const HEIGHT = 260; // px of a plot
 const UNKNOWN = "Not known: no two seconds of driving were kept for validation.";
-const WITHIN = "within the epoch"; // ends the label of such losses
 const LOSSES = 0.98; // share of the losses within the epochs that the plot shows: the first ones are far higher
 // {id, run, runs, others, at, plots, timer}; at: observations of the picture that was chosen, undefined for the latest
 let open;
@@ -152,7 +151,7 @@ function draw() {
       [values("val_loss"), {label: `${of}validation`, stroke, width: 2, points}],
       [values("loss"), {label: `${of}training`, stroke, width: 1, dash: [5, 3],
         points: {...points, fill: colour("--paper")}}],
-      [[trail.map(([done]) => done), trail.map(([, loss]) => loss)], {label: `${of}${WITHIN}`,
+      [[trail.map(([done]) => done), trail.map(([, loss]) => loss)], {label: `${of}within the epoch`, isWithin: true,
         stroke: `color-mix(in srgb, ${stroke} 55%, transparent)`, width: 1, points: {show: false}}],
     );
     if (!best) return;
@@ -168,7 +167,7 @@ function draw() {
       return undefined;
     }
     const usual = values => values.toSorted((a, b) => a - b)[Math.ceil(LOSSES * values.length) - 1] ?? 0;
-    const most = curves.flatMap(([[, values], {label}]) => label.endsWith(WITHIN) ? usual(values) : values);
+    const most = curves.flatMap(([[, values], {isWithin}]) => isWithin ? usual(values) : values);
     return new uPlot({
       width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
       hooks: {ready: [plot => setTimeout(() => plot.setLegend({idx: plot.data[0].length - 1}))]}, // till the mouse points
