@@ -46,7 +46,7 @@ from simulator.report import lap_report
 from simulator.run import Run
 from simulator.workers import add_workers, started_workers
 from tools.command import ROOT, command_line, python, run_tool
-from tools.score_table import Board, Driven, NetworkResults, RealRecording, Replayed, course, driven, table
+from tools.score_table import Board, Driven, NetworkResults, RealRecording, Replayed, course, driven, replay_text, table
 
 DIRECTIONS = ("ccw", "cw")
 UNSEEN_LOOKS = (101, 102)  # no model was trained on looks 101 to 1000
@@ -82,12 +82,6 @@ def drive_laps(model: str, mph: int, laps: float, on: tuple[str, str, int]) -> D
     conditions = Conditions(model, mph, look, direction, metres, set_back=True)
     done = drive(conditions, track, lambda run, _: runs.append(run))
     return driven(lap_report(runs[0]), mph, look, laps, finished=not done.failed)
-
-
-def in_words(limit: str, result: Replayed) -> str:
-    """Return the result of a replay at a limit in m, for people."""
-    autonomy, times, metres = result["autonomy_percent"], result["interventions"], result["distance_mean_m"]
-    return f"{autonomy:.1f} % autonomy at {limit} m ({times} interventions), {metres:.2f} m from the centre on average"
 
 
 def lap_in_words(drive: Driven) -> str:
@@ -176,7 +170,7 @@ def measure(options: argparse.Namespace) -> None:
         replays = pool.map(partial(replay, options.model), folders)
         for folder, (recording, results) in zip(folders, replays, strict=True):
             board["recordings"][folder.name], network["replays"][folder.name] = recording, results
-            save(f"{folder.name}: {'; '.join(in_words(limit, result) for limit, result in results.items())}")
+            save("; ".join(f"{folder.name}, limit {limit} m: {replay_text(each)}" for limit, each in results.items()))
     if not courses:
         return
     with started_workers(options.processes, options.scheduler) as workers:

@@ -17,31 +17,26 @@ class NotReplayedError(UserError):
     """A row that a replay left out: it is cut, has an unusable image, or is no part of two seconds of driving."""
 
 
-def _rows(images: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the recording's row of each centre image: int64 (k,); images: int (k,); centres: as in `rows_driven`."""
-    first = np.full(max(centres.max(initial=0), images.max(initial=0)) + 1, -1)
-    first[centres[::-1]] = np.arange(len(centres))[::-1]
-    return first[images]
-
-
-def rows_driven(result: Result, centres: np.ndarray) -> np.ndarray:
-    """Return the recording's row of each value in the result's columns: int64 (k,).
+def rows_with(images: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Return the recording's row of each centre image: int64 (k,); images: int (k,).
 
     centres: int32 (n,), the rows' centre images. Of rows with the same one, which are copies, it is the first.
     """
-    return _rows(result.images, centres)
+    first = np.full(max(centres.max(initial=0), images.max(initial=0)) + 1, -1)
+    first[centres[::-1]] = np.arange(len(centres))[::-1]
+    return first[images]
 
 
 def figures(result: Result, centres: np.ndarray) -> dict[str, Any]:
     """Return a replay's metrics, its interventions as [row, offset in m], and where the lane is not known.
 
     The row is the last one before the car is set back, which shows where it went; the first of a line has none. Where
-    the lane is not known: [the first row, rows, why]. centres: as in `rows_driven`.
+    the lane is not known: [the first row, rows, why]. centres: as in `rows_with`.
     """
-    rows = rows_driven(result, centres)
+    rows = rows_with(result.images, centres)
     where = [[int(rows[index - 1]), metres] for index, metres in result.about["where"]]
     unknown = result.about["unknown"]
-    firsts = _rows(np.array([image for image, *_ in unknown], int), centres).tolist()
+    firsts = rows_with(np.array([image for image, *_ in unknown], int), centres).tolist()
     parts = [[row, *more] for row, (_, *more) in zip(firsts, unknown, strict=True)]
     return {**result.about, "where": where, "unknown": parts, "driven": len(rows)}
 
@@ -60,7 +55,7 @@ class LineViews:
     def __init__(self, recording: Recording, result: Result, line: int):
         """line: its index among the reference lines."""
         indices = np.flatnonzero(result.columns["line"] == line)
-        part = recording.take(rows_driven(result, recording.images[:, 0])[indices])
+        part = recording.take(rows_with(result.images, recording.images[:, 0])[indices])
         self.views = StretchViews(part, Stretch.of(part, slice(0, len(part))))
         self.right, self.yaw = (result.columns[name][indices] for name in ("right", "yaw"))
         self.first = int(indices[0])

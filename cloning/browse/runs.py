@@ -105,22 +105,22 @@ def overview(files: RunFiles) -> dict[str, Any]:
     rate = images / seconds if images and seconds else history[-1]["images"] / last if last else None
     epoch = last or (samples / rate if rate else None)
     left = epoch * max(0.0, epochs - finished - min(1.0, images / samples)) if epoch and state == "running" else None
-    recordings = options.get("recordings")
+    recordings, robust = options.get("recordings"), options.get("robust") is True or options.get("name") == "robust"
     return {
         "run": progress.get("run"),
         "state": state,
-        "robust": options.get("robust") is True or options.get("name") == "robust",
+        "robust": robust,
         "recordings": [str(each) for each in recordings] if isinstance(recordings, list) else [],
         "epochs": epochs,
         "samples_per_epoch": samples,
-        "history": [{key: _finite(value) for key, value in row.items()} for row in history],
+        "history": [{key: value if math.isfinite(value) else None for key, value in row.items()} for row in history],
         "images": images,
         "loss": progress.get("loss"),
         "age": age,
         "rate": rate,
         "left": left,
         "trail": _trail(progress, finished + min(1.0, images / samples)),
-        "best": _best(history, options),
+        "best": _best(history, options.get("best_by") or ("val_loss" if robust else "val_drift")),
         "options": _flat(options),
         "has_report": files.report.is_file(),
         "pictures": _pictures(files, progress["batches"] * options["batch_size"] if progress else math.inf),
@@ -136,10 +136,8 @@ def _trail(progress: dict[str, Any], done: float) -> list[list[float]]:
     return [[round(n * every / batches * done, 4), loss] for n, loss in known]
 
 
-def _best(history: list[dict[str, float]], options: dict[str, Any]) -> dict[str, Any] | None:
-    """Return {"epoch", "by", "value"} of the best epoch, or None."""
-    robust = options.get("robust") is True or options.get("name") == "robust"
-    by = options.get("best_by") or ("val_loss" if robust else "val_drift")
+def _best(history: list[dict[str, float]], by: Any) -> dict[str, Any] | None:
+    """Return {"epoch", "by", "value"} of the best epoch, or None; by: the metric that the run's options name."""
     if not history:
         return None
     by = judged_by(history, by if by in ("val_loss", "val_drift") else "val_loss")
@@ -154,10 +152,6 @@ def _flat(options: dict[str, Any]) -> dict[str, str]:
         for name, value in options.items()
         if not isinstance(value, dict) and name not in ("output", "resume")
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _json(path: Path, kinds: dict[str, Any], least: int, within: str = "") -> dict[str, Any]:
