@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from cloning.base.arguments import MAX_PORT, address, number
+from cloning.base.arguments import MAX_PORT, address, command_line, number
 from cloning.base.errors import UserError
 from cloning.base.frame import FRAME
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
@@ -296,11 +296,8 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; arguments: those of this process if None."""
-    parser = argparse.ArgumentParser(
-        description=program.in_commands(__doc__ or ""),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="Exit status: 0 after Ctrl-C, 1 if frames could not be saved, 2 if the server could not start.",
-    )
+    status = "Exit status: 0 after Ctrl-C, 1 if frames could not be saved, 2 if the server could not start."
+    parser = command_line(None, __doc__, status)
     add = parser.add_argument
     add("model", nargs="?", type=Path, help="model file (default: model.pt if it exists, else the project's own)")
     add("folder", nargs="?", type=Path, help="save the frames here; frames saved here earlier are deleted")

@@ -12,7 +12,6 @@ from cloning.base import program
 if __name__ == "__main__":
     program.end_on_interrupt("video.py", "stopped; no film was written")  # also while the libraries below are loaded
 
-import argparse
 import sys
 from collections.abc import Callable
 from datetime import datetime
@@ -21,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.base.arguments import number, ratio
+from cloning.base.arguments import command_line, number, ratio
 from cloning.base.errors import UserError
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.base.progress import progress_bar
@@ -123,9 +122,7 @@ def load_overlay(model_file: Path) -> Overlay:
 
 def main() -> int:
     """Parse the command line and make the film; return the exit status."""
-    parser = argparse.ArgumentParser(
-        description=program.in_commands(__doc__ or ""), formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(None, __doc__)
     parser.add_argument("folder", type=Path, help="the folder with the frames; the film is FOLDER.mp4")
     fps_help = "frames per second, such as 60 or 30000/1001 (default: from the frames' times)"
     parser.add_argument("--fps", type=number(ratio, *FPS_RANGE), help=fps_help)

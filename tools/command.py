@@ -1,6 +1,5 @@
 """What the tools share: their command lines, how they end, commands in other processes, and tables in Markdown."""
 
-import argparse
 import subprocess
 import sys
 from collections.abc import Callable
@@ -8,15 +7,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cloning.base import program
+from cloning.base.arguments import command_line as command_line  # re-exported
 from cloning.base.errors import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-def command_line(name: str, documentation: str | None) -> argparse.ArgumentParser:
-    """Return a parser of a tool's options, whose help begins with the tool's docstring."""
-    raw = argparse.RawDescriptionHelpFormatter
-    return argparse.ArgumentParser(name, description=documentation, formatter_class=raw)
 
 
 def run_tool(main: Callable[[], int]) -> NoReturn:

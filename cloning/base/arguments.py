@@ -5,8 +5,20 @@ import math
 from collections.abc import Callable
 from typing import TypeVar
 
+from cloning.base.program import in_commands
+
 Number = TypeVar("Number", int, float)
 MAX_PORT = 65535
+
+
+def command_line(name: str | None, documentation: str | None, epilog: str | None = None) -> argparse.ArgumentParser:
+    """Return a command's parser, whose help begins with the command's docstring and ends with the epilog.
+
+    name: as a clone's user starts it, such as `python -m cloning.browse`; None: the name of the file.
+    """
+    name, words = name and in_commands(name), in_commands(documentation or "")
+    raw = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(name, description=words, epilog=epilog, formatter_class=raw)
 
 
 def number(read: Callable[[str], Number], least: float = -math.inf, most: float = math.inf) -> Callable[[str], Number]:

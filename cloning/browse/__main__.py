@@ -16,7 +16,7 @@ if __name__ == "__main__":
 import argparse
 from pathlib import Path
 
-from cloning.base.arguments import MAX_PORT, number
+from cloning.base.arguments import MAX_PORT, command_line, number
 from cloning.base.errors import UserError
 from cloning.browse.library import Library
 from cloning.browse.page import create_app
@@ -28,12 +28,8 @@ from cloning.server.site import BROWSE_HOST, BROWSE_PORT
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; arguments: those of this process if None."""
-    parser = argparse.ArgumentParser(
-        prog=program.in_commands("python -m cloning.browse"),
-        description=program.in_commands(__doc__ or ""),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="Exit status: 0 after Ctrl-C, 2 if the server could not start.",
-    )
+    status = "Exit status: 0 after Ctrl-C, 2 if the server could not start."
+    parser = command_line("python -m cloning.browse", __doc__, status)
     add = parser.add_argument
     add("recordings", nargs="*", metavar="FOLDER", help="recordings, or folders of recordings (default: data)")
     models = "show the steering of these models"

@@ -17,7 +17,7 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.errors import OutputError, RecordingError, UserError
 from cloning.base.outputs import plural
 from cloning.lerobot.driven import read_driven
@@ -31,11 +31,7 @@ from cloning.recordings.saved_frames import DRIVEN
 
 def parse_arguments() -> argparse.Namespace:
     """Return the arguments of the command line."""
-    parser = argparse.ArgumentParser(
-        prog=program.in_commands("python -m cloning.lerobot"),
-        description=program.in_commands(__doc__ or ""),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_line("python -m cloning.lerobot", __doc__)
     source = "recordings, or folders with recordings; or one data set, tub or drive"
     parser.add_argument("source", nargs="+", help=source)
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="new folder to write")

@@ -12,7 +12,6 @@ from cloning.base import program
 if __name__ == "__main__":
     program.end_on_interrupt("export")
 
-import argparse
 import logging
 import warnings
 from pathlib import Path
@@ -22,6 +21,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from cloning.base.arguments import command_line
 from cloning.base.errors import ModelError, UserError
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME
@@ -83,11 +83,7 @@ def check_frames() -> np.ndarray:
 
 def main() -> int:
     """Export a model and print what the file contains; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog=program.in_commands("python -m cloning.network.export"),
-        description=program.in_commands(__doc__ or ""),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_line("python -m cloning.network.export", __doc__)
     parser.add_argument("model", type=Path, help="model file to read")
     parser.add_argument("output", type=Path, help="ONNX file to write")
     arguments = parser.parse_args()

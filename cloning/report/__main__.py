@@ -13,9 +13,9 @@ from cloning.base import program
 if __name__ == "__main__":
     program.end_on_interrupt("report")
 
-import argparse
 from pathlib import Path
 
+from cloning.base.arguments import command_line
 from cloning.base.errors import UserError
 from cloning.base.outputs import check_folders, write_output
 from cloning.recordings.log import find_folders
@@ -26,11 +26,7 @@ from cloning.training.run_files import RunFiles
 
 def main() -> int:
     """Write the report and print its name; return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog=program.in_commands("python -m cloning.report"),
-        description=program.in_commands(__doc__ or ""),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_line("python -m cloning.report", __doc__)
     add = parser.add_argument
     add("run", type=Path, metavar="FOLDER", help="folder that model.py has written to; report.html is written there")
     held_out = "recordings, or folders of recordings, that the network was not trained on: it drives them"
