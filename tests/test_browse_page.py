@@ -351,6 +351,7 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
     with browsing("--run", *(tmp_path / name for name in ("a", "b", "none"))) as server:
         page.open(f"{server.base}#/run/2")
         page.shows("#notice", "none: no training run in this folder yet; `python model.py --output")
+        assert page.barriers() == []
         page.open(server.base)
         page.shows("#runs", "stopped or killed in epoch 2 of 4")
         page.click("#runs a")
