@@ -112,15 +112,16 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => page
 // Export: of the marked stretch, or the matches, or what the curves show
 
 function selected() {
-  const {matches, plots: {zoom}, count} = page.open, stretch = marked();
+  const {condition, matches, plots: {zoom}, count} = page.open, stretch = marked();
   if (stretch) return ["the marked stretch", [stretch]];
-  if (matches?.stretches.length) return ["what matches", matches.stretches];
+  if (condition) return ["what matches", matches?.stretches ?? []];
   if (zoom) return ["what the curves show", [[Math.ceil(zoom[0]), Math.floor(zoom[1]) + 1]]];
   return ["the whole recording", [[0, count]]];
 }
 
 export function askToExport() {
   const [what, stretches] = selected(), frames = stretches.reduce((sum, [first, end]) => sum + end - first, 0);
+  if (!frames) return say("No frame matches: change or clear the condition, then export.");
   element("selection").textContent = `${what}: ${many(frames, "frame")}`;
   element("export-name").value ||= `${page.open.details.name}-part`;
   element("export").returnValue = "";
