@@ -231,7 +231,7 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         assert len(read_recording(linked)) == 60 - found.sum()
         page.shows("#matches", "no frame")
         page.press("e")
-        page.shows("#said", "No frame matches")
+        page.shows("#said", "Nothing to export: what matches has no frames")
         page.click("#home")
         page.wait("document.querySelector('article h2 a')")
         page.click("article h2 a")

@@ -120,8 +120,11 @@ function selected() {
 }
 
 export function askToExport() {
-  const [what, stretches] = selected(), frames = stretches.reduce((sum, [first, end]) => sum + end - first, 0);
-  if (!frames) return say("No frame matches: change or clear the condition, then export.");
+  const [what, stretches] = selected(), kept = new Uint8Array(page.open.count);
+  for (const [first, end] of stretches) kept.fill(1, first, end);
+  for (const [first, end] of page.open.details.cuts.flatMap(cut => cut.stretches)) kept.fill(0, first, end);
+  const frames = kept.reduce((sum, each) => sum + each, 0);
+  if (!frames) return say(`Nothing to export: ${what} has no frames, or all are cut.`);
   element("selection").textContent = `${what}: ${many(frames, "frame")}`;
   element("export-name").value ||= `${page.open.details.name}-part`;
   element("export").returnValue = "";
