@@ -198,13 +198,12 @@ class Page:
         return self.run("document.documentElement.scrollWidth <= innerWidth")
 
     def barriers(self) -> list[str]:
-        """What axe-core finds on the page that is a serious or critical barrier to people."""
+        """What axe-core finds on the page that is a barrier to people, however small."""
         self.run(AXE.read_text(encoding="utf-8") + ";0")
         found = self.run("axe.run({resultTypes: ['violations']}).then(({violations}) => violations)")
         return [
-            f"{each['id']}: {node['html']}: {node['failureSummary']}"
+            f"{each['id']}, {each['impact']}: {node['html']}: {node['failureSummary']}"
             for each in found
-            if each["impact"] in ("serious", "critical")
             for node in each["nodes"]
         ]
 

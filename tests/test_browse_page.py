@@ -230,6 +230,8 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         page.shows("#said", "Undo takes it back")
         assert len(read_recording(linked)) == 60 - found.sum()
         page.shows("#matches", "no frame")
+        page.press("e")
+        page.shows("#said", "Nothing to export: what matches has no frames")
         page.click("#home")
         page.wait("document.querySelector('article h2 a')")
         page.click("article h2 a")
@@ -351,6 +353,7 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
     with browsing("--run", *(tmp_path / name for name in ("a", "b", "none"))) as server:
         page.open(f"{server.base}#/run/2")
         page.shows("#notice", "none: no training run in this folder yet; `python model.py --output")
+        assert page.barriers() == []
         page.open(server.base)
         page.shows("#runs", "stopped or killed in epoch 2 of 4")
         page.click("#runs a")

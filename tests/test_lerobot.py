@@ -203,6 +203,8 @@ def test_a_donkeycar_tub_becomes_a_recording(tub, tmp_path):
         road = np.ptp(read_frame(recording.path(0, camera))[90].astype(int), axis=1) < 40
         middles.append(road.nonzero()[0].mean())
     assert middles[1] > middles[0] + 10 > middles[2] + 20, "seen from the left, the road lies further to the right"
+    gone = run(tub / "gone", "--output", tmp_path / "other")
+    assert gone.returncode == 2 and "gone: no such folder; name a recording, data set" in gone.stderr
 
 
 @pytest.mark.parametrize(

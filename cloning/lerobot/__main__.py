@@ -56,6 +56,8 @@ def main() -> int:
     source, output, notes = Path(arguments.source[0]), arguments.output, Counter[str]()
     is_tub, is_data_set = (source / MANIFEST).is_file(), (source / "meta" / "info.json").is_file()
     try:
+        if not source.exists():
+            raise UserError(f"{source}: no such folder; name a recording, data set, tub or drive")
         if output.exists():
             raise OutputError(f"{output}: exists already; name another folder, or delete this one")
         is_drive = (source / DRIVEN).is_file()

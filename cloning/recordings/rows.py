@@ -2,9 +2,10 @@
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,10 +27,10 @@ from cloning.recordings.columns import (
 )
 from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, NUMBERS
 
-FOLDER = r'(?:(?:[^,"/\\]*+[/\\])++| *)'  # of an image, or blanks
+FOLDER = r'(?:[^,"/\\]*+[/\\])*+'  # of an image; nearly always the same for all three: \1, which is found faster
 # A row as the simulator writes it: nearly all are, so these are read at once.
 PLAIN_ROW = re.compile(
-    rf"{FOLDER}(center(_[\d_]{{1,99}}\.jpg)) *,{FOLDER}(left\2) *,{FOLDER}(right\2) *"
+    rf" *+({FOLDER})(center(_[\d_]{{1,99}}\.jpg)) *, *+(?:\1|{FOLDER})(left\3) *, *+(?:\1|{FOLDER})(right\3) *"
     + rf", *({NUMBER.pattern}) *" * len(NUMBERS),
     re.ASCII,
 )
@@ -87,7 +88,7 @@ class RowReader:
         self.rejected: list[Rejected] = []
         self._columns: tuple[str, ...] = COLUMNS  # below the last header, as `header_columns` returns them
         self._headers = {0: False}  # line -> whether it names all columns; 0 for none
-        self._rows: list[tuple[int, Sequence[str], Sequence[str]]] = []  # line, names and numbers
+        self._rows: list[tuple[Any, ...]] = []  # line, three names and four numbers, as texts
         self._has_points = False  # a number with a decimal point has been seen
         self._with_commas: list[tuple[int, list[str], list[str]]] = []  # line, names and fields that may be numbers
 
@@ -99,8 +100,8 @@ class RowReader:
         text = text.rstrip("\r\n").removeprefix(BYTE_ORDER_MARK)
         if self._columns == COLUMNS and (plain := PLAIN_ROW.fullmatch(text)):
             self.rows_read += 1
-            self._has_points = self._has_points or "." in text[plain.end(4) :]
-            self._rows.append((line, plain.group(1, 3, 4), plain.group(5, 6, 7, 8)))
+            self._has_points = self._has_points or "." in text[plain.end(5) :]
+            self._rows.append((line, *plain.group(2, 4, 5, 6, 7, 8, 9)))
         elif text.startswith(MERGE_MARKERS):
             self._reject(line, Finding.MERGE_CONFLICT, f"{text[:20]!r}: resolve the merge, delete the line")
         elif not NO_CONTENT.fullmatch(text):
@@ -120,7 +121,8 @@ class RowReader:
         """
         self._read_decimal_commas()
         lines = np.array([line for line, *_ in self._rows], np.int32)
-        numbers = np.array([float(token) for *_, tokens in self._rows for token in tokens]).reshape(-1, len(NUMBERS))
+        numbers = np.array([float(token) for row in self._rows for token in row[-len(NUMBERS) :]])
+        numbers = numbers.reshape(-1, len(NUMBERS))
         below = np.searchsorted(list(self._headers), lines) - 1
         outside, is_named = np.zeros(numbers.shape, bool), list(self._headers.values())
         for header in np.unique(below):
@@ -136,7 +138,7 @@ class RowReader:
             self._reject(int(lines[row]), Finding.OUT_OF_RANGE, detail)
         if open_line in lines[usable]:
             self._repair("the file ends within this line: its last number may be cut short", open_line)
-        names = np.array([name.encode(errors="surrogateescape") for _, row, _ in self._rows for name in row], bytes)
+        names = np.array([name.encode(errors="surrogateescape") for _, *row in self._rows for name in row[:3]], bytes)
         return names.reshape(-1, len(CAMERAS))[usable], numbers[usable], lines[usable]
 
     def _read_odd_line(self, line: int, text: str) -> None:
@@ -208,7 +210,7 @@ class RowReader:
             raise UnclearRowError(Finding.NOT_A_NUMBER, detail)
         if extra:
             self._repair("extra columns ignored", line)
-        self._rows.append((line, names, numbers))
+        self._rows.append((line, *names, *numbers))
 
     def _read_decimal_commas(self) -> None:
         """Add the rows of more than four whole numbers, if they are surely four numbers with decimal commas.
@@ -229,7 +231,7 @@ class RowReader:
         for (line, names, tokens), found in zip(self._with_commas, readings, strict=True):
             if len(found) == 1 and not doubt:
                 self._repair("decimal commas", line)
-                self._rows.append((line, names, found[0]))
+                self._rows.append((line, *names, *found[0]))
             else:
                 reason = f"may be four numbers with decimal commas in {len(found)} ways{doubt}"
                 detail = f"{','.join(tokens)!r} {reason}; write decimal points, or {REMEDY}"

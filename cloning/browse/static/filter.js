@@ -112,15 +112,19 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => page
 // Export: of the marked stretch, or the matches, or what the curves show
 
 function selected() {
-  const {matches, plots: {zoom}, count} = page.open, stretch = marked();
+  const {condition, matches, plots: {zoom}, count} = page.open, stretch = marked();
   if (stretch) return ["the marked stretch", [stretch]];
-  if (matches?.stretches.length) return ["what matches", matches.stretches];
+  if (condition) return ["what matches", matches?.stretches ?? []];
   if (zoom) return ["what the curves show", [[Math.ceil(zoom[0]), Math.floor(zoom[1]) + 1]]];
   return ["the whole recording", [[0, count]]];
 }
 
 export function askToExport() {
-  const [what, stretches] = selected(), frames = stretches.reduce((sum, [first, end]) => sum + end - first, 0);
+  const [what, stretches] = selected(), kept = new Uint8Array(page.open.count);
+  for (const [first, end] of stretches) kept.fill(1, first, end);
+  for (const [first, end] of page.open.details.cuts.flatMap(cut => cut.stretches)) kept.fill(0, first, end);
+  const frames = kept.reduce((sum, each) => sum + each, 0);
+  if (!frames) return say(`Nothing to export: ${what} has no frames, or all are cut.`);
   element("selection").textContent = `${what}: ${many(frames, "frame")}`;
   element("export-name").value ||= `${page.open.details.name}-part`;
   element("export").returnValue = "";

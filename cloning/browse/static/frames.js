@@ -89,7 +89,7 @@ export class Frames {
       this.loaded.set(row, known);
     } else {
       const parts = this.pictures.map(({path, looks, has}) => has && !has(row)
-        ? [Promise.resolve({message: "not replayed here"})]
+        ? [Promise.resolve({message: "not replayed here: cut, an unusable image, off the road, or standing"})]
         : [`${path}.jpg`, ...looks.map(model => `${path}/${model}.png`)].map(path => this.layer(row, path)));
       this.loaded.set(row, {
         frames: Promise.all(parts.map(async ([frame]) => together([await frame]))),

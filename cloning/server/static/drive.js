@@ -184,15 +184,15 @@ class Graph {
     const colours = getComputedStyle(document.body), colour = name => colours.getPropertyValue(name);
     const axis = {stroke: colour("--quiet"), font: "12px system-ui, sans-serif", ticks: {show: false},
       grid: {stroke: colour("--edge"), width: 0.5}};
-    const curve = {width: 1.25, points: {show: false}};
+    const curve = {width: 1.25, points: {show: false}}, limit = this.isDistance ? LIMITS.at(-1) : 0;
     this.plot = new uPlot({
       ...this.size(), legend: {show: false}, cursor: {show: false}, padding: [6, RIGHT, 0, 0],
       scales: {x: {time: false, range: [-SECONDS, 0]}, y: {range: () => this.range}},
       axes: [
         {...axis, size: 24, gap: 8, space: 64, incrs: [5, 10, 15, 30, 60], values: (_, times) => times.map(time => `${time} s`)},
-        {...axis, size: LEFT, space: 20, values: (_, values) => values.map(value => `${value}${this.unit}`),
-          ...this.isDistance && {splits: (_, at, low, high) => [0, LIMITS.at(-1), ...high > 2 * LIMITS.at(-1) ? [high] : []]
-            .flatMap(metres => metres ? [-metres, metres] : 0)}},
+        {...axis, size: LEFT, space: 20, values: (_, values) => values.map(value => `${Number(value.toPrecision(3))}${this.unit}`),
+          ...this.both && {splits: (_, at, low, high) => [...new Set([0, limit, high > 2 * limit ? high : 0])]
+            .flatMap(value => value ? [-value, value] : 0)}}, // of its own, uPlot may give a low plot nothing but 0
       ],
       series: [{}, {...curve, stroke: colour("--line")}, ...this.marks().map(([name]) => ({...curve, stroke: colour(name), dash: [6, 4]}))],
     }, [[], [], ...this.marks().map(() => [])], this.holder);
