@@ -46,6 +46,7 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
         if scheduler:
             yield _dask(scheduler, stack)
             return
+        others = multiprocessing.active_children()
         try:
             with program.interrupt_deferred():
                 pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
@@ -56,7 +57,8 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
             raise SimulatorError("a driving process was killed, perhaps for lack of memory; start again") from error
         except BaseException:
             for process in multiprocessing.active_children():  # after Ctrl-C they would drive on to their roads' ends
-                process.terminate()
+                if process not in others:
+                    process.terminate()
             raise
 
 
