@@ -47,9 +47,10 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
             yield _dask(scheduler, stack)
             return
         others = multiprocessing.active_children()
+        with program.interrupt_deferred():
+            pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
         try:
             with program.interrupt_deferred():
-                pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
                 for _ in range(processes):  # each starts a process
                     pool.submit(int)
             yield pool
@@ -59,6 +60,8 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
             for process in multiprocessing.active_children():  # after Ctrl-C they would drive on to their roads' ends
                 if process not in others:
                     process.terminate()
+            # One that ends while it sends leaves half a result, and the pool would wait for ever for the other half.
+            pool._result_queue._writer.close()  # type: ignore[attr-defined]
             raise
 
 
