@@ -29,8 +29,7 @@ USAGE = "usage: behavioral-cloning COMMAND …\n\n" + "\n".join(
 def start(module: str) -> int | None:
     """Run a module's `main`; return its exit status."""
     try:
-        with program.loading():
-            main = importlib.import_module(module).main
+        main = importlib.import_module(module).main
         return main()
     except ModuleNotFoundError as error:  # of an extra of pyproject.toml
         print(f"behavioral-cloning: {program.missing_library(error)}", file=sys.stderr)

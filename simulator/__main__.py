@@ -262,8 +262,7 @@ def chosen_track(arguments: argparse.Namespace, needs_file: bool = True) -> Trac
 
 def run_record(arguments: argparse.Namespace) -> int:
     """Record the expert; print its departures and how fast it was recorded."""
-    with program.loading():
-        from simulator.record import record
+    from simulator.record import record
 
     track = chosen_track(arguments)
     begin = time.perf_counter()
@@ -286,13 +285,12 @@ def run_record(arguments: argparse.Namespace) -> int:
 
 def run_drive(arguments: argparse.Namespace) -> int:
     """Let drive.py drive, and write the requested files even if the drive ends early."""
-    with program.loading():
-        from simulator import report, scenery
-        from simulator.cameras import Cameras
-        from simulator.client import Client
-        from simulator.film import ChaseFilm
-        from simulator.run import Run
-        from simulator.world import Scene
+    from simulator import report, scenery
+    from simulator.cameras import Cameras
+    from simulator.client import Client
+    from simulator.film import ChaseFilm
+    from simulator.run import Run
+    from simulator.world import Scene
 
     check_folders(arguments.report, arguments.picture, arguments.film)
     run = Run(chosen_track(arguments), "autonomous")
@@ -319,11 +317,10 @@ def run_drive(arguments: argparse.Namespace) -> int:
 
 def run_correct(arguments: argparse.Namespace) -> int:
     """Let drive.py drive with corrections by the expert; print a lap report and what was recorded."""
-    with program.loading():
-        from simulator import report, scenery
-        from simulator.correct import CorrectedClient
-        from simulator.run import Run
-        from simulator.world import Scene
+    from simulator import report, scenery
+    from simulator.correct import CorrectedClient
+    from simulator.run import Run
+    from simulator.world import Scene
 
     check_name_of_corrections(arguments.folder)
     run = Run(chosen_track(arguments), "autonomous")
@@ -342,8 +339,7 @@ def run_correct(arguments: argparse.Namespace) -> int:
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Let a model drive real recordings."""
-    with program.loading():
-        from cloning.replay import command
+    from cloning.replay import command
 
     options = {name: value for name, value in vars(arguments).items() if name != "run"}
     command.run(command.Options(**options))
@@ -354,9 +350,8 @@ def run_window(arguments: argparse.Namespace) -> int:
     """Open the window in which a person drives or watches."""
     from datetime import datetime
 
-    with program.loading():
-        from simulator.controls import HELP
-        from simulator.window import Window
+    from simulator.controls import HELP
+    from simulator.window import Window
 
     ending = PROBLEM_AREAS[-1] if arguments.autonomous else ""
     folder = arguments.folder or f"data/window-{datetime.now():%Y%m%d-%H%M%S}{ending}"
@@ -372,8 +367,7 @@ def run_window(arguments: argparse.Namespace) -> int:
 
 def run_join(arguments: argparse.Namespace) -> int:
     """Let another program's server drive, or write the program that does this."""
-    with program.loading():
-        from simulator.join import join, write_launcher
+    from simulator.join import join, write_launcher
 
     if not arguments.launcher:
         return join(arguments, chosen_track(arguments, needs_file=False), given_for_road(arguments))
@@ -383,8 +377,7 @@ def run_join(arguments: argparse.Namespace) -> int:
 
 def run_benchmark(arguments: argparse.Namespace) -> int:
     """Let an entry drive the benchmark's tasks."""
-    with program.loading():
-        from simulator.benchmark import command
+    from simulator.benchmark import command
 
     command.run(arguments)
     return program.DONE

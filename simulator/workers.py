@@ -46,9 +46,11 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
         if scheduler:
             yield _dask(scheduler, stack)
             return
+        others = multiprocessing.active_children()
+        with program.interrupt_deferred():
+            pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
         try:
             with program.interrupt_deferred():
-                pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
                 for _ in range(processes):  # each starts a process
                     pool.submit(int)
             yield pool
@@ -56,7 +58,10 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
             raise SimulatorError("a driving process was killed, perhaps for lack of memory; start again") from error
         except BaseException:
             for process in multiprocessing.active_children():  # after Ctrl-C they would drive on to their roads' ends
-                process.terminate()
+                if process not in others:
+                    process.terminate()
+            # One that ends while it sends leaves half a result, and the pool would wait for ever for the other half.
+            pool._result_queue._writer.close()  # type: ignore[attr-defined]
             raise
 
 

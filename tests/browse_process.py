@@ -7,7 +7,7 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import warm
@@ -24,12 +24,12 @@ from cloning.training.run_files import RunFiles
 class Browse:
     """A server of recordings, in a process of its own."""
 
-    def __init__(self, *arguments, modules: Path = ROOT):
-        """modules: a folder of modules that go before the installed ones."""
+    def __init__(self, *arguments, modules: Path = ROOT, stderr: IO[str] | None = None):
+        """modules: a folder of modules that go before the installed ones; stderr: a file for its log."""
         command = [sys.executable, "-m", "cloning.browse", *map(str, arguments), "--port", "0"]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(modules), str(ROOT)])}
         start = warm.Popen if modules == ROOT else subprocess.Popen  # the warm process has loaded the installed ones
-        self.process = start(command, stdout=subprocess.PIPE, text=True, env=environment)
+        self.process = start(command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=environment)
         assert self.process.stdout
         with self.process.stdout as lines:
             self.port = int(found(r"http://127.0.0.1:(\d+)/", lines.readline()))

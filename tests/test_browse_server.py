@@ -1,6 +1,7 @@
 """The server of recordings over a real socket: what it tells, what it refuses, and cuts."""
 
 import json
+import socket
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -158,6 +159,16 @@ def test_an_image_that_is_no_frame_is_not_served(linked):
                 shown.jpeg(row, "center")
 
 
+def test_requests_that_are_none_leave_few_lines_in_the_log(sample_recording, tmp_path):
+    with open(tmp_path / "log", "w") as log, browsing(sample_recording, stderr=log) as server:
+        for _ in range(100):
+            with socket.create_connection(("127.0.0.1", server.port), 10) as client:
+                client.sendall(b"G\r\n\r\n")
+                client.recv(10)
+    times = ("", " (10 times so far)", " (100 times so far)")
+    assert (tmp_path / "log").read_text().splitlines() == [f"browse: a request can't be read{each}" for each in times]
+
+
 def test_cuts_over_the_socket(linked):
     """Two pages cut and undo; a wrong request, a changed log and a vanished recording lose nothing."""
     log, names = (linked / "driving_log.csv").read_bytes(), [center(linked, row) for row in range(60)]
@@ -193,9 +204,11 @@ def test_cuts_over_the_socket(linked):
         wrongs: tuple[object, ...] = ([], one, [1], [{"first": 1, "last": "b", "reason": ""}], [one | {"more": ""}])
         for wrong in wrongs:
             assert server.ask(f"{here}/cuts", "POST", wrong)[0] == 400
-        for wrong in (b"[" * 100_000, json.dumps([one | {"reason": "\ud800"}]).encode()):
-            status, data, _ = server.ask(f"{here}/cuts", "POST", wrong)
-            assert status == 400 and b"Cuts are a list of JSON objects" in data
+        status, data, _ = server.ask(f"{here}/cuts", "POST", json.dumps([one | {"reason": "\ud800"}]).encode())
+        assert status == 400 and b"Cuts are a list of JSON objects" in data
+        for path in ("cuts", "export"):
+            status, data, _ = server.ask(f"{here}/{path}", "POST", b"[" * 100_000)
+            assert status == 400 and b"nested too deeply" in data
         refused("is not the centre image", "cuts", "POST", [two, one | {"first": "../x"}])
         refused("comes before", "cuts", "POST", [one | {"last": names[2]}])
         text = f'first image,last image,reason\n{names[10]},{names[10]},"crash, hard"\n'

@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -114,6 +115,12 @@ def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path):
     saved = sorted((tmp_path / "run1").glob("*.jpg"))
     assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(200)]
     assert all(re.fullmatch(r"\d{4}(_\d\d){5}_\d{3}\.jpg", path.name) for path in saved)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
+def test_the_signal_that_comes_as_soon_as_it_listens_ends_it_as_usual(model_file):
+    with serving(model_file) as process:
+        assert process.stop(signal.SIGTERM) == 0
 
 
 def test_a_terminal_that_nobody_reads_and_requests_that_fill_it_stop_no_car(model_file, jpegs):

@@ -41,6 +41,7 @@ TOOLS = [
         ("simulator", "numpy", ["-m", "simulator", "record", "data"]),
         ("simulator", "panda3d", ["-m", "simulator", "drive"]),
         ("simulator", "torch", ["-m", "simulator", "replay", "RECORDING", "--model", "model.pt"]),
+        ("video.py", "torch", ["video.py", "run1", "--overlay", "model.pt"]),
         ("export", "onnx", ["-m", "cloning.network.export", "cloning/network/shipped.pt", "none.onnx"]),
         ("behavioral-cloning browse", "flask", [*INSTALLED, "browse"]),
         *((tool, "numpy", ["-m", f"tools.{tool}"]) for tool in TOOLS),
@@ -53,6 +54,35 @@ def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, sample_recording, progr
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 130
     assert done.stderr.startswith(f"{program}: stopped") and done.stderr.count("\n") == 1
+
+
+LOADING_MAIN = """
+from cloning.base import program
+program.end_on_interrupt("test")
+def main():
+    try:
+        import large
+    finally:
+        print("cleaned up", flush=True)
+    print("not stopped")
+program.run(main)
+"""
+
+
+@pytest.mark.parametrize(
+    ("library", "printed"),
+    [
+        ("try:\n    os.kill(os.getpid(), signal.SIGINT)\nexcept BaseException:\n    pass", ["cleaned up"]),
+        ("os.kill(os.getpid(), signal.SIGINT)\nwhile True:\n    (lambda: time.sleep(0.01))()", []),
+    ],
+    ids=["that drops it", "that takes long"],
+)
+def test_ctrl_c_while_main_loads_a_library(tmp_path, library, printed):
+    (tmp_path / "large.py").write_text(f"import os, signal, time\n{library}", encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-c", LOADING_MAIN]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.splitlines(), done.stderr) == (130, printed, "test: stopped\n")
 
 
 @pytest.mark.parametrize(
@@ -94,6 +124,22 @@ def test_an_old_python_is_told_in_one_sentence():
     assert "Python 3.11 or later is needed, and" in done.stderr and "is Python 3.10.4" in done.stderr
 
 
+@pytest.mark.parametrize("hours", [-1, 1])
+def test_a_changed_clock_changes_no_time_in_the_progress(monkeypatch, hours):
+    now = time.time
+    with progress.progress_bar(4, "image") as bar:
+        bar.update()
+        monkeypatch.setattr("tqdm.std.time", lambda: now() + 3600 * hours)
+        monkeypatch.setattr(time, "time", lambda: now() + 3600 * hours)
+        bar.update()
+        assert bar.format_dict["elapsed"] < 60
+    with progress.progress_bar(4, "image") as bar:
+        bar.update()
+        monkeypatch.undo()
+        bar.update()
+        assert 0 <= bar.format_dict["elapsed"] < 60
+
+
 def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys):
     monkeypatch.setattr(progress, "LINE_SECONDS", 0.05)
     with progress.progress_bar(100, "image", desc="training") as bar:
@@ -103,7 +149,7 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
             time.sleep(0.003)
     lines = capsys.readouterr().err.splitlines()
     assert 3 <= len(lines) <= 20, "not every update"
-    assert re.fullmatch(r"training +\d+ %, \d+/100 image, 00:00 since the start, 00:00 left, loss \d+", lines[0])
+    assert re.fullmatch(r"training +\d+ %, \d+/100 image, 00:00 since the start, 00:\d\d left, loss \d+", lines[0])
 
 
 @pytest.mark.parametrize(
@@ -138,7 +184,7 @@ def main():
             os.kill(os.getpid(), signal.SIGINT)
         except KeyboardInterrupt:
             print("cleaned up")
-            raise
+            raise RuntimeError("as some libraries do") from None
     return 1
 program.run(main)
 """

@@ -1,8 +1,11 @@
 """Frames that cannot be saved are counted and reported, and driving goes on."""
 
 import errno
+import itertools
 import shutil
 import threading
+import time
+from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
 
@@ -56,12 +59,33 @@ def test_a_folder_that_disappears_while_driving_is_made_again_or_its_frames_are_
         saver.close()
 
 
+def test_a_clock_that_is_set_while_frames_are_saved_changes_no_name(tmp_path, monkeypatch):
+    class Clock(datetime):
+        """One that goes an hour forward at each look, then back again."""
+
+        hours = itertools.cycle([0, 1, -1])
+
+        @classmethod
+        def now(cls, tz=None):
+            return datetime.now(tz) + timedelta(hours=next(cls.hours))
+
+    monkeypatch.setattr(frames, "datetime", Clock)
+    saver = frames.FrameSaver(tmp_path / "run1")
+    session = saver.start_session()
+    for _ in range(3):
+        session.save(b"jpeg", (0.0, 0.0, 0.0))
+        time.sleep(0.01)
+    saver.close()
+    taken = sorted(filter(None, (frames.taken_at(path.name) for path in (tmp_path / "run1").glob("*.jpg"))))
+    assert timedelta(seconds=0.02) <= taken[-1] - taken[0] < timedelta(minutes=1)
+
+
 def test_frames_are_named_by_the_simulators_own_time_where_it_tells_it(tmp_path):
     """A simulator that waits for its answers, and begins anew after its third frame."""
     saver = frames.FrameSaver(tmp_path / "run1")
     session = saver.start_session()
-    for time in (100.0, 100.5, 101.0, 0.0, 0.25):
-        session.save(b"frame", (0, 0, 0), time)
+    for simulated in (100.0, 100.5, 101.0, 0.0, 0.25):
+        session.save(b"frame", (0, 0, 0), simulated)
     saver.close()
     times = [frames.taken_at(path.name) for path in sorted((tmp_path / "run1").glob("*.jpg"))]
     seconds = [(time - times[0]).total_seconds() for time in times if time and times[0]]

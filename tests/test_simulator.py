@@ -286,22 +286,40 @@ def test_ctrl_c_while_rendering_processes_are_started_leaves_no_recording(tmp_pa
 
 
 DRIVING = """
-import os, signal, threading, time
+import multiprocessing, os, signal, threading, time
+from half import work
 from cloning.base import program
 from simulator.workers import results, started_workers
 program.end_on_interrupt("test")
 def main():
-    with started_workers(2) as pool:
-        threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
-        list(results(pool, time.sleep, [60, 60, 60]))
+    other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
+    other.start()
+    try:
+        with started_workers(2) as pool:
+            threading.Timer(1, os.kill, (os.getpid(), signal.SIGINT)).start()
+            list(results(pool, work, [60, 60, 60]))
+    finally:
+        print(other.is_alive(), flush=True)
+        other.kill()
 program.run(main)
 """
 
 
+SENDING_HALF = """
+import os, time
+from multiprocessing.connection import Connection
+def work(_):
+    Connection._send = lambda self, data, write=os.write: [write(self.fileno(), data[:2]), time.sleep(60)]
+"""
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
-def test_ctrl_c_ends_workers_with_what_they_do_and_one_message():
-    done = subprocess.run([sys.executable, "-c", DRIVING], cwd=ROOT, capture_output=True, text=True, timeout=50)
-    assert (done.returncode, done.stderr) == (130, "test: stopped\n")
+@pytest.mark.parametrize("module", ["from time import sleep as work", SENDING_HALF], ids=["working", "sending"])
+def test_ctrl_c_ends_workers_with_what_they_do_but_no_other_process(tmp_path, module):
+    (tmp_path / "half.py").write_text(module, encoding="utf-8")
+    command, environment = [sys.executable, "-c", DRIVING], {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=50)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "True\n", "test: stopped\n")
 
 
 def test_a_frame_depends_on_the_pose_alone():

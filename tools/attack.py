@@ -8,17 +8,17 @@ one telemetry in flight, must get the right answer to each of its frames, and in
 answered, and the attack's connections must be closed. Needs Linux, because memory is read from /proc.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("attack")  # also while the libraries below are loaded
+
 import itertools
 import multiprocessing
 import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("attack")  # also while the libraries below are loaded
 
 import numpy as np
 

@@ -9,6 +9,11 @@ thread). The servers take turns, so that other load on the machine affects all o
 time and memory are read from /proc.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("bench_driving")  # also while the libraries below are loaded
+
 import itertools
 import json
 import subprocess
@@ -19,11 +24,6 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("bench_driving")  # also while the libraries below are loaded
 
 import numpy as np
 import torch

@@ -9,6 +9,11 @@ other load on the machine disturbs it less than wall time. Memory is that of all
 counted once. Needs Linux, because memory is read from /proc.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("bench_simulator")  # also while the libraries below are loaded
+
 import contextlib
 import os
 import re
@@ -19,11 +24,6 @@ import tempfile
 import time
 from pathlib import Path
 from typing import NamedTuple
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("bench_simulator")  # also while the libraries below are loaded
 
 from cloning.base.arguments import number
 from cloning.base.errors import SimulatorError

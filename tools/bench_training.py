@@ -13,6 +13,11 @@ process of its own; the parts take turns, so that a change of the machine's spee
 training images per second.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("bench_training")  # also while the libraries below are loaded
+
 import argparse
 import itertools
 import json
@@ -25,11 +30,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("bench_training")  # also while the libraries below are loaded
 
 import cv2
 import numpy as np

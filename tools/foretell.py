@@ -13,16 +13,16 @@ counted in windows of 5 s in drives without a departure. An interrupted run cont
 takes about 5 s on a core.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("foretell")  # also while the libraries below are loaded
+
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, Self
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("foretell")  # also while the libraries below are loaded
 
 import numpy as np
 import torch

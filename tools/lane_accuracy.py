@@ -7,13 +7,13 @@ that the network was not trained on. For real recordings only the position of th
 in the jungle the line that is painted along the road's centre.
 """
 
-import tempfile
-import time
-
 from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("lane_accuracy")  # also while the libraries below are loaded
+
+import tempfile
+import time
 
 import numpy as np
 

@@ -6,12 +6,12 @@
 table compares mean colours, and mean colours of image rows.
 """
 
-from pathlib import Path
-
 from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("likeness")  # also while the libraries below are loaded
+
+from pathlib import Path
 
 import cv2
 import numpy as np

@@ -7,15 +7,15 @@ Damage may cost its own rows alone. The truth is where the undamaged recording i
 generated roads, alone or within a recording of a known track, nothing may be placed.
 """
 
-import copy
-import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-
 from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("placing")  # also while the libraries below are loaded
+
+import copy
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 

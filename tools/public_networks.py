@@ -11,17 +11,17 @@ What is different: rows are drawn at random in place of shuffled passes over all
 theirs overflows; and commaai, made for real roads, is trained for 10 of its 200 epochs.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("public_networks")  # also while the libraries below are loaded
+
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("public_networks")  # also while the libraries below are loaded
 
 import cv2
 import numpy as np

@@ -7,12 +7,12 @@ Left the car from behind, right what its camera sees: first on the lake, then in
 as the stand-in simulator renders them. The film is an animated WebP, which web pages show like a picture.
 """
 
-import io
-
 from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("readme_film")
+
+import io
 
 import cv2
 import gymnasium

@@ -12,6 +12,11 @@ same options give the same results, on any number of processes. The folder gets 
 (robustness.png), and the result of each drive (robustness.json) as it comes: a run that was interrupted goes on there.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("robustness")  # also while the libraries below are loaded
+
 import functools
 import hashlib
 import itertools
@@ -21,11 +26,6 @@ from collections.abc import Sequence
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
 from typing import NamedTuple
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("robustness")  # also while the libraries below are loaded
 
 import cv2
 import numpy as np

@@ -14,6 +14,11 @@ What a model was trained on, and so what is in sample, follows from the names of
 ones must be named by track, direction and look, such as jungle-cw-look5. --trained-on adds other names.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("scoreboard")  # also while the libraries below are loaded
+
 import argparse
 import hashlib
 import json
@@ -26,11 +31,6 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from functools import partial
 from itertools import product
 from pathlib import Path, PureWindowsPath
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("scoreboard")  # also while the libraries below are loaded
 
 from cloning.base.arguments import number
 from cloning.base.cores import threads

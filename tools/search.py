@@ -14,17 +14,17 @@ The folder gets a file for each failure, which `--road` of `python -m simulator`
 printed; and failures.png: the roads from above, and where the car left them.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("search")  # also while the libraries below are loaded
+
 import functools
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("search")  # also while the libraries below are loaded
 
 import numpy as np
 

@@ -11,17 +11,17 @@ The network that comes with the project was made so; cloning/network/shipped.md,
 what came out.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("shipped")  # also while the libraries below are loaded
+
 import shutil
 import time
 from concurrent.futures import as_completed
 from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("shipped")  # also while the libraries below are loaded
 
 from cloning.base.arguments import number
 from cloning.base.cores import threads

@@ -7,6 +7,11 @@ Each run trains with --robust and counts everything until its model is saved: lo
 checking the recordings, estimating the lane, training, validation, pictures. Then a replay drives with the model.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("speedrun")
+
 import argparse
 import os
 import statistics
@@ -15,11 +20,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("speedrun")
 
 import numpy as np
 import torch

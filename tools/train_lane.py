@@ -14,15 +14,15 @@ from the two tracks without shadows. For both, the jungle was first rendered wit
 lines.
 """
 
-import time
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import NamedTuple
-
 from cloning.base import program
 
 if __name__ == "__main__":
     program.end_on_interrupt("train_lane")  # also while the libraries below are loaded
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np

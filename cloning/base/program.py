@@ -21,6 +21,7 @@ import functools
 import io
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -34,9 +35,11 @@ DONE = 0
 INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film, a car that left the road
 FAILED = 2  # not done: argparse's status for wrong arguments, and that of every other error the user can correct
 NO_MEMORY = ("allocate", "out of memory", "start new thread")  # in a RuntimeError of torch or Python
+PATIENCE = 0.5  # s that Ctrl-C waits for a library that is being loaded
 name = "python"  # of the command, which begins its messages; this one if another program calls its `main`
 installed: dict[str, str] = {}  # a clone's commands, such as python drive.py -> as the installed project calls them
 end_at_once: Callable[[int, FrameType | None], None] | None = None  # the handler of `end_on_interrupt`
+interrupted = False  # whether Ctrl-C has come in `main`
 
 
 def in_commands(text: str) -> str:
@@ -97,19 +100,37 @@ def _tell(otherwise: Callable[..., object], kind: type[BaseException], error: Ba
     os._exit(FAILED)
 
 
-@contextmanager
-def loading() -> Iterator[None]:
-    """A context in `main` in which Ctrl-C ends the process at once: libraries load, and nothing is to be saved."""
-    before = signal.signal(signal.SIGINT, end_at_once or signal.getsignal(signal.SIGINT))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+def _interrupt(_: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt: at once, or when the library has loaded that is loading; after PATIENCE end the process.
+
+    While they load, libraries turn an exception into errors of their own, or drop it.
+    """
+    global interrupted
+    interrupted = True
+    importing = None  # what imports the library
+    while frame:
+        before, frame = frame, frame.f_back
+        if frame and before.f_code.co_filename == "<frozen importlib._bootstrap>":
+            importing = frame
+    if not importing:
+        raise KeyboardInterrupt
+    latest = time.monotonic() + PATIENCE
+
+    def loaded(*_: object) -> NoReturn:
+        sys.settrace(None)
+        raise KeyboardInterrupt
+
+    def loading(*_: object) -> None:
+        if time.monotonic() > latest and end_at_once:
+            end_at_once(signal.SIGINT, None)
+
+    importing.f_trace, importing.f_trace_opcodes = loaded, True  # called before its next instruction
+    sys.settrace(loading)
 
 
 @contextmanager
 def interrupt_deferred() -> Iterator[None]:
-    """A context in which processes are started; Ctrl-C raises KeyboardInterrupt at its end, and not in the processes.
+    """A context in which processes are started; Ctrl-C has its effect at its end, and none in the processes.
 
     Python would ignore an exception from its own code around a fork. Call it in the main thread.
     """
@@ -130,8 +151,8 @@ def interrupt_deferred() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         if callable(handler):
             signal.signal(signal.SIGINT, handler)
-    if received:
-        raise KeyboardInterrupt
+        if received:
+            signal.raise_signal(signal.SIGINT)
 
 
 def run(main: Callable[[], int | None]) -> NoReturn:
@@ -146,22 +167,25 @@ def run(main: Callable[[], int | None]) -> NoReturn:
         sys.stdout.reconfigure(errors="backslashreplace")
     stop = signal.getsignal(signal.SIGINT)
     if callable(stop):
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, _interrupt)
     try:
         status = main()
-    except KeyboardInterrupt:
+    except BaseException as error:
         signal.signal(signal.SIGINT, stop)
-        with suppress(OSError):  # Ctrl-C has ended the reader of a pipe, too
-            sys.stdout.flush()
-        status = 128 + signal.SIGINT
-        if callable(stop):
-            stop(signal.SIGINT, None)
-    except OSError as error:  # of stdout, for example: a full disk, or a pipe that nobody reads
-        status = failed(error)
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and not any(words in str(error) for words in NO_MEMORY):
+        if interrupted or isinstance(error, KeyboardInterrupt):  # a library may have raised an error of its own for it
+            with suppress(OSError):  # Ctrl-C has ended the reader of a pipe, too
+                sys.stdout.flush()
+            status = 128 + signal.SIGINT
+            if callable(stop):
+                stop(signal.SIGINT, None)
+        elif isinstance(error, OSError):  # of stdout, for example: a full disk, or a pipe that nobody reads
+            status = failed(error)
+        elif isinstance(error, MemoryError) or (
+            isinstance(error, RuntimeError) and any(words in str(error) for words in NO_MEMORY)
+        ):
+            status = failed(UserError(f"too little memory is free: {str(error) or 'MemoryError'}"))
+        else:
             raise
-        status = failed(UserError(f"too little memory is free: {str(error) or 'MemoryError'}"))
     finally:
         signal.signal(signal.SIGINT, stop)
     leave(status)

@@ -1,6 +1,7 @@
 """How far a long job is: a bar on a terminal, and elsewhere, as in a log file, a line now and then."""
 
 import sys
+import time
 from typing import Any
 
 from tqdm import tqdm
@@ -9,7 +10,14 @@ LINE_SECONDS = 30.0  # between two lines
 LINE = "{desc}{percentage:3.0f} %, {n_fmt}/{total_fmt} {unit}, {elapsed} since the start, {remaining} left{postfix}"
 
 
-class Lines(tqdm):
+class Bar(tqdm):
+    """A progress bar whose times do not change with the system's clock."""
+
+    monitor_interval = 0  # tqdm's thread would compare them with the clock
+    _time = property(lambda _: time.monotonic, lambda _, clock: None)
+
+
+class Lines(Bar):
     """A progress bar that is printed as a line every LINE_SECONDS."""
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
@@ -20,7 +28,8 @@ class Lines(tqdm):
 
 def progress_bar(total: int, unit: str, hidden: bool = False, **options: Any) -> tqdm:
     """Return a progress bar of tqdm on stderr; options: more of tqdm's."""
+    options["miniters"] = 1  # each update looks at the time
     if sys.stderr.isatty() or hidden:
-        return tqdm(total=total, unit=unit, disable=hidden, **options)
+        return Bar(total=total, unit=unit, disable=hidden, **options)
     every: dict[str, Any] = {"delay": LINE_SECONDS, "mininterval": LINE_SECONDS, "maxinterval": LINE_SECONDS}
     return Lines(total=total, unit=unit, bar_format=LINE, **{**options, **every, "leave": False})

@@ -5,17 +5,17 @@ python -m cloning.browse.analyse RECORDING steering model.pt    # the model's st
 python -m cloning.browse.analyse RECORDING replay model.pt 1    # a drive with the model as the driver, at 1 m
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("analyse")
+
 import argparse
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("analyse")
 
 import numpy as np
 

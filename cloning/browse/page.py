@@ -49,6 +49,10 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
         # Its methods work in threads, so that others are answered while a long log is read.
         return eventlet.tpool.Proxy(library[identifier])
 
+    @app.errorhandler(RecursionError)
+    def nested(_: RecursionError) -> tuple[dict[str, str], int]:
+        return {"message": "the request's JSON is nested too deeply"}, 400
+
     @app.errorhandler(UserError)
     @app.errorhandler(OSError)
     def explain(error: UserError | OSError) -> tuple[dict[str, str], int]:
@@ -185,7 +189,7 @@ def cuts() -> list[Cut]:
             raise TypeError
         for each in body:
             "".join(each.values()).encode(**BYTES)
-    except (AttributeError, RecursionError, TypeError, UnicodeEncodeError):  # nested too deeply; no texts; half of one
+    except (AttributeError, TypeError, UnicodeEncodeError):  # no texts; half of one
         flask.abort(400, "Cuts are a list of JSON objects with the texts first, last and reason.")
     return [Cut(**each) for each in body]
 

@@ -68,9 +68,9 @@ def main() -> int:
         elif is_tub:
             samples = read_tub(source, arguments.camera, notes)
         else:
-            with program.loading():
-                from cloning.lerobot.dataset import write_data_set
-                from cloning.lerobot.reader import read_data_set
+            from cloning.lerobot.dataset import write_data_set
+            from cloning.lerobot.reader import read_data_set
+
             if not is_data_set:
                 recordings = [check_images(read_recording(folder)) for folder in find_folders(arguments.source)]
                 for recording in recordings:

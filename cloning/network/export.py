@@ -39,10 +39,9 @@ def export(network: Network, path: Path) -> None:
     Raises UserError without the libraries for it, ModelError if the file steers differently, OSError.
     """
     try:
-        with program.loading():
-            import onnx
-            import onnxruntime
-            import onnxscript  # noqa: F401  # torch's exporter needs it, and says so less clearly
+        import onnx
+        import onnxruntime
+        import onnxscript  # noqa: F401  # torch's exporter needs it, and says so less clearly
     except ImportError as error:
         raise UserError(f"{error}; pip install onnx onnxscript onnxruntime") from None
     frames = check_frames()
@@ -63,7 +62,7 @@ def export(network: Network, path: Path) -> None:
 def onnx_program(network: nn.Module, images: torch.Tensor, **options: Any) -> torch.onnx.ONNXProgram:
     """Return a network as an ONNX program, quietly; images: an example of its input; options: more of torch's."""
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports its steps as warnings
-    with program.loading(), warnings.catch_warnings():  # torch's exporter loads more
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 warns of its own code
         exported = torch.onnx.export(network, (images,), dynamo=True, opset_version=OPSET, verbose=False, **options)
     assert exported, "torch returns the program with dynamo=True"

@@ -9,6 +9,7 @@ import os
 import queue
 import re
 import threading
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -124,6 +125,7 @@ class SessionFolder:
         """jobs: the queue of the thread that writes the frames."""
         self.path, self._queue = path, jobs
         self.saved, self.lost, self.error = 0, 0, ""
+        self._booted = datetime.now(UTC) - timedelta(seconds=time.monotonic())  # the clock may be set while it drives
         self._last = datetime.min.replace(tzinfo=UTC)  # time in the last frame's name
         self._zero: datetime | None = None  # of the simulator's clock
         self._simulated = 0.0  # s, of the last frame
@@ -134,7 +136,7 @@ class SessionFolder:
         driven: the answer's steering and throttle, -1..1, and the frame's speed, mph; simulated: seconds by the
         simulator's own clock, 0 to 1e6, if it tells them.
         """
-        now = datetime.now(UTC)
+        now = self._booted + timedelta(seconds=time.monotonic())
         if simulated is not None:
             if self._zero is None or simulated < self._simulated:  # its first frame, or it has begun anew
                 self._zero = max(now, self._last) - timedelta(seconds=simulated)

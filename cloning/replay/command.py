@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import cv2
 
-from cloning.base import program
 from cloning.base.outputs import check_folders, run_all, write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.recordings.log import Recording, find_folders
@@ -97,9 +96,8 @@ def run(options: Options) -> None:
 def _driver(options: Options) -> "ModelDriver | ServerDriver":
     """Return the driver; each needs a library of its own, PyTorch or wsproto. Raises ModelError."""
     if options.model:
-        with program.loading():
-            from cloning.network.compute import one_thread
-            from cloning.replay.model_driver import ModelDriver
+        from cloning.network.compute import one_thread
+        from cloning.replay.model_driver import ModelDriver
 
         one_thread()  # other drives run at the same time
         return ModelDriver(options.model)

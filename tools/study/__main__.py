@@ -13,6 +13,11 @@ The folder then holds study.csv, a row for each network, study.md with the rank 
 driving, and pictures. An interrupted study continues when it is started again with the same options.
 """
 
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("study")  # also while the libraries below are loaded
+
 import argparse
 import json
 import multiprocessing
@@ -21,11 +26,6 @@ import signal
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("study")  # also while the libraries below are loaded
 
 from cloning.base.arguments import number
 from cloning.base.cores import threads
