@@ -24,7 +24,7 @@ from tools.simulator_client import Simulator, telemetry
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory and open files are read from /proc")
 
-SECONDS = 0.3  # of each attack; `python -m tools.attack` takes longer, and measures the round trips too
+SECONDS = 0.5  # of each attack; `python -m tools.attack` takes longer, and measures the round trips too
 
 
 @pytest.fixture(scope="module")

@@ -264,7 +264,7 @@ def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):
     assert "lane's centre unknown in 60 rows from center_" in done.stdout
     assert "2 m, from the recorded driver's path: autonomy" in done.stdout and "0.0% of the rows" in done.stdout
     limits = list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"])
-    assert limits == ["2", "1"], "a limit given twice is driven once"
+    assert limits == ["2", "1"], "one given twice counts once"
     assert film_frames(tmp_path / "x.mp4") == 60, "one drive writes the film"
 
 
