@@ -1,5 +1,6 @@
 """Fixtures that several files of tests share."""
 
+import functools
 import os
 import shutil
 import signal
@@ -17,10 +18,15 @@ from rendered import render_frame, render_recording
 
 from cloning.network.network import Network, load_model, save_model
 from cloning.recordings.images import decode
+from simulator import scenery
 
 
 def pytest_configure():
-    """Ctrl-C reaches the commands that tests start, even if the tests run in a shell's background, which ignores it."""
+    """Ctrl-C reaches the commands that tests start, even if the tests run in a shell's background, which ignores it.
+
+    Here PyTorch computes in one thread: those of several processes would wait for each other.
+    """
+    torch.set_num_threads(1)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -44,6 +50,15 @@ def shared_cache(tmp_path_factory):
     """Fixtures that several tests share write no checked images into the user's cache folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def built_once():
+    """The scenery of a track that has a name is built once in a process; nothing changes it."""
+    build, once = scenery.build, functools.lru_cache(8)(scenery.build)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenery, "build", lambda road, look=0: (once if isinstance(road, str) else build)(road, look))
         yield
 
 
@@ -104,7 +119,6 @@ def jpegs() -> list[bytes]:
 @pytest.fixture(scope="session")
 def steering(model_file, jpegs) -> list[np.float32]:
     """The network's steering for the same JPEGs, without drive.py."""
-    torch.set_num_threads(1)
     network = load_model(model_file)
     with torch.inference_mode():
         return [network(torch.from_numpy(decode(jpeg))[None])[0].clamp(-1, 1).numpy()[()] for jpeg in jpegs]

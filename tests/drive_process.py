@@ -52,8 +52,7 @@ class Process:
     """A drive.py process; first: Python code to run before it."""
 
     def __init__(self, *arguments, port=0, cwd=None, first=""):
-        start = subprocess.Popen if first else warm.Popen  # the warm process has loaded the libraries already
-        self.process: warm.Process = start(
+        self.process: warm.Process = warm.Popen(
             [*script("drive.py", first), *map(str, arguments), "--port", str(port)],
             cwd=cwd,
             env={**os.environ, **HERE},

@@ -25,10 +25,15 @@ def test_numbers_in_their_range_are_read():
 
 
 @pytest.mark.parametrize(
-    "option", ["--laps=0", "--laps=1e18", "--port=0", "--port=-1", "--port=70000", "--host=", "--host= ", "--wait=-1"]
+    "command",
+    [
+        *("drive --laps=0", "drive --laps=1e18", "drive --port=0", "drive --port=-1", "drive --port=70000"),
+        *("drive --host=", "drive --wait=-1", "record x --speed=40", "record x --seed=-1"),
+    ],
 )
-def test_the_simulator_refuses_it_before_it_connects(option, capsys):
+def test_the_simulator_refuses_it_before_it_begins(command, capsys):
     with pytest.raises(SystemExit) as exited:
-        parse_arguments(["drive", option])
+        parse_arguments(command.split(" "))
+    option = command.split(" ")[-1]
     assert exited.value.code == 2
     assert f"argument {option.partition('=')[0]}: " in capsys.readouterr().err

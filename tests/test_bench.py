@@ -2,16 +2,20 @@
 
 import json
 import re
+from dataclasses import replace
 
 from drive_process import warm_python
 
+import model
 from cloning.base.program import DONE, INCOMPLETE
 from cloning.network.network import Network
 from tools import bench_simulator, bench_training, speedrun
 
 
-def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording, capsys):
-    assert bench_training.main([str(sample_recording), "--part", "ab", "--samples", "2370"]) == DONE
+def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording, capsys, monkeypatch):
+    monkeypatch.setattr(model, "REPORT", replace(model.REPORT, batch_size=8))
+    monkeypatch.setattr(bench_training, "BATCH_IMAGES", 30)
+    assert bench_training.main([str(sample_recording), "--part", "ab", "--samples", "150"]) == DONE
     measured = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert set(measured["rates"]) == {"a", "b"} and min(measured["rates"].values()) > 0
 

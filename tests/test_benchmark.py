@@ -180,8 +180,8 @@ def test_the_command_scores_in_another_process_what_is_driven_here(model_file, t
     words = [str(model_file), "--quick", "--folder", str(tmp_path), "--processes", "1"]
     assert __main__.main(["benchmark", *words]) == DONE
     printed, found = capsys.readouterr().out, json.loads((tmp_path / "benchmark.json").read_text(encoding="utf-8"))
-    here = [scores.driven(task, drive(str(model_file), task)) for task in TINY]
-    assert found["drives"] == json.loads(json.dumps(here))
+    here = [scores.driven(task, drive(str(model_file), task)) for task in TINY[::4]]
+    assert len(found["drives"]) == len(TINY) and found["drives"][::4] == json.loads(json.dumps(here))
     assert printed.splitlines()[-1] == scores.line("model", found) and "replays: not run" in printed
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count("data:video/mp4") == 1 and "drove differently" not in page

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import warm
 from commands import HERE, ROOT
 from drive_process import STOP, found, script, serving
 
@@ -100,20 +101,20 @@ def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, stee
         assert process.stop() == 0
     assert len(list(folder.glob("*.jpg"))) == 8
     command = [*script("video.py", ELSEWHERE), str(folder), "--overlay", str(model_file)]
-    film = subprocess.run(command, env={**os.environ, **HERE}, capture_output=True, text=True, timeout=120)
+    film = warm.run(command, env={**os.environ, **HERE}, capture_output=True, text=True, timeout=120)
     assert film.returncode == 0 and "run1.mp4: 8 frames" in film.stdout, film.stderr
 
 
 def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path):
     with serving(model_file, "run1", cwd=tmp_path) as process, Simulator(process.port) as simulator:
         simulator.open()
-        for n in range(200):
+        for n in range(60):
             simulator.drive(telemetry(jpegs[n % 8]))
         simulator.drive({})
         assert process.stop() == 0
-    assert process.lines[-1] == "drive.py: session ended: 200 frames driven, 1 unusable; driven frames saved in run1\n"
+    assert process.lines[-1] == "drive.py: session ended: 60 frames driven, 1 unusable; driven frames saved in run1\n"
     saved = sorted((tmp_path / "run1").glob("*.jpg"))
-    assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(200)]
+    assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(60)]
     assert all(re.fullmatch(r"\d{4}(_\d\d){5}_\d{3}\.jpg", path.name) for path in saved)
 
 
@@ -130,13 +131,13 @@ def test_a_terminal_that_nobody_reads_and_requests_that_fill_it_stop_no_car(mode
         try:
             assert process.stderr
             port = int(found(r"Listening on [\d.]+:(\d+)", "".join(process.stderr.readline() for _ in range(3))))
-            for _ in range(3000):
+            for _ in range(1000):
                 with socket.create_connection(("127.0.0.1", port), 10) as client:
                     client.sendall(b"G\r\n\r\n")
                     client.recv(10)
             with Simulator(port) as simulator:
                 simulator.open()
-                for _ in range(1000):
+                for _ in range(300):
                     with Simulator(port) as other:
                         other.open()
                         other.drive({})  # a warning of its own session, and a line about its end

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scenes import recorded
 from torch import nn
 
 from cloning.base.errors import ModelError
@@ -21,7 +22,6 @@ from cloning.network.network import SHIPPED_MODEL, Network, load_model, save_mod
 from cloning.recordings.images import decode
 from cloning.road.track import Track
 from cloning.training.pieces import Batch, SquaredErrors
-from simulator.record import record
 
 REPORT = """
 lambda_1 (Lambda)                (None, 160, 320, 3)   0           lambda_input_1[0][0]
@@ -376,7 +376,7 @@ def test_code_in_a_model_file_is_not_run(tmp_path):
 @pytest.mark.parametrize(("track", "wrong"), [("lake", 0), ("jungle", 10)])
 def test_the_shipped_network_steers_back_to_the_centre(track, wrong, tmp_path):
     """The side cameras see the road as a car does that is 0.8 m off: further right from the left, and vice versa."""
-    record(tmp_path / track, Track(track), 0.1)
+    recorded(tmp_path / track, Track(track), 0.1, 30, seed=0)
     network = load_model(SHIPPED_MODEL)
     centre, left, right = (
         np.array([steer(network, decode(path.read_bytes())) for path in sorted(tmp_path.glob(f"*/IMG/{camera}_*.jpg"))])

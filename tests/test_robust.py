@@ -1,14 +1,13 @@
 """Recovery steering against geometry, warped frames against a rendered plane, and `model.py --robust`."""
 
 import shutil
-import sys
 from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
-from commands import ROOT, SHORT, finished_run, run_here, run_model, same, started_run, weights
+from commands import SHORT, finished_run, run_here, same, started_run, weights
 from rendered import render_recording, without_files
 
 import model
@@ -274,17 +273,6 @@ def test_validation_counts_centre_images_and_other_poses_alike(sample_recording,
         assert both == pytest.approx((plain + run.validate()[0]) / 2, rel=1e-6)
     assert not np.allclose(labels, other_labels)
     assert not np.array_equal(center(np.arange(3)), warped(np.arange(3)))
-
-
-def test_a_missing_lane_network_is_named(sample_recording, tmp_path):
-    for name in ("cloning", "model.py"):
-        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-        copy(ROOT / name, tmp_path / name)
-    (tmp_path / "cloning" / "lane" / "lane.pt").unlink()
-    done = run_model(sample_recording, *OPTIONS, command=[sys.executable, "model.py"], cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("model.py: ") and "lane.pt: no such file" in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_drives_too_short_are_named(tmp_path):

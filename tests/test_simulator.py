@@ -1,6 +1,5 @@
 """The stand-in simulator's roads, car, expert and recordings, against figures measured on the real one."""
 
-import contextlib
 import csv
 import hashlib
 import math
@@ -333,23 +332,6 @@ def test_a_frame_depends_on_the_pose_alone():
     frames = [eyes.frames(pose) for pose in poses]
     for pose, frame in list(zip(poses, frames, strict=True))[::-1]:
         assert np.array_equal(eyes.frames(pose), frame)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["record"], "folder"),
-        (["record", "x", "--speed", "40"], "at least 1 and at most 30"),
-        (["record", "x", "--laps", "0"], "at least 1e-06"),
-        (["record", "x", "--track", "moon"], "moon"),
-        (["fly"], "fly"),
-        (["record", "x", "--seed", "-1"], "at least 0"),
-    ],
-)
-def test_bad_arguments_are_reported(arguments, message, capsys):
-    with contextlib.suppress(SystemExit):  # argparse's, with the same status
-        assert main(arguments) == 2
-    assert message in capsys.readouterr().err
 
 
 def test_an_existing_recording_is_kept(tmp_path, capsys):

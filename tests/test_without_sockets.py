@@ -17,7 +17,8 @@ sys.meta_path.insert(0, TakenAway())
 import cloning.network.network, cloning.network.attention, cloning.network.compute
 import model, simulator.__main__ as simulator
 recording, trained, *short = sys.argv[1:]
-assert model.main([recording, *short, "--output", trained]) == 0
+assert model.main([recording, "--robust", *short, "--output", trained]) == 0
+assert not {"torch._dynamo", "sympy"} & set(sys.modules)  # torch's own optimizers load its compiler, for seconds
 assert simulator.main(["replay", recording, "--model", trained]) in (0, 1)
 """
 
