@@ -45,7 +45,7 @@ from tools import lane_accuracy, lane_frames, likeness, train_lane
 from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
-SHORT_TRAINING = ("--looks", "1", "--roads", "1", "--frames", "3", "--steps", "2")
+SHORT_TRAINING = ("--looks", "1", "--roads", "1", "--mountains", "1", "--frames", "3", "--steps", "2")
 UNSEEN = 1003  # a look that the network was not trained on
 
 
