@@ -125,7 +125,7 @@ def run_search(
 ) -> tuple[dict[str, Any], list[Driven]]:
     """Search, print each failure and write its file, then drive it again; return figures, and the failures.
 
-    degrees_between: of `diversity`.
+    degrees_between_failures, degrees_between_roads: their `diversity`.
     """
     begin, first_failure = time.perf_counter(), ""
     driven: list[Driven] = []

@@ -1,7 +1,7 @@
 """Measure how soon a network drives: from the start of model.py, with empty caches, to a lap without an intervention.
 
     python -m tools.speedrun data/lake-ccw data/lake-cw         # train on one, drive the other, and the reverse
-    python -m tools.speedrun --in-sample --limit 2.5 --autonomy 95 --images 40000 data/jungle data/jungle-shadows
+    python -m tools.speedrun --in-sample --limit 2.5 --autonomy 95 --images 40000 --learning-rate 4e-3 data/jungle …
 
 Each run trains with --robust and counts everything until its model is saved: loading the libraries, reading and
 checking the recordings, estimating the lane, training, validation, pictures. Then a replay drives with the model.

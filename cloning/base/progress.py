@@ -14,7 +14,7 @@ class Bar(tqdm):
     """A progress bar whose times do not change with the system's clock."""
 
     monitor_interval = 0  # tqdm's thread would compare them with the clock
-    _time = property(lambda _: time.monotonic, lambda _, clock: None)
+    _time = property(lambda _: time.monotonic, lambda _, clock: None)  # tqdm sets it to time.time
 
 
 class Lines(Bar):
