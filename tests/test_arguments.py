@@ -28,7 +28,8 @@ def test_numbers_in_their_range_are_read():
     "command",
     [
         *("drive --laps=0", "drive --laps=1e18", "drive --port=0", "drive --port=-1", "drive --port=70000"),
-        *("drive --host=", "drive --wait=-1", "record x --speed=40", "record x --seed=-1"),
+        *("drive --host=", "drive --host=\t", "drive --wait=-1"),
+        *("record x --laps=0", "record x --speed=40", "record x --seed=-1"),
     ],
 )
 def test_the_simulator_refuses_it_before_it_begins(command, capsys):

@@ -1,13 +1,11 @@
 """Disturbances where they are used: in drives, recordings, replays, other programs' episodes and Gymnasium."""
 
 import base64
-import functools
 import json
 
 import numpy as np
 import pytest
 from rendered import render_recording
-from scenes import Here, cameras
 from steer_server import STEER, Server
 
 from cloning.base.errors import SimulatorError
@@ -15,9 +13,7 @@ from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.replay import replay
 from cloning.road.disturbances import Disturbance, Disturber
-from simulator import record
 from simulator.__main__ import main
-from simulator.cameras import Cameras
 from simulator.dialects import Episodes, Stage
 from simulator.environment import Drive
 
@@ -56,13 +52,8 @@ def test_a_disturbed_drive_is_the_same_again(tmp_path):
     assert rain[0] != sent(tmp_path)[0]
 
 
-def test_a_recording_shows_the_disturbance_in_all_cameras_and_is_the_same_again(tmp_path, monkeypatch):
-    scene = cameras("lake", 0).scene
-    monkeypatch.setattr(record, "started_workers", Here)
-
+def test_a_recording_shows_the_disturbance_in_all_cameras_and_is_the_same_again(tmp_path):
     def recorded(name, *options):
-        anew = functools.cache(lambda view: Cameras(scene, disturbance=view[2], seed=view[3]))
-        monkeypatch.setattr(record, "_cameras", anew)
         assert main(["record", str(tmp_path / name), "--laps", "0.004", *options]) == 0
         recording = read_recording(tmp_path / name)
         return [[recording.path(row, camera).read_bytes() for camera in range(3)] for row in range(len(recording))]

@@ -137,7 +137,7 @@ def test_a_terminal_that_nobody_reads_and_requests_that_fill_it_stop_no_car(mode
                     client.recv(10)
             with Simulator(port) as simulator:
                 simulator.open()
-                for _ in range(300):
+                for _ in range(1000):
                     with Simulator(port) as other:
                         other.open()
                         other.drive({})  # a warning of its own session, and a line about its end

@@ -117,6 +117,21 @@ def test_driving_continues_after_other_messages(server, jpegs, steering, message
         assert np.float32(simulator.drive(telemetry(jpegs[1]))["steering_angle"]) == steering[1]
 
 
+def test_each_kind_of_unusable_frame_is_logged_once(server, jpegs):
+    begin = len(server.lines)
+    with Simulator(server.port) as simulator:
+        simulator.open()
+        simulator.drive(telemetry(jpegs[0]))
+        for _ in range(50):
+            simulator.drive({})
+            simulator.drive({**telemetry(jpegs[0]), "speed": "fast"})
+            simulator.drive(telemetry(jpegs[0][:3000]))
+    awaited(lambda: any("1 frames driven, 150 unusable" in line for line in server.lines[begin:]))
+    text = "".join(server.lines[begin:])
+    assert text.count("can't be used") == 6, "the first and the tenth of each"
+    assert all(reason in text for reason in ("speed is missing", "speed is not a number", "cut short"))
+
+
 def test_two_simulators_are_driven_independently(server, jpegs, steering):
     with Simulator(server.port) as slow, Simulator(server.port) as fast:
         slow.open()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scenes import recorded
 
 from cloning.road.generated import MARKINGS, generate
 from cloning.road.motion import MPH
@@ -73,7 +74,7 @@ def test_roads_are_closed_loops_of_600_to_1500_metres(roads, mountains):
 
 def test_roads_keep_away_from_themselves(roads, mountains):
     """Parts 50 m or more apart along the road leave room for two roads, and 2 m between them; none cross."""
-    for road in roads[:20] + mountains[:15]:
+    for road in roads[:40] + mountains:
         points, n = road.points[:, :2], len(road.points)
         apart = np.abs(np.arange(n)[:, None] - np.arange(n))
         apart = np.minimum(apart, n - apart)
@@ -139,9 +140,9 @@ def test_a_track_of_a_generated_road_lies_where_the_road_does(direction):
 
 
 @pytest.mark.parametrize("name", NO_ROADS)
-def test_a_road_that_does_not_exist_is_a_clear_error(name, capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize("command", [["record", "x"], ["drive"], ["window"]])
+def test_a_road_that_does_not_exist_is_a_clear_error(command, name, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    command = {"moon": ["drive"], "road-0": ["window"]}.get(name, ["record", "x"])
     assert simulator.main([*command, "--track", name]) == 2
     assert f"python: {name}: there is no such track; there are lake, jungle, road-1" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
@@ -161,6 +162,11 @@ def test_expert_drives_a_lap_of_a_generated_road(name, direction, tmp_path):
     assert report.lap_report(run)["track"] == name
     report.write_picture(tmp_path / "map.png", run)
     assert (tmp_path / "map.png").stat().st_size > 10_000
+
+
+def test_records_a_generated_road(tmp_path):
+    recording, _ = recorded(tmp_path / "a", Track("road-2"), 0.005, 30)
+    assert len(recording) > 10
 
 
 @pytest.mark.parametrize("number", range(1, 6))

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,15 @@ def test_roads_are_laid_driven_to_their_end_and_set_back():
     assert number(begun, "angle6") == pytest.approx(357.9, abs=0.1)  # degrees from north to the right
     speeds = [number(data, "speed") for data in program.data]
     assert 5 < max(speeds) <= 13.5  # m/s: 30 mph
+
+
+def test_the_same_program_gets_the_same_drive_again():
+    seen = []
+    for _ in range(2):
+        with Program(RoadTests([0.0])) as program:
+            join("roads", program)
+        seen.append([data for data, before in pairwise(program.data[::-1]) if data["track"] and data != before])
+    assert seen[0] == seen[1]
 
 
 def test_a_driver_in_another_thread_is_waited_for_however_slow_it_is():

@@ -215,7 +215,7 @@ def test_driving_killed_anywhere(driving, jpegs):
     trial.restore()
     points = trial.run(trial.command).points
     assert saved(trial.folder / "run1") == jpegs[:6]
-    for number in chosen(points, 3):
+    for number in chosen(points, 4):
         trial.restore()
         assert trial.run(trial.command, kill=number).status == KILLED
         check_whole(trial.folder)
@@ -230,7 +230,7 @@ def test_driving_killed_anywhere(driving, jpegs):
         assert trial.run(trial.command).status == 0
         assert saved(trial.folder / "run1") == jpegs[:6]
         assert not list((trial.folder / "run1").glob(".*"))
-    print(f"{len(chosen(points, 3))} of {len(points)} points")
+    print(f"{len(chosen(points, 4))} of {len(points)} points")
 
 
 def test_driving_on_a_full_disk(driving, jpegs):
@@ -300,7 +300,7 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
         assert len(read_recording(trial.folder / "lake")) in (38, 33)
 
     trial.companion, trial.checked = browser.post, checked
-    trial.killed_everywhere(3)
+    trial.killed_everywhere(4)
     _, points = trial.whole_run()
     for number in writes(points, 10):
         trial.restore()

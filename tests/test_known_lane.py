@@ -1,7 +1,9 @@
 """lane.csv: what the stand-in simulator writes into it, who reads it, and what is wrong with it."""
 
+import os
 import re
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -89,6 +91,14 @@ def test_training_says_that_it_is_read_or_why_not(lane, tmp_path):
     lane.mkdir()
     done = run_here(lane.parent, *short)
     assert done.returncode == 2 and "lane.csv: not a regular file; make it a readable file, or delete it" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among files")
+def test_a_named_pipe_is_refused_and_not_waited_for(lane):
+    lane.unlink()
+    os.mkfifo(lane)
+    with pytest.raises(RecordingError, match=r"lane.csv: not a regular file; make it a readable file, or delete it"):
+        known(lane.parent)
 
 
 @pytest.mark.parametrize("lines", ["", "center_of_another_drive.jpg,0,0\n"])

@@ -164,12 +164,28 @@ def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_rec
     assert run.generator.observations is training and run.validation is validation
 
 
-def test_every_recording_under_data_is_the_default(linked, tmp_path):
+def test_every_recording_under_data_is_the_default_and_no_run_changes_a_tracked_file(sample_recording, tmp_path):
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "core.autocrlf=false"]
+    if not shutil.which("git"):
+        pytest.skip("git is not installed")
+    for name in (".gitignore", "model.py", "data/README.md"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    for name in ("diagnostic_images/report", "cloning"):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    for command in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "all"]):
+        subprocess.run([*git, *command], cwd=tmp_path, check=True)
+    shutil.copytree(sample_recording, tmp_path / "data" / "lake")
     render_recording(tmp_path / "data" / "turn-repetitive", rows=20, seed=1)
-    done = run_here(*SHORT, "--epochs", 1, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    damaged = next((tmp_path / "data" / "lake" / "IMG").glob("left*"))
+    damaged.write_bytes(b"")  # so that rejected_rows.csv is written, too
+    for _ in range(2):
+        done = run_here(*SHORT, "--epochs", 1, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
     assert next(line.split()[1] for line in done.stdout.splitlines() if line.startswith("total")) == "80"
-    assert (tmp_path / "model.pt").exists()
+    assert (tmp_path / "model-previous.pt").exists() and (tmp_path / "rejected_rows.csv").exists()
+    status = subprocess.run([*git, "status", "--porcelain"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert status.stdout == ""
 
 
 def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_path):
