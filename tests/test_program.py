@@ -159,7 +159,7 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
         ["drive.py", "nowhere.pt"],
         ["video.py", "nowhere"],
         ["-m", "simulator", "replay", "nowhere"],
-        ["-m", "tools.scoreboard", "nowhere.pt", "--name", "x", "--recordings", "nowhere"],
+        ["-m", "tools.speedrun", "nowhere"],
     ],
 )
 def test_an_error_of_the_user_is_a_line_and_status_2(tmp_path, command):

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("cloning", "simulator", "tools")
 SCRIPTS = ("model.py", "drive.py", "video.py")
 WRITTEN = [*ROOT.glob("*.md"), ROOT / "data" / "README.md", ROOT / "tools" / "experiments.md"]
-DOCUMENTS = [*WRITTEN, ROOT / "tools" / "scoreboard.md"]  # tools/scoreboard.py writes this one
+DOCUMENTS = [*WRITTEN, ROOT / "tools" / "scoreboard.md"]  # whose tables have long rows
 NOT_INSTALLED = {"distributed"}  # of the extra dask, whose test is skipped without it
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 WRONG_IMPORTS = {  # contract -> the files that break it, and with what import

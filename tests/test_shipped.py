@@ -136,6 +136,7 @@ def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path,
 def test_a_trained_network_is_measured(sample_recording, tmp_path, rendered, commands):
     out = tmp_path / "out"
     assert shipped.main([str(sample_recording), "--looks", "1", "--roads", "0", "--folder", str(out)]) == DONE
-    training, measuring = commands.run
-    assert training[training.index("--output") + 1] == measuring[2] == str(out / "model.pt")
-    assert measuring[:2] == ["-m", "tools.scoreboard"] and str(sample_recording) in measuring
+    training, replaying, driving = commands.run
+    assert training[training.index("--output") + 1] == driving[3] == str(out / "model.pt")
+    assert replaying[:6] == ["-m", "simulator", "replay", str(sample_recording), "--model", str(out / "model.pt")]
+    assert driving[:3] == ["-m", "simulator", "benchmark"]

@@ -1,1 +1,1 @@
-"""Tools: benchmarks, the scoreboard and the training of the lane network; run one with `python -m tools.NAME`."""
+"""Tools: benchmarks and the training of the lane network; run one with `python -m tools.NAME`."""

@@ -5,7 +5,8 @@
 
 Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
 The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Roads and
-looks 1 to 1000 are left to measure with, and so are these looks' shadowed twins: shipped/scoreboard.md has the results.
+looks 1 to 1000 are left to measure with, and so are these looks' shadowed twins: shipped/report.html tells how the
+network drives there, shipped/replays.json how it drives the real recordings.
 
 The network that comes with the project was made so; cloning/network/shipped.md, its model card, has the recordings and
 what came out.
@@ -53,9 +54,6 @@ RATE = 7.5  # rows a second, half of the simulator's: of so many images, more ro
 FAST = (
     8.5  # m/s² sideways in the jungle's fast laps, where the simulator's drivers reach 8: frames don't show the speed
 )
-# What is driven in the end: both tracks and ten generated roads that were not trained on, in looks with shadows that
-# were not either.
-MEASURED = ("--tracks", *ROADS, *(f"road-{k}" for k in range(1, 11)), "--looks", "own+10100")
 
 
 class Lap(NamedTuple):
@@ -69,7 +67,7 @@ class Lap(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The name of its recording, by which the scoreboard knows what a network was trained on."""
+        """The name of its recording."""
         fast = "" if self.lateral == LATERAL_ACCELERATION else "-fast"
         return f"{self.track}-{self.direction}-look{self.look}{fast}"
 
@@ -179,8 +177,11 @@ def main(argv: list[str] | None = None) -> int:
     status = python(ROOT / "model.py", *real, *rendered, "--output", model, *training).returncode
     if status != program.DONE:
         return status
-    board = ("--name", "shipped", "--speeds", 15, *MEASURED, "--table", options.folder / "scoreboard.md")
-    return python("-m", "tools.scoreboard", model, "--recordings", *options.recordings, *board).returncode
+    replays = (*options.recordings, "--model", model, "--report", options.folder / "replays.json")
+    status = python("-m", "simulator", "replay", *replays).returncode
+    if status != program.DONE:
+        return status
+    return python("-m", "simulator", "benchmark", model, "--quick", "--folder", options.folder).returncode
 
 
 if __name__ == "__main__":
