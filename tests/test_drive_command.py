@@ -131,13 +131,13 @@ def test_a_terminal_that_nobody_reads_and_requests_that_fill_it_stop_no_car(mode
         try:
             assert process.stderr
             port = int(found(r"Listening on [\d.]+:(\d+)", "".join(process.stderr.readline() for _ in range(3))))
-            for _ in range(1000):
+            for _ in range(500):
                 with socket.create_connection(("127.0.0.1", port), 10) as client:
                     client.sendall(b"G\r\n\r\n")
                     client.recv(10)
             with Simulator(port) as simulator:
                 simulator.open()
-                for _ in range(1000):
+                for _ in range(500):
                     with Simulator(port) as other:
                         other.open()
                         other.drive({})  # a warning of its own session, and a line about its end

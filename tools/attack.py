@@ -22,10 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.network.network import SHIPPED_MODEL
 from tools.attacks import Attack, all_attacks, frames
-from tools.command import ROOT, command_line, run_tool
+from tools.command import ROOT, run_tool
 from tools.server_process import ServerProcess
 from tools.simulator_client import Simulator, telemetry_message
 

@@ -36,7 +36,7 @@ import numpy as np
 import torch
 
 import model
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.frame import FRAME
 from cloning.network.compute import keep_freed_memory, threads
@@ -45,7 +45,7 @@ from cloning.road.track import Track
 from cloning.training.distributed import Ranks
 from cloning.training.options import Command, Process, Run
 from simulator.record import record
-from tools.command import command_line, head, python, row, run_tool
+from tools.command import head, python, row, run_tool
 
 BATCH_IMAGES = 474  # images in a batch of 128 observations, at 3.7 images each on average
 NAMES = {

@@ -1,4 +1,4 @@
-"""What the tools share: their command lines, how they end, commands in other processes, and tables in Markdown."""
+"""What the tools share: how they end, commands in other processes, and tables in Markdown."""
 
 import subprocess
 import sys
@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cloning.base import program
-from cloning.base.arguments import command_line as command_line  # re-exported
 from cloning.base.errors import UserError
 
 ROOT = Path(__file__).resolve().parent.parent

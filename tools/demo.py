@@ -22,11 +22,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from cloning.base.arguments import command_line
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError
 from cloning.network.network import SHIPPED_MODEL
 from cloning.report.content import lap_in_words
-from tools.command import ROOT, command_line, python, run_tool
+from tools.command import ROOT, python, run_tool
 from tools.server_process import ServerProcess
 from tools.shipped import Lap, render
 

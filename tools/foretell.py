@@ -27,7 +27,7 @@ from typing import NamedTuple, Self
 import numpy as np
 import torch
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.base.progress import progress_bar
@@ -57,7 +57,7 @@ from simulator.cameras import jpeg
 from simulator.driving import cameras_at
 from simulator.run import Run
 from simulator.workers import results, started_workers
-from tools.command import command_line, head, row, run_tool
+from tools.command import head, row, run_tool
 from tools.lane_frames import every_second_shadowed
 
 DISTURBED, HARD, ORDINARY = "disturbed, strength 5, 25 mph", "mountain roads, 25 mph", "ordinary roads, 15 mph"

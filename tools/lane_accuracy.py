@@ -17,7 +17,7 @@ import time
 
 import numpy as np
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.lane import marking
 from cloning.lane.follow import TrackFilter
 from cloning.lane.localise import estimate_lane_position, follow_line, line_deviations
@@ -38,7 +38,7 @@ from cloning.road.motion import stretches
 from cloning.road.track import ROADS, Track
 from simulator.car import STEP
 from simulator.record import record
-from tools.command import command_line, run_tool
+from tools.command import run_tool
 from tools.lane_frames import RenderedScene, render_all, shadowed
 
 UNSEEN_LOOKS = (1000, 1001, 1002)  # the network was not trained on them, nor on these roads

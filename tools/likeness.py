@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.errors import RecordingError
 from cloning.base.outputs import check_folders, write_output
 from cloning.lane.localise import localise_all
@@ -30,7 +30,7 @@ from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
 from simulator.world import Scene
-from tools.command import command_line, run_tool
+from tools.command import run_tool
 
 COMPARED_ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
 

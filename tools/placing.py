@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.table import Column, Table
 from cloning.lane.known import known_position
 from cloning.lane.localise import localise_recording, shipped_networks
@@ -30,7 +30,7 @@ from cloning.replay.views import StretchViews
 from cloning.road.motion import Stretch, stretch_rows, stretches
 from cloning.road.track import ROADS, Track
 from simulator.record import record
-from tools.command import command_line, head, row, run_tool
+from tools.command import head, row, run_tool
 from tools.lane_frames import shadowed
 
 SPACING = (500, 700)  # rows between two damages

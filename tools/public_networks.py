@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from cloning.base.arguments import command_line
 from cloning.base.cores import threads
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME
@@ -39,7 +40,7 @@ from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
 from simulator.driving import preprocessing
-from tools.command import command_line, run_tool
+from tools.command import run_tool
 
 CPU = torch.device("cpu")
 Rows = Sequence[tuple[Recording, int]]

@@ -21,6 +21,7 @@ import torch
 from PIL import Image
 
 import simulator.environment as environment
+from cloning.base.arguments import command_line
 from cloning.base.errors import UserError
 from cloning.base.outputs import check_folders, write_output
 from cloning.network.attention import visual_backprop
@@ -28,7 +29,7 @@ from cloning.network.network import SHIPPED_MODEL, Network, load_model
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.road.overlay import overlay
 from simulator.scenery.looks import SHADOWED
-from tools.command import ROOT, command_line, run_tool
+from tools.command import ROOT, run_tool
 
 FILM = ROOT / "diagnostic_images" / "report" / "driving.webp"
 CLIPS = (("lake", 0), ("jungle", 0), ("jungle", SHADOWED))  # track and look of each, one after the other

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.figure import png
 from cloning.base.outputs import write_json, write_output
@@ -48,7 +48,7 @@ from cloning.road.track import Track
 from simulator import driving
 from simulator.run import Run
 from simulator.workers import add_workers, started_workers
-from tools.command import command_line, head, row, run_tool
+from tools.command import head, row, run_tool
 
 TRACKS, SPEEDS, DIRECTIONS = ("lake", "jungle"), (30.0, 15.0), ("ccw", "cw")  # mph on each
 STAND_IN, REPLAYS = "stand-in simulator", f"replays at {LIMITS[-1]:g} m"

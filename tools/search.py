@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.errors import TrackError, UserError
 from cloning.base.figure import png
 from cloning.base.outputs import write_json, write_output
@@ -40,7 +40,7 @@ from cloning.road.points import LAND, MARKING, MAX_GRADE, spline_road
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.driving import Conditions, Drive, check_driver, drive
 from simulator.workers import add_workers, results, started_workers
-from tools.command import command_line, head, row, run_tool
+from tools.command import head, row, run_tool
 
 SEARCHES = ("random", "evolution")
 NODES = (7, 8)  # of a road, with these lengths in m between them, as in maxitwo's and MultiSim's generators

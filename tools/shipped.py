@@ -24,7 +24,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError
 from cloning.recordings.excluded import EXCLUDED
@@ -40,7 +40,7 @@ from simulator.run import Run
 from simulator.scenery.looks import SHADOWED
 from simulator.workers import started_workers
 from simulator.world import Scene
-from tools.command import ROOT, command_line, python, run_tool
+from tools.command import ROOT, python, run_tool
 from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 
 REPEATS = 16  # how often each real recording counts, because the rendered ones are many

@@ -24,13 +24,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import ReferenceLine, drive, load_recording, reference_lines
 from cloning.road.autonomy import autonomy
-from tools.command import ROOT, command_line, head, python, row, run_tool
+from tools.command import ROOT, head, python, row, run_tool
 
 IMAGES, BATCH, RATE = 4_500, 8, 8e-3  # enough for one lap of the lake; tools/experiments.md has what was tried
 

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 import torch
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.lane.reader import (
     DIRECTION_TO_STRIP,
     DISTANCES_AHEAD,
@@ -44,7 +44,7 @@ from cloning.network.compute import choose_precision, in_precision, one_thread
 from cloning.recordings.log import find_folders, read_recording
 from cloning.road.camera import LEVEL_CAMERA_MATRIX, camera_position, homographies
 from cloning.road.motion import MAX_GAP, Stretch, components, forward_vector
-from tools.command import command_line, run_tool
+from tools.command import run_tool
 from tools.lane_frames import render_all, scenes
 
 WARP_DEVIATION = (0.9, 3.0)  # m and degrees: standard deviations of the poses to which real frames are warped

@@ -74,11 +74,11 @@ class TrackFilter:
     def predict(self, row: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the state one row later, (3,), and its Jacobian by this one, (3, 3)."""
         s, right, yaw = state
-        turn, slip, bend = self.turn[row], self.slip[row], self.curvature(s)
-        step = self.step[row] / np.hypot(1, self.track.at(s).grade)  # s is the distance on the map
+        turn, slip, bend, here = self.turn[row], self.slip[row], self.curvature(s), self.track.at(s)
+        step = self.step[row] / np.hypot(1, here.grade)  # s is the distance on the map
         slower = max(0.3, 1 - bend * right)  # on the inside of a bend the centre line is the shorter path
         along = step * np.cos(yaw + turn / 2 + slip) / slower
-        road_turn = wrap_angle(self.track.at(s).heading - self.track.at(s + along).heading)
+        road_turn = wrap_angle(here.heading - self.track.at(s + along).heading)
         jacobian = np.array(
             [
                 [1, along * bend / slower, -step * np.sin(yaw)],

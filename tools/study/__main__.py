@@ -27,7 +27,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolEx
 from functools import partial
 from pathlib import Path
 
-from cloning.base.arguments import number
+from cloning.base.arguments import command_line, number
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import csv_bytes
@@ -35,7 +35,7 @@ from cloning.base.outputs import write_json, write_output
 from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record
-from tools.command import command_line, run_tool
+from tools.command import run_tool
 from tools.study.figures import Row, correlation_picture, recovery_picture, report, row
 from tools.study.measures import measure
 from tools.study.networks import EPOCH_IMAGES, RENDERED, TRACKS, Variant, plan
