@@ -104,8 +104,7 @@ def test_stretches_too_short_for_a_window_are_placed_together_or_if_long_enough_
     assert np.isnan(placed(other.take(short), seen[short])).all()
 
 
-@pytest.mark.parametrize("rows", [70, 350])
-@pytest.mark.parametrize("pause", [PAUSE, 2.0])
+@pytest.mark.parametrize(("rows", "pause"), [(350, PAUSE), (70, 2.0)])
 def test_no_row_of_another_road_is_taken_for_the_track(lake, rows, pause):
     """It begins and ends in the midst of a recording of the track."""
     track = Track("road-9")

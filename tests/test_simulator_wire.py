@@ -245,7 +245,7 @@ def test_drives_with_other_peoples_servers(name, tmp_path, capsys, monkeypatch):
             version, port = server.stdout.readline().split()
             assert version[0] in (name[-1], "f")
             for realtime in (False, True):
-                client = drive(SimpleNamespace(port=int(port)), laps=0.02, realtime=realtime)
+                client = drive(SimpleNamespace(port=int(port)), laps=0.01 if realtime else 0.02, realtime=realtime)
                 assert client.reconnections == client.unusable == 0 and client.frames > 20
                 assert ("the real simulator would get no answer" in capsys.readouterr().err) is asks
         finally:

@@ -121,12 +121,6 @@ class PointRoad:
         return hash(self._content())
 
 
-def road_number(name: str) -> int | None:
-    """Return the number in the name of a generated road, as road-7 or mountain-7, or None if it is no such name."""
-    match = NAME.fullmatch(name)
-    return int(match[2]) if match else None
-
-
 @functools.lru_cache(maxsize=16)
 def generate(name: str) -> PointRoad | None:
     """Return the generated road of this name: counter-clockwise, with points about 2 m apart; None if there is none.
