@@ -301,7 +301,12 @@ class TrainingRun:
         while len(history) < self.recipe.epochs:
             self.epoch()
             started = time.monotonic()
-            figures = self.validate()
+            try:
+                with self.stop.at_once(alone=self.ranks.world == 1):
+                    figures = self.validate()
+            except Interrupted:
+                self.save()
+                raise
             self.check_finite(figures[0])
             progress.seconds += time.monotonic() - started
             is_best = progress.finish_epoch(*figures, self.recipe.best_by)

@@ -4,8 +4,6 @@
 has the scripts.
 """
 
-import functools
-import importlib
 import sys
 
 from cloning.base import program
@@ -28,8 +26,10 @@ USAGE = "usage: behavioral-cloning COMMAND …\n\n" + "\n".join(
 
 def start(module: str) -> int | None:
     """Run a module's `main`; return its exit status."""
+    from importlib import import_module  # here, so that nothing delays `end_on_interrupt`
+
     try:
-        main = importlib.import_module(module).main
+        main = import_module(module).main
         return main()
     except ModuleNotFoundError as error:  # of an extra of pyproject.toml
         print(f"behavioral-cloning: {program.missing_library(error)}", file=sys.stderr)
@@ -45,4 +45,4 @@ def main() -> None:
     sys.argv = [f"behavioral-cloning {name}", *sys.argv[1 if name == "replay" else 2 :]]
     program.installed = {clone: f"behavioral-cloning {command}" for command, (_, clone, _) in COMMANDS.items()}
     program.end_on_interrupt(f"behavioral-cloning {name}")
-    program.run(functools.partial(start, COMMANDS[name][0]))
+    program.run(lambda: start(COMMANDS[name][0]))

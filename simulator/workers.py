@@ -16,10 +16,10 @@ from contextlib import ExitStack, contextmanager
 from multiprocessing.context import BaseContext
 from typing import TypeVar
 
-from cloning.base import program
 from cloning.base.arguments import number
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError, UserError
+from cloning.base.processes import interrupt_deferred
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -47,10 +47,10 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
             yield _dask(scheduler, stack)
             return
         others = multiprocessing.active_children()
-        with program.interrupt_deferred():
+        with interrupt_deferred():
             pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
         try:
-            with program.interrupt_deferred():
+            with interrupt_deferred():
                 for _ in range(processes):  # each starts a process
                     pool.submit(int)
             yield pool

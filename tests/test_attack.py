@@ -1,7 +1,9 @@
 """drive.py under attack: every telemetry of a car beside it is answered, memory is bounded, and a new car can come."""
 
 import json
+import os
 import socket
+import subprocess
 import sys
 import time
 import urllib.error
@@ -11,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import warm
 from drive_process import serving
 
 import drive
@@ -56,6 +59,33 @@ def test_the_attacks_find_a_fault(server, jpegs, expected):
         "new car",
         "left open",
     ]
+
+
+INTERRUPTED = """
+import os, signal, time
+from types import SimpleNamespace
+from cloning.base import program
+program.end_on_interrupt("test")
+from tools import attack
+
+def strike(port, until):
+    print(os.getpid(), flush=True)
+    os.killpg(0, signal.SIGINT)
+    time.sleep(60)
+
+attack.Car = lambda *_: SimpleNamespace(drive=lambda until: time.sleep(60))
+server = SimpleNamespace(port=0, forget_peak=int, memory=int, open_files=int)
+program.run(lambda: attack.run(strike, server, [], [], 60))
+"""
+
+
+def test_ctrl_c_ends_an_attack_too():
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = warm.Popen([sys.executable, "-c", INTERRUPTED], text=True, start_new_session=True, **pipes)
+    attacker, errors = process.communicate(timeout=30)
+    assert (process.returncode, errors) == (130, "test: stopped\n")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(attacker), 0)
 
 
 def test_a_client_that_reads_nothing_is_disconnected(server):

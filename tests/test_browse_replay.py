@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 
 import cv2
 import numpy as np
@@ -161,6 +162,19 @@ def test_a_run_is_running_while_its_folder_is_claimed_and_then_stopped(tmp_path)
     holder.communicate()
     found = runs.overview(files)
     assert found["state"] == "stopped" and found["left"] is None
+
+
+@pytest.mark.parametrize("hours", [-1, 1])
+def test_a_changed_clock_changes_no_age_of_a_run(tmp_path, monkeypatch, hours):
+    files, now = written_run(tmp_path, finished=1, images=500), time.time
+    os.utime(files.arguments, (now() - 60,) * 2)
+    os.utime(files.progress, (now() - 40,) * 2)
+    assert 40 <= runs.overview(files)["age"] < 50
+    monkeypatch.setattr(time, "time", lambda: now() + 3600 * hours)
+    assert 40 <= runs.overview(files)["age"] < 50
+    os.utime(files.progress, (time.time(),) * 2)
+    monkeypatch.undo()
+    assert 0 <= runs.overview(files)["age"] < 10
 
 
 def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):

@@ -56,6 +56,13 @@ def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, sample_recording, progr
     assert done.stderr.startswith(f"{program}: stopped") and done.stderr.count("\n") == 1
 
 
+def test_no_library_is_loaded_before_ctrl_c_has_its_handler():
+    """Each millisecond there is one in which Ctrl-C would give a traceback."""
+    code = "import sys; before = {*sys.modules}; from cloning.base import program; print(*{*sys.modules} - before)"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert {*loaded.split()} <= {"cloning", "cloning.base", "cloning.base.program", "__future__", "atexit"}
+
+
 LOADING_MAIN = """
 from cloning.base import program
 program.end_on_interrupt("test")
@@ -255,8 +262,8 @@ def test_a_command_whose_last_lines_cannot_be_printed_says_so():
 def test_ctrl_c_stays_deferred_when_the_first_process_starts():
     """multiprocessing starts a helper then, and unblocks signals, and Ctrl-C ended the one that starts the others."""
     code = (
-        "import multiprocessing, signal; from cloning.base import program\n"
-        "with program.interrupt_deferred():\n"
+        "import multiprocessing, signal; from cloning.base.processes import interrupt_deferred\n"
+        "with interrupt_deferred():\n"
         "    multiprocessing.get_context('forkserver').Process(target=print).start()\n"
         "    assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])"
     )

@@ -17,7 +17,7 @@ from killed import ALL
 from rendered import render_recording
 
 import model
-from cloning.training.stop import StopSignals
+from cloning.training.stop import Interrupted, StopSignals
 from model import REPORT
 
 
@@ -78,6 +78,26 @@ def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_inte
     )
     assert ours == theirs
     assert not list(tmp_path.glob("*previous*"))  # a run never takes its own files for an earlier run's
+
+
+def test_a_signal_does_not_wait_for_the_validation(finished, sample_recording, tmp_path, monkeypatch):
+    def drifts(*_):
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("it has waited")
+
+    monkeypatch.setattr(model, "drifts", drifts)
+    output = tmp_path / "model.pt"
+    assert model.main([str(sample_recording), *map(str, SHORT), "--output", str(output)]) == 128 + signal.SIGINT
+    assert torch.load(tmp_path / "model-resume.pt", weights_only=True)["training"]["images"] >= 150, "the whole epoch"
+    monkeypatch.undo()
+    assert run_here(sample_recording, "--output", output, "--resume").returncode == 0
+    assert same(weights(output), weights(finished[1] / "model.pt"))
+    with StopSignals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        with stop.at_once(alone=False):  # other ranks wait for this one
+            pass
+        with pytest.raises(Interrupted), stop.at_once(alone=True):
+            pytest.fail("it has waited")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.arguments import command_line, number
+from cloning.base.processes import interrupt_deferred
 from cloning.network.network import SHIPPED_MODEL
 from tools.attacks import Attack, all_attacks, frames
 from tools.command import ROOT, run_tool
@@ -151,10 +152,13 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     memory = server.memory()
     before, until = server.open_files(), time.monotonic() + seconds
     attacker = multiprocessing.get_context("fork").Process(target=_attack, args=(attack, server.port, until))
-    attacker.start()
-    drive = car.drive(until)
-    attacker.kill()
-    attacker.join()
+    try:
+        with interrupt_deferred():
+            attacker.start()
+        drive = car.drive(until)
+    finally:
+        attacker.kill()
+        attacker.join()
     if server.process.poll() is not None:
         return Report(drive, 0.0, 0.0, PATIENCE, 0)
     ended = time.monotonic()

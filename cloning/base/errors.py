@@ -30,7 +30,7 @@ class OutputError(UserError):
     """A file that the user asked for cannot be written."""
 
 
-def message_of(error: UserError | OSError) -> str:
+def message_of(error: UserError | OSError | MemoryError) -> str:
     """The message for the user; that of an OSError begins with the file's name, as those of a UserError do.
 
     When no file can be opened any more, the name is that of any file, and tells nothing.

@@ -1,8 +1,11 @@
 """How a command prints and ends: its exit status, its last message, and Ctrl-C without a traceback at any moment.
 
-A command calls `end_on_interrupt` before it imports large libraries, and `run` at the end of its file. Its exit status
-is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C).
+A command imports this first, calls `end_on_interrupt` at once, and `run` at the end of its file. Its exit status is
+DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C). Until `end_on_interrupt`,
+Ctrl-C gives Python's traceback, so nothing is loaded here that Python has not loaded at its start.
 """
+
+from __future__ import annotations
 
 import os
 import sys
@@ -16,18 +19,18 @@ if sys.hexversion < 0x30B0000:  # told before all that an older one does not und
     )
     os._exit(2)
 
+import _signal as signal  # type: ignore[import-not-found]  # `signal` loads for 3 ms, and `typing` for 5
 import atexit
-import functools
 import io
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from types import FrameType
-from typing import NoReturn
 
-from cloning.base.errors import UserError, message_of
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType, TracebackType
+    from typing import NoReturn
+
+    from cloning.base.errors import UserError
 
 OWN_PACKAGES = ("cloning", "simulator", "tools")
 PACKAGES = {"cv2": "opencv-python-headless", "PIL": "pillow", "direct": "panda3d", "socketio": "python-socketio"}
@@ -40,6 +43,7 @@ name = "python"  # of the command, which begins its messages; this one if anothe
 installed: dict[str, str] = {}  # a clone's commands, such as python drive.py -> as the installed project calls them
 end_at_once: Callable[[int, FrameType | None], None] | None = None  # the handler of `end_on_interrupt`
 interrupted = False  # whether Ctrl-C has come in `main`
+warned: set[str] = set()  # the messages of `warn_once`
 
 
 def in_commands(text: str) -> str:
@@ -49,16 +53,19 @@ def in_commands(text: str) -> str:
     return text
 
 
-def failed(error: UserError | OSError) -> int:
+def failed(error: UserError | OSError | MemoryError) -> int:
     """Print an error as `PROGRAM: MESSAGE` to stderr and return the exit status."""
+    from cloning.base.errors import message_of
+
     print(in_commands(f"{name}: {message_of(error)}"), file=sys.stderr)
     return FAILED
 
 
-@functools.cache
 def warn_once(message: str) -> None:
     """Print a warning as `PROGRAM: MESSAGE` to stderr, unless it was printed before."""
-    print(in_commands(f"{name}: {message}"), file=sys.stderr)
+    if message not in warned:
+        warned.add(message)
+        print(in_commands(f"{name}: {message}"), file=sys.stderr)
 
 
 def end_on_interrupt(program: str, message: str = "stopped") -> None:
@@ -69,7 +76,7 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
     """
     global name, end_at_once
     name = program
-    sys.excepthook = functools.partial(_tell, sys.excepthook)
+    sys.excepthook = _tell
 
     def stop(signal_number: int, _: FrameType | None) -> None:
         print(f"{program}: {message}", file=sys.stderr, flush=True)
@@ -91,10 +98,10 @@ def missing_library(error: ModuleNotFoundError) -> str:
     )
 
 
-def _tell(otherwise: Callable[..., object], kind: type[BaseException], error: BaseException, trace: object) -> None:
-    """Print an error that ends the process: a missing library in one sentence, others by the hook `otherwise`."""
+def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Print an error that ends the process: a missing library in one sentence, others with their traceback."""
     if not isinstance(error, ModuleNotFoundError) or str(error.name).partition(".")[0] in OWN_PACKAGES:
-        otherwise(kind, error, trace)
+        sys.__excepthook__(kind, error, trace)
         return
     print(f"{name}: {missing_library(error)}", file=sys.stderr, flush=True)
     os._exit(FAILED)
@@ -128,39 +135,14 @@ def _interrupt(_: int, frame: FrameType | None) -> None:
     sys.settrace(loading)
 
 
-@contextmanager
-def interrupt_deferred() -> Iterator[None]:
-    """A context in which processes are started; Ctrl-C has its effect at its end, and none in the processes.
-
-    Python would ignore an exception from its own code around a fork. Call it in the main thread.
-    """
-    # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
-    if sys.platform != "win32":
-        from multiprocessing import resource_tracker  # here, so that nothing delays `end_on_interrupt`
-
-        resource_tracker.ensure_running()  # multiprocessing starts it with the first process, and then unblocks signals
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    received: list[int] = []  # another thread may still receive it
-    handler = signal.getsignal(signal.SIGINT)
-    if callable(handler):
-        signal.signal(signal.SIGINT, lambda number, _: received.append(number))
-    try:
-        yield
-    finally:
-        if sys.platform != "win32":
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        if callable(handler):
-            signal.signal(signal.SIGINT, handler)
-        if received:
-            signal.raise_signal(signal.SIGINT)
-
-
 def run(main: Callable[[], int | None]) -> NoReturn:
     """Run a command's main function and end with its exit status; Ctrl-C raises KeyboardInterrupt only in `main`.
 
     Characters that stdout cannot show, such as undecodable bytes of a file's name, are printed as escapes there. What
     is printed to a stream that was closed before (`>&-`) is lost.
     """
+    from contextlib import suppress
+
     nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # it stays open
     sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
@@ -183,7 +165,7 @@ def run(main: Callable[[], int | None]) -> NoReturn:
         elif isinstance(error, MemoryError) or (
             isinstance(error, RuntimeError) and any(words in str(error) for words in NO_MEMORY)
         ):
-            status = failed(UserError(f"too little memory is free: {str(error) or 'MemoryError'}"))
+            status = failed(MemoryError(f"too little memory is free: {str(error) or 'MemoryError'}"))
         else:
             raise
     finally:
@@ -196,6 +178,8 @@ def leave(status: int | None) -> NoReturn:
 
     That takes 0.7 s once torch is loaded. Where other threads have work to end, the process ends as usual.
     """
+    import threading
+
     if not all(thread.daemon or thread is threading.main_thread() for thread in threading.enumerate()):
         sys.exit(status)
     atexit._run_exitfuncs()

@@ -4,7 +4,6 @@ import csv
 import json
 import math
 import re
-import time
 from pathlib import Path
 from typing import Any
 
@@ -94,9 +93,7 @@ def overview(files: RunFiles) -> dict[str, Any]:
         history = history[: progress["finished"]]  # else those are an earlier run's, or the state comes in a moment
     epochs, samples = options["epochs"], options["samples_per_epoch"]
     finished, images, seconds = len(history), progress.get("images", 0), progress.get("seconds", 0.0)
-    latest = max((file.stat().st_mtime for file in (files.progress, files.arguments) if file.exists()), default=0)
-    age = max(0.0, time.time() - latest)
-    claimed = files.is_claimed()
+    age, claimed = files.age(), files.is_claimed()
     if claimed or (claimed is None and age < ALIVE and finished < epochs):
         state = "running"
     else:

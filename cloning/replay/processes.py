@@ -9,7 +9,7 @@ from multiprocessing.process import BaseProcess
 from typing import Self
 
 from cloning.base.errors import SimulatorError, UserError
-from cloning.base.program import interrupt_deferred
+from cloning.base.processes import interrupt_deferred
 from cloning.replay.replay import Drive
 
 CAN_FORK = sys.platform == "linux"  # elsewhere there is no fork, or libraries do not survive it

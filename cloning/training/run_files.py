@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -46,6 +47,7 @@ class RunFiles:
         self.rejected = self.last.with_name("rejected_rows.csv")
         self.pictures = self.last.with_name("diagnostic_images")
         self.report = self.last.with_name("report.html")
+        self._written, self._born, self._asked = math.nan, 0.0, -math.inf  # of `age`
 
     @contextlib.contextmanager
     def claimed(self, ranks: "Ranks") -> Iterator[None]:
@@ -75,6 +77,15 @@ class RunFiles:
 
             ranks.from_first(claim)
             yield
+
+    def age(self) -> float:
+        """Return the age of the run's last state in s, at least 0; the clock counts only when it is asked first."""
+        written = max((file.stat().st_mtime for file in (self.progress, self.arguments) if file.exists()), default=0.0)
+        now = time.monotonic()
+        if written != self._written:  # since this was asked last
+            self._written, self._born = written, max(self._asked, now - max(0.0, time.time() - written))
+        self._asked = now
+        return now - self._born
 
     def is_claimed(self) -> bool | None:
         """Return whether a run is writing the files; None if that cannot be told, as where there are no locks.

@@ -3,7 +3,8 @@
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 from cloning.base import program
@@ -31,7 +32,7 @@ class StopSignals:
 
     def __init__(self) -> None:
         """Install no handlers yet; entering the context does."""
-        self.received = 0
+        self.received, self._waiting = 0, False
 
     def __enter__(self) -> "StopSignals":
         self._terminals = [file for file in (1, 2) if os.isatty(file)]
@@ -51,6 +52,20 @@ class StopSignals:
         if self.received and number != getattr(signal, "SIGHUP", None):  # which may come twice
             raise KeyboardInterrupt
         self.received = self.received or number
+        if self._waiting:
+            self._waiting = False
+            raise Interrupted(number)
+
+    @contextmanager
+    def at_once(self, alone: bool) -> Iterator[None]:
+        """A context that takes long; a signal raises Interrupted in it, if no other rank waits for this one's work."""
+        if alone and self.received:
+            raise Interrupted(self.received)
+        self._waiting = alone
+        try:
+            yield
+        finally:
+            self._waiting = False
 
 
 def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:

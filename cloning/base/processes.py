@@ -1,0 +1,32 @@
+"""Processes that a command starts."""
+
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+
+
+@contextmanager
+def interrupt_deferred() -> Iterator[None]:
+    """A context in which processes are started; Ctrl-C has its effect at its end, and none in the processes.
+
+    Python would ignore an exception from its own code around a fork. Call it in the main thread.
+    """
+    # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
+    if sys.platform != "win32":
+        resource_tracker.ensure_running()  # multiprocessing starts it with the first process, and then unblocks signals
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    received: list[int] = []  # another thread may still receive it
+    handler = signal.getsignal(signal.SIGINT)
+    if callable(handler):
+        signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        if sys.platform != "win32":
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        if callable(handler):
+            signal.signal(signal.SIGINT, handler)
+        if received:
+            signal.raise_signal(signal.SIGINT)
