@@ -6,6 +6,7 @@ import threading
 import time
 from contextlib import contextmanager
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from drive_process import ask, serving
 
 import drive
 from cloning.server import page as drive_page
+from tools import bench_driving
 from tools.simulator_client import Simulator, telemetry
 
 
@@ -43,7 +45,7 @@ def shown(server, query: str = "") -> dict:
         connection.close()
 
 
-def test_a_page_is_given_what_was_driven(server, jpegs):
+def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_in_it(server, jpegs):
     with Simulator(server.port) as simulator:
         simulator.open()
         for _ in range(3):
@@ -53,6 +55,18 @@ def test_a_page_is_given_what_was_driven(server, jpegs):
             time_stamp, _, speed, throttle, latency, *_ = live["rows"][-1]
             assert abs(time_stamp - time.monotonic()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
             assert live["image"].startswith("/9j/")
+        measured: Any = SimpleNamespace(port=server.port, latencies=[])
+        bench_driving.Server.read_latencies(measured, 2)
+    assert len(measured.latencies) == 2 and all(0 < seconds < 60 for seconds in measured.latencies)
+
+
+def test_the_benchmark_answers_a_ping_and_waits_for_the_answer():
+    packets, sent = ["first", "2", "second"], list[str]()
+    telemetries = SimpleNamespace(sendall=lambda data: None)
+    client = SimpleNamespace(socket=telemetries, receive=lambda: packets.pop(0), send=sent.append)
+    measured: Any = SimpleNamespace(client=client, cpu_seconds=float)
+    bench_driving.Server.drive(measured, [[b"1"], [b"2"]], count=False)
+    assert not packets and sent == ["3"]
 
 
 def test_the_page_changes_the_set_speed_of_a_car_that_drives(server, jpegs):
