@@ -8,7 +8,7 @@ import numpy as np
 
 from cloning.base.figure import png
 from cloning.base.outputs import write_output
-from cloning.road.autonomy import LIMITS
+from cloning.road.autonomy import LIMITS, lap_in_words
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import STEP
@@ -197,8 +197,9 @@ def write_picture(path: str | Path, run: Run) -> None:
         driven = float(np.sum(trajectory.speed[: round(departure.time / STEP)]) * STEP)
         along.axvline(driven, color="tab:red", linewidth=1)
         along.annotate(f"{departure.time:.0f} s", (driven, -scale), (3, 3), **name)
-    title = report_text(lap_report(run)).splitlines()[0]
-    above.set(xlabel="east, m", ylabel="north, m", title=title.replace(", ", "\n", 1) if map_inches[0] < 5.5 else title)
+    words = lap_in_words(lap_report(run)).replace("; ", "\n")
+    figure.suptitle(f"{track.name} {track.direction}: {words}", fontsize=11)
+    above.set(xlabel="east, m", ylabel="north, m")
     along.set(xlabel="distance driven, m", ylabel="m right of the\ncentre line", ylim=(-1.05 * scale, 1.05 * scale))
     along.set_xlim(0, max(1.0, run.distance))
     along.grid(alpha=0.3)

@@ -174,6 +174,8 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     assert max(page.run(f"{needed}.map(each => each.getBoundingClientRect().bottom)")) <= 768
     bare = f"{CONTROLS}.filter(each => !each.title && !each.closest('#replays, #notes')).length"
     assert page.run(bare) == 0, "tooltips"
+    example = "condition.value = condition.placeholder, condition.scrollWidth <= condition.clientWidth"
+    assert page.run(example), "all of a condition is read"
     assert now(page, "plots.plots[3].axes[1]._splits") == [0, -1, 1, -2.5, 2.5], "metres from the lane's centre"
     page.run("import('/static/state.js').then(({page: {open}}) => open.plots.setZoom(40, 59))")
     assert page.fits(), "with the row outside of what the curves show"
