@@ -164,7 +164,7 @@ def main(argv: list[str] | None = None) -> int:
     laps, project = drives(folder, track), "" if own else ", and the project's network the jungle"
     steps: list[tuple[str, Callable[[], object]]] = [
         (f"train a network on {IMAGES:,} images of them (1 to 3 minutes)", lambda: train(folder, recordings)),
-        (f"let it drive the {track} at {SPEEDS[track]} mph{project}, with films (2 to 4 minutes)", lambda: drive_all(laps)),
+        (f"let it drive the {track} at {SPEEDS[track]} mph{project}; films (2 to 4 minutes)", lambda: drive_all(laps)),
         ("write a report of it all", lambda: report(folder, laps)),
     ]
     if not own:
