@@ -156,7 +156,7 @@ def report_text(report: LapReport) -> str:
 def write_picture(path: str | Path, run: Run) -> None:
     """Plot a drive as PNG: the track from above with the car's path, and the lateral offset along the way.
 
-    The path's colours reach to 1 m, as in the pictures of other drives, or as far as the car was from the centre line.
+    The path's colours reach to 1 m, where a human would take over, as in the pictures of all drives.
     Raises OutputError.
     """
     from matplotlib import colors  # here, because loading matplotlib takes long and only this function needs it
@@ -181,10 +181,11 @@ def write_picture(path: str | Path, run: Run) -> None:
     joined = np.linalg.norm(np.diff(path_driven, axis=0), axis=1) < JUMP
     scale = max(LIMITS[0], math.ceil(10 * np.abs(offset).max(initial=0)) / 10)
     segments = np.stack([path_driven[:-1], path_driven[1:]], axis=1)
-    lines = LineCollection(list(segments[joined]), cmap="viridis", norm=colors.Normalize(0, scale), linewidth=2.5)
+    lines = LineCollection(list(segments[joined]), cmap="viridis", norm=colors.Normalize(0, LIMITS[0]), linewidth=2.5)
     lines.set_array(np.abs(offset)[:-1][joined])
     above.add_collection(lines)
-    figure.colorbar(lines, ax=above, label="m from the centre line", shrink=0.8)
+    extend = "max" if scale > LIMITS[0] else "neither"
+    figure.colorbar(lines, ax=above, label="m from the centre line", shrink=0.8, extend=extend)
     mark_start(above, track)
     whole = metres.copy()
     whole[np.flatnonzero(~joined) + 1] = np.nan  # no line is plotted across a jump
