@@ -209,8 +209,11 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
     recording, cuts = read_recording(linked), linked / "excluded.csv"
     page.look(1280, 900)
     with browsing(linked) as server:
-        page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4")
+        page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4&of=offset")
         page.shows("#matches", "19 frames in 1 stretch")
+        page.wait("location.hash.includes('of=offset') && of.value == 'offset'")
+        page.run("of.value = 'steering'; of.onchange()")
+        page.wait("!location.hash.includes('of=')")
         page.press("g")
         at(page, 41)
         page.press("/")
