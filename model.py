@@ -38,6 +38,7 @@ from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import write
 from cloning.base.progress import progress_bar
 from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
+from cloning.network.layer_table import layer_table
 from cloning.network.network import NETWORKS, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS
@@ -412,6 +413,8 @@ def run(command: Command, ranks: Ranks) -> None:
     """Read the data, train, and print the summary. Raises UserError, OSError, Interrupted, KeyboardInterrupt."""
     training_run = TrainingRun(ranks.from_first(lambda: prepare(command)), command.process, ranks)
     if ranks.first:
+        if training_run.recipe.name != ROBUST.name:  # the report shows it; a run's own report does so in any case
+            print(layer_table(training_run.network))
         print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks))
         labels = training_run.training.steering
         training_run.checkpoint.begin(training_run.progress, training_run.precision, labels)

@@ -8,7 +8,7 @@ import numpy as np
 
 from cloning.base.figure import png
 from cloning.base.outputs import write_output
-from cloning.road.autonomy import LIMITS
+from cloning.road.autonomy import LIMITS, lap_in_words
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import STEP
@@ -156,7 +156,7 @@ def report_text(report: LapReport) -> str:
 def write_picture(path: str | Path, run: Run) -> None:
     """Plot a drive as PNG: the track from above with the car's path, and the lateral offset along the way.
 
-    The path's colours reach to 1 m, as in the pictures of other drives, or as far as the car was from the centre line.
+    The path's colours reach to 1 m, where a human would take over, as in the pictures of all drives.
     Raises OutputError.
     """
     from matplotlib import colors  # here, because loading matplotlib takes long and only this function needs it
@@ -181,10 +181,11 @@ def write_picture(path: str | Path, run: Run) -> None:
     joined = np.linalg.norm(np.diff(path_driven, axis=0), axis=1) < JUMP
     scale = max(LIMITS[0], math.ceil(10 * np.abs(offset).max(initial=0)) / 10)
     segments = np.stack([path_driven[:-1], path_driven[1:]], axis=1)
-    lines = LineCollection(list(segments[joined]), cmap="viridis", norm=colors.Normalize(0, scale), linewidth=2.5)
+    lines = LineCollection(list(segments[joined]), cmap="viridis", norm=colors.Normalize(0, LIMITS[0]), linewidth=2.5)
     lines.set_array(np.abs(offset)[:-1][joined])
     above.add_collection(lines)
-    figure.colorbar(lines, ax=above, label="m from the centre line", shrink=0.8)
+    extend = "max" if scale > LIMITS[0] else "neither"
+    figure.colorbar(lines, ax=above, label="m from the centre line", shrink=0.8, extend=extend)
     mark_start(above, track)
     whole = metres.copy()
     whole[np.flatnonzero(~joined) + 1] = np.nan  # no line is plotted across a jump
@@ -197,8 +198,9 @@ def write_picture(path: str | Path, run: Run) -> None:
         driven = float(np.sum(trajectory.speed[: round(departure.time / STEP)]) * STEP)
         along.axvline(driven, color="tab:red", linewidth=1)
         along.annotate(f"{departure.time:.0f} s", (driven, -scale), (3, 3), **name)
-    title = report_text(lap_report(run)).splitlines()[0]
-    above.set(xlabel="east, m", ylabel="north, m", title=title.replace(", ", "\n", 1) if map_inches[0] < 5.5 else title)
+    words = lap_in_words(lap_report(run)).replace("; ", "\n")
+    figure.suptitle(f"{track.name} {track.direction}: {words}", fontsize=11)
+    above.set(xlabel="east, m", ylabel="north, m")
     along.set(xlabel="distance driven, m", ylabel="m right of the\ncentre line", ylim=(-1.05 * scale, 1.05 * scale))
     along.set_xlim(0, max(1.0, run.distance))
     along.grid(alpha=0.3)

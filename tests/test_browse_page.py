@@ -174,6 +174,8 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     assert max(page.run(f"{needed}.map(each => each.getBoundingClientRect().bottom)")) <= 768
     bare = f"{CONTROLS}.filter(each => !each.title && !each.closest('#replays, #notes')).length"
     assert page.run(bare) == 0, "tooltips"
+    example = "condition.value = condition.placeholder, condition.scrollWidth <= condition.clientWidth"
+    assert page.run(example), "all of a condition is read"
     assert now(page, "plots.plots[3].axes[1]._splits") == [0, -1, 1, -2.5, 2.5], "metres from the lane's centre"
     page.run("import('/static/state.js').then(({page: {open}}) => open.plots.setZoom(40, 59))")
     assert page.fits(), "with the row outside of what the curves show"
@@ -207,8 +209,11 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
     recording, cuts = read_recording(linked), linked / "excluded.csv"
     page.look(1280, 900)
     with browsing(linked) as server:
-        page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4")
+        page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4&of=offset")
         page.shows("#matches", "19 frames in 1 stretch")
+        page.wait("location.hash.includes('of=offset') && of.value == 'offset'")
+        page.run("of.value = 'steering'; of.onchange()")
+        page.wait("!location.hash.includes('of=')")
         page.press("g")
         at(page, 41)
         page.press("/")

@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import pytest
 
 from cloning.base import program
-from cloning.base.errors import SimulatorError
+from cloning.base.errors import SimulatorError, UserError
 from tools import demo
 
 REPORT = {"distance_m": 1137.9, "mean_speed_mph": 29.6, "departures": [], "offset_mean_m": 0.074, "offset_max_m": 0.281}
 DEPARTURE = {"time_s": 1.0}
+DRIVES = demo.drives(demo.FOLDER)
 
 
 @pytest.fixture
@@ -51,12 +52,14 @@ def test_a_whole_demo_and_then_nothing_is_done_again(commands, capsys):
     assert commands[0] == ["record", "ccw", "cw"]
     assert "--robust" in commands[1] and "--resume" not in commands[1]
     assert sum(words[0] == "server" for words in commands) == commands.count(["stopped"]) == 3
-    laps = [lap.picture for lap in demo.DRIVES]
+    laps = [lap.picture for lap in DRIVES]
     assert commands[-1] == ["-m", "cloning.report", "demo", "--lap", *map(str, laps)]
-    assert {*demo.LAPS.iterdir()} == {lap.with_suffix(kind) for lap in laps for kind in (".png", ".json", ".mp4")}
+    assert {*(demo.FOLDER / "laps").iterdir()} == {
+        lap.with_suffix(kind) for lap in laps for kind in (".png", ".json", ".mp4")
+    }
     printed = capsys.readouterr()
     assert printed.err == ""
-    assert all(text in printed.out for text in (demo.ACTIVATE, *(command for command, _ in demo.NEXT)))
+    assert all(text in printed.out for text in (demo.ACTIVATE, *(command.format("demo") for command, _ in demo.NEXT)))
     assert (
         "1138 m at 30 mph, never left the road; 0.07 m from the centre line on average, 0.28 m at most" in printed.out
     )
@@ -77,17 +80,30 @@ def test_a_stopped_training_is_resumed_and_a_stopped_lap_is_driven_again(command
     with pytest.raises(SimulatorError, match="simulator: no room; start the demo again to continue"):
         demo.main([])
     assert "--resume" in commands[1]
-    assert not any(lap.picture.exists() for lap in demo.DRIVES if lap.direction == "cw")
+    assert not any(lap.picture.exists() for lap in DRIVES if lap.direction == "cw")
     monkeypatch.setattr(demo, "python", python)
     assert demo.main([]) == program.DONE
     assert not list(demo.FOLDER.glob("unfinished*"))
 
 
 def test_a_lap_that_left_the_road_is_told_and_ends_with_status_1(commands, capsys):
-    lap = demo.DRIVES[0]
-    demo.LAPS.mkdir()
+    lap = DRIVES[0]
+    lap.picture.parent.mkdir()
     lap.picture.touch()
     left = json.dumps(REPORT | {"departures": [DEPARTURE] * 2})
     lap.picture.with_suffix(".json").write_text(left, encoding="utf-8")
     assert demo.main([]) == program.INCOMPLETE
     assert f"{lap.title}: 1138 m at 30 mph, left the road 2 times" in capsys.readouterr().out
+
+
+def test_recordings_of_ones_own_are_trained_on_and_driven(commands, linked, capsys):
+    assert demo.main([str(linked), "--track", "jungle"]) == program.DONE
+    own = str(Path("demo", "own"))
+    assert commands[0][1] == str(linked) and commands[0][-1] == str(Path(own, "model.pt")), "nothing is recorded"
+    driven = [words for words in commands if "drive" in words]
+    assert [words[words.index("--direction") - 1] for words in driven] == ["jungle", "jungle"]
+    assert commands[-1][:3] == ["-m", "cloning.report", own]
+    assert "python drive.py demo/own/model.pt" in capsys.readouterr().out
+    (demo.OWN / "training_arguments.json").write_text(json.dumps({"recordings": ["/gone"]}), encoding="utf-8")
+    with pytest.raises(UserError, match="a demo with other recordings, /gone: delete the folder first"):
+        demo.main([str(linked)])

@@ -76,7 +76,7 @@ def test_the_report_contains_the_run(written, finished):
     encoded = re.findall(r'srcset="data:image/svg\+xml;base64,([^"]*)', page)
     charts = [base64.b64decode(each).decode() for each in encoded]
     resampled = re.search(r"([\d,]+) observations after resampling", printed)
-    assert "60 rows as driven" in charts[0] and resampled and f"{resampled[1]} for training, resampled" in charts[0]
+    assert "of 60 rows, as driven" in charts[0] and resampled and f"of {resampled[1]} for training" in charts[0]
     named = re.findall(r'(?:src|srcset|href)="([^"]*)"', page)
     assert len(named) >= 3 * 2 + 2 + 6 + 4, "three charts twice, examples, augmentations, drive, laps and a film"
     assert all(address.startswith(("data:image/", "data:video/mp4;base64,ZmlsbQ==")) for address in named)

@@ -107,3 +107,18 @@ def test_a_full_disk_costs_the_film_alone(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["above.png", "report.json"]
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["distance_m"] > 20
     assert load(tmp_path / "above.png").std() > 10
+
+
+def test_all_maps_have_one_scale_of_colours(tmp_path):
+    run = Run(Track("lake"))
+    drive = run.trajectory
+    for x, y, _ in np.repeat(run.track.points[:600], 5, axis=0):  # of which every fifth is drawn
+        for values, value in zip((drive.x, drive.y, drive.offset, drive.speed), (x, y, 0.5, 25.0), strict=True):
+            values.append(float(value))
+    teal = (142, 146, 32)  # BGR of viridis at 0.5
+    drawn = []
+    for furthest in (0.5, 3.0):
+        drive.offset[-5:] = [furthest] * 5
+        report.write_picture(tmp_path / "map.png", run)
+        drawn.append((np.abs(load(tmp_path / "map.png").astype(int) - teal).max(axis=2) < 8).sum())
+    assert drawn[0] > 2000 and drawn[1] > 0.9 * drawn[0], drawn

@@ -224,7 +224,15 @@ window.task_mgr.step()
 window.simulation.step(0, 0)
 window.task_mgr.step()
 assert "left the road on the right" in window.message.getText()
-assert window.dot.is_hidden()
+assert window.dot.is_hidden() and window.scene.brake_lights.is_hidden()
+window.simulation.step(0.5, -1)
+window.show(True)
+assert not window.scene.brake_lights.is_hidden()
+assert {round(wheel.get_h(), 1) for wheel in window.scene.wheels} == {-12.5, 0}, "half of 25 degrees, to the right"
+before = window.scene.wheels[0].get_p()
+window.simulation.distance += 0.1
+window.show(True)
+assert window.scene.wheels[0].get_p() != before, "they roll"
 window.do_record()
 window.task_mgr.step()
 assert not window.dot.is_hidden()

@@ -108,7 +108,9 @@ def test_answers_are_read():
 
 def test_a_missing_server_is_waited_for_then_reported(capsys):
     assert main(["drive", "--wait", "0.5", "--port", str(unused_port())]) == 2
-    assert re.search(r"^python: no server at 127\.0\.0\.1.*drive\.py", capsys.readouterr().err, re.MULTILINE)
+    told = capsys.readouterr().err
+    assert re.search(r"no server at 127\.0\.0\.1.*; start `python drive.py` in another terminal; trying again", told)
+    assert re.search(r"^python: no server at 127\.0\.0\.1.*drive\.py", told, re.MULTILINE)
 
 
 @pytest.mark.parametrize("realtime", [False, True])

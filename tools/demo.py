@@ -1,10 +1,12 @@
 """Record, train and drive in the stand-in simulator, and show the result in a report: five minutes on two cores.
 
-    make demo                   # installs what is needed first
-    python -m tools.demo        # the same in an environment that has it
+    make demo                                          # installs what is needed first
+    python -m tools.demo                               # the same in an environment that has it
+    python -m tools.demo data/mine                     # train on recordings of your own, and drive the lake
+    python -m tools.demo data/mine --track jungle      # or the jungle
 
-Everything is written to the folder demo/, which git ignores. A demo that was stopped continues when it is started
-again; without the folder it begins anew.
+Everything is written to the folder demo/, with recordings of your own to demo/own/; git ignores both. A demo that was
+stopped continues when it is started again; without the folder it begins anew.
 
 Exit status: 0 if every lap was driven without leaving the road, 1 if the car left it, 2 if a step failed.
 """
@@ -17,6 +19,8 @@ if __name__ == "__main__":
 import json
 import subprocess
 import time
+from argparse import Namespace
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,23 +28,24 @@ from typing import Any, NamedTuple
 
 from cloning.base.arguments import command_line
 from cloning.base.cores import threads
-from cloning.base.errors import SimulatorError
+from cloning.base.errors import SimulatorError, UserError
 from cloning.network.network import SHIPPED_MODEL
-from cloning.report.content import lap_in_words
+from cloning.recordings.log import find_folders
+from cloning.road.autonomy import lap_in_words
 from tools.command import ROOT, python, run_tool
 from tools.server_process import ServerProcess
 from tools.shipped import Lap, render
 
-FOLDER = Path("demo")
-MODEL, LAPS = FOLDER / "model.pt", FOLDER / "laps"
+FOLDER, OWN = Path("demo"), Path("demo", "own")  # the second one: with recordings of one's own
 IMAGES = 20_000  # to train on: such a network drove both laps at 30 mph at most 0.25 m off the centre line
 RECORDED = [Lap("lake", "ccw", look=0), Lap("lake", "cw", look=0)]
+SPEEDS = {"lake": 30, "jungle": 15}  # mph
 # Printed at the end: what to type, and what it does.
 ACTIVATE = "source .venv/bin/activate"  # of the environment that make installs; README.md has other systems'
 NEXT = (
     ("python -m simulator window", "drive yourself: the arrow keys steer, R records to data/, F1 shows all keys"),
-    (f"python drive.py {MODEL.as_posix()}", "drive the real simulator: then start it in AUTONOMOUS MODE"),
-    ("python model.py --robust", "train on your own recordings, which are all those below data/"),
+    ("python drive.py {}/model.pt", "drive the real simulator: then start it in AUTONOMOUS MODE"),
+    ("python -m tools.demo data", "train on your own recordings, all those below data/, drive and report"),
 )
 
 
@@ -50,76 +55,100 @@ class Drive(NamedTuple):
     title             of its files in the report: a report (JSON), a picture (PNG) and a film (MP4)
     model             the network's file
     track, direction  of the road
-    speed             set speed in mph
+    folder            of the demo
     """
 
     title: str
     model: Path
     track: str
     direction: str
-    speed: int
+    folder: Path
 
     @property
     def picture(self) -> Path:
         """The last file that is written, so that the lap is driven once it exists."""
-        return LAPS / f"{self.title}.png"
+        return self.folder / "laps" / f"{self.title}.png"
 
     def report(self) -> dict[str, Any]:
         """Return the lap report, once the lap is driven."""
         return dict(json.loads(self.picture.with_suffix(".json").read_bytes()))
 
 
-DRIVES = [
-    Drive("The lake, by the network just trained", MODEL, "lake", "ccw", 30),
-    Drive("The lake the other way round", MODEL, "lake", "cw", 30),
-    Drive("The jungle, by the network that comes with the project", SHIPPED_MODEL, "jungle", "cw", 15),
-]
+def drives(folder: Path, track: str = "lake") -> list[Drive]:
+    """Return the laps of a demo: by its network, in both directions, and in the first demo by the project's, too."""
+    model = folder / "model.pt"
+    laps = [
+        Drive(f"The {track}, by the network just trained", model, track, "ccw", folder),
+        Drive(f"The {track} the other way round", model, track, "cw", folder),
+    ]
+    project = "The jungle, by the network that comes with the project"
+    return laps + [Drive(project, SHIPPED_MODEL, "jungle", "cw", folder)] * (folder == FOLDER)
 
 
-def record() -> None:
-    """Record the laps that are not recorded yet. Raises UserError, OSError."""
-    render(FOLDER / "recorded", RECORDED)
+def check(folder: Path, recordings: list[Path]) -> None:
+    """Raise UserError if a demo in the folder was begun with other recordings."""
+    arguments = folder / "training_arguments.json"
+    trained_on = json.loads(arguments.read_bytes())["recordings"] if arguments.exists() else []
+    if trained_on and [*map(Path, trained_on)] != [each.resolve() for each in recordings]:
+        raise UserError(f"{folder} has a demo with other recordings, {', '.join(trained_on)}: delete the folder first")
 
 
-def train() -> None:
-    """Train a network on the recorded laps, or continue to. Raises SimulatorError."""
-    if MODEL.exists():  # written at the end of the only epoch
+def train(folder: Path, recordings: list[Path]) -> None:
+    """Train a network on recordings, or continue to. Raises SimulatorError."""
+    model = folder / "model.pt"
+    options = ["--robust", "--epochs", 1, "--samples-per-epoch", IMAGES, "--output", model]
+    if model.exists():  # written at the end of the only epoch
         return
-    options = ["--robust", "--epochs", 1, "--samples-per-epoch", IMAGES, "--output", MODEL]
-    if MODEL.with_stem(f"{MODEL.stem}-resume").exists():
+    if model.with_stem(f"{model.stem}-resume").exists():
         options.append("--resume")
-    if python(ROOT / "model.py", FOLDER / "recorded", *options).returncode != program.DONE:
+    if python(ROOT / "model.py", *recordings, *options).returncode != program.DONE:
         raise SimulatorError("the training did not finish; start the demo again to continue it")
 
 
 def drive(lap: Drive) -> None:
     """Let drive.py drive a lap, unless that is done, and print its figures. Raises UserError, OSError."""
     if not lap.picture.exists():
-        with TemporaryDirectory(dir=FOLDER, prefix="unfinished-") as folder:
+        with TemporaryDirectory(dir=lap.folder, prefix="unfinished-") as folder:
             files = {kind: Path(folder, f"lap.{kind}") for kind in ("json", "mp4", "png")}
             outputs = ("--report", files["json"], "--film", files["mp4"], "--picture", files["png"])
-            with ServerProcess(ROOT / "drive.py", lap.model, "--speed", str(lap.speed), "--port", "0") as server:
+            with ServerProcess(
+                ROOT / "drive.py", lap.model, "--speed", str(SPEEDS[lap.track]), "--port", "0"
+            ) as server:
                 road = ("--track", lap.track, "--direction", lap.direction, "--port", server.port)
                 done = python("-m", "simulator", "drive", *road, *outputs, capture_output=True)
             if done.returncode not in (program.DONE, program.INCOMPLETE) or not files["json"].exists():
                 raise SimulatorError(f"{lap.title}: {done.stderr.strip()}; start the demo again to continue")
-            LAPS.mkdir(exist_ok=True)
+            lap.picture.parent.mkdir(exist_ok=True)
             for kind, file in files.items():
                 file.rename(lap.picture.with_suffix(f".{kind}"))
     print(f"{lap.title}: {lap_in_words(lap.report())}", flush=True)
 
 
-def drive_all() -> None:
+def drive_all(laps: list[Drive]) -> None:
     """Drive all laps, as many at the same time as there are cores. Raises UserError, OSError."""
     with ThreadPoolExecutor(threads()) as pool:
-        list(pool.map(drive, reversed(DRIVES)))  # the jungle takes as long as both laps of the lake
+        list(pool.map(drive, reversed(laps)))  # the jungle takes as long as both laps of the lake
 
 
-def report() -> None:
+def report(folder: Path, laps: list[Drive]) -> None:
     """Write the report of the training, with the laps. Raises SimulatorError."""
-    laps = [drive.picture for drive in DRIVES]
-    if python("-m", "cloning.report", FOLDER, "--lap", *laps, stdout=subprocess.DEVNULL).returncode != program.DONE:
+    pictures = [lap.picture for lap in laps]
+    written = python("-m", "cloning.report", folder, "--lap", *pictures, stdout=subprocess.DEVNULL)
+    if written.returncode != program.DONE:
         raise SimulatorError("the report was not written; start the demo again to continue")
+
+
+def parse_arguments(argv: list[str] | None) -> Namespace:
+    """Parse the command line; argv: that of this process if None."""
+    parser = command_line("demo", __doc__)
+    own = "recordings to train on, or folders of recordings (default: two laps that are recorded first)"
+    parser.add_argument("recordings", nargs="*", metavar="FOLDER", help=own)
+    track = "what is then driven, with recordings of your own (default %(default)s)"
+    parser.add_argument("--track", choices=SPEEDS, default="lake", help=track)
+    arguments = parser.parse_args(argv)
+    if arguments.track != "lake" and not arguments.recordings:
+        parser.error("--track is for recordings of your own; name their folder, too")
+    return arguments
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -127,24 +156,32 @@ def main(argv: list[str] | None = None) -> int:
 
     Raises UserError, OSError.
     """
-    parser = command_line("demo", __doc__)
-    parser.parse_args(argv)
-    steps = (
-        ("record an expert who drives a lap of the lake in each direction (1 minute)", record),
-        (f"train a network on {IMAGES:,} images of the two laps (1 minute)", train),
-        ("let it drive the lake at 30 mph, and the project's network the jungle, with films (2 minutes)", drive_all),
-        ("write a report of it all", report),
-    )
+    arguments = parse_arguments(argv)
+    own, track, folder = arguments.recordings, arguments.track, OWN if arguments.recordings else FOLDER
+    recordings = find_folders(own) if own else [FOLDER / "recorded"]
+    if own:
+        check(folder, recordings)
+    folder.mkdir(parents=True, exist_ok=True)
+    laps, project = drives(folder, track), "" if own else ", and the project's network the jungle"
+    steps: list[tuple[str, Callable[[], object]]] = [
+        (f"train a network on {IMAGES:,} images of them (1 to 3 minutes)", lambda: train(folder, recordings)),
+        (f"let it drive the {track} at {SPEEDS[track]} mph{project}; films (2 to 4 minutes)", lambda: drive_all(laps)),
+        ("write a report of it all", lambda: report(folder, laps)),
+    ]
+    if not own:
+        what = "record an expert who drives a lap of the lake in each direction (1 minute)"
+        steps.insert(0, (what, lambda: render(FOLDER / "recorded", RECORDED)))
     for n, (text, step) in enumerate(steps, 1):
         print(f"\n{n} of {len(steps)}: {text}", flush=True)
         begin = time.perf_counter()
         step()
         print(f"{n} of {len(steps)}: done in {time.perf_counter() - begin:.0f} s", flush=True)
-    width = max(len(command) for command, _ in NEXT)
-    print(f"\nLook at it in a browser: {(FOLDER / 'report.html').resolve().as_uri()}")
+    following = [(command.format(folder.as_posix()), text) for command, text in NEXT]
+    width = max(len(command) for command, _ in following)
+    print(f"\nLook at it in a browser: {(folder / 'report.html').resolve().as_uri()}")
     print(f"\nThree things to do next, after `{ACTIVATE}` in every new terminal:")
-    print("\n".join(f"  {command:{width}}  # {text}" for command, text in NEXT))
-    return program.INCOMPLETE if any(lap.report()["departures"] for lap in DRIVES) else program.DONE
+    print("\n".join(f"  {command:{width}}  # {text}" for command, text in following))
+    return program.INCOMPLETE if any(lap.report()["departures"] for lap in laps) else program.DONE
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The table of the network's layers that a training run prints, with the columns and names of the report's."""
+"""The table of the network's layers that the student's recipe prints, with the columns and names of the report's."""
 
 import torch
 from torch import nn

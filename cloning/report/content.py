@@ -24,7 +24,7 @@ from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import Drive, ReplayFrame, load_recording, reference_lines
 from cloning.replay.score import ORACLE, YARDSTICKS, captioned, plot, replay_report
 from cloning.report.pictures import epochs_chart, film_uri, frame_uri, picture_uri, steering_chart, uri
-from cloning.road.autonomy import LIMITS
+from cloning.road.autonomy import LIMITS, lap_in_words
 from cloning.road.overlay import overlay
 from cloning.server.template import whole_page
 from cloning.training.pictures import panel
@@ -77,17 +77,6 @@ class Lap(NamedTuple):
         except (ValueError, LookupError, TypeError) as error:
             raise UserError(f"{report}: not a report of `simulator drive` ({error!r}); make it again") from None
         return cls(picture.stem, figures, picture_uri(picture), film_uri(film, most) if film.exists() else "")
-
-
-def lap_in_words(report: dict[str, Any]) -> str:
-    """Return the figures of a lap in one line; report: of `python -m simulator drive --report`."""
-    times = {0: "never left the road", 1: "left the road once"}
-    departures = len(report["departures"])
-    return (
-        f"{report['distance_m']:.0f} m at {report['mean_speed_mph']:.0f} mph, "
-        f"{times.get(departures, f'left the road {departures} times')}; "
-        f"{report['offset_mean_m']:.2f} m from the centre line on average, {report['offset_max_m']:.2f} m at most"
-    )
 
 
 class Report:
@@ -217,9 +206,9 @@ class Report:
         best = next((row["val_drift"] for row in run["history"] if row["epoch"] == run["best"]["epoch"]), None)
         verdict = next((words for limit, words in VERDICTS if best is not None and best <= limit), "")
         driven = np.sum([each["histogram"] for each in self.recordings], axis=0, dtype=int)
-        counts = {f"{sum(driven):,} rows as driven": driven} if self.recordings else {}
+        counts = {"of {:,} rows, as driven": driven} if self.recordings else {}
         if self.labels and not run["robust"]:  # whose labels depend on the position from which a row is seen
-            counts[f"{sum(self.labels):,} for training, resampled"] = self.labels
+            counts["of {:,} for training, resampled"] = self.labels
         losses = {"loss": "training, augmented", "val_loss": "validation"}
         try:
             return whole_page(

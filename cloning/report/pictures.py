@@ -100,13 +100,18 @@ def chart(*draws: Callable[[Axes], object]) -> Chart:
 
 
 def steering_chart(counts: dict[str, np.ndarray]) -> Chart:
-    """Return histograms of steering, on one scale; counts: title -> int (BINS,), rows from -1 to 1."""
+    """Return histograms of steering, on one scale, whose titles say how much of it is straight on.
+
+    counts: what a title calls them, with "{}" for their number -> int (BINS,), rows from -1 to 1.
+    """
     most = 1.5 * max(max(each) for each in counts.values())
 
     def draw(title: str, axes: Axes) -> None:
         axes.stairs(counts[title], np.linspace(-1, 1, BINS + 1), fill=True)
         scale = {"yscale": "log", "xlim": (-1, 1), "ylim": (0.7, most)}
-        axes.set(title=title, xlabel="steering, -1 left to 1 right", ylabel="rows", **scale)
+        rows, straight = sum(counts[title]), counts[title][BINS // 2]
+        finding = f"{100 * straight / max(1, rows):.0f} % {title.format(rows)}, steer straight on"
+        axes.set(title=finding, xlabel="steering, -1 left to 1 right", ylabel="rows", **scale)
 
     return chart(*(partial(draw, title) for title in counts))
 

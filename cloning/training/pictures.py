@@ -85,10 +85,10 @@ def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:
     epochs, best = [row["epoch"] for row in history], min(history, key=lambda row: row["val_loss"])
     name = f"training (augmented, with{'' if dropout else 'out'} dropout)"
     axes.plot(epochs, [row["loss"] for row in history], "o-", label=name)
-    name = f"validation (lowest: {best['val_loss']:.4f} in epoch {best['epoch']:.0f})"
-    (line,) = axes.plot(epochs, [row["val_loss"] for row in history], "o-", label=name)
+    (line,) = axes.plot(epochs, [row["val_loss"] for row in history], "o-", label="validation")
     axes.plot(best["epoch"], best["val_loss"], "o", color=line.get_color(), markersize=13, fillstyle="none")
-    axes.set(title="Mean squared error of the steering", xlabel="epoch", ylabel="mean squared error", ylim=(0, None))
+    finding = f"The validation loss is lowest in epoch {best['epoch']:.0f}: {best['val_loss']:.4f}"
+    axes.set(title=finding, xlabel="epoch", ylabel="mean squared error of the steering", ylim=(0, None))
     axes.set_xlim(0.5, len(history) + 0.5)
     axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 2.5, 5, 10], integer=True, min_n_ticks=1))
     drift = [row["val_drift"] for row in history]

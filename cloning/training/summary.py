@@ -15,7 +15,6 @@ from cloning.base.errors import RecordingError
 from cloning.base.files import csv_bytes, write
 from cloning.base.outputs import plural
 from cloning.network.compute import threads
-from cloning.network.layer_table import layer_table
 from cloning.network.network import Network
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
@@ -94,10 +93,11 @@ def history_csv(history: list[EpochMetrics]) -> bytes:
 
 
 def run_header(network: Network, device: torch.device, precision: torch.dtype, ranks: Ranks) -> str:
-    """Return the table of layers, and what computes them: device, precision, threads and processes."""
+    """Return the network's size, and what computes it: device, precision, threads and processes."""
     processes = f", {ranks.world} processes" if ranks.world > 1 else ""
     name = str(precision).removeprefix("torch.")
-    return f"{layer_table(network)}\n\n{device}, {name}, {threads()} threads{processes}"
+    size = sum(parameter.numel() for parameter in network.parameters())
+    return f"\na network of {size:,} parameters on {device}, {name}, {threads()} threads{processes}"
 
 
 def epoch_line(row: EpochMetrics) -> str:

@@ -89,7 +89,8 @@ class ClientSession:
         if time.monotonic() > self._patience_ends():
             raise self.no_answer() from None
         if first:
-            _print(f"{error}; trying again for {self.wait:g} s")
+            missing = "" if self._connection else "start `python drive.py` in another terminal; "
+            _print(f"{error}; {missing}trying again for {self.wait:g} s")
         time.sleep(RETRY_INTERVAL)
 
     def progressed(self) -> None:

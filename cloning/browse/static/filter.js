@@ -60,11 +60,9 @@ function columns() {
 }
 
 export function showHistogram() {
-  const select = element("of"), known = columns(), chosen = select.value || "steering";
-  if (select.options.length != known.length) {
-    select.replaceChildren(...known.map(([name]) => make("option", name)));
-    select.value = known.some(([name]) => name == chosen) ? chosen : "steering";
-  }
+  const select = element("of"), known = columns(), {of} = page.open;
+  if (select.options.length != known.length) select.replaceChildren(...known.map(([name]) => make("option", name)));
+  select.value = known.some(([name]) => name == of) ? of : "steering"; // until it is known
   const name = select.value, values = known.find(each => each[0] == name)[1];
   const there = values.filter(value => !Number.isNaN(value)), counts = new Array(BINS).fill(0);
   const [low, high] = there.reduce(([low, high], value) => [Math.min(low, value), Math.max(high, value)],
@@ -105,7 +103,11 @@ function brush(name, low, high) {
   set([...kept, `${low} <= ${name} <= ${high}`].join(" and "));
 }
 
-element("of").onchange = showHistogram;
+element("of").onchange = () => {
+  page.open.of = element("of").value;
+  showHistogram();
+  remember();
+};
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => page.open && showHistogram());
 
 // ---------------------------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ export const KEYS = [
   ["Esc", "close a message; back to the list"],
   ["?", "these keys"],
 ];
-const CHANGED = "The recording's log has changed: press R to read it again. Your cuts are in its folder.";
+const CHANGED = "The recording's log has changed: reload the page, or press R to read it again. Your cuts are in its folder.";
 let latest = 0; // number of the last request for a recording: what comes for an earlier one is dropped
 
 export function leaveRecording() {
@@ -67,7 +67,7 @@ export async function showRecording(id, row, shown) {
   const now = page.open = {
     id, details, columns, count, marks: {first, last}, ...changes(id), row: Math.min(row, count - 1), playing: 0, orders: 0,
     jumps: {...details.jumps}, limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
-    condition: shown.get("find") ?? "", paths: shown.get("paths") != "0",
+    condition: shown.get("find") ?? "", of: shown.get("of") ?? "steering", paths: shown.get("paths") != "0",
     query: () => now.limit ? `?limit=${now.limit}` : "",
     column: name => column(id, details.version, name),
   };

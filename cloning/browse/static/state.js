@@ -19,12 +19,13 @@ export function remember() {
 }
 
 export function note() {
-  const {id, row, limit, attention, condition, plots: {zoom}, marks: {first, last}, speed, loop, paths} = page.open;
+  const {id, row, limit, attention, condition, plots: {zoom}, marks: {first, last}, speed, loop, paths, of} = page.open;
   const state = {
     limit, look: attention, find: condition,
     speed: speed == 1 ? null : speed,
     loop: loop ? 1 : null,
     paths: paths ? null : 0,
+    of: of == "steering" ? null : of,
     zoom: zoom && zoom.map(Math.round).join("-"),
     mark: first == undefined && last == undefined ? null : `${first ?? ""}-${last ?? ""}`,
   };
