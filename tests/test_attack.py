@@ -143,7 +143,7 @@ def test_a_new_car_takes_the_place_of_a_connection_without_a_request(server, jpe
     with ExitStack() as stack:
         for n in range(MAX_CONNECTIONS + 20):
             idle = stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
-            if n % 2:
+            if n >= 20:
                 idle.sendall(b"POST /set-speed HTTP/1.1\r\nContent-Length: 99\r\n\r\n{")
         simulator = stack.enter_context(Simulator(server.port))
         simulator.open()

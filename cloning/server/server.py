@@ -48,7 +48,7 @@ class Client(engineio.socket.Socket):
         self.websocket: WebSocket | None = None
         self.served = time.perf_counter()  # when its last message was handled
         self.waits = False  # for a message to be handled
-        self.last_ping = None  # without: a thread of each session, to ping, outlives it by up to 25 s
+        self.last_ping = None  # without: threads that would ping; 38 MB more after 20 s of reconnections
         self.expects_pings = False
 
     def handle_get_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
@@ -171,7 +171,10 @@ class Server(socketio.Server):
         super()._handle_connect(eio_sid, "/", None)
 
     def _handle_connect(self, eio_sid: str, namespace: str | None, data: Any) -> None:
-        """Connect a client that asks for it: one of Engine.IO 4, which is connected already, and expects pings."""
+        """Connect a client that asks for it: one of Engine.IO 4, which is connected already, and expects pings.
+
+        Without: JavaScript's clients 3 and 4 and Python's 5 fail to connect.
+        """
         self.eio.sockets[eio_sid].expects_pings = True
         if not self.manager.sid_from_eio_sid(eio_sid, namespace or "/"):
             super()._handle_connect(eio_sid, namespace, data)
