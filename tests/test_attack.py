@@ -14,13 +14,14 @@ from typing import Any
 
 import pytest
 import warm
-from drive_process import serving
+from drive_process import awaited, serving
 
 import drive
 from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
-from cloning.server.server import MAX_CLIENTS, QUIET
+from cloning.server.libraries import eventlet
+from cloning.server.server import MAX_CLIENTS, Client, Server
 from tools import attack
 from tools.attacks import GET, WEBSOCKET, all_attacks, frame
 from tools.simulator_client import Simulator, telemetry
@@ -107,33 +108,72 @@ def test_a_long_ping_is_not_answered(server):
         assert stranger.receive() == "3"
 
 
-def test_one_client_too_many_waits_until_another_is_quiet(model_file, jpegs):
-    with serving(model_file) as process:
-        others = [Simulator(process.port) for _ in range(MAX_CLIENTS)]
+def test_one_client_too_many_waits_until_another_ends(model_file, jpegs):
+    with serving(model_file) as process, Simulator(process.port) as first, ExitStack() as stack:
+        for _ in range(MAX_CLIENTS - 1):
+            stack.enter_context(Simulator(process.port)).open()
+        first.open()
         with Simulator(process.port) as refused:
             assert refused.status == 503
-        until = time.monotonic() + QUIET + 1
-        while time.monotonic() < until:
-            for other in others[1:]:
-                other.send("2")
-            time.sleep(0.2)
-        assert any("4 clients are connected already" in line for line in process.lines), "its user is told"
-        with Simulator(process.port) as new:
-            assert new.status == 101
-            new.open()
-            new.drive(telemetry(jpegs[0]))
+        awaited(lambda: any("4 clients are connected already" in line for line in process.lines))
+        first.drive(telemetry(jpegs[0]))
+        first.socket.close()
+        assert attack.Car(process.port, jpegs[:1]).expected
+
+
+def test_a_client_that_says_nothing_for_long_gives_its_place_back(model_file, jpegs):
+    soon = "import cloning.wire.protocol as protocol; protocol.PING_INTERVAL = protocol.PONG_TIMEOUT = 0.2"
+    with serving(model_file, first=soon) as process, ExitStack() as stack:
+        quiet = [stack.enter_context(Simulator(process.port)) for _ in range(MAX_CLIENTS)]
+        assert attack.Car(process.port, jpegs[:1]).expected
         with pytest.raises(ConnectionError):
-            others[0].open()
-            others[0].receive()
-        for other in others:
-            other.socket.close()
+            for _ in range(4):
+                quiet[0].receive()
+
+
+def test_a_failed_handshake_takes_no_place(server, jpegs):
+    for _ in range(2 * MAX_CLIENTS):
+        with socket.create_connection(("127.0.0.1", server.port), 10) as stranger:
+            stranger.sendall(WEBSOCKET.replace(b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n", b"") % b"")
+            assert stranger.recv(12) == b"HTTP/1.1 400"
+    attack.Car(server.port, jpegs[:1]).simulator.socket.close()
+
+
+def test_the_client_that_was_served_longest_ago_goes_first():
+    """So a car that waits for its answer waits for one other at most, however many never wait."""
+    engine, served = Server().eio, list[str]()
+
+    def serve(client):
+        client._take_turn()
+        served.append(client.sid)
+        client.served = time.perf_counter()
+
+    for sid in "314502":
+        client = engine.sockets[sid] = Client(engine, sid)
+        client.served, client.waits = client.served - 10 + int(sid), sid != "5"
+    engine.sockets["5"].served -= 10
+    engine.sockets["5"].websocket = SimpleNamespace(parts=["its message arrives"], arrived=time.perf_counter() - 1)
+    arriving = engine.sockets.pop("0")
+    arriving.websocket, arriving.waits = (
+        SimpleNamespace(parts=["so does this"], arrived=time.perf_counter() + 60),
+        False,
+    )
+    engine.sockets["0"] = arriving
+    waiting = [client for client in engine.sockets.values() if client.waits]
+    threads = [eventlet.spawn(serve, client) for client in waiting]
+    eventlet.sleep(0)
+    assert not served, "the rest of a message of the one before all is about to arrive"
+    threads.append(eventlet.spawn(serve, arriving))
+    for thread in threads:
+        thread.wait()
+    assert served == ["0", "1", "2", "3", "4"], "and not those that need too long for a message"
 
 
 def test_a_new_car_takes_the_place_of_a_connection_without_a_request(server, jpegs):
     with ExitStack() as stack:
         for n in range(MAX_CONNECTIONS + 20):
             idle = stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
-            if n % 2:
+            if n >= 20:
                 idle.sendall(b"POST /set-speed HTTP/1.1\r\nContent-Length: 99\r\n\r\n{")
         simulator = stack.enter_context(Simulator(server.port))
         simulator.open()

@@ -1,6 +1,6 @@
 """The connections of a server: how many there may be, what a request may take, and which sites it may come from.
 
-Here and in the two other modules that override what libraries do, a comment says what is worse without it, as the
+Here, in server.py and in websocket.py a comment says what is worse without an override of what libraries do, as the
 attacks of tools/attacks.py show; a time is that of the server's processor in a car's round trip, of which 99 of 100 are
 shorter: 4.9 ms alone.
 """
@@ -22,7 +22,8 @@ from cloning.server.libraries import eventlet
 MAX_CONNECTIONS = 192  # at once: macOS lets a process open 256 files
 MAX_BODY = 1 << 17  # bytes of a request
 TIMEOUT = 10.0  # s in which a client must send something of a request, or read something of an answer
-# Errors of accept that pass: no more file handles, or the client has broken the connection already.
+# Errors of accept that pass: no more file handles (without: 128 of them and 200 connections end the server), or the
+# client has broken the connection already.
 PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM, errno.ECONNABORTED, errno.ECONNRESET, errno.EPROTO)
 log = logging.getLogger(__name__)
 
@@ -104,6 +105,7 @@ def whole_requests(app: WSGIApplication, listener: Listener) -> WSGIApplication:
         if "HTTP_TRANSFER_ENCODING" in environ or length > MAX_BODY:
             text = f"A request's body has a Content-Length, of {MAX_BODY} bytes at most."
             return refuse(start_response, "413 Content Too Large", text)
+        # Without: 192 connections that send slow bodies keep every new car out.
         environ["wsgi.input"] = io.BytesIO(environ["wsgi.input"].read(length))
         listener.idle.pop(environ["eventlet.input"].get_socket(), None)
         return app(environ, start_response)

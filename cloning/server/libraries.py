@@ -13,7 +13,6 @@ try:
         # eventlet advises against using it in new projects, but no server has been used longer with this simulator.
         warnings.simplefilter("ignore")
         import engineio
-        import engineio.async_drivers.eventlet
         import engineio.packet
         import engineio.socket
         import eventlet
@@ -21,7 +20,6 @@ try:
         import eventlet.websocket
         import eventlet.wsgi
         import socketio
-        import socketio.packet
 except ImportError as error:  # PackageNotFoundError is one, too
     raise UserError(f"{error}: run `pip install .` in the folder of the project") from error
 
