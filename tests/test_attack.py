@@ -21,7 +21,7 @@ from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
 from cloning.server.libraries import eventlet
-from cloning.server.server import MAX_CLIENTS, Client, Server
+from cloning.server.server import MAX_CLIENTS, QUIET, Client, Server
 from tools import attack
 from tools.attacks import GET, WEBSOCKET, all_attacks, frame
 from tools.simulator_client import Simulator, telemetry
@@ -108,27 +108,33 @@ def test_a_long_ping_is_not_answered(server):
         assert stranger.receive() == "3"
 
 
-def test_one_client_too_many_waits_until_another_ends(model_file, jpegs):
-    with serving(model_file) as process, Simulator(process.port) as first, ExitStack() as stack:
-        for _ in range(MAX_CLIENTS - 1):
-            stack.enter_context(Simulator(process.port)).open()
+def test_one_client_too_many_waits_until_another_ends_or_is_quiet(model_file, jpegs):
+    with serving(model_file) as process, ExitStack() as stack:
+        first, quiet, *others = [stack.enter_context(Simulator(process.port)) for _ in range(MAX_CLIENTS)]
         first.open()
         with Simulator(process.port) as refused:
             assert refused.status == 503
         awaited(lambda: any("4 clients are connected already" in line for line in process.lines))
         first.drive(telemetry(jpegs[0]))
         first.socket.close()
-        assert attack.Car(process.port, jpegs[:1]).expected
-
-
-def test_a_client_that_says_nothing_for_long_gives_its_place_back(model_file, jpegs):
-    soon = "import cloning.wire.protocol as protocol; protocol.PING_INTERVAL = protocol.PONG_TIMEOUT = 0.2"
-    with serving(model_file, first=soon) as process, ExitStack() as stack:
-        quiet = [stack.enter_context(Simulator(process.port)) for _ in range(MAX_CLIENTS)]
-        assert attack.Car(process.port, jpegs[:1]).expected
+        others.append(attack.Car(process.port, jpegs[:1]).simulator)
+        until = time.monotonic() + QUIET + 1
+        while time.monotonic() < until:
+            for other in others:
+                other.send("2")
+            time.sleep(0.2)
+        attack.Car(process.port, jpegs[:1]).simulator.socket.close()
         with pytest.raises(ConnectionError):
-            for _ in range(4):
-                quiet[0].receive()
+            quiet.open()
+            quiet.receive()
+        others[-1].socket.close()
+
+
+def test_a_client_that_says_nothing_for_long_is_disconnected(model_file):
+    soon = "import cloning.wire.protocol as protocol; protocol.PING_INTERVAL = protocol.PONG_TIMEOUT = 0.2"
+    with serving(model_file, first=soon) as process, Simulator(process.port) as silent, pytest.raises(ConnectionError):
+        for _ in range(4):
+            silent.receive()
 
 
 def test_a_failed_handshake_takes_no_place(server, jpegs):

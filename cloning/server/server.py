@@ -15,6 +15,7 @@ from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 
 ARRIVAL = 0.002  # s within which a simulator sends the rest of a message, if it is read at once
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
+QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 OPENING_INTERVAL = 0.005  # s between two new clients; without: 23 ms beside reconnections
 PACKET_TYPES = ("1", "3", "4", "5")  # of Engine.IO, besides pings, that a client may send
 # Events that announce attachments count as unreadable: python-socketio keeps any number, 88 MB in 3 s of `attachments`.
@@ -96,6 +97,12 @@ class Client(engineio.socket.Socket):
             eventlet.sleep(0)
         self.waits = False
 
+    def hang_up(self) -> None:
+        """Give the place back at once, and end the connection."""
+        self.server.sockets.pop(self.sid, None)
+        if self.websocket:
+            self.websocket.hang_up()
+
     def has_message(self) -> bool:
         """Return whether a message waits to be handled, or its rest will arrive at once."""
         arriving = self.websocket and self.websocket.parts and time.perf_counter() < self.websocket.arrived + ARRIVAL
@@ -135,10 +142,23 @@ class Engine(engineio.Server):
             return refuse(start_response, "200 OK", reason, NO_SESSION + json.dumps({"message": reason}))
         with self.opening:
             eventlet.sleep(OPENING_INTERVAL)
-        if len(self.sockets) >= MAX_CLIENTS:
+        if not self._make_room():
             return refuse(start_response, "503 Service Unavailable", f"{MAX_CLIENTS} clients are connected already.")
         environ["QUERY_STRING"] = "EIO=4&transport=websocket"  # without: clients of Engine.IO 3 are refused
         return super().handle_request(environ, start_response)
+
+    def _make_room(self) -> bool:
+        """Return whether there is room for another client; end the quietest one's session for that.
+
+        Without: four connections that say nothing keep every car out for 85 s.
+        """
+        if len(self.sockets) < MAX_CLIENTS:
+            return True
+        quietest = min(self.sockets.values(), key=lambda client: client.served)
+        if time.perf_counter() < quietest.served + QUIET:
+            return False
+        quietest.hang_up()
+        return True
 
 
 class Server(socketio.Server):

@@ -96,4 +96,8 @@ class WebSocket:
             self.sock.settimeout(SEND_TIMEOUT)
             self.sock.sendall(self.protocol.send(event))
         except OSError:
-            eventlet.greenio.shutdown_safe(self.sock)  # so that `receive` finds the end
+            self.hang_up()
+
+    def hang_up(self) -> None:
+        """End the connection at once, so that `receive` finds the end."""
+        eventlet.greenio.shutdown_safe(self.sock)
