@@ -38,7 +38,6 @@ from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import write
 from cloning.base.progress import progress_bar
 from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
-from cloning.network.layer_table import layer_table
 from cloning.network.network import NETWORKS, load_model
 from cloning.recordings.check import check_images
 from cloning.recordings.format import CAMERAS
@@ -302,12 +301,8 @@ class TrainingRun:
         while len(history) < self.recipe.epochs:
             self.epoch()
             started = time.monotonic()
-            try:
-                with self.stop.at_once(alone=self.ranks.world == 1):
-                    figures = self.validate()
-            except Interrupted:
-                self.save()
-                raise
+            with self.stop.at_once(self.save, alone=self.ranks.world == 1):
+                figures = self.validate()
             self.check_finite(figures[0])
             progress.seconds += time.monotonic() - started
             is_best = progress.finish_epoch(*figures, self.recipe.best_by)
@@ -413,9 +408,8 @@ def run(command: Command, ranks: Ranks) -> None:
     """Read the data, train, and print the summary. Raises UserError, OSError, Interrupted, KeyboardInterrupt."""
     training_run = TrainingRun(ranks.from_first(lambda: prepare(command)), command.process, ranks)
     if ranks.first:
-        if training_run.recipe.name != ROBUST.name:  # the report shows it; a run's own report does so in any case
-            print(layer_table(training_run.network))
-        print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks))
+        layers = training_run.recipe.name != ROBUST.name  # the report shows them, and so does each run's own
+        print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks, layers))
         labels = training_run.training.steering
         training_run.checkpoint.begin(training_run.progress, training_run.precision, labels)
     try:

@@ -92,12 +92,14 @@ def test_a_signal_does_not_wait_for_the_validation(finished, sample_recording, t
     monkeypatch.undo()
     assert run_here(sample_recording, "--output", output, "--resume").returncode == 0
     assert same(weights(output), weights(finished[1] / "model.pt"))
+    saved = list[str]()
     with StopSignals() as stop:
         signal.raise_signal(signal.SIGINT)
-        with stop.at_once(alone=False):  # other ranks wait for this one
-            pass
-        with pytest.raises(Interrupted), stop.at_once(alone=True):
+        with stop.at_once(lambda: saved.append("other ranks wait for this one"), alone=False):
+            assert not saved
+        with pytest.raises(Interrupted), stop.at_once(lambda: saved.append("state"), alone=True):
             pytest.fail("it has waited")
+        assert saved == ["state"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")

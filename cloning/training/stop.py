@@ -57,13 +57,16 @@ class StopSignals:
             raise Interrupted(number)
 
     @contextmanager
-    def at_once(self, alone: bool) -> Iterator[None]:
-        """A context that takes long; a signal raises Interrupted in it, if no other rank waits for this one's work."""
-        if alone and self.received:
-            raise Interrupted(self.received)
+    def at_once(self, save: Callable[[], None], alone: bool) -> Iterator[None]:
+        """A context that takes long; a signal saves and raises Interrupted, if no other rank waits for this one."""
         self._waiting = alone
         try:
+            if alone and self.received:
+                raise Interrupted(self.received)
             yield
+        except Interrupted:
+            save()
+            raise
         finally:
             self._waiting = False
 

@@ -15,6 +15,7 @@ from cloning.base.errors import RecordingError
 from cloning.base.files import csv_bytes, write
 from cloning.base.outputs import plural
 from cloning.network.compute import threads
+from cloning.network.layer_table import layer_table
 from cloning.network.network import Network
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
@@ -92,12 +93,13 @@ def history_csv(history: list[EpochMetrics]) -> bytes:
     return csv_bytes([history[0], *(["" if math.isnan(x) else x for x in row.values()] for row in history)])
 
 
-def run_header(network: Network, device: torch.device, precision: torch.dtype, ranks: Ranks) -> str:
-    """Return the network's size, and what computes it: device, precision, threads and processes."""
+def run_header(network: Network, device: torch.device, precision: torch.dtype, ranks: Ranks, layers: bool) -> str:
+    """Return the network's size, with or without its layers, and what computes it: device, precision, threads."""
     processes = f", {ranks.world} processes" if ranks.world > 1 else ""
     name = str(precision).removeprefix("torch.")
     size = sum(parameter.numel() for parameter in network.parameters())
-    return f"\na network of {size:,} parameters on {device}, {name}, {threads()} threads{processes}"
+    table = f"{layer_table(network)}\n" if layers else ""
+    return f"{table}\na network of {size:,} parameters on {device}, {name}, {threads()} threads{processes}"
 
 
 def epoch_line(row: EpochMetrics) -> str:
