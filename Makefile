@@ -25,8 +25,7 @@ lint: .venv/installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 
-# The stamp is written last, so that an interrupted installation is repeated. Without --no-compile, pip compiles 13,000
-# files, most of which nothing imports.
+# The stamp is written last, so that an interrupted installation is repeated.
 .venv/installed: requirements.txt
 	@$(PYTHON) -c "import sys; sys.exit('Python 3.11 or later is needed, and $(PYTHON) is Python ' + sys.version.split()[0] \
 		+ ': name another, as in make demo PYTHON=python3.12' if sys.version_info < (3, 11) else 0)"
@@ -34,7 +33,7 @@ lint: .venv/installed
 	@[ "$$(uname)" != Linux ] || PATH="$$PATH:/sbin" ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
 	@echo "install into .venv: some minutes; 2 GB on disk, or 5.5 GB where PyTorch brings NVIDIA's libraries: see README.md"
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -r requirements.txt
+	$(BIN)/python -m pip install --disable-pip-version-check -r requirements.txt
 	touch $@
 
 lock:

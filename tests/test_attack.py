@@ -20,7 +20,7 @@ import drive
 from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
-from cloning.server.libraries import eventlet
+from cloning.server.libraries import engineio, eventlet
 from cloning.server.server import MAX_CLIENTS, QUIET, Client, Server
 from tools import attack
 from tools.attacks import GET, WEBSOCKET, all_attacks, frame
@@ -145,8 +145,9 @@ def test_a_failed_handshake_takes_no_place(server, jpegs):
     attack.Car(server.port, jpegs[:1]).simulator.socket.close()
 
 
-def test_the_client_that_was_served_longest_ago_goes_first():
+def test_the_client_that_was_served_longest_ago_goes_first(monkeypatch):
     """So a car that waits for its answer waits for one other at most, however many never wait."""
+    monkeypatch.setattr(engineio.socket, "Socket", engineio.socket.Socket)  # a Server replaces it, here until the end
     engine, served = Server().eio, list[str]()
 
     def serve(client):
