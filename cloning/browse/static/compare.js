@@ -3,7 +3,7 @@ import {ask, element, make, many, notice, onClick, renew} from "./common.js";
 import {LIMITS} from "./replays.js";
 
 const COLUMNS = { // of each model, and what they mean
-  "steering error": "Root mean square of the difference from the human's steering, in all frames",
+  "steering error": "Root mean square of the difference from the driver's steering, in all frames",
   autonomy: "Share of the time without an intervention, each of which counts as 6 s",
   "mean distance": "From the lane's centre, while the model drives",
 };
@@ -50,7 +50,7 @@ function table(found, limit) {
   const names = found.find(({models}) => models)?.models.map(({name}) => name) ?? [];
   const each = Object.entries(COLUMNS);
   const head = make("tr", "", {},
-    ...["recording", "minutes", "road", "human's distance"].map(text => make("th", text, {rowspan: 2, scope: "col"})),
+    ...["recording", "minutes", "road", "driver's distance"].map(text => make("th", text, {rowspan: 2, scope: "col"})),
     ...names.map(name => make("th", name, {colspan: each.length, scope: "colgroup"})));
   const below = make("tr", "", {}, ...names.flatMap(() =>
     each.map(([text, title]) => make("th", text, {scope: "col", title}))));

@@ -62,7 +62,7 @@ export class Plots {
       marks: replay.where.map(([row]) => row)})).filter(Boolean);
     const drivers = this.replays.map((replay, index) => replay &&
       ({...models[index], name: `${models[index].name} driving`, values: replay.driver})).filter(Boolean);
-    const human = {name: "human", values: steering, colour: colours.getPropertyValue("--line")};
+    const human = {name: "driver", values: steering, colour: colours.getPropertyValue("--line")};
     const taught = label ? [{name: "label", values: label, colour: colours.getPropertyValue("--label"),
       title: "The recovery steering, which model.py --robust learns"}] : [];
     this.steerings = {human, taught, models};
@@ -76,7 +76,7 @@ export class Plots {
         curves: [{name: "", values: speed}]},
       {title: "Metres right of the lane's centre", unit: " m", digits: 2, tall: 120, lines: LIMITS,
         range: (_, low, high) => balanced(Math.max(2.75, -low * 1.05, high * 1.05), OFF),
-        curves: [{name: replays.length ? "human" : "", values: offset}, ...replays]},
+        curves: [{name: replays.length ? "driver" : "", values: offset}, ...replays]},
     ];
     this.shown = [];
     this.plots = graphs.map((graph, at) => this.plot({...graph, isLast: at == graphs.length - 1}));

@@ -27,7 +27,7 @@ export const KEYS = [
   ["P", "draw on the picture where each steering leads, or not"],
   ["F Shift+F", "the row with the largest lateral offset, then the next largest; back"],
   ["S Shift+S", "next, previous row with the wheels at full lock"],
-  ["D Shift+D", "the row where a model differs most from the human, then the next; back (with --model)"],
+  ["D Shift+D", "the row where a model differs most from the driver, then the next; back (with --model)"],
   ["L", "replay with each model as the driver, at the next limit; off after the last (with --model)"],
   ["N Shift+N", "next, previous intervention of a replay"],
   ["A", "show what the next model looks at; off after the last (with --model)"],

@@ -14,7 +14,7 @@ export function cameras() {
   element("cameras").className = isReplayed ? "replaying" : "";
   document.querySelectorAll("#cameras .replayed").forEach(figure => figure.remove());
   const recorded = (canvas, caption, looks = []) => ({canvas, caption: () => caption, path: canvas, looks, paths: []});
-  const centre = {...recorded("center", isReplayed ? "Human" : "Centre", attention == null ? [] : [attention]),
+  const centre = {...recorded("center", isReplayed ? "Driver" : "Centre", attention == null ? [] : [attention]),
     paths: drawn(isReplayed ? [human, ...taught] : [...models, ...taught, human])};
   element("cameras").dataset.views = replays.filter(Boolean).length;
   if (!isReplayed) return [recorded("left", "Left"), centre, recorded("right", "Right")];
@@ -97,12 +97,12 @@ function section(replay, index) {
   const score = ({autonomy_percent: percent, interventions}) => `${percent.toFixed(1)} %, ${many(interventions, "intervention")}`;
   const {lane_centre: byLane, human_way: byHuman} = replay.by_reference;
   const lines = Object.entries({
-    ...(byLane && byHuman && {"where the lane is known": score(byLane), "elsewhere, from the human's path": score(byHuman)}),
+    ...(byLane && byHuman && {"where the lane is known": score(byLane), "elsewhere, from the driver's path": score(byHuman)}),
     autonomy: `${replay.autonomy_percent.toFixed(1)} %`,
     distance: `mean ${replay.distance_mean_m.toFixed(2)} m, 95 % below ${replay.distance_p95_m.toFixed(2)} m`,
-    "human's distance": `mean ${replay.human_mean_m.toFixed(2)} m`,
+    "driver's distance": `mean ${replay.human_mean_m.toFixed(2)} m`,
     driven: many(replay.driven, "frame") + (replay.by_lane < replay.driven
-      ? `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the human's path: no lane known` : ""),
+      ? `; in ${(replay.driven - replay.by_lane).toLocaleString("en")}, measured from the driver's path: no lane known` : ""),
     placed: many(replay.rows_placed, "frame"),
     "mean speed": `${replay.mean_speed_mph.toFixed(1)} mph`,
     "steering's change": `${replay.steering_roughness_per_s.toFixed(2)} per second`,
