@@ -93,7 +93,7 @@ def test_a_signal_does_not_wait_for_the_validation(finished, sample_recording, t
     assert run_here(sample_recording, "--output", output, "--resume").returncode == 0
     assert same(weights(output), weights(finished[1] / "model.pt"))
     saved = list[str]()
-    with StopSignals() as stop:
+    with pytest.raises(Interrupted), StopSignals() as stop:
         signal.raise_signal(signal.SIGINT)
         with stop.at_once(lambda: saved.append("other ranks wait for this one"), alone=False):
             assert not saved

@@ -40,9 +40,12 @@ class StopSignals:
         self._handlers = {number: signal.signal(number, self._note) for number in noted}
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        """Raise Interrupted for a signal that came when all was done but what the last epoch saves."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
+        if self.received and not error:
+            raise Interrupted(self.received)
 
     def _note(self, number: int, _: FrameType | None) -> None:
         if number == getattr(signal, "SIGHUP", None):  # printing would fail, before the state is saved
