@@ -24,18 +24,6 @@ USAGE = "usage: behavioral-cloning COMMAND …\n\n" + "\n".join(
 )
 
 
-def start(module: str) -> int | None:
-    """Run a module's `main`; return its exit status."""
-    from importlib import import_module  # here, so that nothing delays `end_on_interrupt`
-
-    try:
-        main = import_module(module).main
-        return main()
-    except ModuleNotFoundError as error:  # of an extra of pyproject.toml
-        print(f"behavioral-cloning: {program.missing_library(error)}", file=sys.stderr)
-        return program.FAILED
-
-
 def main() -> None:
     """Run the command that the arguments name."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
@@ -45,4 +33,6 @@ def main() -> None:
     sys.argv = [f"behavioral-cloning {name}", *sys.argv[1 if name == "replay" else 2 :]]
     program.installed = {clone: f"behavioral-cloning {command}" for command, (_, clone, _) in COMMANDS.items()}
     program.end_on_interrupt(f"behavioral-cloning {name}")
-    program.run(lambda: start(COMMANDS[name][0]))
+    from importlib import import_module  # here, so that nothing delays `end_on_interrupt`
+
+    program.run(import_module(COMMANDS[name][0]).main)
