@@ -37,6 +37,8 @@ class Joined(ClientSession):
     answer changes: then the driver has seen it.
     """
 
+    remedy = ""  # the server is another team's program
+
     def __init__(self, dialect: Dialect, host: str, port: int, wait: float, pace: float, rate: float):
         """wait: s to wait for a server; pace: simulated s a second, 0 for lock-step.
 

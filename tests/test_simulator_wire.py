@@ -111,6 +111,9 @@ def test_a_missing_server_is_waited_for_then_reported(capsys):
     told = capsys.readouterr().err
     assert re.search(r"no server at 127\.0\.0\.1.*; start `python drive.py` in another terminal; trying again", told)
     assert re.search(r"^python: no server at 127\.0\.0\.1.*drive\.py", told, re.MULTILINE)
+    assert main(["join", "--dialect", "roads", "--wait", "0.5", "--port", str(unused_port())]) == 2
+    told = capsys.readouterr().err
+    assert re.search(r"no server at 127\.0\.0\.1.*\); trying again", told) and "drive.py" not in told
 
 
 @pytest.mark.parametrize("realtime", [False, True])

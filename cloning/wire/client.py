@@ -41,6 +41,10 @@ class ConnectionLost(Exception):
     """The server closed the connection, or was never there; the message says which."""
 
 
+class NoServer(ConnectionLost):
+    """Nothing listens at the server's address."""
+
+
 @dataclass(frozen=True)
 class Answer:
     """The server's answer to a telemetry: steering and throttle, -1..1, or None for "manual", which changes nothing."""
@@ -146,7 +150,7 @@ class Connection:
         try:
             self.socket = socket.create_connection((host, port), timeout=timeout)
         except (OSError, UnicodeError) as error:  # UnicodeError: a name that no host can have
-            raise ConnectionLost(f"no server at {address} ({getattr(error, 'strerror', None) or error})") from error
+            raise NoServer(f"no server at {address} ({getattr(error, 'strerror', None) or error})") from error
         self.real_timing, self.send_timeout, self.max_packet = real_timing, send_timeout, max_packet
         self.protocol = WSConnection(ConnectionType.CLIENT)
         self.packets: deque[str] = deque()  # received, but not yet returned by `receive`

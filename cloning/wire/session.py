@@ -16,6 +16,7 @@ from cloning.wire.client import (
     Answer,
     Connection,
     ConnectionLost,
+    NoServer,
     parse_answer,
 )
 
@@ -30,6 +31,8 @@ class ClientSession:
     Connecting is no progress, since a server may break each connection: only an answer that the car was driven by
     (`request_answer` returned it, or `progressed` was called) lets `wait` seconds begin anew.
     """
+
+    remedy = "start `python drive.py` in another terminal; "  # where there is no server
 
     def __init__(self, host: str, port: int, wait: float, real_timing: bool = False, max_packet: int = MAX_PACKET):
         """wait: seconds to wait for a server to appear, or for a usable answer; the others: see Connection."""
@@ -89,8 +92,8 @@ class ClientSession:
         if time.monotonic() > self._patience_ends():
             raise self.no_answer() from None
         if first:
-            missing = "" if self._connection else "start `python drive.py` in another terminal; "
-            _print(f"{error}; {missing}trying again for {self.wait:g} s")
+            remedy = self.remedy if isinstance(error, NoServer) else ""
+            _print(f"{error}; {remedy}trying again for {self.wait:g} s")
         time.sleep(RETRY_INTERVAL)
 
     def progressed(self) -> None:
