@@ -66,17 +66,16 @@ class Client(engineio.socket.Socket):
         self.websocket = WebSocket(opened.socket)
         for packet in self.poll():
             self.send(packet)
-        heard = pinged = time.monotonic()
+        pinged = time.perf_counter()
         while not self.closed and (text := self.websocket.receive()) is not None:
-            now = time.monotonic()
+            now = time.perf_counter()
             if self.expects_pings and now > pinged + PING_INTERVAL:
                 pinged = now
                 self.send(engineio.packet.Packet(engineio.packet.PING))
             if text:
-                heard = now
                 self._handle(text)
                 self.served = time.perf_counter()
-            elif now > heard + PING_INTERVAL + PONG_TIMEOUT:
+            elif now > self.served + PING_INTERVAL + PONG_TIMEOUT:
                 break
 
     def _handle(self, text: str) -> None:
