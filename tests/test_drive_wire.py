@@ -278,7 +278,7 @@ def test_javascripts_client(server, node_client, jpegs, steering, version):
     for answer in driven["answers"][1:]:
         assert np.float32(answer["steering_angle"]) == steering[3] and answer["throttle"] == "0"
     assert session({})["refused"] == (ONLY_WEBSOCKET if version > 2 else "xhr poll error")
-    assert any(ONLY_WEBSOCKET in line for line in server.lines), "the terminal tells in any case"
+    awaited(lambda: any(ONLY_WEBSOCKET in line for line in server.lines))  # the terminal tells in any case
 
 
 def test_pythons_client(server, jpegs, steering):

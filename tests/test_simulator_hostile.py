@@ -177,8 +177,8 @@ def lake():
     return Track("lake")
 
 
-def drive(server, realtime, laps=0.01):
-    client = Client(Run(lake(), "autonomous"), Blank(), "127.0.0.1", server.port, WAIT, realtime)
+def drive(server, realtime, laps=0.01, wait=WAIT):
+    client = Client(Run(lake(), "autonomous"), Blank(), "127.0.0.1", server.port, wait, realtime)
     client.drive(laps)
     return client
 
@@ -212,7 +212,7 @@ def test_a_flood_of_answers_drives_on(realtime):
     with Hostile(Case("", flood=frame(AHEAD) * 100)) as server:
         # What the client sends fills a small buffer at once, on any machine: nobody reads it.
         server.listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
-        client = drive(server, realtime, laps=0.002)
+        client = drive(server, realtime, laps=0.002, wait=3 * WAIT)  # the server is slow where others need the cores
         assert server.open
     assert client.run.travelled >= 0.002 * client.run.track.length
 
