@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
 from cloning.server.libraries import engineio, eventlet
 from cloning.server.server import MAX_CLIENTS, QUIET, Client, Server
-from tools import attack
+from tools import attack, soak
 from tools.attacks import GET, WEBSOCKET, all_attacks, frame
 from tools.simulator_client import Simulator, telemetry
 
@@ -67,7 +68,7 @@ import os, signal, time
 from types import SimpleNamespace
 from cloning.base import program
 program.end_on_interrupt("test")
-from tools import attack
+from tools import attack, soak
 
 def strike(port, until):
     print(os.getpid(), flush=True)
@@ -289,3 +290,12 @@ def test_a_new_page_gets_the_last_minute_in_as_many_rows_as_it_can_show(jpegs, m
     times = [row[0] for row in json.loads(next(pages.events())[6:])["rows"]]
     assert len(times) <= page.SHOWN_FRAMES and times == sorted(times)
     assert times[-1] == session.history[-1].time and times[-1] - times[0] > 49
+
+
+def test_a_soak_finds_what_does_not_stay_as_it_was(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(soak, "VISIT", 0.1)
+    monkeypatch.setattr(soak, "PAUSE", 0.1)
+    lines, found = soak.soak(server, tmp_path, 40)
+    assert len(lines) == 11 and found == []
+    monkeypatch.setattr(soak, "MAX_GROWTH", -1000.0)
+    assert re.fullmatch(r"memory grew by -?\d+ MB", *soak.soak(server, tmp_path, 40)[1])

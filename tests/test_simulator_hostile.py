@@ -192,6 +192,7 @@ def test_a_drive_ends_when_its_patience_does(name, realtime, capsys):
         assert server.open, "the client ended by itself"
     text = str(caught.value)
     assert f"no usable answer in {WAIT:g} s" in text and text.isprintable() and len(text) < 300
+    assert "start `python drive.py" not in text  # something listens there
     assert capsys.readouterr().err.count("trying again") <= 1
 
 

@@ -105,11 +105,11 @@ class Car:
 class Target(ServerProcess):
     """A drive.py process under attack."""
 
-    def __init__(self, model: str | Path):
-        """Start it."""
+    def __init__(self, model: str | Path, *folder: Path):
+        """Start it; folder: for its frames."""
         import resource  # missing on Windows, where main refuses to run
 
-        super().__init__(ROOT / "drive.py", model, "--port", "0")
+        super().__init__(ROOT / "drive.py", model, *folder, "--port", "0")
         resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (OPEN_FILES, OPEN_FILES))
 
     def open_files(self) -> int:

@@ -32,7 +32,7 @@ class ClientSession:
     (`request_answer` returned it, or `progressed` was called) lets `wait` seconds begin anew.
     """
 
-    remedy = "start `python drive.py` in another terminal; "  # where there is no server
+    remedy = "; start `python drive.py` in another terminal"  # where there is no server
 
     def __init__(self, host: str, port: int, wait: float, real_timing: bool = False, max_packet: int = MAX_PACKET):
         """wait: seconds to wait for a server to appear, or for a usable answer; the others: see Connection."""
@@ -93,7 +93,7 @@ class ClientSession:
             raise self.no_answer() from None
         if first:
             remedy = self.remedy if isinstance(error, NoServer) else ""
-            _print(f"{error}; {remedy}trying again for {self.wait:g} s")
+            _print(f"{error}{remedy}; trying again for {self.wait:g} s")
         time.sleep(RETRY_INTERVAL)
 
     def progressed(self) -> None:
@@ -160,12 +160,12 @@ class ClientSession:
     def no_answer(self) -> SimulatorError:
         """Return the error for a server that is missing, breaks each connection, or sends nothing usable."""
         reason = f"{self._lost}; " if self._lost else ""
-        remedy = "start `python drive.py model.pt` first"
+        remedy = self.remedy if isinstance(self._lost, NoServer) else ""
         if self._connection:
-            remedy = "a server is there, but is silent: it may be busy, or have no handler for the event `telemetry`"
+            remedy = "; a server is there, but is silent: it may be busy, or have no handler for the event `telemetry`"
         if self.unusable:
-            remedy = f"{self.unusable} unusable answers so far: `steer` must contain strings, as drive.py sends them"
-        return SimulatorError(f"{reason}no usable answer in {self.wait:g} s; {remedy}")
+            remedy = f"; {self.unusable} unusable answers so far: `steer` must contain strings, as drive.py sends them"
+        return SimulatorError(f"{reason}no usable answer in {self.wait:g} s{remedy}")
 
     def count_reconnection(self, error: ConnectionLost) -> None:
         """Count a lost connection and wait before a new one is made. Raises SimulatorError after `wait` seconds."""

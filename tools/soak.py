@@ -1,0 +1,175 @@
+"""Let cars drive with one drive.py for hours' worth of frames, and tell whether it stays as it was at the start.
+
+    python -m tools.soak                        # a million frames: about an hour and a half on two cores
+    python -m tools.soak --frames 20000         # about two minutes
+
+Beside a car in lock-step, which leaves and comes again, a second one comes at times, pages are opened and closed, and
+the frames that drive.py saves are deleted. The table has a line for each tenth of the frames. The exit status is 1 if
+an answer was lost or wrong, if memory grew by more than 20 MB after the first twentieth, or if a file or connection was
+left open. Needs Linux, because memory is read from /proc.
+"""
+
+from cloning.base import program
+
+if __name__ == "__main__":
+    program.end_on_interrupt("soak")  # also while the libraries below are loaded
+
+import http.client
+import os
+import random
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cloning.base.arguments import command_line, number
+from cloning.base.progress import progress_bar
+from cloning.network.network import SHIPPED_MODEL
+from tools.attack import Car, Target
+from tools.attacks import frames
+from tools.command import head, row, run_tool
+
+TENTHS = 10
+MAX_GROWTH = 20.0  # MB
+VISIT, PAUSE = 5.0, 3.0  # s, mean: how long a second car or a page stays, and until the next one
+STAY = 3000  # frames, mean: after these the car leaves, and comes again
+KEPT = 2.0  # s: how long saved frames are left on the disk
+SETTLE = 1.0  # s at the end, until all that was closed is gone
+PAGES = ("/", "/live")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The server at one moment: memory in MB, open files and sockets, its own processor time in s."""
+
+    memory: float
+    files: int
+    seconds: float
+
+    @staticmethod
+    def of(server: Target) -> "Reading":
+        """Read it."""
+        fields = Path(f"/proc/{server.process.pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
+        seconds = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return Reading(server.memory(), server.open_files(), seconds)
+
+
+class Company:
+    """What goes on beside the car, in threads until the `with` statement ends; an error in one is raised there."""
+
+    def __init__(self, port: int, car: Callable[[], Car], folder: Path):
+        """port: of the server; car: makes another one; folder: the frames are saved in its folders."""
+        self.port, self.car, self.folder = port, car, folder
+        self.asked = self.answered = self.wrong = 0  # of the second car
+        self._ended, self._errors = threading.Event(), list[Exception]()
+        works = (self._visit, self._look, self._delete)
+        self._threads = [threading.Thread(target=self._repeat, args=(work,)) for work in works]
+
+    def __enter__(self) -> "Company":
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+        for error in self._errors:
+            raise error
+
+    def _repeat(self, work: Callable[[float], None]) -> None:
+        try:
+            while not self._ended.wait(random.expovariate(1 / PAUSE)):
+                work(time.monotonic() + random.expovariate(1 / VISIT))
+        except Exception as error:
+            self._errors.append(error)
+
+    def _visit(self, until: float) -> None:
+        car = self.car()
+        drive = car.drive(until)
+        car.simulator.socket.close()
+        self.asked += drive.asked
+        self.answered += drive.answered
+        self.wrong += drive.wrong
+
+    def _look(self, until: float) -> None:
+        for path in PAGES:
+            connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+            connection.request("GET", path)
+            response = connection.getresponse()
+            assert response.status == 200, f"{path}: {response.status}"
+            while response.read1() and time.monotonic() < until:  # /live has no end
+                pass
+            response.close()
+            connection.close()
+
+    def _delete(self, until: float) -> None:
+        for path in self.folder.glob("*/*.jpg"):
+            if path.stat().st_mtime < time.time() - KEPT:
+                path.unlink()
+
+
+def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]]:
+    """Drive this many frames; return the table's lines and what was found wrong. Raises OSError."""
+    jpegs = frames()
+    expected = Car(server.port, jpegs).expected
+
+    def new_car() -> Car:
+        return Car(server.port, jpegs, expected)
+
+    car, leaves, wrong = new_car(), 0, 0
+    lines = [head("frames", "MB", "open files", "ms of processor time", "p50, ms", "p99, ms")]
+    early = before = Reading.of(server)
+    alone = before.files  # with one car
+    bar = progress_bar(count, "frames")
+    with Company(server.port, new_car, folder) as company, bar:
+        for tenth in range(TENTHS):
+            times, others = [], company.answered
+            for n in range(tenth * count // TENTHS, (tenth + 1) * count // TENTHS):
+                if n == leaves:
+                    car.simulator.socket.close()
+                    car, leaves = new_car(), n + 1 + int(random.expovariate(1 / STAY))
+                if n == count // (2 * TENTHS):
+                    early = Reading.of(server)
+                began, k = time.perf_counter(), n % len(jpegs)
+                wrong += car.ask(car.messages[k]) != expected[k]  # one that is lost raises OSError
+                times.append(1000 * (time.perf_counter() - began))
+                bar.update()
+            now, answered = Reading.of(server), len(times) + company.answered - others
+            spent = 1000 * (now.seconds - before.seconds) / answered
+            p50, p99 = np.quantile(times, (0.5, 0.99))
+            figures = f"{now.memory:.1f}", now.files, f"{spent:.2f}", f"{p50:.1f}", f"{p99:.1f}"
+            lines.append(row((tenth + 1) * count // TENTHS, *figures))
+            before = now
+    time.sleep(SETTLE)
+    files, lost, grown = server.open_files(), company.asked - company.answered, before.memory - early.memory
+    car.simulator.socket.close()
+    wrong += company.wrong
+    found = {
+        f"{lost} answers lost": lost > 0,
+        f"{wrong} answers wrong": wrong > 0,
+        f"memory grew by {grown:.0f} MB": grown > MAX_GROWTH,
+        f"{files} open files, {alone} at the start": files != alone,
+    }
+    return lines, [what for what, is_so in found.items() if is_so]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Drive, and print the table; return the exit status. Raises UserError, OSError."""
+    parser = command_line("soak", __doc__)
+    parser.add_argument("--model", default=SHIPPED_MODEL, help="a model file (default: the project's own)")
+    parser.add_argument("--frames", type=number(int, 100, 10**9), default=10**6, help="default %(default)s")
+    options = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory() as folder, Target(options.model, Path(folder) / "frames") as server:
+        lines, found = soak(server, Path(folder), options.frames)
+    print("\n".join(lines))
+    print(f"\n{'; '.join(found) or 'as at the start'}")
+    return program.INCOMPLETE if found else program.DONE
+
+
+if __name__ == "__main__":
+    run_tool(main)
