@@ -356,7 +356,7 @@ def main() -> int:
     )
     gc.collect()
     gc.freeze()  # else a client can make the collector look through all the libraries' objects: 0.2 s each time
-    status = program.DONE
+    lost = False
     try:
         connections.serve(listener, server.app, stopped, server.tell_of_silence, StatusLine(server, stderr).update)
     finally:
@@ -366,9 +366,9 @@ def main() -> int:
                 server.saver.close()
             except UserError as error:
                 print(f"{program.name}: {error}", file=sys.stderr)
-                status = program.INCOMPLETE
+                lost = True
         stderr.finish()
-    return status
+    return program.INCOMPLETE if lost else 128 + stopped[0]
 
 
 if __name__ == "__main__":

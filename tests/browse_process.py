@@ -59,7 +59,7 @@ def browsing(*arguments, **more):
         yield server
     finally:
         server.process.send_signal(signal.SIGINT)
-        assert server.process.wait(30) == 0
+        assert server.process.wait(30) == 128 + signal.SIGINT
 
 
 @contextmanager

@@ -168,7 +168,7 @@ def test_a_vanished_simulator_and_a_restarted_server(model_file, jpegs, steering
             with Simulator(port) as simulator:
                 simulator.open()
                 assert np.float32(simulator.drive(telemetry(jpegs[2]))["steering_angle"]) == steering[2]
-                assert process.stop(signal.SIGTERM) == (0 if sys.platform != "win32" else 1)
+                assert process.stop(signal.SIGTERM) == (128 + signal.SIGTERM if sys.platform != "win32" else 1)
                 with pytest.raises(OSError):
                     simulator.receive()
 

@@ -70,7 +70,7 @@ def main() -> int:
     finally:
         library.close()
         stderr.finish()
-    return program.DONE
+    return 128 + stopped[0]
 
 
 if __name__ == "__main__":
