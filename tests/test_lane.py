@@ -277,6 +277,14 @@ def test_a_damaged_image_is_named(copied):
         detect_centres(read_recording(copied))
 
 
+def test_what_a_network_may_notice_of_a_frame_is_measured():
+    flat, sharp = np.full((1, 20, 30, 3), (40, 20, 20), np.uint8), np.full((1, 20, 30, 3), 100, np.uint8)
+    sharp[:, :, 15:] = 200
+    assert likeness.measures(flat).tolist() == [100, 127.5 + 0.5, 0, 0]  # dark, half saturated
+    dark, saturation, edges, laplacian = likeness.measures(sharp)
+    assert (dark, saturation) == (0, 0) and edges == pytest.approx(100 / 30) and laplacian > 100
+
+
 def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsys):
     """The table of differences, of a rendered recording against the same places rendered again."""
     recording, _ = drive

@@ -3,7 +3,8 @@
     python -m tools.likeness data/lake-ccw --picture side_by_side.png
 
 `cloning.lane.localise` locates a real recording on a known road, and the stand-in simulator renders the same poses. The
-table compares mean colours, and mean colours of image rows.
+table compares mean colours, also of image rows, and what a network may notice in the road's rows: how many pixels are
+dark, the saturation, and how sharp the frames are.
 """
 
 from cloning.base import program
@@ -18,6 +19,7 @@ import numpy as np
 
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import RecordingError
+from cloning.base.frame import ROAD_ROWS
 from cloning.base.outputs import check_folders, write_output
 from cloning.lane.localise import localise_all
 from cloning.lane.reader import estimate_centres, read_strips
@@ -33,6 +35,8 @@ from simulator.world import Scene
 from tools.command import run_tool
 
 COMPARED_ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
+DARK = 50  # of 255, the largest of R, G and B
+EDGE = (100, 200)  # the thresholds of OpenCV's Canny
 
 
 def render(track: Track, look: int, states: np.ndarray) -> np.ndarray:
@@ -69,6 +73,8 @@ def compare(folder: Path, count: int, look: int, picture: str | None) -> None:
         print_colours(f"{camera}, mean colour RGB", [frames[:, c].mean((0, 1, 2)) for frames in both])
     for row in COMPARED_ROWS:
         print_colours(f"center, row {row}", [frames[:, 0, row].mean((0, 1)) for frames in both])
+    for name, *values in zip(MEASURES, *(measures(frames[:, 0, ROAD_ROWS]) for frames in both), strict=True):
+        print(f"{name:28}" + "".join(f"{value:>24.1f}" for value in values))
     profile = [frames[:, 0].mean((0, 2, 3)) for frames in both]
     print(
         f"{'row profile, correlation':28}{np.corrcoef(*profile)[0, 1]:>24.3f}"
@@ -76,6 +82,20 @@ def compare(folder: Path, count: int, look: int, picture: str | None) -> None:
     )
     if picture:
         write_picture(picture, *both)
+
+
+MEASURES = ("dark pixels, %", "saturation, of 255", "edges, % of pixels", "variance of the Laplacian")
+
+
+def measures(images: np.ndarray) -> np.ndarray:
+    """Return the MEASURES (4,), means over images, uint8 (n, rows, columns, 3) RGB."""
+    found = []
+    for image in images:
+        _, saturation, value = cv2.split(cv2.cvtColor(image, cv2.COLOR_RGB2HSV))
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        edges, laplacian = cv2.Canny(grey, *EDGE), cv2.Laplacian(grey, cv2.CV_64F)
+        found.append([100 * (value < DARK).mean(), saturation.mean(), 100 * (edges > 0).mean(), laplacian.var()])
+    return np.mean(found, 0)
 
 
 def print_colours(name: str, colours: list[np.ndarray]) -> None:
