@@ -23,6 +23,7 @@ import subprocess
 import sys
 import threading
 import types
+import uuid
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +37,7 @@ LIBRARIES = (
     *("engineio.async_drivers.eventlet", "socketio", "eventlet.websocket", "eventlet.wsgi", "flask", "wsproto"),
 )
 FORKS = sys.platform == "linux"  # elsewhere there is no fork, or libraries do not survive it
+RUN = os.environ.get("PYTEST_XDIST_TESTRUNUID") or uuid.uuid4().hex  # of pytest, the same for all of its workers
 Command = Sequence[str | os.PathLike[str]]
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -129,7 +131,7 @@ class WarmProcess:
     def __init__(self, prepare: str) -> None:
         """prepare: Python code that it runs at first."""
         pytest = os.getppid() if "PYTEST_XDIST_WORKER" in os.environ else os.getpid()
-        name = f"\0warm process of {pytest}"  # of no file
+        name = f"\0{RUN}"  # of no file
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         while self.socket.connect_ex(name):  # none listens yet
             with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
