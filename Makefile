@@ -33,7 +33,9 @@ lint: .venv/installed
 	@[ "$$(uname)" != Linux ] || PATH="$$PATH:/sbin" ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
 	@echo "install into .venv: some minutes; 2 GB on disk, or 5.5 GB where PyTorch brings NVIDIA's libraries: see README.md"
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --disable-pip-version-check -r requirements.txt
+	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -r requirements.txt
+	@# By itself, pip would compile on one core, libraries' own tests too. A few of their files are not for this Python.
+	$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' .venv/lib || true
 	touch $@
 
 lock:

@@ -323,26 +323,23 @@ def main() -> int:
     stderr = terminal.log_to_stderr(program.name)
     log.setLevel(logging.INFO)
     torch.set_num_threads(1)  # a second thread would make single frames slower and their latency less regular
-    try:
-        from cloning.server import connections  # here, because it needs the socket libraries
+    from cloning.server import connections  # here, because it needs the socket libraries
 
-        model = choose_model(arguments.model, arguments.folder)
-        network = load_model(model, arguments.device)
-        limits = load_limits(model, network)
-        if arguments.stop_when_lost and not limits:
-            raise UserError(
-                f"{limits_file(model)}: no such file for this network, so nothing tells when it is lost; "
-                f"`python -m tools.foretell {model}` makes it, or leave out --stop-when-lost"
-            )
-        if arguments.folder:
-            saved_frames.check_folder(arguments.folder)
-        origin = "the model that comes with the project" if model == SHIPPED_MODEL else ""
-        server = DriveServer(network, arguments.speed, origin or str(model), limits, arguments.stop_when_lost)
-        listener = connections.claim_port(arguments.host, arguments.port)
-        if arguments.folder:
-            server.saver, server.recording = saved_frames.FrameSaver(arguments.folder), True  # last: it empties it
-    except (UserError, OSError) as error:
-        return program.failed(error)
+    model = choose_model(arguments.model, arguments.folder)
+    network = load_model(model, arguments.device)
+    limits = load_limits(model, network)
+    if arguments.stop_when_lost and not limits:
+        raise UserError(
+            f"{limits_file(model)}: no such file for this network, so nothing tells when it is lost; "
+            f"`python -m tools.foretell {model}` makes it, or leave out --stop-when-lost"
+        )
+    if arguments.folder:
+        saved_frames.check_folder(arguments.folder)
+    origin = "the model that comes with the project" if model == SHIPPED_MODEL else ""
+    server = DriveServer(network, arguments.speed, origin or str(model), limits, arguments.stop_when_lost)
+    listener = connections.claim_port(arguments.host, arguments.port)
+    if arguments.folder:
+        server.saver, server.recording = saved_frames.FrameSaver(arguments.folder), True  # last: it empties it
     stopped, port = connections.noted_signals(), listener.getsockname()[1]
     watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(arguments.host, arguments.host)
     stand_in = program.in_commands("python -m simulator drive")

@@ -130,10 +130,7 @@ def main() -> int:
     arguments = parser.parse_args()
     folder = arguments.folder if arguments.folder.name not in ("", "..") else arguments.folder.resolve()  # "." has none
     fps = Fraction(arguments.fps).limit_denominator(1001) if arguments.fps else None
-    try:
-        left_out = make_film(folder, fps, load_overlay(arguments.overlay) if arguments.overlay else None)
-    except (UserError, OSError) as error:
-        return program.failed(error)
+    left_out = make_film(folder, fps, load_overlay(arguments.overlay) if arguments.overlay else None)
     return program.INCOMPLETE if left_out else program.DONE
 
 

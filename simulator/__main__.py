@@ -341,8 +341,7 @@ def run_replay(arguments: argparse.Namespace) -> int:
     """Let a model drive real recordings."""
     from cloning.replay import command
 
-    options = {name: value for name, value in vars(arguments).items() if name != "run"}
-    command.run(command.Options(**options))
+    command.run(arguments)
     return program.DONE
 
 

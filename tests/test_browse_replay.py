@@ -26,10 +26,11 @@ from cloning.network.network import load_checkpoint, load_model, steer
 from cloning.recordings.excluded import Cut, add_cuts
 from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording
-from cloning.replay import command, replay
+from cloning.replay import replay
 from cloning.replay.model_driver import ModelDriver
 from cloning.road.overlay import MAGENTA, overlay
 from cloning.training.run_files import RunFiles
+from simulator import __main__ as simulator
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Replays
@@ -49,7 +50,8 @@ def test_a_replay_on_the_page_is_that_of_the_command(linked, model_file, tmp_pat
     wanted = Analysis("replay", str(model_file), 1.0)
     write_result(linked, wanted, stamp(linked, wanted), analyse.replayed(replay.load_recording(linked), wanted))
     report = tmp_path / "replay.json"
-    command.run(command.Options([str(linked)], str(model_file), "", 0, 0, [1.0], "lane", str(report), None, None))
+    words = ("replay", linked, "--model", model_file, "--limit", 1, "--report", report)
+    assert simulator.main([*map(str, words)]) == 0
     expected = json.loads(report.read_bytes())[0]["limits"]["1"]
     with opened(linked, model_file) as recording:
         shown = recording.details("1")["replays"][0]

@@ -309,7 +309,7 @@ def test_episodes_have_weather_pauses_metrics_and_segments():
         seen["foggy"] = program.data
 
     with EpisodeProgram(plan) as program:
-        assert join("episodes", program) == 0
+        assert join("episodes", program, "--wait", "2") == 0  # other land is built meanwhile
     data = seen["sunny"]
     assert {"lap", "sector", "next_cte", "cte", "pos_x", "pos_y", "pos_z", "speed", "steering_angle"} <= set(data)
     assert number(data, "speed") > 3

@@ -49,14 +49,6 @@ def recording(folder):
     return replay.load_recording(folder)
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    torch.manual_seed(0)
-    path = tmp_path_factory.mktemp("model") / "model.pt"
-    save_model(path, Network())
-    return path
-
-
 def run(*arguments, **more) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "simulator", "replay", *map(str, arguments)]
     return warm.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, **more)
@@ -213,12 +205,12 @@ def test_one_intervention_is_counted_as_one(recording):
     assert re.search(r"\b1 intervention\b", text.splitlines()[1])
 
 
-def test_the_command_gives_the_same_figures_over_the_wire(sample_recording, model, tmp_path):
+def test_the_command_gives_the_same_figures_over_the_wire(sample_recording, model_file, tmp_path):
     folder = "--reference", "human", sample_recording
     outputs = "--picture", tmp_path / "way.png", "--film", tmp_path / "seen.mp4"
-    alone = run(*folder, "--model", model, "--report", tmp_path / "a.json", *outputs)
+    alone = run(*folder, "--model", model_file, "--report", tmp_path / "a.json", *outputs)
     assert alone.returncode == 0, alone.stderr
-    with serving(model) as server:
+    with serving(model_file) as server:
         served = run(*folder, "--port", server.port, "--report", tmp_path / "b.json")
     assert served.returncode == 0, served.stderr
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
@@ -254,12 +246,12 @@ def test_the_film_runs_at_the_recordings_own_rate(recording, tmp_path):
     assert shown and float(shown) == pytest.approx(rate, rel=1e-3)
 
 
-def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):
+def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model_file):
     folder, rng = render_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
     for path in (folder / "IMG").iterdir():
         cv2.imwrite(str(path), rng.integers(0, 255, (160, 320, 3), np.uint8))
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json"
-    done = run(folder, "--model", model, "--limit", *"212", *outputs)
+    done = run(folder, "--model", model_file, "--limit", *"212", *outputs)
     assert done.returncode == 0, done.stderr
     assert "lane's centre unknown in 60 rows from center_" in done.stdout
     assert "2 m, from the recorded driver's path: autonomy" in done.stdout and "0.0% of the rows" in done.stdout
@@ -268,9 +260,9 @@ def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model):
     assert film_frames(tmp_path / "x.mp4") == 60, "one drive writes the film"
 
 
-def test_a_driver_changes_no_setting_of_the_process(model, monkeypatch):
+def test_a_driver_changes_no_setting_of_the_process(model_file, monkeypatch):
     monkeypatch.setattr(torch, "set_num_threads", lambda _: pytest.fail("the caller decides"))
-    ModelDriver(str(model))
+    ModelDriver(str(model_file))
 
 
 @pytest.mark.parametrize("crop", [CROP, (85, 0)])
@@ -325,8 +317,8 @@ def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, p
         (["SHORT", "--model", "MODEL"], "two seconds"),
     ],
 )
-def test_unusable_arguments_are_reported(folder, model, tmp_path, arguments, message, capsys):
-    known = {"FOLDER": folder, "MODEL": model}
+def test_unusable_arguments_are_reported(folder, model_file, tmp_path, arguments, message, capsys):
+    known = {"FOLDER": folder, "MODEL": model_file}
     if "SHORT" in arguments:
         known["SHORT"] = render_recording(tmp_path / "short", rows=20)
     assert simulator.main(["replay", *[str(known.get(argument, argument)) for argument in arguments]]) == 2
@@ -337,11 +329,11 @@ def film_frames(path) -> int:
     return sum(1 for _ in av.open(str(path)).decode(video=0))
 
 
-def test_a_full_disk_costs_the_film_alone(sample_recording, model, tmp_path, capsys, monkeypatch):
+def test_a_full_disk_costs_the_film_alone(sample_recording, model_file, tmp_path, capsys, monkeypatch):
     resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json", "--picture", tmp_path / "p.png"
-    options = "--reference", "human", sample_recording, "--model", model, "--limit", "2", *outputs
+    options = "--reference", "human", sample_recording, "--model", model_file, "--limit", "2", *outputs
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))  # bytes: enough for the plot, half of the film
     try:
         assert simulator.main(["replay", *map(str, options)]) == 2
@@ -384,12 +376,12 @@ def test_an_error_at_one_limit_ends_the_drives_at_the_others(recording, at_fault
 
 
 @pytest.mark.skipif(not CAN_FORK, reason="on this system drives follow one another")
-def test_ctrl_c_ends_drives_in_processes_with_one_message(folder, model, tmp_path):
+def test_ctrl_c_ends_drives_in_processes_with_one_message(folder, model_file, tmp_path):
     """The terminal sends it to all of them."""
     log = tmp_path / "log"
     with log.open("w") as file:
-        command_line = [sys.executable, "-m", "simulator", "replay", folder, "--model", model, "--limit", *"123456789"]
-        command_line += ["--reference", "human"]
+        command_line = [sys.executable, "-m", "simulator", "replay", folder, "--model", model_file]
+        command_line += ["--reference", "human", "--limit", *"123456789"]
         process = warm.Popen(command_line, cwd=ROOT, stderr=file, start_new_session=True)
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
         while len(children.read_text().split()) < 8:

@@ -316,7 +316,7 @@ def test_resume_is_recommended_only_once_the_new_run_has_a_state(
         raise error
 
     monkeypatch.setattr(model, function, fail)
-    done = run_here(sample_recording, *SHORT, "--seed", 1, "--output", begun / "model.pt")
+    done = run_here(sample_recording, *TINY, "--seed", 1, "--output", begun / "model.pt")
     assert done.returncode in (2, 130)
     assert ("--resume" in done.stderr) == (advice == "--resume") and advice in done.stderr
     assert seed_of(begun / "model-resume.pt") == (advice == "--resume")

@@ -62,13 +62,13 @@ def anticipating(controls: Controls, pressed: list[set[str]], wanted: float, spe
 
 
 @pytest.mark.parametrize(("track", "seconds", "person"), [("lake", 0.9, simple), ("jungle", 1.1, anticipating)])
-def test_a_person_with_keys_alone_drives_three_laps_at_20_mph(track, seconds, person):
+def test_a_person_with_keys_alone_drives_a_lap_at_20_mph(track, seconds, person):
     """A scripted person of moderate reaction, who looks so far ahead and presses left, right or nothing."""
     run, controls, held, pressed = Run(Track(track)), Controls(), {"w"}, [{"w"}] * REACTION
     run.s = run.track.straight(STRAIGHT)
     run.set_back()
     run.car.speed_limit = 20 * MPH
-    for step in range(30_000):
+    for step in range(10_000):
         if step % LOOK == 0:
             position, ahead = run.car.node.get_pos(), 2 + seconds * run.car.speed
             goal = run.track.at((run.s + ahead) % run.track.length)
@@ -78,9 +78,9 @@ def test_a_person_with_keys_alone_drives_three_laps_at_20_mph(track, seconds, pe
         pressed.append(held)
         controls.step(pressed.pop(0), speed=run.speed_mph)
         run.step(controls.steering, controls.throttle)
-        if run.laps == 3:
+        if run.laps:
             break
-    assert run.laps == 3 and not run.departures
+    assert run.laps and not run.departures
 
 
 def test_a_person_starts_on_a_straight():

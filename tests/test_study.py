@@ -135,9 +135,12 @@ def follow(run):
 def test_the_command_measures_and_goes_on(tmp_path, capsys, monkeypatch):
     for pool in ("ProcessPoolExecutor", "ThreadPoolExecutor"):
         monkeypatch.setattr(study, pool, Here)
+    monkeypatch.setattr("simulator.record.started_workers", Here)
+    first = plan()[0]
+    monkeypatch.setattr(study, "plan", lambda: [first._replace(recipe=replace(first.recipe, epochs=1))])
     data, folder = tmp_path / "data", tmp_path / "study"
-    for seed, name in enumerate(["jungle", "jungle-shadows", "lake-ccw", "lake-cw"]):
-        render_recording(data / name, seed=seed)
+    for seed, (name, rows) in enumerate({"jungle": 1, "jungle-shadows": 1, "lake-ccw": 60, "lake-cw": 60}.items()):
+        render_recording(data / name, rows, seed)
     command = [str(data), "--folder", str(folder), "--jobs", "1", "--networks", "1"]
     command += ["--images", "30", "--laps", "0.01", "--starts", "1"]
     assert study.main(command) == 0

@@ -16,6 +16,7 @@ from commands import ROOT
 
 import video
 from cloning.base import program
+from cloning.base.errors import UserError
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.network.network import Network, save_model
 
@@ -48,6 +49,8 @@ def run(tmp_path, monkeypatch, capsys):
         status: object
         try:
             status = video.main()
+        except (UserError, OSError) as error:
+            status = program.failed(error)
         except SystemExit as error:  # argparse's
             status = error.code
         return status, "".join(capsys.readouterr())

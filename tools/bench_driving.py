@@ -32,7 +32,7 @@ from cloning.base.arguments import command_line, number
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
 from cloning.server.page import DrivenFrame
-from tools.command import ROOT, run_tool
+from tools.command import ROOT
 from tools.server_process import ServerProcess
 from tools.simulator_client import Simulator, fragments, telemetry_message
 
@@ -173,4 +173,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

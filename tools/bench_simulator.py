@@ -35,7 +35,7 @@ from simulator.car import STEP
 from simulator.expert import Expert
 from simulator.run import Run
 from simulator.world import Scene
-from tools.command import ROOT, run_tool
+from tools.command import ROOT
 
 WARM_UP = 20  # frames before the lock-step measurement
 
@@ -129,4 +129,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

@@ -45,7 +45,7 @@ from cloning.road.track import Track
 from cloning.training.distributed import Ranks
 from cloning.training.options import Command, Process, Run
 from simulator.record import record
-from tools.command import head, python, row, run_tool
+from tools.command import head, python, row
 
 BATCH_IMAGES = 474  # images in a batch of 128 observations, at 3.7 images each on average
 NAMES = {
@@ -261,4 +261,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

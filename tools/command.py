@@ -1,27 +1,14 @@
-"""What the tools share: how they end, commands in other processes, and tables in Markdown."""
+"""What the tools share: commands in other processes, and tables in Markdown."""
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from cloning.base import program
-from cloning.base.errors import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-def run_tool(main: Callable[[], int]) -> NoReturn:
-    """Run a tool's main function, print an error of the user as `PROGRAM: MESSAGE`, and end with the exit status."""
-
-    def status() -> int:
-        try:
-            return main()
-        except (UserError, OSError) as error:
-            return program.failed(error)
-
-    program.run(status)
+run_tool = program.run
 
 
 def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -32,7 +32,7 @@ from cloning.base.errors import SimulatorError, UserError
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.log import find_folders
 from cloning.road.autonomy import lap_in_words
-from tools.command import ROOT, python, run_tool
+from tools.command import ROOT, python
 from tools.server_process import ServerProcess
 from tools.shipped import Lap, render
 
@@ -185,4 +185,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

@@ -38,7 +38,6 @@ from cloning.road.motion import stretches
 from cloning.road.track import ROADS, Track
 from simulator.car import STEP
 from simulator.record import record
-from tools.command import run_tool
 from tools.lane_frames import RenderedScene, render_all, shadowed
 
 UNSEEN_LOOKS = (1000, 1001, 1002)  # the network was not trained on them, nor on these roads
@@ -161,4 +160,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

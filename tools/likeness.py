@@ -32,7 +32,6 @@ from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
 from simulator.world import Scene
-from tools.command import run_tool
 
 COMPARED_ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
 DARK = 50  # of 255, the largest of R, G and B
@@ -126,4 +125,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

@@ -40,7 +40,6 @@ from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, find_folders, print_findings, read_recording
 from simulator.driving import preprocessing
-from tools.command import run_tool
 
 CPU = torch.device("cpu")
 Rows = Sequence[tuple[Recording, int]]
@@ -293,4 +292,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

@@ -29,7 +29,7 @@ from cloning.network.network import SHIPPED_MODEL, Network, load_model
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.road.overlay import overlay
 from simulator.scenery.looks import SHADOWED
-from tools.command import ROOT, run_tool
+from tools.command import ROOT
 
 FILM = ROOT / "diagnostic_images" / "report" / "driving.webp"
 CLIPS = (("lake", 0), ("jungle", 0), ("jungle", SHADOWED))  # track and look of each, one after the other
@@ -90,4 +90,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

@@ -48,7 +48,7 @@ from cloning.road.track import Track
 from simulator import driving
 from simulator.run import Run
 from simulator.workers import add_workers, started_workers
-from tools.command import head, row, run_tool
+from tools.command import head, row
 
 TRACKS, SPEEDS, DIRECTIONS = ("lake", "jungle"), (30.0, 15.0), ("ccw", "cw")  # mph on each
 STAND_IN, REPLAYS = "stand-in simulator", f"replays at {LIMITS[-1]:g} m"
@@ -278,4 +278,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

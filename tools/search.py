@@ -40,7 +40,7 @@ from cloning.road.points import LAND, MARKING, MAX_GRADE, spline_road
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.driving import Conditions, Drive, check_driver, drive
 from simulator.workers import add_workers, results, started_workers
-from tools.command import head, row, run_tool
+from tools.command import head, row
 
 SEARCHES = ("random", "evolution")
 NODES = (7, 8)  # of a road, with these lengths in m between them, as in maxitwo's and MultiSim's generators
@@ -233,4 +233,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

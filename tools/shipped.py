@@ -40,7 +40,7 @@ from simulator.run import Run
 from simulator.scenery.looks import SHADOWED
 from simulator.workers import started_workers
 from simulator.world import Scene
-from tools.command import ROOT, python, run_tool
+from tools.command import ROOT, python
 from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 
 REPEATS = 16  # how often each real recording counts, because the rendered ones are many
@@ -185,4 +185,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

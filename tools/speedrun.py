@@ -30,8 +30,9 @@ from cloning.recordings.log import Recording, find_folders
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import ReferenceLine, drive, load_recording, reference_lines
 from cloning.road.autonomy import autonomy
-from tools.command import ROOT, head, python, row, run_tool
+from tools.command import ROOT, head, python, row
 
+Course = tuple[Recording, list[ReferenceLine]]  # what a model drives
 IMAGES, BATCH, RATE = 4_500, 8, 8e-3  # enough for one lap of the lake; tools/experiments.md has what was tried
 
 
@@ -48,19 +49,6 @@ class Result(NamedTuple):
     distance: float
 
 
-class Course(NamedTuple):
-    """A recording to replay: what the model drives."""
-
-    recording: Recording
-    lines: list[ReferenceLine]
-
-    @staticmethod
-    def of(folder: Path) -> "Course":
-        """Read a recording, and estimate its lane. Raises UserError."""
-        recording = load_recording(folder)
-        return Course(recording, reference_lines(recording))
-
-
 def speed_run(train: Sequence[Path], courses: Sequence[Course], options: argparse.Namespace, seed: int) -> Result:
     """Train on some recordings and drive others. Raises UserError if the training fails."""
     with tempfile.TemporaryDirectory() as folder:
@@ -74,7 +62,7 @@ def speed_run(train: Sequence[Path], courses: Sequence[Course], options: argpars
         if done.returncode != program.DONE:
             raise UserError(f"model.py failed: {done.stderr.strip()[-500:]}")
         driver = ModelDriver(str(model))
-        drives = [drive(course.recording, course.lines, options.limit, driver) for course in courses]
+        drives = [drive(*course, options.limit, driver) for course in courses]
     driven = sum(sum(each.seconds) for each in drives)
     share = autonomy(sum(len(each.interventions) for each in drives), driven)
     return Result(seconds, 100 * share, float(np.abs(np.concatenate([each.offset for each in drives])).mean()))
@@ -98,7 +86,8 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     folders = find_folders(options.recordings)
-    courses = {folder: Course.of(folder) for folder in folders}
+    recordings = [load_recording(folder) for folder in folders]
+    courses = {folder: (whole, reference_lines(whole)) for folder, whole in zip(folders, recordings, strict=True)}
     runs = [([train], [other for other in folders if other != train]) for train in folders]
     if options.in_sample:
         runs = [(folders, folders)]
@@ -123,4 +112,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

@@ -44,7 +44,6 @@ from cloning.network.compute import choose_precision, in_precision, one_thread
 from cloning.recordings.log import find_folders, read_recording
 from cloning.road.camera import LEVEL_CAMERA_MATRIX, camera_position, homographies
 from cloning.road.motion import MAX_GAP, Stretch, components, forward_vector
-from tools.command import run_tool
 from tools.lane_frames import render_all, scenes
 
 WARP_DEVIATION = (0.9, 3.0)  # m and degrees: standard deviations of the poses to which real frames are warped
@@ -322,4 +321,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

@@ -140,8 +140,8 @@ def _interrupt(_: int, frame: FrameType | None) -> None:
 def run(main: Callable[[], int | None]) -> NoReturn:
     """Run a command's main function and end with its exit status; Ctrl-C raises KeyboardInterrupt only in `main`.
 
-    Characters that stdout cannot show, such as undecodable bytes of a file's name, are printed as escapes there. What
-    is printed to a stream that was closed before (`>&-`) is lost.
+    Its UserError or OSError is told by `failed`. Characters that stdout cannot show, such as undecodable bytes of a
+    file's name, are printed as escapes there. What is printed to a stream that was closed before (`>&-`) is lost.
     """
     from contextlib import suppress
 
@@ -158,13 +158,15 @@ def run(main: Callable[[], int | None]) -> NoReturn:
         status = main()
     except BaseException as error:
         signal.signal(signal.SIGINT, stop)
+        from cloning.base.errors import UserError  # not at the top: see the docstring above
+
         if interrupted or isinstance(error, KeyboardInterrupt):  # a library may have raised an error of its own for it
             with suppress(OSError):  # Ctrl-C has ended the reader of a pipe, too
                 sys.stdout.flush()
             status = 128 + signal.SIGINT
             if callable(stop):
                 stop(signal.SIGINT, None)
-        elif isinstance(error, OSError):  # of stdout, for example: a full disk, or a pipe that nobody reads
+        elif isinstance(error, UserError | OSError):  # also of stdout: a full disk, or a pipe that nobody reads
             status = failed(error)
         elif isinstance(error, MemoryError) or (
             isinstance(error, RuntimeError) and any(words in str(error) for words in NO_MEMORY)

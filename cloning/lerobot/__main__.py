@@ -55,40 +55,37 @@ def main() -> int:
     arguments = parse_arguments()
     source, output, notes = Path(arguments.source[0]), arguments.output, Counter[str]()
     is_tub, is_data_set = (source / MANIFEST).is_file(), (source / "meta" / "info.json").is_file()
-    try:
-        if not source.exists():
-            raise UserError(f"{source}: no such folder; name a recording, data set, tub or drive")
-        if output.exists():
-            raise OutputError(f"{output}: exists already; name another folder, or delete this one")
-        is_drive = (source / DRIVEN).is_file()
-        if (is_tub or is_data_set or is_drive) and len(arguments.source) > 1:
-            raise UserError(f"{source} is a {'tub' if is_tub else 'drive' if is_drive else 'data set'}: name it alone")
-        if is_drive:
-            samples = read_driven(source, notes)
-        elif is_tub:
-            samples = read_tub(source, arguments.camera, notes)
-        else:
-            from cloning.lerobot.dataset import write_data_set
-            from cloning.lerobot.reader import read_data_set
+    if not source.exists():
+        raise UserError(f"{source}: no such folder; name a recording, data set, tub or drive")
+    if output.exists():
+        raise OutputError(f"{output}: exists already; name another folder, or delete this one")
+    is_drive = (source / DRIVEN).is_file()
+    if (is_tub or is_data_set or is_drive) and len(arguments.source) > 1:
+        raise UserError(f"{source} is a {'tub' if is_tub else 'drive' if is_drive else 'data set'}: name it alone")
+    if is_drive:
+        samples = read_driven(source, notes)
+    elif is_tub:
+        samples = read_tub(source, arguments.camera, notes)
+    else:
+        from cloning.lerobot.dataset import write_data_set
+        from cloning.lerobot.reader import read_data_set
 
-            if not is_data_set:
-                recordings = [check_images(read_recording(folder)) for folder in find_folders(arguments.source)]
-                for recording in recordings:
-                    print_findings(recording)
-                    if (lane := recording.folder / LANE_FILE).exists():
-                        print(f"{lane}: left out; of what comes back, --robust will have to estimate the lane")
-                print(f"{output}: {write_data_set(recordings, output)}")
-                return program.DONE
-            samples = read_data_set(source, arguments.camera, arguments.steering)
-        try:
-            rows = write_recording(samples, output, arguments.full_lock, notes)
-        except RecordingError as error:
-            raise RecordingError(f"{source}: {error}") from None
-        for note, times in notes.items():
-            print(f"{source}: {note} ({plural(times, 'time')})")
-        print(f"{output}: {plural(rows, 'row')}; look at them with `python -m cloning.browse {output}`")
-    except (UserError, OSError) as error:
-        return program.failed(error)
+        if not is_data_set:
+            recordings = [check_images(read_recording(folder)) for folder in find_folders(arguments.source)]
+            for recording in recordings:
+                print_findings(recording)
+                if (lane := recording.folder / LANE_FILE).exists():
+                    print(f"{lane}: left out; of what comes back, --robust will have to estimate the lane")
+            print(f"{output}: {write_data_set(recordings, output)}")
+            return program.DONE
+        samples = read_data_set(source, arguments.camera, arguments.steering)
+    try:
+        rows = write_recording(samples, output, arguments.full_lock, notes)
+    except RecordingError as error:
+        raise RecordingError(f"{source}: {error}") from None
+    for note, times in notes.items():
+        print(f"{source}: {note} ({plural(times, 'time')})")
+    print(f"{output}: {plural(rows, 'row')}; look at them with `python -m cloning.browse {output}`")
     return program.DONE
 
 

@@ -70,7 +70,8 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
     recordings = [recording.without_copies() for recording in recordings]
     times, speed = (np.concatenate([getattr(each, name) for each in recordings]) for name in ("time", "speed"))
     rate = round(frame_rate(times.tolist(), SAMPLE_RATE))
-    lengths = np.array([len(rows) for recording in recordings for rows in _drives(recording)])
+    breaks = [np.flatnonzero(np.diff(each.time) > DRIVE_GAP) + 1 for each in recordings]
+    lengths = np.concatenate([np.diff([0, *at, len(each)]) for each, at in zip(recordings, breaks, strict=True)])
     starts = np.cumsum(lengths) - lengths
     index, rows = np.arange(len(times)), [(each, row) for each in recordings for row in range(len(each))]
     episode = np.repeat(np.arange(len(lengths)), lengths)
@@ -116,11 +117,6 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
         write(temporary / "README.md", (CARD + (__doc__ or "").partition("\n\n")[2]).encode())
         write(temporary / "env.py", ENVIRONMENT.encode())
     return f"{plural(len(times), 'frame')} of 3 cameras in {plural(len(lengths), 'episode')}, {rate} a second"
-
-
-def _drives(recording: Recording) -> list[np.ndarray]:
-    """Return the rows of each of a recording's drives."""
-    return np.split(np.arange(len(recording)), np.flatnonzero(np.diff(recording.time) > DRIVE_GAP) + 1)
 
 
 def _features(rate: int) -> dict[str, dict[str, Any]]:

@@ -1,8 +1,8 @@
 """The command `python -m simulator replay`: a model drives real recordings."""
 
+import argparse
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,36 +30,11 @@ if TYPE_CHECKING:
     from cloning.replay.server_driver import ServerDriver
 
 
-@dataclass(frozen=True)
-class Options:
-    """The options of the command.
-
-    folders                recordings, or folders of recordings
-    model                  a model file, to drive with in this process; None: drive.py drives, over the wire
-    host, port, wait       address of drive.py, and seconds to wait for it
-    limits                 m from the reference line
-    reference              "lane" or "human"
-    report, picture, film  files to write, or None; the film shows the drives at the last limit
-    disturb                disturbance of what the driver sees, or None
-    """
-
-    folders: list[str]
-    model: str | None
-    host: str
-    port: int
-    wait: float
-    limits: Sequence[float]
-    reference: str
-    report: str | None
-    picture: str | None
-    film: str | None
-    disturb: Disturbance | None = None
-
-
-def run(options: Options) -> None:
+def run(options: argparse.Namespace) -> None:
     """Replay the recordings at each limit, print their reports and write the files. Raises UserError.
 
-    After an error or Ctrl-C, the files are still written, with the recordings replayed until then.
+    options: those of the command, under their names. After an error or Ctrl-C, the files are still written, with the
+    recordings replayed until then.
     """
     check_folders(options.report, options.picture, options.film, model=options.model)
     folders = find_folders(options.folders)
@@ -93,7 +68,7 @@ def run(options: Options) -> None:
     run_all(*steps)
 
 
-def _driver(options: Options) -> "ModelDriver | ServerDriver":
+def _driver(options: argparse.Namespace) -> "ModelDriver | ServerDriver":
     """Return the driver; each needs a library of its own, PyTorch or wsproto. Raises ModelError."""
     if options.model:
         from cloning.network.compute import one_thread

@@ -16,7 +16,6 @@ if __name__ == "__main__":
 from pathlib import Path
 
 from cloning.base.arguments import command_line
-from cloning.base.errors import UserError
 from cloning.base.outputs import check_folders, write_output
 from cloning.recordings.log import find_folders
 from cloning.report.content import Report
@@ -36,16 +35,13 @@ def main() -> int:
     add("--markdown", action="store_true", help="also write report.md, with its pictures in report/")
     arguments = parser.parse_args()
     output = RunFiles(str(arguments.run / "model.pt")).report
-    try:
-        report = Report(arguments.run, arguments.lap)
-        check_folders(str(output))
-        report.replay(find_folders(arguments.held_out) if arguments.held_out else [])
-        page = report.page()
-        write_output(output, page.encode(errors="replace"))
-        if arguments.markdown:
-            write_markdown(page, output.with_suffix(".md"))
-    except (UserError, OSError) as error:
-        return program.failed(error)
+    report = Report(arguments.run, arguments.lap)
+    check_folders(str(output))
+    report.replay(find_folders(arguments.held_out) if arguments.held_out else [])
+    page = report.page()
+    write_output(output, page.encode(errors="replace"))
+    if arguments.markdown:
+        write_markdown(page, output.with_suffix(".md"))
     print(f"{output}: open {output.resolve().as_uri()} in a browser")
     return program.DONE
 
