@@ -4,7 +4,7 @@ import {element, make, rounded} from "./site.js";
 const {seconds, topSpeed, limits} = element("plots").dataset;
 const SECONDS = Number(seconds), TOP_SPEED = Number(topSpeed), LIMITS = JSON.parse(limits); // s, mph, m
 const AGAIN = 1000; // ms until a page that lost drive.py asks again
-const DRAWN = 200; // ms between two drawings of curves and map: with each picture, they cost most of time and memory
+const DRAWN = 200; // ms between two drawings of headline, curves and map: with each picture, they cost most memory
 const STILL = 0.5; // mph: a car that is slower stands
 const GAP = 1; // s without a frame that interrupt a curve
 const LEFT = 64, RIGHT = 16; // px of a plot; drive.css has them for the captions
@@ -140,10 +140,10 @@ function hear(event) {
   if (live.state == "gone" && before.state != "gone") answer("");
   const stops = live.state == "driving" && live.set_speed == 0;
   say(stops ? rows.at(-1)?.[SPEED] > STILL ? "stopping" : "stopped" : live.state);
-  showNow();
   showFigures(live);
   if (performance.now() - drawn < DRAWN) return;
   drawn = performance.now();
+  showNow();
   showMap();
   draw();
 }
