@@ -31,7 +31,7 @@ from simulator.run import Run
 from simulator.world import INSIDE, OUTSIDE, Scene, configure_engine, make_texture
 
 SIZE = 960, 540
-FIELD_OF_VIEW = 80  # degrees, horizontal
+FIELD_OF_VIEW = 80  # degrees, horizontal; in a flatter window more, so that it sees the wheels of the car from behind
 MAX_DELAY = 0.2  # s of physics that are caught up after a slow frame; the rest is skipped
 SLOW_FRAMES = 3  # one after another, of which the window tells
 STRAIGHT = 40.0  # m of the straight on which a person starts
@@ -129,7 +129,6 @@ class Window(ShowBase):
         self.saved = (self.simulation.s, 0.0)  # position to jump back to: m along the track, lateral offset in m
         self.chase = True
         self.camLens.set_near_far(NEAR_PLANE, FAR_PLANE)
-        self.camLens.set_fov(FIELD_OF_VIEW)
         self.looks: core.Vec3 | None = None  # the chase camera's direction
         self.told, self.told_until = "", 0.0  # what the middle of the window tells, until this time.monotonic()
         self.departures = self.slow = 0  # departures that it has told of; slow frames one after another
@@ -171,8 +170,11 @@ class Window(ShowBase):
         self.device = OnscreenText("", parent=holder, pos=(BAR + MARGIN, -LETTERS / 4), align=left, **style)
 
     def fit(self) -> None:
-        """Let the texts fit the window's shape."""
-        width = 2 * self.get_aspect_ratio() if self.get_aspect_ratio() > 1 else 2.0
+        """Let the view and the texts fit the window's shape."""
+        aspect = self.get_aspect_ratio()
+        flatter = max(1.0, aspect * SIZE[1] / SIZE[0])
+        self.camLens.set_fov(2 * math.degrees(math.atan(flatter * math.tan(math.radians(FIELD_OF_VIEW / 2)))))
+        width = 2 * max(1.0, aspect)
         self.text.setWordwrap((width - 2 * MARGIN - 3 * LETTERS) / LETTERS)
         self.message.setWordwrap((width - 4 * MARGIN) / LETTERS)
         size = min(LETTERS, (width - 4 * MARGIN) / 34)  # the help's lines have at most 60 letters of half its height

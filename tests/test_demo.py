@@ -63,9 +63,12 @@ def test_a_whole_demo_and_then_nothing_is_done_again(commands, capsys):
     assert (
         "1138 m at 30 mph, never left the road; 0.07 m from the centre line on average, 0.28 m at most" in printed.out
     )
+    for lap in DRIVES:  # nobody waits a minute without knowing for what
+        assert 0 < printed.out.index(f"{lap.title}: it sets off") < printed.out.index(f"{lap.title}: 1138 m")
     commands.clear()
     assert demo.main([]) == program.DONE
     assert [words[0] for words in commands] == ["record", "-m"]  # which finds its recordings; and the report
+    assert "sets off" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("status", [program.FAILED, program.INCOMPLETE])  # with an error, or a crash

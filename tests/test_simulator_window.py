@@ -202,7 +202,7 @@ from cloning.road.track import Track
 from simulator.window import Window, corner_texture
 window = Window(Track("lake"), "recorded", disturbance=Disturbance("fog", 4))
 window.finish()
-for size in ((960, 540), (960, 600), (500, 620)):
+for size in ((960, 540), (960, 600), (1000, 312), (500, 620)):
     properties = core.WindowProperties.size(*size)
     window.win.request_properties(properties)
     window.tell("too slow for the picture " * 4)
@@ -214,6 +214,9 @@ for size in ((960, 540), (960, 600), (500, 620)):
         low, high = text.get_tight_bounds(window.aspect2d)
         assert -width <= low.x < high.x <= width, (size, low, high)
     window.do_help()
+    for wheel in window.scene.wheels:
+        low, high = wheel.get_tight_bounds(window.cam)
+        assert window.camLens.project(core.Point3(low.x, low.y, low.z), core.Point2()), (size, "a wheel is cut off")
 assert window.win.get_x_size() == 500
 assert "fog:4" in window.text.getText()
 shown, seen = window.corner.get_texture(), corner_texture(window.seen.last[0])

@@ -108,6 +108,7 @@ def train(folder: Path, recordings: list[Path]) -> None:
 def drive(lap: Drive) -> None:
     """Let drive.py drive a lap, unless that is done, and print its figures. Raises UserError, OSError."""
     if not lap.picture.exists():
+        print(f"{lap.title}: it sets off; how it drove follows in 1 to 2 minutes", flush=True)
         with TemporaryDirectory(dir=lap.folder, prefix="unfinished-") as folder:
             files = {kind: Path(folder, f"lap.{kind}") for kind in ("json", "mp4", "png")}
             outputs = ("--report", files["json"], "--film", files["mp4"], "--picture", files["png"])
@@ -166,7 +167,7 @@ def main(argv: list[str] | None = None) -> int:
     steps: list[tuple[str, Callable[[], object]]] = [
         (f"train a network on {IMAGES:,} images of them (1 to 3 minutes)", lambda: train(folder, recordings)),
         (f"let it drive the {track} at {SPEEDS[track]} mph{project}; films (2 to 4 minutes)", lambda: drive_all(laps)),
-        ("write a report of it all", lambda: report(folder, laps)),
+        ("write a report of it all (half a minute)", lambda: report(folder, laps)),
     ]
     if not own:
         what = "record an expert who drives a lap of the lake in each direction (1 minute)"

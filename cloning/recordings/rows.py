@@ -5,7 +5,6 @@ import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,7 +87,8 @@ class RowReader:
         self.rejected: list[Rejected] = []
         self._columns: tuple[str, ...] = COLUMNS  # below the last header, as `header_columns` returns them
         self._headers = {0: False}  # line -> whether it names all columns; 0 for none
-        self._rows: list[tuple[Any, ...]] = []  # line, three names and four numbers, as texts
+        self._lines: list[int] = []  # of the rows
+        self._texts: list[str] = []  # of the rows, one after the other: three names and four numbers of each
         self._has_points = False  # a number with a decimal point has been seen
         self._with_commas: list[tuple[int, list[str], list[str]]] = []  # line, names and fields that may be numbers
 
@@ -101,7 +101,8 @@ class RowReader:
         if self._columns == COLUMNS and (plain := PLAIN_ROW.fullmatch(text)):
             self.rows_read += 1
             self._has_points = self._has_points or "." in text[plain.end(5) :]
-            self._rows.append((line, *plain.group(2, 4, 5, 6, 7, 8, 9)))
+            self._lines.append(line)
+            self._texts += plain.group(2, 4, 5, 6, 7, 8, 9)
         elif text.startswith(MERGE_MARKERS):
             self._reject(line, Finding.MERGE_CONFLICT, f"{text[:20]!r}: resolve the merge, delete the line")
         elif not NO_CONTENT.fullmatch(text):
@@ -120,9 +121,10 @@ class RowReader:
         header, or without one, are not those of its columns.
         """
         self._read_decimal_commas()
-        lines = np.array([line for line, *_ in self._rows], np.int32)
-        numbers = np.array([float(token) for row in self._rows for token in row[-len(NUMBERS) :]])
-        numbers = numbers.reshape(-1, len(NUMBERS))
+        lines, count = np.array(self._lines, np.int32), len(self._lines)
+        columns = [self._texts[at :: len(COLUMNS)] for at in range(len(COLUMNS))]
+        images, tokens = columns[: len(CAMERAS)], columns[len(CAMERAS) :]
+        numbers = np.array([np.fromiter(map(float, column), float, count) for column in tokens]).T
         below = np.searchsorted(list(self._headers), lines) - 1
         outside, is_named = np.zeros(numbers.shape, bool), list(self._headers.values())
         for header in np.unique(below):
@@ -138,8 +140,8 @@ class RowReader:
             self._reject(int(lines[row]), Finding.OUT_OF_RANGE, detail)
         if open_line in lines[usable]:
             self._repair("the file ends within this line: its last number may be cut short", open_line)
-        names = np.array([name.encode(errors="surrogateescape") for _, *row in self._rows for name in row[:3]], bytes)
-        return names.reshape(-1, len(CAMERAS))[usable], numbers[usable], lines[usable]
+        names = np.array([[name.encode(errors="surrogateescape") for name in column] for column in images], bytes).T
+        return names[usable], numbers[usable], lines[usable]
 
     def _read_odd_line(self, line: int, text: str) -> None:
         """Read a line that is not as the simulator writes it. Raises UnclearRowError, UnclearLogError."""
@@ -210,7 +212,8 @@ class RowReader:
             raise UnclearRowError(Finding.NOT_A_NUMBER, detail)
         if extra:
             self._repair("extra columns ignored", line)
-        self._rows.append((line, *names, *numbers))
+        self._lines.append(line)
+        self._texts += [*names, *numbers]
 
     def _read_decimal_commas(self) -> None:
         """Add the rows of more than four whole numbers, if they are surely four numbers with decimal commas.
@@ -231,7 +234,8 @@ class RowReader:
         for (line, names, tokens), found in zip(self._with_commas, readings, strict=True):
             if len(found) == 1 and not doubt:
                 self._repair("decimal commas", line)
-                self._rows.append((line, *names, *found[0]))
+                self._lines.append(line)
+                self._texts += [*names, *found[0]]
             else:
                 reason = f"may be four numbers with decimal commas in {len(found)} ways{doubt}"
                 detail = f"{','.join(tokens)!r} {reason}; write decimal points, or {REMEDY}"

@@ -36,6 +36,9 @@ export function onClick(button, action) {
   };
 }
 
+// The attributes of a button that needs more words than it shows: for a screen reader, and as a tooltip.
+export const told = words => ({"aria-label": words, title: words});
+
 // Give an element new children, unless they would show the same as before; build: makes them. A focus in them stays:
 // on the button with the same index.
 export function renew(holder, content, build) {

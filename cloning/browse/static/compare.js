@@ -24,7 +24,8 @@ export async function showComparison(shown) {
   document.title = "Recordings compared";
   element("comparison").hidden = false;
   renew(element("comparing"), now.limit, () => ["Replays at a limit of", ...LIMITS.map(limit => {
-    const button = make("button", `${limit} m`, {"aria-pressed": limit == now.limit});
+    const button = make("button", `${limit} m`, {
+      "aria-pressed": limit == now.limit, title: `A model is set back when it is ${limit} m from the lane's centre`});
     const ids = shown.get("ids"), state = new URLSearchParams({...ids && {ids}, limit});
     onClick(button, () => location.hash = `#/compare?${state}`);
     return button;

@@ -1,5 +1,5 @@
 // Marking stretches, cutting them from a recording or tagging them, and undoing it; what can be undone survives leaving the page.
-import {ask, clock, element, make, many, notice, renew} from "./common.js";
+import {ask, clock, element, make, many, notice, renew, told} from "./common.js";
 import {find} from "./filter.js";
 import {seek, stop} from "./moving.js";
 import {page, remember, say} from "./state.js";
@@ -14,8 +14,8 @@ export function showCuts() {
     const some = details[kind].map(cut => ({...cut, begin: cut.stretches[0]?.[0] ?? 0})).sort((a, b) => a.begin - b.begin);
     const item = ({begin, frames, first, last, reason}) => {
       const time = clock(now.columns.seconds[begin]);
-      const go = make("button", time, {"aria-label": `Go to the ${word} at ${time}`});
-      const remove = make("button", "Delete", {"aria-label": `Delete the ${word} at ${time}`});
+      const go = make("button", time, told(`Go to the ${word} at ${time}`));
+      const remove = make("button", "Delete", told(`Delete the ${word} at ${time}`));
       go.onclick = () => seek(begin);
       remove.onclick = () => change(kind, "DELETE", [{first, last, reason}], `Deleted the ${word}`);
       return make("li", "", {}, go, ` ${many(frames, "frame")}: ${reason || "no reason given"} `, remove);

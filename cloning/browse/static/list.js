@@ -166,7 +166,7 @@ function draw(overview, card) {
     ...words(overview).length ? [make("p", words(overview).join(", "), {class: "found"})] : [],
     make("p", overview.folder, {class: "quiet"}));
   if (lane.state == "failed") {
-    const retry = make("button", "Look for the road again"), now = shown;
+    const retry = make("button", "Look for the road again", {title: "Do the analysis again that failed"}), now = shown;
     onClick(retry, () => ask(`/${id}/columns/offset`, {method: "POST"})
       .then(() => fill(id, card, now)).catch(error => notice(error.message)));
     card.append(retry);

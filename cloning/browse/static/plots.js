@@ -19,7 +19,7 @@ export class Plots {
     Object.assign(this, {columns, models, seek, stretches: [], replays: [], row: 0, zoom: null});
     this.count = columns.seconds.length;
     this.rows = Array.from({length: this.count}, (_, row) => row);
-    this.resizing = new ResizeObserver(() => this.plots.forEach(plot => plot.setSize(this.size(plot))));
+    this.resizing = new ResizeObserver(() => this.fit());
     this.resizing.observe(element("plots"));
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.redo = () => this.build();
@@ -39,6 +39,14 @@ export class Plots {
     const grown = Math.min(MOST, Math.max(1, (innerHeight - ROOM) / PLOTS));
     const height = Math.round(tall * grown) + (isLast ? TIMES : 0);
     return {width: Math.max(200, element("plots").clientWidth), height};
+  }
+
+  // To draw a curve again takes a while, so only where the size has changed: an observer tells of the first one, too.
+  fit() {
+    for (const plot of this.plots) {
+      const size = this.size(plot);
+      if (size.width != plot.width || size.height != plot.height) plot.setSize(size);
+    }
   }
 
   close() {
@@ -72,7 +80,7 @@ export class Plots {
         range: (_, low, high) => balanced(Math.max(0.1, -low * 1.05, high * 1.05), 1)},
       {title: "Throttle", unit: "", digits: 2, tall: 54, range: [Math.min(0, least(throttle)), 1],
         curves: [{name: "", values: throttle}]},
-      {title: "Speed", unit: " mph", digits: 1, tall: 60, range: [0, Math.max(31, -least(speed.map(value => -value)))],
+      {title: "Speed", unit: " mph", digits: 1, tall: 60, range: [0, Math.max(31, most(speed))],
         curves: [{name: "", values: speed}]},
       {title: "Metres right of the lane's centre", unit: " m", digits: 2, tall: 120, lines: LIMITS,
         range: (_, low, high) => balanced(Math.max(2.75, -low * 1.05, high * 1.05), OFF),
@@ -238,6 +246,7 @@ export class Plots {
 
 const balanced = (bound, most) => [-Math.min(bound, most), Math.min(bound, most)];
 const least = values => values.reduce((low, value) => Math.min(low, value), Infinity);
+const most = values => values.reduce((high, value) => Math.max(high, value), 0);
 // uPlot leaves gaps at nulls, which typed arrays do not have.
 const gaps = values =>
   values.some(Number.isNaN) ? Array.from(values, value => Number.isNaN(value) ? null : value) : values;

@@ -6,7 +6,7 @@ import {Frames} from "./frames.js";
 import {changeSpeed, goTo, jump, JUMPS, play, seek, setLoop, setSpeed} from "./moving.js";
 import {Plots} from "./plots.js";
 import {cameras, nextAttention, nextLimit, offerModels, showReplays} from "./replays.js";
-import {orderButton, note, page, remember, say} from "./state.js";
+import {orderButton, note, page, remember, say, TITLES} from "./state.js";
 
 const SECOND = 15; // rows, of the larger step
 const PENDING = 2000, IDLE = 5000; // ms between two questions for news, while something is being analysed and else
@@ -54,7 +54,7 @@ export function leaveRecording() {
 export async function showRecording(id, row, shown) {
   const mine = ++latest, limits = shown.get("limit");
   const details = await ask(`/${id}/details${limits ? `?limit=${limits}` : ""}`);
-  const names = ["steering", "throttle", "speed", "seconds"], columns = {};
+  const names = ["steering", "throttle", "speed", "seconds", ...analysed(details, {})], columns = {};
   const parts = await Promise.all(names.map(name => column(id, details.version, name)));
   if (mine != latest) return;
   names.forEach((name, at) => columns[name] = parts[at]);
@@ -86,6 +86,13 @@ export async function showRecording(id, row, shown) {
   await find();
 }
 
+// The columns of finished analyses that are not here yet.
+function analysed({lane, models}, columns) {
+  const names = lane.state == "ready" ? ["offset", "label"] : [];
+  models.forEach(({state}, index) => state == "ready" && names.push(`model-${index}`));
+  return names.filter(name => !columns[name]);
+}
+
 async function column(id, version, name) {
   return new Float32Array(await ask(`/${id}/columns/${name}?version=${version}`, {binary: true}));
 }
@@ -102,12 +109,8 @@ async function update(details) {
     return notice(CHANGED);
   }
   now.details = details;
-  const analyses = [["offset", details.lane], ...details.models.map((model, index) => [`model-${index}`, model])];
-  const ready = analyses.filter(([name, analysis]) => analysis.state == "ready" && !now.columns[name]);
-  for (const [name] of ready) {
-    now.columns[name] = await now.column(name);
-    if (name == "offset") now.columns.label = await now.column("label");
-  }
+  const ready = analysed(details, now.columns);
+  for (const name of ready) now.columns[name] = await now.column(name);
   if (page.open != now) return;
   if (ready.length) {
     now.plots.build();
@@ -120,7 +123,7 @@ async function update(details) {
   showCuts();
   showFindings();
   buttons();
-  const states = [...analyses.map(([, {state}]) => state), ...details.replays.map(({state}) => state)];
+  const states = [details.lane, ...details.models, ...details.replays].map(({state}) => state);
   const pending = states.some(state => ["waiting", "running"].includes(state));
   clearTimeout(now.timer);
   now.timer = setTimeout(() => refresh(now), pending ? PENDING : IDLE);
@@ -171,7 +174,7 @@ function showFindings() {
 
 // A button that ends the analyses until they are to go on, those of other recordings, too.
 function pauseButton(text, method) {
-  const button = make("button", text), now = page.open;
+  const button = make("button", text, {title: TITLES[text]}), now = page.open;
   onClick(button, () => request("/analyses", {method}).then(() => refresh(now)).catch(error => notice(error.message)));
   return button;
 }

@@ -1,5 +1,5 @@
 // Replays of the recording with each model as the driver, and what a model looks at.
-import {clock, element, make, many, onClick, renew} from "./common.js";
+import {clock, element, make, many, onClick, renew, told} from "./common.js";
 import {seek} from "./moving.js";
 import {MODEL_COLOURS} from "./plots.js";
 import {order, orderButton, page, remember, say} from "./state.js";
@@ -112,12 +112,12 @@ function section(replay, index) {
     make("dl", "", {}, ...lines.flatMap(([term, value]) => [make("dt", term), make("dd", value)])));
   const places = (kind, what, all) => {
     if (!all.length) return;
-    made.append(make("ol", "", {class: `where ${kind}`}, ...all.map(([row, words, told]) => {
+    made.append(make("ol", "", {class: `where ${kind}`}, ...all.map(([row, words, answer]) => {
       const time = clock(page.open.columns.seconds[row]);
-      const go = make("button", time, {"aria-label": `Go to the ${what} at ${time}`});
+      const go = make("button", time, told(`Go to the ${what} at ${time}`));
       onClick(go, () => {
         seek(row);
-        say(told);
+        say(answer);
       });
       return make("li", "", {}, go, ` ${words}`);
     })));

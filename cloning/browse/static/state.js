@@ -45,8 +45,16 @@ export async function order(method, path) {
   }
 }
 
+export const TITLES = { // of the buttons that begin and end analyses
+  Replay: "Let each model drive: seconds to minutes",
+  Stop: "End the replays that are not done",
+  Pause: "Pause the analyses of all recordings",
+  "Go on": "Go on with the analyses of all recordings",
+  "Try again": "Do the analysis again that failed",
+};
+
 export function orderButton(text, method, path) {
-  const made = make("button", text);
+  const made = make("button", text, {title: TITLES[text]});
   onClick(made, () => order(method, path));
   return made;
 }

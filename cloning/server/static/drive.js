@@ -4,6 +4,7 @@ import {element, make, rounded} from "./site.js";
 const {seconds, topSpeed, limits} = element("plots").dataset;
 const SECONDS = Number(seconds), TOP_SPEED = Number(topSpeed), LIMITS = JSON.parse(limits); // s, mph, m
 const AGAIN = 1000; // ms until a page that lost drive.py asks again
+const DRAWN = 200; // ms between two drawings of headline, curves and map: with each picture, they cost most memory
 const STILL = 0.5; // mph: a car that is slower stands
 const GAP = 1; // s without a frame that interrupt a curve
 const LEFT = 64, RIGHT = 16; // px of a plot; drive.css has them for the captions
@@ -33,10 +34,17 @@ const GRAPHS = [
   {column: THROTTLE, title: "Throttle", unit: "", digits: 2, least: 0.1},
   {column: LATENCY, title: "Time in drive.py", unit: " ms", digits: 1, least: 10},
 ];
-let live = {}, rows = [], road = "", heard = false, events, again;
+let live = {}, rows = [], road = "", heard = false, drawn = 0, events, again;
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Words and figures
+
+// Give an element a text and a class, unless it has them: the browser would make new nodes.
+function write(id, words, look = "") {
+  const shown = element(id);
+  if (shown.textContent != words) shown.textContent = words;
+  if (shown.className != look) shown.className = look;
+}
 
 function say(state) {
   if (element("head").dataset.state == state) return;
@@ -49,36 +57,34 @@ function say(state) {
 // The figures of the headline: speed, distance from the lane's centre, departures.
 function showNow() {
   const last = live.state == "waiting" ? undefined : rows.at(-1), distance = last?.[DISTANCE];
-  element("now-speed").textContent = last ? `${rounded(last[SPEED], 1)} mph` : "";
+  write("now-speed", last ? `${rounded(last[SPEED], 1)} mph` : "");
   const side = live.track ? distance < 0 ? " left of" : " right of" : " from";
-  element("now-distance").textContent = distance == null ? "" : `${Math.abs(distance).toFixed(2)} m${side} the lane's centre`;
-  element("now-distance").className = ["", "off", "far"][LIMITS.filter(limit => Math.abs(distance) > limit).length];
+  write("now-distance", distance == null ? "" : `${Math.abs(distance).toFixed(2)} m${side} the lane's centre`,
+    ["", "off", "far"][LIMITS.filter(limit => Math.abs(distance) > limit).length]);
   const departures = live.departures;
-  element("now-departures").textContent = departures == null ? "" : departures == 1 ? "1 departure" : `${departures || "no"} departures`;
-  element("now-departures").className = departures ? "far" : "";
+  write("now-departures", departures == null ? "" : departures == 1 ? "1 departure" : `${departures || "no"} departures`,
+    departures ? "far" : "");
 }
 
 // Whether drive.py holds the car, so that Go lets it drive.
 const isStopped = () => live.set_speed == 0 || live.state == "doubtful";
 
 function showFigures({rate, frames, unusable, reason, saving, recording, folder, set_speed, state}) {
-  element("rate").textContent = ["driving", "doubtful"].includes(state) ? rate.toFixed(1) : "–";
-  element("frames").textContent = frames ?? "–";
-  element("unusable").textContent = unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–";
-  element("unusable").className = unusable ? "bad" : "";
-  element("saving").textContent = saving || (recording ? "begins with the first frame" : "no");
+  write("rate", ["driving", "doubtful"].includes(state) ? rate.toFixed(1) : "–");
+  write("frames", frames ?? "–");
+  write("unusable", unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–", unusable ? "bad" : "");
+  write("saving", saving || (recording ? "begins with the first frame" : "no"));
   element("record").setAttribute("aria-pressed", recording);
-  element("record").textContent = recording ? "Stop recording" : "Record";
+  write("record", recording ? "Stop recording" : "Record");
   for (const each of document.querySelectorAll(".saved")) each.hidden = !folder;
   const commands = {film: `python video.py ${folder}`, browse: `python -m cloning.lerobot ${folder} --output ${folder}-recording && python -m cloning.browse ${folder}-recording`};
-  for (const [id, command] of Object.entries(commands)) if (element(id).textContent != command) element(id).textContent = command;
+  for (const [id, command] of Object.entries(commands)) write(id, command);
   element("plots").hidden = !rows.length;
   element("start").hidden = !["waiting", "gone"].includes(state);
   const stopped = isStopped();
-  element("stop").textContent = stopped ? "Go" : "Stop";
-  element("stop").className = stopped ? "go" : "";
+  write("stop", stopped ? "Go" : "Stop", stopped ? "go" : "");
   if (!stopped) element("speed").value = set_speed;
-  element("set-speed").textContent = stopped ? `${element("speed").value} mph, stopped` : `${set_speed} mph`;
+  write("set-speed", stopped ? `${element("speed").value} mph, stopped` : `${set_speed} mph`);
 }
 
 // The road from above, where it is known, with the last minute's path.
@@ -124,17 +130,20 @@ async function show(base64) {
 function hear(event) {
   const before = live;
   live = JSON.parse(event.data);
-  if (live.session != before.session) rows = [];
+  if (live.session != before.session) [rows, drawn] = [[], 0];
   if (!heard) answer("");
   heard = true;
   const last = rows.at(-1)?.[0] ?? 0; // after a reconnection the server sends the last minute again
-  rows = rows.concat((live.rows ?? []).filter(row => row[0] > last)).filter(row => row[0] > live.now - SECONDS);
+  rows.push(...(live.rows ?? []).filter(row => row[0] > last));
+  while (rows[0]?.[0] <= live.now - SECONDS) rows.shift();
   if (live.image) show(live.image);
   if (live.state == "gone" && before.state != "gone") answer("");
   const stops = live.state == "driving" && live.set_speed == 0;
   say(stops ? rows.at(-1)?.[SPEED] > STILL ? "stopping" : "stopped" : live.state);
-  showNow();
   showFigures(live);
+  if (performance.now() - drawn < DRAWN) return;
+  drawn = performance.now();
+  showNow();
   showMap();
   draw();
 }
