@@ -88,12 +88,13 @@ def test_the_observer_sees_what_the_network_steers_by_and_both_sides_alike(netwo
 
 def driven(rng: np.random.Generator, number: int, kind: str, strange: bool) -> tuple[tool.Course, tool.Drive]:
     """A drive of 30 s; one that is strange departs at its end, and what is seen becomes strange 5 s before."""
-    seen = observations(rng, 450, 0)
+    seen, time = observations(rng, 450, 0), np.arange(450) / 15
     if strange:
         late = observations(rng, 75, 1.0)
         seen = Observation(*(np.concatenate([a[:-75], b]) for a, b in zip(seen, late, strict=True)))
     course = tool.Course(kind, "lake", number, "fog:5" if kind == tool.DISTURBED else "")
-    return course, tool.Drive(seen, np.arange(450) / 15, np.array([29.95] if strange else []))
+    away = 0.2 + strange * np.maximum(time - 25, 0) / 2
+    return course, tool.Drive(seen, time, away, np.array([29.95] if strange else []))
 
 
 def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
@@ -111,11 +112,32 @@ def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
 
 def test_an_alarm_counts_from_6_to_1_s_before_a_departure():
     time = np.arange(0, 20, 1 / 15)
-    part = tool.Part(tool.HARD, np.zeros((len(time), 1)), time, 20.0)
+    part = tool.Part(tool.HARD, np.zeros((len(time), 1)), time, time, 20.0)
     for first, last, wanted in ((13.5, 13.9, 0), (14.1, 14.3, 1), (18.8, 18.95, 1), (19.1, 20, 0)):
         assert tool.greatest(part, ((time >= first) & (time <= last)) * 1.0) == [wanted]
     assert tool.greatest(part._replace(departure=None), (time < 0.1) * 1.0) == [1, 0, 0], "whole windows of 5 s"
-    assert tool.greatest(tool.Part(tool.HARD, np.zeros((2, 1)), np.array([19.5, 19.6]), 20.0), np.ones(2)) == []
+    late = np.array([19.5, 19.6])
+    assert tool.greatest(tool.Part(tool.HARD, np.zeros((2, 1)), late, late, 20.0), np.ones(2)) == []
+
+
+def test_what_is_fitted_is_how_far_from_the_centre_the_car_will_be():
+    time = np.arange(0, 20, 1 / 15)
+    part = tool.Part(tool.HARD, np.zeros((len(time), 1)), time, np.abs(time - 10), None)
+    found = part.coming[np.searchsorted(time, [0, 5.9, 13, 18.5, 19.5])]
+    assert found[:4] == pytest.approx([9, 3.1, 9, 9.9], abs=0.1) and np.isnan(found[4]), "1 to 6 s later"
+    leaves, before = part._replace(departure=20.0).coming, time < 13.99
+    assert (leaves[~before] == tool.OFF_ROAD).all() and (leaves[before] == part.coming[before]).all()
+
+
+def test_the_regression_is_that_of_least_squares_with_a_row_more_for_each_weight():
+    """Against NumPy's, on rows scaled by the root of their share; such a row pulls its weight to 0."""
+    rng = np.random.default_rng(7)
+    signs, away, share = rng.normal(3, 2, (300, 4)), rng.uniform(0, 4, 300), rng.dirichlet(np.ones(300))
+    scaled = np.c_[(signs - signs.mean(0)) / (signs.std(0) + 1e-3), np.ones(300)] * np.sqrt(share)[:, None]
+    wanted = np.log(away + tool.NEAR) * np.sqrt(share)
+    pull = np.sqrt(tool.DECAY) * np.eye(4, 5)
+    found = np.linalg.lstsq(np.r_[scaled, pull], np.r_[wanted, np.zeros(4)], rcond=None)[0][:4]
+    assert tool.regress(signs, away, share) == pytest.approx(found / (signs.std(0) + 1e-3), rel=1e-4)
 
 
 def test_what_measures_was_not_tuned_on():

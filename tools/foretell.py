@@ -5,7 +5,8 @@
 
 The network drives in the stand-in simulator: generated roads and both tracks in foul weather, mountain roads at 25 mph,
 and ordinary roads at 15. Numbers of roads and looks above 2000 and the disturbances of which networks may be trained
-tune the figures; those below 1000 and the other disturbances, on which nothing was tuned, measure them. The figures are
+tune the figures; those below 1000 and the other disturbances, on which nothing was tuned, measure them. Departures are
+rare, so what is fitted is how far from the lane's centre the car will be, which every drive tells. The figures are
 written beside the network, as model.limits.pt; from then on drive.py shows the risk.
 
 The measure is SelfOracle's (ICSE 2020): a departure is foretold by an alarm 1 to 6 s before it, and false alarms are
@@ -22,10 +23,9 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from cloning.base.arguments import command_line, number
 from cloning.base.files import written_whole
@@ -34,6 +34,7 @@ from cloning.base.progress import progress_bar
 from cloning.lane.foretell import (
     ALARM,
     EARLIEST,
+    LATEST,
     Limits,
     Observation,
     Observer,
@@ -61,10 +62,14 @@ from tools.command import head, row, run_tool
 from tools.lane_frames import every_second_shadowed
 
 DISTURBED, HARD, ORDINARY = "disturbed, strength 5, 25 mph", "mountain roads, 25 mph", "ordinary roads, 15 mph"
+CONDITIONS = (DISTURBED, HARD, ORDINARY)
 MAX_DEPARTURES = 4  # in a drive: more are at the same place
-FALSE_ALARMS = 0.05  # share of the windows without a departure, on roads for tuning, in which there is an alarm
-MARGIN = 0.25  # log odds above the greatest risk on ordinary roads for tuning: there a car is stopped
-DECAY = 3e-2  # of the regression's weights
+FALSE_ALARMS = 0.05  # share of the windows without a departure, in drives for tuning, in which there is an alarm
+MARGIN = 0.25  # log odds above that of an alarm and the greatest in clear drives for tuning: there a car is stopped
+OFF_ROAD = 4.0  # m from the centre: taken for where a car is that leaves the road
+NEAR = 0.1  # m added to distances before their logarithm is taken: a car on the centre is not infinitely better
+STEEPNESS = 4.0  # log odds for a distance e times as great
+DECAY = 0.1  # of the regression's weights
 
 
 class Course(NamedTuple):
@@ -103,17 +108,19 @@ class Drive(NamedTuple):
 
     seen        observations, each array with a row for each frame
     time        float64 (n,): s
+    away        float64 (n,): m from the lane's centre
     departures  float64 (k,): s
     """
 
     seen: Observation
     time: np.ndarray
+    away: np.ndarray
     departures: np.ndarray
 
-    @classmethod
-    def of(cls, seen: Sequence[Observation], time: Sequence[float], departures: Sequence[float]) -> Self:
-        """Join observations."""
-        return cls(Observation(*map(np.stack, zip(*seen, strict=True))), np.array(time), np.array(departures))
+
+def joined(seen: Sequence[Observation]) -> Observation:
+    """Return the observations of single frames as those of a drive."""
+    return Observation(*map(np.stack, zip(*seen, strict=True)))
 
 
 @cache
@@ -131,16 +138,17 @@ def drive(model: Path, course: Course) -> Drive:
     run.set_back()
     disturber = Disturber(Disturbance.parse(course.disturbance), course.number) if course.disturbance else None
     controller, clock = SpeedController(15 if course.kind == ORDINARY else 25), SampleClock(1 / SAMPLE_RATE)
-    seen, time = [], []
+    seen, time, away = [], [], []
     while run.time < (30 if disturber else 40) and len(run.departures) < MAX_DEPARTURES:
         frame = decode(jpeg(cameras.frames(run.car.node.get_transform())[0]))
         seen.append(observe(disturber(frame) if disturber else frame))
         time.append(run.time)
+        away.append(abs(run.offset))
         throttle, due = controller.throttle(run.speed_mph), False
         while not due:
             run.step(float(seen[-1].steering), throttle)
             due = clock.due(run.time)
-    return Drive.of(seen, time, [departure.time for departure in run.departures])
+    return Drive(joined(seen), *map(np.array, (time, away, [departure.time for departure in run.departures])))
 
 
 def drive_into(folder: Path, model: Path, course: Course) -> None:
@@ -149,24 +157,23 @@ def drive_into(folder: Path, model: Path, course: Course) -> None:
     if not path.exists():
         driven = drive(model, course)
         with written_whole(path) as unfinished, open(unfinished, "wb") as file:
-            np.savez(file, *driven.seen, driven.time, driven.departures)
+            np.savez(file, *driven.seen, *driven[1:])
 
 
 def load(path: Path) -> Drive:
     """Return what `drive_into` saved."""
     with np.load(path) as saved:
-        *seen, time, departures = saved.values()
-    return Drive(Observation(*seen), time, departures)
+        *seen, time, away, departures = saved.values()
+    return Drive(Observation(*seen), time, away, departures)
 
 
-def observe_recording(observe: Observer, folder: Path) -> Drive:
+def observe_recording(observe: Observer, folder: Path) -> Observation:
     """Return what is seen in a recording, every fourth frame. Raises RecordingError."""
     recording, frame, seen = read_recording(folder), np.zeros(FRAME, np.uint8), []
-    rows = range(0, len(recording), 4)
-    for at in rows:
+    for at in range(0, len(recording), 4):
         frame[ROAD_ROWS] = recording.road(at)
         seen.append(observe(frame))
-    return Drive.of(seen, [at / SAMPLE_RATE for at in rows], [])
+    return joined(seen)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -174,11 +181,15 @@ def observe_recording(observe: Observer, folder: Path) -> Drive:
 
 
 class Part(NamedTuple):
-    """A part of a drive without an interruption: signs float32 (n, k), time (n,), when the car left the road then."""
+    """A part of a drive without an interruption; departure: when the car left the road at its end, None if it did not.
+
+    signs: float32 (n, k). time, away: of the drive, (n,).
+    """
 
     kind: str
     signs: np.ndarray
     time: np.ndarray
+    away: np.ndarray
     departure: float | None
 
     @property
@@ -187,9 +198,16 @@ class Part(NamedTuple):
         return self.departure is not None
 
     @property
-    def ahead(self) -> np.ndarray:
-        """Seconds before the departure; 0 in all rows of a part without one."""
-        return np.zeros(len(self.time)) if self.departure is None else self.departure - self.time
+    def coming(self) -> np.ndarray:
+        """The greatest distance from the centre LATEST to EARLIEST s later, (n,), m; NaN where the part ends before."""
+        found = np.full(len(self.time), np.nan)
+        for at, now in enumerate(self.time):
+            later = self.away[(self.time >= now + LATEST) & (self.time < now + EARLIEST)]
+            if self.departure is not None and self.departure - now <= EARLIEST:
+                found[at] = OFF_ROAD
+            elif len(later):
+                found[at] = later.max()
+        return found
 
 
 def parts(ordinary: Ordinary, course: Course, driven: Drive) -> Iterator[Part]:
@@ -199,7 +217,7 @@ def parts(ordinary: Ordinary, course: Course, driven: Drive) -> Iterator[Part]:
         if len(rows):
             each = (Observation(*(values[at] for values in driven.seen)) for at in rows)
             found = np.stack([signs(seen, driven.time[at]) for at, seen in zip(rows, each, strict=True)])
-            yield Part(course.kind, found, driven.time[rows], end if np.isfinite(end) else None)
+            yield Part(course.kind, found, driven.time[rows], driven.away[rows], end if np.isfinite(end) else None)
 
 
 def greatest(part: Part, risk: np.ndarray) -> list[float]:
@@ -210,45 +228,36 @@ def greatest(part: Part, risk: np.ndarray) -> list[float]:
     return [each.max() for each in found if len(each)]
 
 
-def regress(signs: np.ndarray, leaves: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return the weights (k,) of a logistic regression; leaves: bool (n,), of which both cases count the same.
+def regress(signs: np.ndarray, away: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return the weights (k,) with which signs (n, k) tell the logarithm of a distance, by ridge regression.
 
-    share: float (n,), how much a row counts among those of its case.
+    away: (n,), m. share: (n,), how much a row counts, together 1.
     """
-    mean, deviation = signs.mean(0), signs.std(0) + 1e-3
-    inputs, targets = torch.from_numpy((signs - mean) / deviation), torch.from_numpy(leaves.astype(np.float32))
-    shares = torch.from_numpy((share / np.where(leaves, share[leaves].sum(), share[~leaves].sum())).astype(np.float32))
-    weights = torch.zeros(signs.shape[1] + 1, requires_grad=True)
-    optimizer = torch.optim.LBFGS([weights], max_iter=200, line_search_fn="strong_wolfe")
-
-    def loss() -> torch.Tensor:
-        optimizer.zero_grad()
-        logits = inputs @ weights[:-1] + weights[-1]
-        error = torch.nn.functional.binary_cross_entropy_with_logits(logits, targets, shares, reduction="sum")
-        total = error + DECAY * weights[:-1].square().sum()
-        total.backward()
-        return total
-
-    optimizer.step(loss)
-    return weights.detach().numpy()[:-1] / deviation
+    deviation = signs.std(0) + 1e-3
+    inputs, wanted = (signs - share @ signs) / deviation, np.log(away + NEAR)
+    weighted = inputs.T * share
+    weights = np.linalg.solve(weighted @ inputs + DECAY * np.eye(len(deviation)), weighted @ (wanted - share @ wanted))
+    return (weights / deviation).astype(np.float32)
 
 
-def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Drive]) -> Limits:
+def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation]) -> Limits:
     """Return the limits; driven: what tunes them."""
     fair = [(course, each) for course, each in driven if not course.disturbance and not len(each.departures)]
     # Every second one says what is ordinary: in these the networks' activations are nearer to it than in any others.
     known = {course for course, _ in fair[::2]}
-    seen = [each.seen for course, each in fair if course in known] + [each.seen for each in recordings]
+    seen = [each.seen for course, each in fair if course in known] + list(recordings)
     ordinary = Ordinary.of(Observation(*map(np.concatenate, zip(*seen, strict=True))))
     drives = [list(parts(ordinary, course, each)) for course, each in driven if course not in known]
-    tuned = [part for each in drives for part in each]
-    rows = [np.concatenate([part.signs[part.ahead <= EARLIEST] for part in each]) for each in drives]
-    leaves = [np.full(len(found), each[0].leaves) for each, found in zip(drives, rows, strict=True)]
-    share = [np.full(len(found), 1 / len(found)) for found in rows]  # each drive counts the same
-    weights = regress(*map(np.concatenate, (rows, leaves, share)))
-    odds = {kind: risks(tuned, kind, lambda signs: signs @ weights)[1] for kind in (HARD, ORDINARY)}
+    coming = [np.concatenate([part.coming for part in each]) for each in drives]
+    told = [np.isfinite(each) for each in coming]
+    share = [rows / rows.sum() / len(drives) for rows in told]  # each drive counts the same
+    tuned, rows = [part for each in drives for part in each], np.concatenate(told)
+    signs = np.concatenate([part.signs for part in tuned])[rows]
+    weights = STEEPNESS * regress(signs, *(np.concatenate(each)[rows] for each in (coming, share)))
+    odds = {kind: risks(tuned, kind, lambda signs: signs @ weights)[1] for kind in CONDITIONS}
     alarm = np.quantile(np.concatenate(list(odds.values())), 1 - FALSE_ALARMS)
-    stop = 1 / (1 + np.exp(alarm - odds[ORDINARY].max() - MARGIN))
+    clear = max(odds[kind].max() for kind in (HARD, ORDINARY))
+    stop = 1 / (1 + np.exp(min(0, alarm - clear) - MARGIN))
     return Limits(ordinary, weights, -float(alarm), float(stop))
 
 
@@ -272,7 +281,7 @@ def table(limits: Limits, driven: Sequence[tuple[Course, Drive]]) -> str:
         figures = [f"{100 * values.mean():.0f} %" if len(values) else "" for values in (before >= ALARM, alarms)]
         rows.append(row(name, len(before), *figures, len(without), f"{100 * (without >= ALARM).mean():.1f} %"))
 
-    for kind in (DISTURBED, HARD, ORDINARY):
+    for kind in CONDITIONS:
         total.append(risks(found, kind, limits.risk))
         add(kind, *total[-1])
     add("**all**", *map(np.concatenate, zip(*total, strict=True)))

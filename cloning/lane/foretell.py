@@ -2,9 +2,10 @@
 
 Signs of that are what the lane reader sees (how far off the lane's centre the car is, and whether a frame and its
 mirror image tell it the same), steering that does not fit it or changes quickly, and activations of either network that
-are unlike those of ordinary driving (their Mahalanobis distance, arXiv 1807.03888). A logistic regression on the signs'
-means over a short and a longer time gives the risk. Its figures are in a file beside the network's, which
-`python -m tools.foretell` writes and measures; they fit this one network.
+are unlike those of ordinary driving (their Mahalanobis distance, arXiv 1807.03888). From the signs' means over a short
+and a longer time, a regression tells how far off the lane's centre the car will be; the farther, the greater the risk.
+Its figures are in a file beside the network's, which `python -m tools.foretell` writes and measures; they fit this one
+network.
 """
 
 from collections.abc import Mapping
