@@ -29,7 +29,7 @@ import numpy as np
 from cloning.base.arguments import command_line, number
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
-from tools.attack import Car, Target
+from tools.attack import LEFT_OPEN, Car, Target
 from tools.attacks import frames
 from tools.command import head, row, run_tool
 
@@ -38,7 +38,7 @@ MAX_GROWTH = 20.0  # MB
 VISIT, PAUSE = 5.0, 3.0  # s, mean: how long a second car or a page stays, and until the next one
 STAY = 3000  # frames, mean: after these the car leaves, and comes again
 KEPT = 2.0  # s: how long saved frames are left on the disk
-SETTLE = 1.0  # s at the end, until all that was closed is gone
+SETTLE = 1.0  # s at the start, until what was closed is gone
 PAGES = ("/", "/live")
 
 
@@ -123,8 +123,10 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
 
     car, leaves, wrong = new_car(), 0, 0
     lines = [head("frames", "MB", "open files", "ms of processor time", "p50, ms", "p99, ms")]
+    car.ask(car.messages[0])  # so that its frames' file is open, too
+    time.sleep(SETTLE)
     early = before = Reading.of(server)
-    alone = before.files  # with one car
+    alone = before.files
     bar = progress_bar(count, "frames")
     with Company(server.port, new_car, folder) as company, bar:
         for tenth in range(TENTHS):
@@ -145,8 +147,10 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
             figures = f"{now.memory:.1f}", now.files, f"{spent:.2f}", f"{p50:.1f}", f"{p99:.1f}"
             lines.append(row((tenth + 1) * count // TENTHS, *figures))
             before = now
-    time.sleep(SETTLE)
-    files, lost, grown = server.open_files(), company.asked - company.answered, before.memory - early.memory
+    until = time.monotonic() + LEFT_OPEN
+    while (files := server.open_files()) != alone and time.monotonic() < until:
+        time.sleep(0.1)
+    lost, grown = company.asked - company.answered, before.memory - early.memory
     car.simulator.socket.close()
     wrong += company.wrong
     found = {
