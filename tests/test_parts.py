@@ -5,10 +5,12 @@ import pytest
 from rendered import without_files
 
 from cloning.lane.ahead import centre_ahead
+from cloning.lane.cuts import find_cuts
 from cloning.lane.localise import localise_all
-from cloning.lane.parts import certain_parts
+from cloning.lane.parts import ALONG, Part, certain_parts, unrivalled
 from cloning.lane.reader import DISTANCES_AHEAD, MOUNT_OFFSETS, fuse_detections
 from cloning.lane.recovery import MISHAP, LanePosition
+from cloning.lane.search import Localisation
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, steering_for, stretches
@@ -104,22 +106,90 @@ def test_stretches_too_short_for_a_window_are_placed_together_or_if_long_enough_
     assert np.isnan(placed(other.take(short), seen[short])).all()
 
 
+def pieces(lake, *rows, pause=PAUSE):
+    """Rows of the drive on the lake, as (rows, pause) each after a pause of so many seconds."""
+    order, seconds = np.concatenate(rows), np.full(sum(map(len, rows)), PAUSE)
+    seconds[np.cumsum([len(each) for each in rows])[:-1]] = pause
+    return lake[0].take(order, time=np.cumsum(seconds)), lake[1][order]
+
+
+def plain(brightness):
+    """Strips of one brightness in each row."""
+    return lambda rows: np.tile(brightness[rows, None, None, None, None], (1, 3, 32, 160, 3))
+
+
 @pytest.mark.parametrize(("rows", "pause"), [(350, PAUSE), (70, 2.0)])
 def test_no_row_of_another_road_is_taken_for_the_track(lake, rows, pause):
-    """It begins and ends in the midst of a recording of the track."""
+    """It begins and ends in the midst of a recording of the track, in another light."""
     track = Track("road-9")
     other, seen = driven("road-9", rows, start=track.step * np.abs(track.curvature).argmax() - 30)  # a bend
-    pieces = (lake[0].take(slice(0, 450)), other, lake[0].take(slice(450, 900)))
+    recordings = (lake[0].take(slice(0, 450)), other, lake[0].take(slice(450, 900)))
     pauses = np.full(900 + rows, PAUSE)
     pauses[[450, 450 + rows]] = pause
-    offset = placed(
-        Recording.joined(pieces, time=np.cumsum(pauses)), np.concatenate([lake[1][:450], seen, lake[1][450:]])
-    )
+    recording = Recording.joined(recordings, time=np.cumsum(pauses))
     foreign = np.zeros(900 + rows, bool)
     foreign[450 : 450 + rows] = True
-    # Measured: 59 rows, where both roads are straight and one goes over into the other at once; none after a pause.
-    assert np.sum(~np.isnan(offset[foreign])) < (70 if pause == PAUSE else 1)
+    strips = plain(np.where(foreign, 90, 60).astype(np.uint8))
+    offset, centres = np.full(len(recording), np.nan), np.concatenate([lake[1][:450], seen, lake[1][450:]])
+    for part, found in localise_all(recording, stretches(recording), centres, strips):
+        offset[part] = found.states[:, 1] + REAR_AXLE * np.sin(found.states[:, 2])
+    assert np.isnan(offset[foreign]).all()  # without the cut in the frames, 59 rows of 350 were taken for the lake
     check(offset, ~foreign)
+
+
+def test_rows_after_which_the_car_is_back_at_once_are_another_road(lake):
+    """They fit the track where the part before them ends, but there was no time to come back from where they end."""
+    recording, centres = pieces(lake, np.r_[0:450], np.r_[477:547], np.r_[450:900], pause=2.0)
+    foreign = np.r_[np.zeros(450, bool), np.ones(70, bool), np.zeros(450, bool)]
+    offset = placed(recording, centres)
+    assert np.isnan(offset[foreign]).all()
+    check(offset, ~foreign)
+
+
+def test_a_stretch_of_which_only_the_start_fits_is_another_road(lake):
+    recording, centres = pieces(lake, np.r_[0:450], np.r_[477:727], np.r_[450:900], pause=2.0)
+    centres[530:700] = np.random.default_rng(1).uniform(-4, 4, centres[530:700].shape)
+    foreign = np.r_[np.zeros(450, bool), np.ones(250, bool), np.zeros(450, bool)]
+    offset = placed(recording, centres)
+    assert np.isnan(offset[foreign]).all()
+    check(offset, ~foreign)
+
+
+@pytest.mark.parametrize(("blocks", "rows", "cuts"), [(80, 1, [29]), (60, 1, []), (80, 3, [])])
+def test_a_road_that_is_cut_is_told_from_one_that_changes(blocks, rows, cuts):
+    """Shade comes over a part of the frames, or over all of them in successive rows."""
+    colours = 100 + np.random.default_rng(0).normal(0, 3, (60, 96, 3)).astype(np.float32)
+    for later in range(rows):
+        colours[30 + later :, :blocks] -= 20
+    assert np.flatnonzero(find_cuts(colours)).tolist() == cuts
+
+
+def test_a_turn_that_the_steering_does_not_explain_ends_a_part(lake):
+    """What the cameras see fits all the time."""
+    recording, centres = lake[0].take(slice(None)), lake[1]
+    recording.steering[400:440] += 0.15
+    offset = placed(recording, centres)
+    undamaged = np.r_[np.ones(400, bool), np.zeros(40, bool), np.ones(460, bool)]
+    check(offset, undamaged)
+    assert np.isnan(offset[410:430]).all()
+
+
+def test_a_short_drive_that_turns_otherwise_than_it_steers_is_not_certain(lake):
+    """Each row may be on the lake, but in 239 m the turns are too uncertain to tell it from other roads."""
+    recording = lake[0].take(slice(0, 300))
+    recording.steering[:] += np.random.default_rng(0).normal(0, 0.09, 300)
+    assert np.isnan(placed(recording, lake[1][:300])).all()
+
+
+def test_of_two_parts_as_good_as_each_other_none_is_certain():
+    states = np.stack([np.arange(300.0), np.zeros(300), np.zeros(300)], axis=1)
+    part, near, far, worse = (
+        Part(0, 0, 0, 300, Localisation(Track("lake", "ccw"), states + np.array([shift, 0, 0]), fit, 0.2))
+        for shift, fit in ((0, -0.05), (5, -0.06), (50, -0.06), (50, -0.34))
+    )
+    assert unrivalled([part, near], ALONG) is part
+    assert unrivalled([part, worse], ALONG) is part
+    assert unrivalled([part, far], ALONG) is None
 
 
 def test_a_mishap_belongs_to_no_piece(lake):
@@ -127,7 +197,7 @@ def test_a_mishap_belongs_to_no_piece(lake):
     recording, centres = lake
     centres = centres.copy()
     centres[400:460] = np.random.default_rng(1).uniform(-4, 4, centres[400:460].shape)
-    parts = list(localise_all(recording, stretches(recording), centres, lambda rows: np.empty(0)))
+    parts = list(localise_all(recording, stretches(recording), centres, plain(np.zeros(900, np.uint8))))
     position = fuse_detections(recording, centres)
     assert isinstance(position, LanePosition) and not position.placed.any() and not position.piece.any()
     for number, (rows, _) in enumerate(parts, 1):

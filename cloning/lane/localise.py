@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from cloning.lane import marking
+from cloning.lane.cuts import split_at_cuts
 from cloning.lane.follow import Candidate, TrackFilter
 from cloning.lane.parts import certain_parts
 from cloning.lane.reader import (
@@ -72,7 +73,7 @@ def localise_all(
 
     stretches: of the recording; centres: float32 (n, 3, 5): of `reader.detect_centres`, in the recording's rows.
     """
-    for part, localisation in certain_parts(recording, stretches, centres):
+    for part, localisation in certain_parts(recording, split_at_cuts(recording, stretches, strips), centres):
         if ROADS[localisation.track.name].centre_line:
             localisation = follow_line(localisation, part, centres[part.rows], strips)
         yield part.rows, localisation

@@ -15,7 +15,7 @@ import numpy as np
 from cloning.lane.follow import Candidate, TrackFilter
 from cloning.lane.search import MAX_TURN_RESIDUAL, MIN_LOG_LIKELIHOOD, Localisation, followed, known_tracks, search
 from cloning.recordings.log import Recording
-from cloning.road.motion import MIN_STRETCH_ROWS, MPH, Stretch
+from cloning.road.motion import MIN_STRETCH_ROWS, MPH, TOP_SPEED_MPH, Stretch
 
 WINDOW, WINDOW_STEP = 300, 150  # rows: a shorter window may resemble a bend of any track
 # A row's score is 1 if all agrees, and 0 at this log-likelihood of its detections, or at so many standard deviations
@@ -44,6 +44,7 @@ PROBE_STEP = 5.0  # m between candidates
 SLACK, SLACK_PER_METRE = 5.0, 0.1  # m, and of the metres driven: where the car should be without a mishap
 BACK, BEYOND = 30.0, 20.0  # m: further back, or further on than it drove, the car is not after a mishap
 MAX_REACH, MAX_PAUSE = 200.0, 10.0  # m, s: after more, it may be anywhere
+MOSTLY = 0.5  # share of a stretch's rows: where fewer fit beside its neighbours, it is another road's
 AMBIGUOUS = 0.8  # share of the best part's quality: a part as good as this, but elsewhere, leaves it uncertain
 ALONG, ACROSS = 0, 1  # the road: columns of `Localisation.states`
 SAME_PLACE = {ALONG: 10.0, ACROSS: 0.3}  # m: what is further apart is elsewhere
@@ -240,6 +241,8 @@ class Placing:
         for index in sorted(range(len(self.followers)), key=lambda i: -len(self.followers[i].stretch)):
             if index in placed or not (first := self.alone(index)):
                 continue
+            if not all(self.may_drive_between(first, part) for part in self.parts):
+                continue
             group = copy.copy(self)
             group.parts = [first]
             for forward in (True, False):
@@ -248,6 +251,15 @@ class Placing:
             if first.metres() >= ALONE_METRES or sum(part.metres() for part in new) >= TOGETHER_METRES:
                 self.parts = sorted([*self.parts, *new], key=lambda part: (part.stretch, part.start))
                 placed |= {part.stretch for part in new}
+
+    def leave_out_other_roads(self) -> None:
+        """Leave out the parts of stretches of which neither MOSTLY all rows nor those of a window are placed."""
+        rows = np.array([len(followers.stretch) for followers in self.followers])
+        placed = np.zeros(len(rows), int)
+        for part in self.parts:
+            placed[part.stretch] += part.end - part.start
+        enough = placed >= np.minimum(MOSTLY * rows, WINDOW)
+        self.parts = [part for part in self.parts if enough[part.stretch]]
 
     def alone(self, index: int) -> Part | None:
         """Return the part of a stretch that is at the limits ALONE, or None."""
@@ -272,8 +284,27 @@ class Placing:
                 if reach > MAX_REACH:
                     return None
                 if found := self.near(part, index, (start, first, end), reach, forward):
-                    return found
+                    if all(self.may_drive_between(found, each) for each in (part, other) if each):
+                        return found
+                    break
         return None
+
+    def may_drive_between(self, part: Part, other: Part) -> bool:
+        """Return whether a car has the time to drive, or to be pushed, from one part to the other.
+
+        Rows of another road may resemble the track where the part before them ends, and seem to lead on from there; but
+        the part after them does not begin where they end.
+        """
+        earlier, later = sorted((part, other), key=lambda each: (each.stretch, each.start))
+        leaves, arrives = (self.followers[each.stretch].stretch.rows.start for each in (earlier, later))
+        time = self.recording.time[leaves + earlier.end - 1 : arrives + later.start + 1]
+        if time[-1] - time[0] > MAX_PAUSE or np.diff(time).min() < 0:
+            return True
+        ahead, length = later.found.states[0, 0] - earlier.found.states[-1, 0], earlier.found.track.length
+        ahead = (ahead + length / 2) % length - length / 2
+        reach = TOP_SPEED_MPH * MPH * (time[-1] - time[0])
+        near = -reach - SLACK < ahead < (1 + SLACK_PER_METRE) * reach + SLACK
+        return earlier.track == later.track and bool(near)
 
     def gaps(self, part: Part, other: Part | None, forward: bool) -> Iterable[tuple[int, int, int]]:
         """Yield the rows between two parts: the index of a stretch, and its rows."""
@@ -348,6 +379,7 @@ def certain_parts(
     for forward in (True, False):
         placing.spread(forward)
     placing.together()
+    placing.leave_out_other_roads()
     found = []
     for part in placing.parts:
         whole = stretches[part.stretch].rows.start
