@@ -26,7 +26,7 @@ from cloning.base.arguments import command_line, number
 from cloning.base.processes import interrupt_deferred
 from cloning.network.network import SHIPPED_MODEL
 from tools.attacks import Attack, all_attacks, frames
-from tools.command import ROOT, run_tool
+from tools.command import ROOT
 from tools.server_process import ServerProcess
 from tools.simulator_client import Simulator, telemetry_message
 
@@ -216,4 +216,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

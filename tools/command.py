@@ -5,10 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from cloning.base import program
-
 ROOT = Path(__file__).resolve().parent.parent
-run_tool = program.run
 
 
 def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -58,7 +58,7 @@ from simulator.cameras import jpeg
 from simulator.driving import cameras_at
 from simulator.run import Run
 from simulator.workers import results, started_workers
-from tools.command import head, row, run_tool
+from tools.command import head, row
 from tools.lane_frames import every_second_shadowed
 
 DISTURBED, HARD, ORDINARY = "disturbed, strength 5, 25 mph", "mountain roads, 25 mph", "ordinary roads, 15 mph"
@@ -315,4 +315,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

@@ -30,7 +30,7 @@ from cloning.replay.views import StretchViews
 from cloning.road.motion import Stretch, stretch_rows, stretches
 from cloning.road.track import ROADS, Track
 from simulator.record import record
-from tools.command import head, row, run_tool
+from tools.command import head, row
 from tools.lane_frames import shadowed
 
 SPACING = (500, 700)  # rows between two damages
@@ -336,4 +336,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)

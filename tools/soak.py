@@ -31,7 +31,7 @@ from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
 from tools.attack import LEFT_OPEN, Car, Target
 from tools.attacks import frames
-from tools.command import head, row, run_tool
+from tools.command import head, row
 
 TENTHS = 10
 MAX_GROWTH = 20.0  # MB
@@ -176,4 +176,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    run_tool(main)
+    program.run(main)
