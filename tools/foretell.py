@@ -299,7 +299,8 @@ def main(argv: list[str] | None = None) -> int:
     add("--folder", type=Path, default=Path("foretell"), help="for what the drives show (default %(default)s)")
     options = parser.parse_args(argv)
     observe, chosen = observer(options.model), courses()[: options.drives]
-    folder = options.folder / fingerprint(observe.network)[:8]  # another network drives otherwise
+    # Another network drives otherwise, and an earlier version of this tool saved no distances.
+    folder = options.folder / f"{fingerprint(observe.network)[:8]}-away"
     folder.mkdir(parents=True, exist_ok=True)
     recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
     work = partial(drive_into, folder, options.model)
