@@ -124,6 +124,7 @@ class Trial:
     begin: Path | None = None
     checked: Callable[[], None] = lambda: None
     companion: Callable[[Watched], None] = lambda running: None  # does its part while the command runs
+    done: int = 0  # the command's exit status; a server's is that of the Ctrl-C with which its companion ends it
     whole: tuple[dict[str, object], list[str]] | None = None  # what `whole_run` has found
     sizes: dict[str, int] = field(default_factory=dict)  # of the files that it left
 
@@ -150,7 +151,7 @@ class Trial:
             return self.whole
         self.restore()
         ended = self.run(self.command)
-        assert ended.status == 0, ended.printed
+        assert ended.status == self.done, ended.printed
         check_whole(self.folder)
         assert not temporaries(self.folder)
         self.sizes = {path.name: path.stat().st_size for path in self.folder.rglob("*")}
@@ -177,7 +178,7 @@ class Trial:
     def goes_on(self, wanted: dict[str, object]) -> None:
         """The next run ends as if the one before had not been killed, and leaves no temporary file."""
         ended = self.run(self.again)
-        assert ended.status == 0, ended.printed
+        assert ended.status == self.done, ended.printed
         self.checked()
         assert differences(contents(self.folder), wanted) == []
 

@@ -199,7 +199,7 @@ def driving(model_file, jpegs, tmp_path):
     (begin / "run1" / "2018_07_16_17_11_43_382.jpg").write_bytes(jpegs[7])
     (begin / "run1" / ".2018_07_16_17_11_43_383.jpg.0123abcd.part").write_bytes(jpegs[7][:100])
     command = [ROOT / "drive.py", model_file, "run1", "--port", 0]
-    trial = Trial(tmp_path / "trial", command, command, begin)
+    trial = Trial(tmp_path / "trial", command, command, begin, done=128 + signal.SIGINT)
     car = Car(jpegs)
     trial.companion = car.drive
     return trial, car
@@ -227,7 +227,7 @@ def test_driving_killed_anywhere(driving, jpegs):
             trial.companion = car.drive
             assert film.status == 0 and f"run1.mp4: {len(frames)} frames" in film.printed
             assert "unreadable" not in film.printed
-        assert trial.run(trial.command).status == 0
+        assert trial.run(trial.command).status == trial.done
         assert saved(trial.folder / "run1") == jpegs[:6]
         assert not list((trial.folder / "run1").glob(".*"))
     print(f"{len(chosen(points, 4))} of {len(points)} points")
@@ -291,7 +291,7 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
     earlier, new = Cut(center[1], center[2], "off"), Cut(center[5], center[9], "off")
     add_cuts(recorded, earlier)
     command = ["-m", "cloning.browse", "lake", "--port", 0]
-    trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin")
+    trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin", done=128 + signal.SIGINT)
     browser = Browser("cuts", [{"first": new.first, "last": new.last, "reason": new.reason}])
 
     def checked() -> None:
@@ -304,7 +304,7 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
     _, points = trial.whole_run()
     for number in writes(points, 10):
         trial.restore()
-        assert trial.run(command, full=number).status == 0
+        assert trial.run(command, full=number).status == trial.done
         assert "excluded.csv: No space left on device" in browser.answer["message"]
         assert [each.row() for each in read_cuts(trial.folder / "lake")] == [earlier.row()]
         assert sorted(path.name for path in (trial.folder / "lake").iterdir()) == sorted(os.listdir(recorded))
@@ -323,7 +323,7 @@ def test_an_exported_part_is_whole_or_no_recording(lake, tmp_path):
     for name in (name for names in images for name in names):
         shutil.copy(lake / "IMG" / name, recorded / "IMG")
     command = ["-m", "cloning.browse", "lake", "--port", 0]
-    trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin")
+    trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin", done=128 + signal.SIGINT)
     browser, part = Browser("export", {"rows": "1-3", "name": "part"}), trial.folder / "part"
     trial.companion = browser.post
 
@@ -344,7 +344,7 @@ def test_an_exported_part_is_whole_or_no_recording(lake, tmp_path):
     trial.killed_everywhere(3, next_run)
     for number in writes(points, 2):
         trial.restore()
-        assert trial.run(command, full=number).status == 0
+        assert trial.run(command, full=number).status == trial.done
         assert "No space left on device; mend it, and export again" in browser.answer["message"]
         assert not part.exists()
 
