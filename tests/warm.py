@@ -1,10 +1,9 @@
 """Python commands in children of a warm process, which has loaded the libraries: a start costs 0.1 instead of 2 to 4 s.
 
-`run` and `Popen` take a command that begins with sys.executable, as those of subprocess do. One process loads the
-libraries, but never uses them: `python tests/warm.py FD PID`. It forks one for each of pytest's workers, and that forks
-a child for each command, with the command's own working folder, environment, input and outputs. A command that looks at
-how libraries are loaded, at its memory or at itself in the list of processes needs a process of its own, from
-subprocess.
+`run` and `Popen` take a command that begins with sys.executable, as those of subprocess do. Each worker of pytest has
+one warm process, `python tests/warm.py FD`, which forks a child for each command: with the command's own working
+folder, environment, input and outputs, and with the libraries loaded, but never used. A command that looks at how
+libraries are loaded, at its memory or at itself in the list of processes needs a process of its own, from subprocess.
 """
 
 import atexit
@@ -16,14 +15,12 @@ import json
 import multiprocessing.connection
 import os
 import runpy
-import select
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import types
-import uuid
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -37,34 +34,23 @@ LIBRARIES = (
     *("engineio.async_drivers.eventlet", "socketio", "eventlet.websocket", "eventlet.wsgi", "flask", "wsproto"),
 )
 FORKS = sys.platform == "linux"  # elsewhere there is no fork, or libraries do not survive it
-RUN = os.environ.get("PYTEST_XDIST_TESTRUNUID") or uuid.uuid4().hex  # of pytest, the same for all of its workers
 Command = Sequence[str | os.PathLike[str]]
 
 # ----------------------------------------------------------------------------------------------------------------------
 # In the warm process
 
 
-def load() -> None:
-    """Import, but never use: a library that has started threads would not survive a fork."""
+def load(prepare: str) -> None:
+    """Import, but never use: a library that has started threads would not survive a fork.
+
+    prepare: Python code that does more.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # eventlet advises against using it
         for name in LIBRARIES:
             importlib.import_module(name)
+    exec(prepare, {})
     gc.freeze()  # the children then share more of their memory
-
-
-def connected(listener: socket.socket, pytest: int) -> socket.socket | None:
-    """Fork a process for each worker that connects; return its connection there, None at the end of pytest.
-
-    pytest: the process.
-    """
-    ended = os.pidfd_open(pytest)  # readable then
-    while ended not in select.select([listener.fileno(), ended], [], [])[0]:
-        worker, _ = listener.accept()
-        if not os.fork():
-            return worker
-        worker.close()
-    return None
 
 
 def serve(pytest: socket.socket) -> dict[str, Any] | None:
@@ -74,11 +60,7 @@ def serve(pytest: socket.socket) -> dict[str, Any] | None:
         if not data:
             return None
         request = json.loads(data)
-        if "prepare" in request:
-            exec(request["prepare"], {})
-            gc.freeze()
-            answer = 0
-        elif "wait" in request:
+        if "wait" in request:
             answer = os.waitstatus_to_exitcode(os.waitpid(request["wait"], 0)[1])
         elif not (answer := os.fork()):
             for number, file in enumerate(files):
@@ -126,27 +108,22 @@ def run_command(words: list[str]) -> None:
 
 
 class WarmProcess:
-    """A worker's warm process, as the tests see it; it ends with the worker."""
+    """The warm process, as the tests see it; it ends with pytest."""
 
     def __init__(self, prepare: str) -> None:
-        """prepare: Python code that it runs at first."""
-        pytest = os.getppid() if "PYTEST_XDIST_WORKER" in os.environ else os.getpid()
-        name = f"\0{RUN}"  # of no file
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        while self.socket.connect_ex(name):  # none listens yet
-            with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
-                listener.bind(name)  # an OSError if another worker does it at this moment
-                listener.listen()
-                subprocess.Popen(
-                    [sys.executable, __file__, str(listener.fileno()), str(pytest)],
-                    env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    pass_fds=[listener.fileno()],
-                )
+        """prepare: see `load`."""
+        self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        with theirs:
+            subprocess.Popen(
+                [sys.executable, __file__, str(theirs.fileno()), prepare],
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+            )
         self.lock = threading.Lock()
         atexit.register(self.socket.close)
-        self.ask({"prepare": prepare})
 
     def ask(self, request: dict[str, Any], files: Sequence[int] = ()) -> int:
         """Send a request with files; return the answer: a process's id or exit status."""
@@ -175,7 +152,7 @@ class Child:
         creationflags: int = 0,  # Windows's
         prepare: str = "",
     ):
-        """prepare: each code has a warm process of its own, which has run it."""
+        """prepare: each code, see `load`, has a warm process of its own."""
         self.args = command
         self.returncode: int | None = None
         python, *words = (os.fspath(word) for word in command)
@@ -274,8 +251,6 @@ def run(
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for pytest
-    load()
-    with socket.socket(fileno=int(sys.argv[1])) as waiting:
-        connection = connected(waiting, int(sys.argv[2]))
-    if connection and (request := serve(connection)):
+    load(prepare=sys.argv[2])
+    if request := serve(socket.socket(fileno=int(sys.argv[1]))):
         run_request(request)
