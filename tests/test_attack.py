@@ -68,7 +68,7 @@ import os, signal, time
 from types import SimpleNamespace
 from cloning.base import program
 program.end_on_interrupt("test")
-from tools import attack, soak
+from tools import attack
 
 def strike(port, until):
     print(os.getpid(), flush=True)

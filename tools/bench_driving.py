@@ -36,7 +36,6 @@ from tools.command import ROOT
 from tools.server_process import ServerProcess
 from tools.simulator_client import Simulator, fragments, telemetry_message
 
-TICKS = 100  # per second: the unit of time in /proc/PID/stat
 TURN = 100  # frames that a server answers in one turn
 WARM_UP = 50  # frames that are not counted
 PAGE_OPEN, TYPICAL = "drive.py, page open", "typical server"  # names in the table
@@ -74,11 +73,6 @@ class Server(ServerProcess):
             self.seconds += time.perf_counter() - started
             self.cpu_time += self.cpu_seconds() - cpu_before
             self.megabytes.append(self.memory())
-
-    def cpu_seconds(self) -> float:
-        """Return the server's CPU time so far in seconds, user and system."""
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / TICKS
 
     def read_latencies(self, frames: int) -> None:
         """Read the latencies of the last frames, as the server measured them, from the events for its page."""

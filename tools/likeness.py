@@ -36,6 +36,7 @@ from simulator.world import Scene
 COMPARED_ROWS = (10, 30, 50, 60, 70, 80, 90, 100, 115, 130, 145)
 DARK = 50  # of 255, the largest of R, G and B
 EDGE = (100, 200)  # the thresholds of OpenCV's Canny
+MEASURES = ("dark pixels, %", "saturation, of 255", "edges, % of pixels", "variance of the Laplacian")
 
 
 def render(track: Track, look: int, states: np.ndarray) -> np.ndarray:
@@ -81,9 +82,6 @@ def compare(folder: Path, count: int, look: int, picture: str | None) -> None:
     )
     if picture:
         write_picture(picture, *both)
-
-
-MEASURES = ("dark pixels, %", "saturation, of 255", "edges, % of pixels", "variance of the Laplacian")
 
 
 def measures(images: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ if __name__ == "__main__":
     program.end_on_interrupt("soak")  # also while the libraries below are loaded
 
 import http.client
-import os
 import random
 import tempfile
 import threading
@@ -53,9 +52,7 @@ class Reading:
     @staticmethod
     def of(server: Target) -> "Reading":
         """Read it."""
-        fields = Path(f"/proc/{server.process.pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
-        seconds = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-        return Reading(server.memory(), server.open_files(), seconds)
+        return Reading(server.memory(), server.open_files(), server.cpu_seconds())
 
 
 class Company:
