@@ -22,7 +22,7 @@ from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
 from cloning.server.libraries import engineio, eventlet
-from cloning.server.server import MAX_CLIENTS, QUIET, Client, Server
+from cloning.server.server import MAX_CLIENTS, MAX_UNANSWERED, QUIET, Client, Server
 from tools import attack, soak
 from tools.attacks import GET, WEBSOCKET, all_attacks, frame
 from tools.simulator_client import Simulator, telemetry
@@ -99,6 +99,20 @@ def test_a_client_that_reads_nothing_is_disconnected(server):
         with pytest.raises(ConnectionError):
             for _ in range(10_000):
                 stranger.sendall(frame(b'42["telemetry",0]') * 100)
+
+
+@pytest.mark.parametrize("text", [b"42[", b"7", b"3", b"", b'42["other",1]'])
+def test_a_client_whose_messages_have_no_answer_is_disconnected(server, text):
+    """So that the server does not work for long on what is left of a client that has gone."""
+    with Simulator(server.port) as stranger:
+        stranger.open()
+        for _ in range(20):
+            stranger.socket.sendall(frame(text) * 90)
+            stranger.send("2")
+            assert stranger.receive() == "3"
+        stranger.socket.sendall(frame(text) * (MAX_UNANSWERED + 1))
+        with pytest.raises(ConnectionError):
+            stranger.receive()
 
 
 def test_a_long_ping_is_not_answered(server):

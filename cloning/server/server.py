@@ -16,6 +16,7 @@ from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 ARRIVAL = 0.002  # s within which a simulator sends the rest of a message, if it is read at once
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
+MAX_UNANSWERED = 1000  # texts of a client since it was last sent one; without: 10 s of work when `garbage` has gone
 OPENING_INTERVAL = 0.005  # s between two new clients; without: 23 ms beside reconnections
 PACKET_TYPES = ("1", "3", "4", "5")  # of Engine.IO, besides pings, that a client may send
 # Events that announce attachments count as unreadable: python-socketio keeps any number, 88 MB in 3 s of `attachments`.
@@ -51,6 +52,7 @@ class Client(engineio.socket.Socket):
         self.waits = False  # for a message to be handled
         self.last_ping = None  # without: threads that would ping; 38 MB more after 20 s of reconnections
         self.expects_pings = False
+        self.unanswered = 0  # texts since it was last sent one
 
     def handle_get_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
         """Open the websocket, and serve the client until it ends."""
@@ -67,7 +69,8 @@ class Client(engineio.socket.Socket):
         for packet in self.poll():
             self.send(packet)
         pinged = time.perf_counter()
-        while not self.closed and (text := self.websocket.receive()) is not None:
+        while self.unanswered <= MAX_UNANSWERED and not self.closed and (text := self.websocket.receive()) is not None:
+            self.unanswered += 1
             now = time.perf_counter()
             if self.expects_pings and now > pinged + PING_INTERVAL:
                 pinged = now
@@ -109,6 +112,7 @@ class Client(engineio.socket.Socket):
 
     def send(self, packet: Any) -> None:
         """Send a packet, as soon as the websocket is open."""
+        self.unanswered = 0
         if self.websocket:
             self.websocket.send(packet.encode())
         else:
