@@ -33,13 +33,13 @@ def configure_engine() -> None:
     """Set up panda3d for this process, before it makes anything; simulated cars and rendered scenes call this.
 
     The transform cache is off, because it replaces transforms by nearly equal earlier ones: a frame would depend on the
-    frames before it.
+    frames before it. Bounds are boxes, because spheres around flat cells reach into views that do not show them.
     """
     core.load_prc_file_data(
         "",
         "window-type none\naudio-library-name null\nsync-video false\nprint-pipe-types false\n"
         "notify-level-display error\nnotify-level-device fatal\n"
-        "load-display p3tinydisplay\nuniquify-transforms false\ntransform-cache false\n",
+        "load-display p3tinydisplay\nuniquify-transforms false\ntransform-cache false\nbounds-type box\n",
     )
 
 
@@ -69,11 +69,12 @@ def build_physics(track: Track) -> bullet.BulletWorld:
 def _vertex_format(on_road: bool) -> core.GeomVertexFormat:
     """Return a format with positions, colours and texture coordinates in one array each.
 
-    So the colours can be replaced on their own. on_road: whether there are texture coordinates for shadows, too.
+    So the colours can be replaced on their own. They are as the renderer computes with them, or it would convert each
+    point in each frame. on_road: whether there are texture coordinates for shadows, too.
     """
     columns = [
-        (core.InternalName.get_vertex(), 3, core.Geom.NT_float32, core.Geom.C_point),
-        (core.InternalName.get_color(), 4, core.Geom.NT_uint8, core.Geom.C_color),
+        (core.InternalName.get_vertex(), 4, core.Geom.NT_float32, core.Geom.C_point),
+        (core.InternalName.get_color(), 4, core.Geom.NT_float32, core.Geom.C_color),
         (core.InternalName.get_texcoord(), 2, core.Geom.NT_float32, core.Geom.C_texcoord),
         (SHADE, 2, core.Geom.NT_float32, core.Geom.C_texcoord),
     ]
@@ -100,10 +101,10 @@ def make_texture(image: np.ndarray, repeat: bool, mipmaps: bool) -> core.Texture
 
 
 def _rgba(colours: np.ndarray) -> np.ndarray:
-    """Clip colours (n, 3) to 0..255 and return them as uint8 RGBA (n, 4)."""
-    rgba = np.full((len(colours), 4), 255, np.uint8)
-    np.clip(colours, 0, 255, out=rgba[:, :3], casting="unsafe")
-    return rgba
+    """Clip colours (3, n) to 0..255, leave out fractions, and return them as float32 RGBA (n, 4), 0..1."""
+    rgba = np.full((colours.shape[1], 4), 255, np.float32)
+    np.floor(np.clip(colours, 0, 255), out=rgba.T[:3])
+    return rgba * np.float32(1 / 255)  # to the bit what the engine makes of bytes
 
 
 def _fill(array: core.GeomVertexArrayData, values: np.ndarray) -> None:
@@ -118,10 +119,11 @@ class MeshCell:
         self.used, faces = np.unique(faces, return_inverse=True)
         self.data = core.GeomVertexData("cell", _vertex_format(shade_uv is not None), core.Geom.UH_static)
         self.data.unclean_set_num_rows(len(self.used))
-        for i, values in ((0, mesh.points), (2, mesh.uv), (3, shade_uv)):
+        _fill(self.data.modify_array(0), np.c_[mesh.points[self.used], np.ones(len(self.used))].astype(np.float32))
+        for i, values in ((2, mesh.uv), (3, shade_uv)):
             if values is not None:
                 _fill(self.data.modify_array(i), values[self.used].astype(np.float32))
-        self.set_colours(_rgba(mesh.colours[self.used] * 255))
+        self.set_colours(_rgba(mesh.colours[self.used].T * 255))
         triangles = core.GeomTriangles(core.Geom.UH_static)
         triangles.set_index_type(core.Geom.NT_uint32)
         index = triangles.modify_vertices()
@@ -133,7 +135,7 @@ class MeshCell:
         self.node.add_geom(geom)
 
     def set_colours(self, colours: np.ndarray) -> None:
-        """Set the used points' colours: uint8 (n, 4), RGBA."""
+        """Set the used points' colours: float32 (n, 4), RGBA, 0..1."""
         _fill(self.data.modify_array(1), colours)
 
 
@@ -176,17 +178,19 @@ class MeshGroup:
             root.set_transparency(core.TransparencyAttrib.M_binary)
         self.root = root
         used = np.concatenate([cell.used for cell in self.cells])
-        self.points, self.colours = mesh.points[used].astype(np.float32), mesh.colours[used].astype(np.float32) * 255
+        # (3, n), because numpy needs several times as long for (n, 3).
+        self.points = np.ascontiguousarray(mesh.points[used].T, np.float32)
+        self.colours = np.ascontiguousarray(mesh.colours[used].T, np.float32) * 255
         self.starts = np.cumsum([len(cell.used) for cell in self.cells])[:-1]  # of the cells after the first in these
         self.brightness = float(mesh.texture[..., :3].mean()) / 255
 
     def update_colours(self, eye: np.ndarray, haze: Haze | None) -> None:
-        """Apply haze and sheen to the colours, as seen from `eye`: (3,), m."""
-        colours, distance = self.colours, np.sqrt(np.square(self.points - eye).sum(axis=1))[:, None]
+        """Apply haze and sheen to the colours, as seen from `eye`: (3, 1), m."""
+        colours, distance = self.colours, np.sqrt(np.square(self.points - eye).sum(axis=0))
         if haze:
             start, end = haze.range
             share = np.clip((distance - start) / (end - start), 0, haze.maximum)
-            goal = np.array(haze.colour, np.float32) * (255 / self.brightness)
+            goal = np.array(haze.colour, np.float32)[:, None] * (255 / self.brightness)
             colours = colours + (goal - colours) * share
         if self.mesh.sheen:
             share = np.clip(1 - SHEEN_START / np.maximum(distance, SHEEN_START), 0, 1)
@@ -282,7 +286,7 @@ class Scene:
             if not changes or here == self.viewpoints.get(step):
                 continue
             self.viewpoints[step] = here
-            eye = np.array([here[0] * step, here[1] * step, 0], np.float32)
+            eye = np.array([[here[0] * step], [here[1] * step], [0]], np.float32)
             for group in self.groups:
                 if bool(group.mesh.sheen) == (step == SHEEN_STEP):
                     group.update_colours(eye, self.scenery.haze)
