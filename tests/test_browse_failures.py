@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 from browse_process import at, browsing, placed, replayed, steered
 from browser import needs_chromium
+from test_excluded import center
 
 pytestmark = needs_chromium
 
@@ -79,3 +80,40 @@ def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked,
         page.wait("document.querySelector('#notice').hidden")
         page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
         at(page, 59)
+
+
+def test_an_undo_that_fails_can_be_tried_again(linked, page):
+    """After the cut was deleted elsewhere, and written again."""
+    placed(linked, np.zeros(60))
+    file, header = linked / "excluded.csv", "first image,last image,reason\n"
+    cuts = [f"{center(linked, row)},{center(linked, row)},off\n" for row in (0, 1)]
+    with browsing(linked) as server:
+        page.look(1280, 900)
+        page.open(f"{server.base}{server.hash('lake')}")
+        for row in range(2):
+            at(page, row)
+            for key in "iox":
+                page.press(key)
+            page.wait("document.querySelector('#reason[open]')")
+            page.run("document.querySelector('#reason-text').value = 'off'")
+            page.press("Enter")
+            page.wait(f"document.querySelectorAll('#cuts button').length == {2 * row + 2}")
+            page.press("ArrowRight")
+        assert file.read_text(encoding="utf-8") == header + "".join(cuts)
+        file.write_text(header + cuts[0], encoding="utf-8")
+        page.press("z")
+        page.shows("#notice", "it was deleted elsewhere")
+        file.write_text(header + "".join(cuts), encoding="utf-8")
+        page.press("z")
+        page.press("z")
+        page.shows("#cuts", "None")
+        assert file.read_text(encoding="utf-8") == header and page.run("document.querySelector('#notice').hidden")
+        file.unlink()
+        file.mkdir()
+        page.press("y")
+        page.shows("#notice", "not a regular file")
+        file.rmdir()
+        page.press("y")
+        page.press("y")
+        page.wait("document.querySelectorAll('#cuts button').length == 4")
+        assert file.read_text(encoding="utf-8") == header + "".join(cuts)
