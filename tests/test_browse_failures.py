@@ -1,9 +1,10 @@
 """What the page of recordings says, in a real Chromium, where something fails, takes long, or is gone."""
 
+import os
 import shutil
 
 import numpy as np
-from browse_process import at, browsing, placed, replayed, steered
+from browse_process import at, browsing, placed, replayed, steered, written_run
 from browser import needs_chromium
 from test_excluded import center
 
@@ -117,3 +118,50 @@ def test_an_undo_that_fails_can_be_tried_again(linked, page):
         page.press("y")
         page.wait("document.querySelectorAll('#cuts button').length == 4")
         assert file.read_text(encoding="utf-8") == header + "".join(cuts)
+
+
+# The next answer about the recording comes when `go` is called.
+HELD = """const own = fetch; fetch = async (...what) => {
+    const answer = await own(...what);
+    if (what[0].includes("/details") && !window.go) await new Promise(held => go = held);
+    return answer;
+}; 0"""
+
+
+def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, page, tmp_path, model_file):
+    model = shutil.copy(model_file, tmp_path / "one.pt")
+    (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)", encoding="utf-8")
+    placed(linked, np.zeros(60))
+    steered(linked, model)
+    with browsing(linked, "--model", model, modules=tmp_path) as server:
+        page.open(server.base)
+        page.wait("document.querySelector('article .road')")
+        page.run(HELD)
+        page.run(f"location.hash = '{server.hash('lake')}/7'")
+        page.wait("window.go")
+        os.utime(model, (0, 0))
+        page.run("go()")
+        at(page, 7)
+        page.shows("#findings", "one.pt: 0 % analysed")
+
+
+def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, model_file):
+    """Limits, models, runs and recordings that an earlier server had."""
+    placed(linked, np.zeros(60))
+    written_run(tmp_path, finished=1, images=500)
+    (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)", encoding="utf-8")
+    with browsing(linked, "--model", model_file, "--run", tmp_path, modules=tmp_path) as server:
+        here = server.hash("lake")
+        page.open(f"{server.base}{here}/7?limit=7&look=3&mark=x-9")
+        at(page, 7)
+        page.wait(f"location.hash == '{here}/7'")
+        page.run("location.hash = '#/run/0?with=0,3'")
+        page.wait("document.querySelectorAll('#losses .uplot').length")
+        page.run(f"location.hash = '#/compare?limit=7&ids=gone,{here[2:]}'")
+        page.shows("#table", "lake")
+        page.shows("#notice", "Not here, of the recordings in this address: 1")
+        page.click("#compare-all")
+        page.shows("#compared", "2 analyses to do")
+        page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
+        page.shows("#notice", "does not answer")
+        page.wait("document.querySelector('#notice').hidden")

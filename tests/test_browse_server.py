@@ -43,6 +43,7 @@ def test_the_server_tells_what_the_reader_tells(served, sample_recording):
     here = served.recordings()["lake sample"]
     recording, details = read_recording(sample_recording), served.get(f"{here}/details")
     assert details["frames"] == details["rows_read"] == 60 and details["cuts"] == [] and details["rejected"] == 0
+    assert served.get(f"{here}/overview")["outline"] and not {"outline", "path"} & details.keys(), "sent once"
     for name in ("steering", "throttle", "speed"):
         status, data, _ = served.ask(f"{here}/columns/{name}?version={details['version']}")
         assert status == 200

@@ -121,6 +121,10 @@ class ShownRecording:
             shown["message"] = message_of(error)
         return shown
 
+    def _figures(self) -> dict[str, Any]:
+        """Return the overview without what draws its map: what is asked for every few seconds need not send that."""
+        return {name: value for name, value in self.overview().items() if name not in summary.MAP}
+
     def details(self, limit: str | None = None) -> dict[str, Any]:
         """Return what the page shows of one recording besides its columns; limit: of the replays to tell of, or None.
 
@@ -129,7 +133,7 @@ class ShownRecording:
         recording, cuts = self.read(), read_cuts(self.folder)
         self.analyses.urgent = self.folder
         models = [{"name": Path(model).name, **self._state(f"model-{at}")} for at, model in enumerate(self.models)]
-        shown = self.overview() | {"lane": self._state("offset"), "version": self.version()}
+        shown = self._figures() | {"lane": self._state("offset"), "version": self.version()}
         for kind, some in (("cuts", cuts), ("tags", read_cuts(self.folder, TAGS))):
             covered = _rows_cut(self.folder, tuple(some), recording)
             shown[kind] = [
@@ -214,7 +218,7 @@ class ShownRecording:
 
         begin: begin the analyses that are missing. Raises UnknownError, RecordingError.
         """
-        shown, models = self.overview(), list[dict[str, Any]]()
+        shown, models = self._figures(), list[dict[str, Any]]()
         if "message" in shown:
             return shown
         recording = self.read()

@@ -22,7 +22,8 @@ export async function showList(state) {
   if (now != shown) return;
   element("list").hidden = false;
   element("query").value = state.get("find") ?? "";
-  element("sort").value = state.get("sort") ?? "name";
+  element("sort").value = state.get("sort");
+  if (!element("sort").value) element("sort").value = "name";
   showRuns(now);
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);

@@ -29,10 +29,10 @@ export async function showRun(id, shown) {
 }
 
 // This run, and those laid over it; the others that there are.
-async function load({id, others}) {
-  const shown = [id, ...others].map(each => request(`/runs/${each}`));
-  const [all, ...runs] = await Promise.all([request("/runs"), ...shown]);
-  return {all, runs};
+async function load(now) {
+  const all = await request("/runs");
+  now.others = now.others.filter(other => all.some(({id}) => id == other)); // the address may be of an earlier server
+  return {all, runs: await Promise.all([now.id, ...now.others].map(each => request(`/runs/${each}`)))};
 }
 
 const nameOf = ({folder}) => folder.split(/[\\/]/).at(-1);
