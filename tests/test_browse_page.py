@@ -330,6 +330,18 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
             page.run(f"document.querySelector('#query').value = '{query}'; document.querySelector('#query').oninput()")
             assert page.run(shown) == names
         assert page.run("location.hash") == "#?find=refused%3E0"
+        page.run("document.querySelector('#query').value = ''; document.querySelector('#query').oninput()")
+        for name in ("lake", "one"):
+            page.click(f"[aria-label='Select {name}']")
+        page.wait("location.hash.includes('select=')")
+        page.click("#merge")
+        page.shows("#selection", "2 recordings as one: 61 frames")
+        assert page.barriers() == []
+        page.run("document.querySelector('#export-name').value = 'both'")
+        page.click("#export [value=recording]")
+        page.shows("#merged", "both. The list has it. one is put 1 day later")
+        page.shows("#total", "5 recordings, 182 frames")
+        assert len(read_recording(linked.with_name("both"))) == 61
         page.run(f"location.hash = '{server.hash('one')}'")
         page.shows("#where", "frame 1 of 1")
         assert now(page, "plots.plots[3].axes[0]._splits.length") == 1, "no axis of a hundred NaN:NaN"
@@ -370,6 +382,15 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.click("#run-others button")
         page.shows("#losses", "b drift")
         assert page.run("location.hash") == "#/run/0?with=1"
+        page.run("smooth.value = 0.5; smooth.oninput(); smooth.onchange()")
+        page.wait("location.hash == '#/run/0?with=1&smooth=0.5'")
+        assert page.run("document.querySelectorAll('#losses .u-series.smoothed').length") == 6, "beside the raw ones"
+        average = page.run("import('/static/run.js').then(({average}) => average([1, 0, null, 0], 0.5))")
+        assert average == [1, pytest.approx(1 / 3), None, pytest.approx(1 / 7)], "sums of 1, 1/2, 1/4, 1/8"
+        page.run("dispatchEvent(new HashChangeEvent('hashchange'))")
+        page.wait(
+            "smoothed.textContent == '0.50' && document.querySelectorAll('#losses .u-series.smoothed').length == 6"
+        )
         page.click("#run-options summary")
         assert page.text("#run-table").split("\n") == ["option\ta\tb", "epochs\t4\t5"]
         page.shows("#run-which", "after 1,200 observations")
@@ -399,7 +420,7 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
     page.open(served.base)
     for hash, key, condition in (
         ("#", "", "document.querySelector('article .road')"),
-        ("#/run/0", "", "document.querySelector('#losses .uplot')"),
+        ("#/run/0?smooth=0.9", "", "document.querySelector('#losses .smoothed')"),
         ("#/compare", "", "document.querySelector('#table td')"),
         (f"{served.hash('lake sample')}/5", "", "document.querySelector('#where').textContent.includes('frame 6 of')"),
         ("", "l", "document.querySelectorAll('.replayed').length == 2"),
