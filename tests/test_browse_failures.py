@@ -8,6 +8,8 @@ from browse_process import at, browsing, placed, replayed, steered, written_run
 from browser import needs_chromium
 from test_excluded import center
 
+from cloning.recordings.log import read_recording
+
 pytestmark = needs_chromium
 
 
@@ -165,3 +167,23 @@ def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, 
         page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
         page.shows("#notice", "does not answer")
         page.wait("document.querySelector('#notice').hidden")
+
+
+def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(linked, page):
+    """As while many others are loaded; an error there would stop all frames in the end."""
+    placed(linked, np.zeros(60))
+    with browsing(linked) as server:
+        page.open(f"{server.base}{server.hash('lake')}")
+        at(page, 0)
+        page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
+        page.run("""const own = fetch; fetch = async (...what) => {
+            if (what[0].includes("/rows/1/") && !window.late) await new Promise(go => late = go);
+            return own(...what);
+        }; 0""")
+        page.press("ArrowRight")
+        page.wait("window.late")
+        page.run("import('/static/state.js').then(({page: {open: {frames}}}) => frames.forget(1))")
+        page.run("new Promise(done => setTimeout(done, 2000)).then(late)")
+        frame = read_recording(linked).path(1, 1).read_bytes()
+        page.until(lambda: page.difference("left", frame) < 3, 20)
+        assert page.complaints() == []

@@ -107,7 +107,7 @@ element("merge").onclick = () => {
     what: `${many(all.length, "recording")} as one: ${many(sum, "frame")}`, name: `${name}-and-more`,
     id, version, rows: `0-${frames}`, others: others.map(({id}) => id),
     tell: words => element("merged").textContent = words,
-    written: () => dispatchEvent(new HashChangeEvent("hashchange")),
+    written: () => element("list").hidden || dispatchEvent(new HashChangeEvent("hashchange")), // which shows it
   });
 };
 element("compare").onclick = () => {
