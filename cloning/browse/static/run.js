@@ -158,11 +158,11 @@ export function average(values, weight) {
   });
 }
 
-// A curve, and before it the same one pale if it is smoothed; the legend has the values as they are.
+// A curve, and before it the same one pale if it is smoothed; the legend has the values as they are, in its full colour.
 function smoothed([[epochs, values], looks]) {
   if (!open.smooth) return [[[epochs, values], looks]];
   const stroke = `color-mix(in srgb, ${looks.stroke} 30%, transparent)`;
-  return [[[epochs, values], {...looks, stroke, points: {...looks.points, stroke, fill: stroke}}],
+  return [[[epochs, values], {...looks, stroke, full: looks.stroke, points: {...looks.points, stroke, fill: stroke}}],
     [[epochs, average(values, open.smooth)], {...looks, class: "smoothed", points: {show: false}}]];
 }
 
@@ -203,6 +203,7 @@ function draw() {
     const most = curves.flatMap(([[, values], {isWithin}]) => isWithin ? usual(values) : values);
     return new uPlot({
       width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
+      legend: {markers: {stroke: (plot, at) => plot.series[at].full ?? plot.series[at].stroke(plot, at)}},
       hooks: {ready: [plot => setTimeout(() => plot.setLegend({idx: plot.data[0].length - 1}))]}, // till the mouse points
       scales: {x: {time: false, range: [0, Math.max(...runs.map(({epochs}) => epochs))]},
         y: {range: [0, Math.max(...most, 0) * 1.08 || 0.1]}},
