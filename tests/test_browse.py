@@ -135,7 +135,7 @@ def test_a_part_of_a_recording_is_a_recording_with_the_same_images(linked, tmp_p
     lane += [f"{recording.name(row)},{row / 100},0" for row in range(60)]
     (linked / "lane.csv").write_text("\n".join(lane) + "\n", encoding="utf-8")
     chosen = recording.take(np.arange(60) % 3 == 1)
-    write_part(chosen, tmp_path / "part")
+    assert write_part([chosen], tmp_path / "part") == []
     written = read_recording(tmp_path / "part")
     for name in ("steering", "throttle", "brake", "speed", "time"):
         assert (getattr(written, name) == getattr(chosen, name)).all(), name
@@ -144,11 +144,39 @@ def test_a_part_of_a_recording_is_a_recording_with_the_same_images(linked, tmp_p
     known = (tmp_path / "part/lane.csv").read_text(encoding="utf-8").splitlines()
     assert known == [lane[0], *lane[2::3]]
     with pytest.raises(RecordingError, match="part: exists already"):
-        write_part(chosen, tmp_path / "part")
+        write_part([chosen], tmp_path / "part")
     recording.path(10).unlink()
     with pytest.raises(RecordingError, match=f"{recording.name(10)}: No such file"):
-        write_part(chosen, tmp_path / "other")
+        write_part([chosen], tmp_path / "other")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "part"]
+
+
+def test_recordings_become_one_with_each_drive_as_it_was(linked, tmp_path):
+    """Those of the same time are put on different days; what does not fit is told, or refused."""
+    recording, lane = read_recording(linked), "center image,lateral offset (m),heading error (radians)\n"
+    (linked / "lane.csv").write_text(lane + f"{recording.name(0)},0.5,0\n", encoding="utf-8")
+    parts = [recording.take(slice(0, 20)), recording.take(slice(20, 40)), recording.take(slice(15, 25))]
+    days = ["lake is put 1 day later, after another drive", "lake is put 2 days later, after another drive"]
+    assert write_part(parts, tmp_path / "one") == days
+    one = read_recording(tmp_path / "one")
+    assert (one.steering == np.concatenate([part.steering for part in (parts[0], parts[2], parts[1])])).all()
+    assert not one.repairs and not one.rejected and one.path(20).samefile(recording.path(15))
+    assert (np.flatnonzero(np.diff(one.time) > 1) == [19, 29]).all() and one.time[20] - recording.time[15] == 86400
+    assert (tmp_path / "one/lane.csv").read_text(encoding="utf-8") == lane + f"{recording.name(0)},0.5,0\n"
+    plain = shutil.copytree(linked, tmp_path / "data" / "plain")
+    (plain / "lane.csv").unlink()
+    notes = ["plain is put 1 day later, after another drive", "lane.csv is left out: plain has none"]
+    assert write_part([recording, read_recording(plain)], tmp_path / "two") == notes
+    assert len(read_recording(tmp_path / "two")) == 120 and not (tmp_path / "two/lane.csv").exists()
+    log = (plain / "driving_log.csv").read_text(encoding="utf-8").splitlines()[0]
+    for image in (plain / "IMG").glob("*"):
+        if image.name in log:
+            image.rename(image.with_name(f"{image.name.split('_')[0]}_1.jpg"))
+            log = log.replace(image.name, f"{image.name.split('_')[0]}_1.jpg")
+    (plain / "driving_log.csv").write_text(log + "\n", encoding="utf-8")
+    with pytest.raises(RecordingError, match="no time in its name"):
+        write_part([recording, read_recording(plain)], tmp_path / "three")
+    assert not (tmp_path / "three").exists()
 
 
 # ----------------------------------------------------------------------------------------------------------------------

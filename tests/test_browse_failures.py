@@ -1,10 +1,14 @@
 """What the page of recordings says, in a real Chromium, where something fails, takes long, or is gone."""
 
+import os
 import shutil
 
 import numpy as np
-from browse_process import at, browsing, placed, replayed, steered
+from browse_process import at, browsing, placed, replayed, steered, written_run
 from browser import needs_chromium
+from test_excluded import center
+
+from cloning.recordings.log import read_recording
 
 pytestmark = needs_chromium
 
@@ -79,3 +83,107 @@ def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked,
         page.wait("document.querySelector('#notice').hidden")
         page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
         at(page, 59)
+
+
+def test_an_undo_that_fails_can_be_tried_again(linked, page):
+    """After the cut was deleted elsewhere, and written again."""
+    placed(linked, np.zeros(60))
+    file, header = linked / "excluded.csv", "first image,last image,reason\n"
+    cuts = [f"{center(linked, row)},{center(linked, row)},off\n" for row in (0, 1)]
+    with browsing(linked) as server:
+        page.look(1280, 900)
+        page.open(f"{server.base}{server.hash('lake')}")
+        for row in range(2):
+            at(page, row)
+            for key in "iox":
+                page.press(key)
+            page.wait("document.querySelector('#reason[open]')")
+            page.run("document.querySelector('#reason-text').value = 'off'")
+            page.press("Enter")
+            page.wait(f"document.querySelectorAll('#cuts button').length == {2 * row + 2}")
+            page.press("ArrowRight")
+        assert file.read_text(encoding="utf-8") == header + "".join(cuts)
+        file.write_text(header + cuts[0], encoding="utf-8")
+        page.press("z")
+        page.shows("#notice", "it was deleted elsewhere")
+        file.write_text(header + "".join(cuts), encoding="utf-8")
+        page.press("z")
+        page.press("z")
+        page.shows("#cuts", "None")
+        assert file.read_text(encoding="utf-8") == header and page.run("document.querySelector('#notice').hidden")
+        file.unlink()
+        file.mkdir()
+        page.press("y")
+        page.shows("#notice", "not a regular file")
+        file.rmdir()
+        page.press("y")
+        page.press("y")
+        page.wait("document.querySelectorAll('#cuts button').length == 4")
+        assert file.read_text(encoding="utf-8") == header + "".join(cuts)
+
+
+# The next answer about the recording comes when `go` is called.
+HELD = """const own = fetch; fetch = async (...what) => {
+    const answer = await own(...what);
+    if (what[0].includes("/details") && !window.go) await new Promise(held => go = held);
+    return answer;
+}; 0"""
+
+
+def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, page, tmp_path, model_file):
+    model = shutil.copy(model_file, tmp_path / "one.pt")
+    (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)", encoding="utf-8")
+    placed(linked, np.zeros(60))
+    steered(linked, model)
+    with browsing(linked, "--model", model, modules=tmp_path) as server:
+        page.open(server.base)
+        page.wait("document.querySelector('article .road')")
+        page.run(HELD)
+        page.run(f"location.hash = '{server.hash('lake')}/7'")
+        page.wait("window.go")
+        os.utime(model, (0, 0))
+        page.run("go()")
+        at(page, 7)
+        page.shows("#findings", "one.pt: 0 % analysed")
+
+
+def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, model_file):
+    """Limits, models, runs and recordings that an earlier server had."""
+    placed(linked, np.zeros(60))
+    written_run(tmp_path, finished=1, images=500)
+    (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)", encoding="utf-8")
+    with browsing(linked, "--model", model_file, "--run", tmp_path, modules=tmp_path) as server:
+        here = server.hash("lake")
+        page.open(f"{server.base}{here}/7?limit=7&look=3&mark=x-9")
+        at(page, 7)
+        page.wait(f"location.hash == '{here}/7'")
+        page.run("location.hash = '#/run/0?with=0,3'")
+        page.wait("document.querySelectorAll('#losses .uplot').length")
+        page.run(f"location.hash = '#/compare?limit=7&ids=gone,{here[2:]}'")
+        page.shows("#table", "lake")
+        page.shows("#notice", "Not here, of the recordings in this address: 1")
+        page.click("#compare-all")
+        page.shows("#compared", "2 analyses to do")
+        page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
+        page.shows("#notice", "does not answer")
+        page.wait("document.querySelector('#notice').hidden")
+
+
+def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(linked, page):
+    """As while many others are loaded; an error there would stop all frames in the end."""
+    placed(linked, np.zeros(60))
+    with browsing(linked) as server:
+        page.open(f"{server.base}{server.hash('lake')}")
+        at(page, 0)
+        page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
+        page.run("""const own = fetch; fetch = async (...what) => {
+            if (what[0].includes("/rows/1/") && !window.late) await new Promise(go => late = go);
+            return own(...what);
+        }; 0""")
+        page.press("ArrowRight")
+        page.wait("window.late")
+        page.run("import('/static/state.js').then(({page: {open: {frames}}}) => frames.forget(1))")
+        page.run("new Promise(done => setTimeout(done, 2000)).then(late)")
+        frame = read_recording(linked).path(1, 1).read_bytes()
+        page.until(lambda: page.difference("left", frame) < 3, 20)
+        assert page.complaints() == []

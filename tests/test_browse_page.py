@@ -2,7 +2,6 @@
 
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 from browse_process import at, browsing, placed, replayed, steered, written_run
@@ -330,6 +329,18 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
             page.run(f"document.querySelector('#query').value = '{query}'; document.querySelector('#query').oninput()")
             assert page.run(shown) == names
         assert page.run("location.hash") == "#?find=refused%3E0"
+        page.run("document.querySelector('#query').value = ''; document.querySelector('#query').oninput()")
+        for name in ("lake", "one"):
+            page.click(f"[aria-label='Select {name}']")
+        page.wait("location.hash.includes('select=')")
+        page.click("#merge")
+        page.shows("#selection", "2 recordings as one: 61 frames")
+        assert page.barriers() == []
+        page.run("document.querySelector('#export-name').value = 'both'")
+        page.click("#export [value=recording]")
+        page.shows("#merged", "both. The list has it. one is put 1 day later")
+        page.shows("#total", "5 recordings, 182 frames")
+        assert len(read_recording(linked.with_name("both"))) == 61
         page.run(f"location.hash = '{server.hash('one')}'")
         page.shows("#where", "frame 1 of 1")
         assert now(page, "plots.plots[3].axes[0]._splits.length") == 1, "no axis of a hundred NaN:NaN"
@@ -347,51 +358,6 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
     assert page.barriers() == []
 
 
-def test_a_training_run_refreshes_itself(tmp_path, page):
-    files = written_run(tmp_path / "a", finished=1, images=500, drifts=(0.9, 0.8, 0.6, 0.7))
-    written_run(tmp_path / "b", finished=4, images=0, epochs=5)
-    (tmp_path / "none").mkdir()
-    for path in files.pictures.iterdir():
-        cv2.imwrite(str(path), np.zeros((1, 1), np.uint8))
-    with browsing("--run", *(tmp_path / name for name in ("a", "b", "none"))) as server:
-        page.open(f"{server.base}#/run/2")
-        page.shows("#notice", "none: no training run in this folder yet; `python model.py --output")
-        assert page.barriers() == []
-        page.open(server.base)
-        page.shows("#runs", "stopped or killed in epoch 2 of 4")
-        page.click("#runs a")
-        page.wait("document.querySelectorAll('#losses .uplot').length == 2")
-        assert page.run("document.title").startswith("stopped: ")
-        assert "Drift" in page.text("#losses section") and "within the epoch" in page.text("#losses")
-        page.shows("#run-figures", f"not written yet: python -m cloning.report {tmp_path / 'a'}")
-        files.report.write_text("<p>What it learned", encoding="utf-8")
-        page.shows("#run-figures a", "report.html")
-        assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<p>What it learned"
-        page.click("#run-others button")
-        page.shows("#losses", "b drift")
-        assert page.run("location.hash") == "#/run/0?with=1"
-        page.click("#run-options summary")
-        assert page.text("#run-table").split("\n") == ["option\ta\tb", "epochs\t4\t5"]
-        page.shows("#run-which", "after 1,200 observations")
-        page.press("ArrowLeft")
-        page.shows("#run-which", "after 0 observations")
-        page.run("document.querySelector('#run-read summary').focus()")
-        page.press("Enter")
-        page.wait("document.querySelector('#run-read').open")
-        assert "It reads 1 recording\nlake" in page.text()
-        page.wait("document.querySelector('#run-pictures img').naturalWidth == 1")
-        progress = files.progress.read_text(encoding="utf-8")
-        files.progress.write_text(progress.replace('"finished": 1', '"finished": 4'), encoding="utf-8")
-        page.shows("#run-figures", "finished: 4 epochs")
-        page.shows("#run-figures", "epoch 4, in model-best.pt: it has the least validation loss, 0.2000")
-        page.shows("#run-figures", "the least drift, 0.60 m, is that of epoch 3")
-        assert page.run("document.querySelector('#run-bar').value") == 1
-        assert page.run("document.querySelector('#run-read').open"), "after it has refreshed itself"
-        page.run("location.hash = '#/run/1'")
-        page.shows("#losses section", "Not known: no two seconds")
-        assert page.complaints() == []
-
-
 @pytest.mark.parametrize("width, dark", LOOKS)
 def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
     """And every control has a tooltip, and is large enough for a thumb."""
@@ -399,7 +365,7 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
     page.open(served.base)
     for hash, key, condition in (
         ("#", "", "document.querySelector('article .road')"),
-        ("#/run/0", "", "document.querySelector('#losses .uplot')"),
+        ("#/run/0?smooth=0.9", "", "document.querySelector('#losses .smoothed')"),
         ("#/compare", "", "document.querySelector('#table td')"),
         (f"{served.hash('lake sample')}/5", "", "document.querySelector('#where').textContent.includes('frame 6 of')"),
         ("", "l", "document.querySelectorAll('.replayed').length == 2"),

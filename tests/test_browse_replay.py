@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import pytest
 import warm
-from browse_process import opened, placed, written_run
+from browse_process import browsing, opened, placed, written_run
+from browser import needs_chromium
 from commands import HERE, run_here
 from drive_process import awaited
 from test_excluded import center
@@ -221,3 +222,58 @@ def test_a_run_that_was_killed_before_it_told_of_its_end_tells_when_it_is_resume
     done = run_here("--resume", "--output", files.last)
     assert done.returncode == 0, done.stderr
     assert runs.overview(files)["state"] == "finished" and json.loads(files.progress.read_bytes()) == progress
+
+
+@needs_chromium
+def test_a_training_run_refreshes_itself(tmp_path, page):
+    files = written_run(tmp_path / "a", finished=1, images=500, drifts=(0.9, 0.8, 0.6, 0.7))
+    written_run(tmp_path / "b", finished=4, images=0, epochs=5)
+    (tmp_path / "none").mkdir()
+    for path in files.pictures.iterdir():
+        cv2.imwrite(str(path), np.zeros((1, 1), np.uint8))
+    with browsing("--run", *(tmp_path / name for name in ("a", "b", "none"))) as server:
+        page.open(f"{server.base}#/run/2")
+        page.shows("#notice", "none: no training run in this folder yet; `python model.py --output")
+        assert page.barriers() == []
+        page.open(server.base)
+        page.shows("#runs", "stopped or killed in epoch 2 of 4")
+        page.click("#runs a")
+        page.wait("document.querySelectorAll('#losses .uplot').length == 2")
+        assert page.run("document.title").startswith("stopped: ")
+        assert "Drift" in page.text("#losses section") and "within the epoch" in page.text("#losses")
+        page.shows("#run-figures", f"not written yet: python -m cloning.report {tmp_path / 'a'}")
+        files.report.write_text("<p>What it learned", encoding="utf-8")
+        page.shows("#run-figures a", "report.html")
+        assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<p>What it learned"
+        page.click("#run-others button")
+        page.shows("#losses", "b drift")
+        assert page.run("location.hash") == "#/run/0?with=1"
+        page.run("smooth.value = 0.5; smooth.oninput(); smooth.onchange()")
+        page.wait("location.hash == '#/run/0?with=1&smooth=0.5'")
+        assert page.run("document.querySelectorAll('#losses .u-series.smoothed').length") == 6, "beside the raw ones"
+        average = page.run("import('/static/run.js').then(({average}) => average([1, 0, null, 0], 0.5))")
+        assert average == [1, pytest.approx(1 / 3), None, pytest.approx(1 / 7)], "sums of 1, 1/2, 1/4, 1/8"
+        page.run("dispatchEvent(new HashChangeEvent('hashchange'))")
+        page.wait(
+            "smoothed.textContent == '0.50' && document.querySelectorAll('#losses .u-series.smoothed').length == 6"
+        )
+        page.click("#run-options summary")
+        assert page.text("#run-table").split("\n") == ["option\ta\tb", "epochs\t4\t5"]
+        page.shows("#run-which", "after 1,200 observations")
+        page.press("ArrowLeft")
+        page.shows("#run-which", "after 0 observations")
+        page.run("document.querySelector('#run-read summary').focus()")
+        page.press("Enter")
+        page.wait("document.querySelector('#run-read').open")
+        assert "It reads 1 recording\nlake" in page.text()
+        page.wait("document.querySelector('#run-pictures img').naturalWidth == 1")
+        progress = files.progress.read_text(encoding="utf-8")
+        files.progress.write_text(progress.replace('"finished": 1', '"finished": 4'), encoding="utf-8")
+        page.shows("#run-figures", "finished: 4 epochs")
+        page.shows("#run-figures", "epoch 4, in model-best.pt: it has the least validation loss, 0.2000")
+        page.shows("#run-figures", "the least drift, 0.60 m, is that of epoch 3")
+        assert page.run("document.querySelector('#run-bar').value") == 1
+        assert page.run("document.querySelector('#run-read').open"), "after it has refreshed itself"
+        page.run("location.hash = '#/run/1'")
+        page.shows("#losses section", "Not known: no two seconds")
+        assert page.complaints() == []

@@ -43,6 +43,7 @@ def test_the_server_tells_what_the_reader_tells(served, sample_recording):
     here = served.recordings()["lake sample"]
     recording, details = read_recording(sample_recording), served.get(f"{here}/details")
     assert details["frames"] == details["rows_read"] == 60 and details["cuts"] == [] and details["rejected"] == 0
+    assert served.get(f"{here}/overview")["outline"] and not {"outline", "path"} & details.keys(), "sent once"
     for name in ("steering", "throttle", "speed"):
         status, data, _ = served.ask(f"{here}/columns/{name}?version={details['version']}")
         assert status == 200
@@ -101,6 +102,11 @@ def test_a_film_and_a_new_recording_of_a_selection(linked, tmp_path):
         made = json.loads(data)
         assert status == 200 and len(read_recording(made["folder"])) == 15
         assert server.get(f"/recordings/{made['id']}/overview")["frames"] == 15, "the list has it"
+        body = {"rows": "0-60", "name": "two", "others": made["id"]}
+        made = json.loads(server.ask(f"{here}/export?version={version}", "POST", body)[1])
+        assert made["notes"] == ["part is put 1 day later, after another drive"]
+        assert len(read_recording(made["folder"])) == 70, "without what is cut"
+        assert server.ask(f"{here}/export?version={version}", "POST", body | {"others": "gone"})[0] == 404
         for name, words in (("part", "exists already"), ("../part", "not the name of a folder"), (".", "not the name")):
             status, data, _ = server.ask(f"{here}/export?version={version}", "POST", {"rows": "0-9", "name": name})
             assert status == 409 and words in json.loads(data)["message"]
@@ -108,7 +114,7 @@ def test_a_film_and_a_new_recording_of_a_selection(linked, tmp_path):
         assert server.ask(f"{here}/export", "POST", {"rows": "0-9", "name": "other"})[0] == 409, "of no version"
         for rows in ("", "1", "a-b", "1-" + "9" * 10):
             assert server.ask(f"{here}/film.mp4?rows={rows}&version={version}")[0] == 400
-        assert sorted(path.name for path in linked.parent.iterdir()) == ["lake", "part"]
+        assert sorted(path.name for path in linked.parent.iterdir()) == ["lake", "part", "two"]
 
 
 FOREIGN = {"Origin": "http://evil.example"}, {"Host": "localhost.evil.example:80"}, {"Sec_Fetch_Site": "same-site"}

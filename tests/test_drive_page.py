@@ -256,6 +256,7 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             feeder.message = {**usual, "cte": "-0.7500"}
             page.shows("#plots", "-0.75 m")
             assert page.run(PLOTS) == 5 and "0.75 m from the lane's centre" in page.text("#now")
+            page.run("own = fetch; fetch = async () => { fetch = own; throw new Error('cut off'); }; 0")
             feeder.message = {**usual, "stand_in": {**PLACE, "offset": 1.2}}
             page.shows("#now-distance", "1.20 m right of the lane's centre")
             page.shows("#now-departures", "2 departures")

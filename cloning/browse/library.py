@@ -112,7 +112,7 @@ class ShownRecording:
         shown: dict[str, Any] = {"id": self.identifier, "name": self.folder.resolve().name, "folder": str(self.folder)}
         try:
             cuts = tuple(read_cuts(self.folder))
-            shown |= _figures(self.folder, self.version(), cuts)
+            shown |= {"version": self.version(), **_figures(self.folder, self.version(), cuts)}
             shown["tags"] = sorted({tag.reason for tag in read_cuts(self.folder, TAGS)})
             shown["lane"] = self._state("offset")
             if shown["lane"]["state"] == "ready":
@@ -120,6 +120,10 @@ class ShownRecording:
         except (UserError, OSError) as error:
             shown["message"] = message_of(error)
         return shown
+
+    def _figures(self) -> dict[str, Any]:
+        """Return the overview without what draws its map: what is asked for every few seconds need not send that."""
+        return {name: value for name, value in self.overview().items() if name not in summary.MAP}
 
     def details(self, limit: str | None = None) -> dict[str, Any]:
         """Return what the page shows of one recording besides its columns; limit: of the replays to tell of, or None.
@@ -129,7 +133,7 @@ class ShownRecording:
         recording, cuts = self.read(), read_cuts(self.folder)
         self.analyses.urgent = self.folder
         models = [{"name": Path(model).name, **self._state(f"model-{at}")} for at, model in enumerate(self.models)]
-        shown = self.overview() | {"lane": self._state("offset"), "version": self.version()}
+        shown = self._figures() | {"lane": self._state("offset"), "version": self.version()}
         for kind, some in (("cuts", cuts), ("tags", read_cuts(self.folder, TAGS))):
             covered = _rows_cut(self.folder, tuple(some), recording)
             shown[kind] = [
@@ -214,7 +218,7 @@ class ShownRecording:
 
         begin: begin the analyses that are missing. Raises UnknownError, RecordingError.
         """
-        shown, models = self.overview(), list[dict[str, Any]]()
+        shown, models = self._figures(), list[dict[str, Any]]()
         if "message" in shown:
             return shown
         recording = self.read()
@@ -284,9 +288,13 @@ class ShownRecording:
         delete_cuts(self.folder, *cuts, file=file)
         return cuts
 
-    def _selected(self, stretches: list[list[int]], version: str) -> Recording:
-        """Return the rows of stretches, [first, row after the last], without those that are cut. Raises UserError."""
+    def _selected(self, stretches: list[list[int]] | None = None, version: str | None = None) -> Recording:
+        """Return the rows of stretches, [first, row after the last], without those that are cut. Raises UserError.
+
+        stretches: None for all rows.
+        """
         recording = self.read(version)
+        stretches = [[0, len(recording)]] if stretches is None else stretches
         chosen = np.zeros(len(recording), bool)
         for first, end in stretches:
             chosen[first:end] = True
@@ -295,13 +303,18 @@ class ShownRecording:
             raise RecordingError(f"{self.folder}: all of the selection is cut; select other frames")
         return recording.take(chosen)
 
-    def export(self, stretches: list[list[int]], version: str, name: str) -> Path:
-        """Write stretches as a recording of its own beside this one, and return its folder. Raises UserError."""
+    def export(
+        self, stretches: list[list[int]], version: str, name: str, others: list["ShownRecording"]
+    ) -> tuple[Path, list[str]]:
+        """Write stretches, and all of the other recordings, as one recording beside this one.
+
+        Return its folder, and what did not fit, in words. Raises UserError.
+        """
         if not name.strip(". ") or any(c in r'/\:*?"<>|' or not c.isprintable() for c in name) or len(name) > 100:
             raise OutputError(f"{name[:60]!r}: not the name of a folder; use letters and digits, for example bends")
-        selected, folder = self._selected(stretches, version), self.folder.resolve().with_name(name)
-        write_part(selected, folder)
-        return folder
+        selected = [self._selected(stretches, version), *(other._selected() for other in others)]
+        folder = self.folder.resolve().with_name(name)
+        return folder, write_part(selected, folder)
 
     def film(self, stretches: list[list[int]], version: str) -> bytes:
         """Return an mp4 film of stretches, with the path ahead at the human driver's steering. Raises UserError."""

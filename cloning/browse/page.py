@@ -32,7 +32,8 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     ones as "changed".
     `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are.
     `matches?condition=` has the stretches that meet a condition, `compared?limit=` the models' figures, and POST begins
-    what they need. `export` writes a recording, {"rows", "name"}; `film.mp4?rows=` is one: rows are "first-end,…".
+    what they need. `export` writes a recording, {"rows", "name", "others"}, with all of these other recordings, "ID,…";
+    it answers what did not fit as "notes". `film.mp4?rows=` is a film: rows are "first-end,…".
     What depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/analyses`: DELETE
     pauses them, POST goes on. `/runs` and `/runs/N` tell of training runs, `/runs/N/NAME` is a picture of one, and
     `/runs/N/report.html` its report. An error is {"message"}.
@@ -129,9 +130,11 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     @app.post("/recordings/<identifier>/export")
     def export(identifier: str) -> dict[str, Any]:
         body = flask.request.get_json()
-        name, rows = (str(body.get(key, "")) if isinstance(body, dict) else "" for key in ("name", "rows"))
-        folder = shown(identifier).export(stretches(rows), version() or "", name)
-        return {"id": library.add(folder), "folder": str(folder)}
+        body = body if isinstance(body, dict) else {}
+        name, rows, others = (str(body.get(key, "")) for key in ("name", "rows", "others"))
+        together = [library[other] for other in others.split(",") if other]
+        folder, notes = shown(identifier).export(stretches(rows), version() or "", name, together)
+        return {"id": library.add(folder), "folder": str(folder), "notes": notes}
 
     @app.get("/recordings/<identifier>/film.mp4")
     def film(identifier: str) -> flask.Response:

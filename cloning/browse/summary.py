@@ -13,6 +13,7 @@ PATH_POINTS = 500  # of a drive on the map
 AT_STOP = 0.999  # |steering| from which the wheels are at their stop
 JUMPS = 20  # rows to jump to, for each reason
 APART = 2 * SAMPLE_RATE  # rows between two of them
+MAP = "outline", "path"  # of `road_of`, m
 MIN_DIRECTION = 0.05  # share of the rows with a known road below which a road or direction is left out
 
 

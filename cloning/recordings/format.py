@@ -18,6 +18,7 @@ DRIVE_GAP = 1.0  # s: rows further apart are of different drives
 # Training repeats a recording whose name ends like this, as the report does with problem areas.
 PROBLEM_AREAS = "-repetitive", "-corrections"
 TIME_STAMP = "%Y_%m_%d_%H_%M_%S_%f"  # in the names of images, with milliseconds in place of microseconds
+STAMP_LENGTH = 23  # characters of yyyy_MM_dd_HH_mm_ss_fff
 MAX_NAME = 255  # bytes of a file's name
 
 

@@ -15,7 +15,7 @@ from cloning.base.errors import RecordingError
 from cloning.base.table import Column, Table
 from cloning.recordings.columns import Finding, Rejected, UnclearLogError
 from cloning.recordings.excluded import EXCLUDED, Cut, cut_rows, read_cuts
-from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE
+from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE, STAMP_LENGTH
 from cloning.recordings.frames import FrameCache
 from cloning.recordings.images import read_frame
 from cloning.recordings.rows import RowReader, read_lines
@@ -26,7 +26,6 @@ WHERE_TO_GET_RECORDINGS = (
     f"{DRIVING_LOG} and {IMAGE_FOLDER}/."
 )
 SHOWN_REJECTED = 5  # rows of each finding that are printed, so that a damaged recording does not fill the screen
-STAMP_LENGTH = 23  # characters of yyyy_MM_dd_HH_mm_ss_fff
 STAMP_SEPARATORS = [4, 7, 10, 13, 16, 19]  # where its underscores are
 
 

@@ -1,51 +1,106 @@
-"""Write some rows of a recording as a recording of its own, whose images are hard links to the same files."""
+"""Write rows of recordings as a recording of its own, whose images are hard links to the same files."""
 
 import csv
 import os
 import shutil
+from collections.abc import Sequence
+from datetime import timedelta
+from math import ceil, inf
 from pathlib import Path
 
 import numpy as np
 
 from cloning.base.errors import RecordingError
 from cloning.base.files import csv_bytes, write
-from cloning.recordings.format import CAMERAS, COLUMNS, DRIVING_LOG, IMAGE_FOLDER, LANE_COLUMNS, LANE_FILE, NUMBERS
+from cloning.recordings.format import (
+    CAMERAS,
+    COLUMNS,
+    DRIVE_GAP,
+    DRIVING_LOG,
+    IMAGE_FOLDER,
+    LANE_COLUMNS,
+    LANE_FILE,
+    NUMBERS,
+    STAMP_LENGTH,
+    parse_time_stamp,
+    time_stamp,
+)
 from cloning.recordings.log import Recording
 
+DAY = timedelta(days=1)
 
-def write_part(recording: Recording, folder: Path) -> None:
-    """Write all rows of a recording into a new folder: `recording.take` chooses them.
+
+def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
+    """Write all rows of recordings into one new folder: `recording.take` chooses them. Return what did not fit, if any.
 
     The images are hard links, or copies where the file system has none. Numbers are those that were read, so the new
-    log needs no repairs. A `lane.csv` goes along. The log is written last: a process killed at any time leaves a whole
-    recording, or a folder that is none. Raises RecordingError if the folder exists, if an image is missing, or if it
+    log needs no repairs. A `lane.csv` goes along if every recording has one. A recording of the same time as another,
+    as the stand-in makes them, is put so many days later that each stays a drive of its own. The log is written last: a
+    process killed at any time leaves a whole recording, or a folder that is none. Raises RecordingError if the folder
+    exists, if an image is missing, if one of several recordings has images without a time in their names, or if it
     cannot be written; then nothing is left.
     """
+    recordings = sorted(recordings, key=lambda recording: float(recording.time[0]))
+    renamed, notes, end = list[dict[str, str]](), list[str](), -inf
+    for recording in recordings:
+        days = ceil(max(0.0, (end + DRIVE_GAP - recording.time[0]) / DAY.total_seconds()))
+        end = recording.time[-1] + (days * DAY).total_seconds()
+        renamed.append(_renamed(recording, days, check=len(recordings) > 1))
+        if days:
+            notes.append(f"{recording.folder.name} is put {days} day{'s' * (days > 1)} later, after another drive")
+    lanes = [(recording.folder / LANE_FILE).exists() for recording in recordings]
+    if any(lanes) and not all(lanes):
+        notes.append(f"{LANE_FILE} is left out: {recordings[lanes.index(False)].folder.name} has none")
     try:
         folder.mkdir()
     except FileExistsError:
         raise RecordingError(f"{folder}: exists already; give the new recording another name") from None
     except OSError as error:
         raise RecordingError(f"{folder}: {error.strerror}; make the folder around it writable") from None
+    rows, known = list[list[str]](), list[list[str]]()
     try:
         (folder / IMAGE_FOLDER).mkdir()
-        for image in np.unique(recording.images):
-            name = os.fsdecode(recording.names[image])
-            _link(recording.folder / IMAGE_FOLDER / name, folder / IMAGE_FOLDER / name)
-        rows = [
-            [f"{IMAGE_FOLDER}/{recording.name(row, camera)}" for camera in range(len(CAMERAS))]
-            + [str(getattr(recording, name)[row]) for name in NUMBERS]
-            for row in range(len(recording))
-        ]
-        if (recording.folder / LANE_FILE).exists():
-            names = {recording.name(row) for row in range(len(recording))}
-            with open(recording.folder / LANE_FILE, encoding="utf-8", errors="surrogateescape", newline="") as file:
-                known = [line for line in csv.reader(file) if line and line[0] in names]
+        for recording, names in zip(recordings, renamed, strict=True):
+            for old, new in names.items():
+                _link(recording.folder / IMAGE_FOLDER / old, folder / IMAGE_FOLDER / new)
+            rows += [
+                [f"{IMAGE_FOLDER}/{names[recording.name(row, camera)]}" for camera in range(len(CAMERAS))]
+                + [str(getattr(recording, name)[row]) for name in NUMBERS]
+                for row in range(len(recording))
+            ]
+            if all(lanes):
+                centres = {recording.name(row) for row in range(len(recording))}
+                with open(recording.folder / LANE_FILE, encoding="utf-8", errors="surrogateescape", newline="") as file:
+                    known += [[names[line[0]], *line[1:]] for line in csv.reader(file) if line and line[0] in centres]
+        if all(lanes):
             write(folder / LANE_FILE, csv_bytes([list(LANE_COLUMNS), *known]))
         write(folder / DRIVING_LOG, csv_bytes([list(COLUMNS), *rows]))
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
         raise RecordingError(f"{error.filename or folder}: {error.strerror}; mend it, and export again") from None
+    return notes
+
+
+def _renamed(recording: Recording, days: int, check: bool) -> dict[str, str]:
+    """Return the new name of each image of a recording that is put some days later.
+
+    check: whether all names must have a time. Raises RecordingError.
+    """
+    names = dict[str, str]()
+    for image in np.unique(recording.images):
+        name = os.fsdecode(recording.names[image])
+        names[name] = name
+        if check:
+            stem, dot, extension = name.rpartition(".")
+            try:
+                moment = parse_time_stamp(stem[-STAMP_LENGTH:]) + days * DAY
+            except ValueError:
+                raise RecordingError(
+                    f"{recording.folder / IMAGE_FOLDER / name}: no time in its name, by which the drives would follow "
+                    "each other; leave this recording out"
+                ) from None
+            names[name] = f"{stem[:-STAMP_LENGTH]}{time_stamp(moment)}{dot}{extension}"
+    return names
 
 
 def _link(source: Path, copy: Path) -> None:

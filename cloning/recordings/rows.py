@@ -127,7 +127,7 @@ class RowReader:
         numbers = np.array([np.fromiter(map(float, column), float, count) for column in tokens]).T
         below = np.searchsorted(list(self._headers), lines) - 1
         outside, is_named = np.zeros(numbers.shape, bool), list(self._headers.values())
-        for header in np.unique(below):
+        for header in np.flatnonzero(np.bincount(below)):  # np.unique would first import numpy.ma, which takes 40 ms
             rows = below == header
             outside[rows] = check_numbers(lines[rows], numbers[rows], is_named[header])
         usable = ~outside.any(1)

@@ -29,7 +29,7 @@ async function route(isAgain) {
     if (number != routed) return;
     VIEWS.forEach(view => element(view).hidden = true);
     notice(error.message);
-    if (error.status != 404) again = setTimeout(route, AGAIN, true);
+    again = setTimeout(route, AGAIN, true);
   }
 }
 

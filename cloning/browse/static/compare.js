@@ -17,16 +17,18 @@ export function leaveComparison() {
 
 // shown: ids, separated by commas, all if there are none; limit of the replays.
 export async function showComparison(shown) {
-  const now = open = {limit: shown.get("limit") ?? LIMITS[0], ids: shown.get("ids")?.split(",")};
-  now.ids ??= (await ask("")).map(({id}) => id);
+  const limit = LIMITS.find(each => each == shown.get("limit")) ?? LIMITS[0], ids = shown.get("ids");
+  const now = open = {limit}, all = (await ask("")).map(({id}) => id), asked = ids?.split(",") ?? all;
   if (open != now) return;
+  now.ids = asked.filter(id => all.includes(id));
+  if (now.ids.length < asked.length) notice(`Not here, of the recordings in this address: ${asked.length - now.ids.length}.`);
   element("title").textContent = "/ compared";
   document.title = "Recordings compared";
   element("comparison").hidden = false;
   renew(element("comparing"), now.limit, () => ["Replays at a limit of", ...LIMITS.map(limit => {
     const button = make("button", `${limit} m`, {
       "aria-pressed": limit == now.limit, title: `A model is set back when it is ${limit} m from the lane's centre`});
-    const ids = shown.get("ids"), state = new URLSearchParams({...ids && {ids}, limit});
+    const state = new URLSearchParams({...ids && {ids}, limit});
     onClick(button, () => location.hash = `#/compare?${state}`);
     return button;
   })]);
@@ -34,18 +36,30 @@ export async function showComparison(shown) {
 }
 
 async function refresh(now, method) {
-  const found = await Promise.all(now.ids.map(id => ask(`/${id}/compared?limit=${now.limit}`, {method})));
+  clearTimeout(now.timer);
+  const again = () => now.timer = setTimeout(() => refresh(now, "GET"), AGAIN);
+  let found;
+  try {
+    found = await Promise.all(now.ids.map(id => ask(`/${id}/compared?limit=${now.limit}`, {method})));
+  } catch (error) {
+    if (open != now) return;
+    now.lost = true;
+    notice(error.message);
+    return again();
+  }
   if (open != now) return;
+  if (now.lost) notice();
+  now.lost = false;
   const models = found.flatMap(({models = []}) => models);
   const states = models.flatMap(({steering, replay}) => [steering.state, replay.state]);
   const count = state => states.filter(each => each == state).length, pending = count("running") + count("waiting");
   element("compare-all").hidden = !(count("none") + count("paused"));
   element("compared").textContent = pending ? `${many(pending, "analysis", "analyses")} to do` : "";
   renew(element("table"), found, () => table(found, now.limit));
-  if (pending) now.timer = setTimeout(() => refresh(now, "GET").catch(error => notice(error.message)), AGAIN);
+  if (pending) again();
 }
 
-element("compare-all").onclick = () => refresh(open, "POST").catch(error => notice(error.message));
+element("compare-all").onclick = () => refresh(open, "POST");
 
 function table(found, limit) {
   const names = found.find(({models}) => models)?.models.map(({name}) => name) ?? [];

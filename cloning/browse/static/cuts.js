@@ -5,6 +5,7 @@ import {seek, stop} from "./moving.js";
 import {page, remember, say} from "./state.js";
 
 const OPPOSITE = {POST: "DELETE", DELETE: "POST"};
+let turn = Promise.resolve(); // ends when all changes that were begun are made
 let asked; // the cuts that the dialog asks a reason for, without it: [first, row after the last] or names of images
 
 export function showCuts() {
@@ -91,18 +92,31 @@ element("reason").onclose = async () => {
   }
 };
 
-// Add or delete cuts or tags; what: for the message; from: the list that it was taken from, if it is undone or done again.
-async function change(kind, method, cuts, what, from = "") {
+// Make one change after the other, so that each begins with what the one before it has left.
+function inTurn(action) {
+  turn = turn.then(action);
+  return turn;
+}
+
+function change(...what) {
   const now = page.open;
+  return inTurn(() => act(now, ...what));
+}
+
+// Add or delete cuts or tags; what: for the message; from: the list whose last entry is undone or done again, which stays
+// there if that fails.
+async function act(now, kind, method, cuts, what, from = "") {
   try {
     const details = await ask(`/${now.id}/${kind}${now.query()}`, {
       method, headers: {"Content-Type": "application/json"}, body: JSON.stringify(cuts),
     });
-    if (page.open != now) return;
     now.orders += 1;
     const changed = details.changed.map(({first, last, reason}) => ({first, last, reason}));
+    if (from) now[from].pop();
+    else now.undone = [];
     now[from == "done" ? "undone" : "done"].push({kind, method: OPPOSITE[method], cuts: changed});
-    if (!from) now.undone = [];
+    localStorage.setItem(`cuts-${now.id}`, JSON.stringify({done: now.done, undone: now.undone}));
+    if (page.open != now) return;
     if (method == "POST") now.marks = {};
     notice();
     say(`${what}: ${many(changed.length, "stretch", "stretches")}.${from ? "" : " Undo takes it back."}`);
@@ -110,8 +124,6 @@ async function change(kind, method, cuts, what, from = "") {
     find();
   } catch (error) {
     notice(error.message);
-  } finally {
-    localStorage.setItem(`cuts-${now.id}`, JSON.stringify({done: now.done, undone: now.undone}));
   }
 }
 
@@ -127,14 +139,17 @@ export function undo() {
     say("The marks are gone.");
     showStretches();
     remember();
-  } else if (now.done.length) {
-    const {kind = "cuts", method, cuts} = now.done.pop();
-    change(kind, method, cuts, "Undone", "done");
-  } else say("Nothing to undo; a cut in the list has a button that deletes it.");
+  } else takeBack("done", "Undone", "Nothing to undo; a cut in the list has a button that deletes it.");
 }
 
 export function redo() {
-  const now = page.open, next = now.undone.pop();
-  if (next) change(next.kind ?? "cuts", next.method, next.cuts, "Done again", "undone");
-  else say("Nothing to do again.");
+  takeBack("undone", "Done again", "Nothing to do again.");
+}
+
+function takeBack(from, what, none) {
+  const now = page.open;
+  inTurn(() => {
+    const last = now[from].at(-1);
+    return last ? act(now, last.kind ?? "cuts", last.method, last.cuts, what, from) : say(none);
+  });
 }

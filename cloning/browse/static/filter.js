@@ -1,6 +1,7 @@
 // Finding frames by a condition, written or brushed on a histogram, and what can be done with them: cut, export.
-import {ask, element, make, many, notice, request} from "./common.js";
+import {ask, element, make, many} from "./common.js";
 import {askForReason, marked, showStretches} from "./cuts.js";
+import {askForName} from "./export.js";
 import {page, remember, say} from "./state.js";
 
 const SOON = 300, BINS = 60, HEIGHT = 52; // ms after the last letter; of the histogram, and its px
@@ -127,31 +128,6 @@ export function askToExport() {
   for (const [first, end] of page.open.details.cuts.flatMap(cut => cut.stretches)) kept.fill(0, first, end);
   const frames = kept.reduce((sum, each) => sum + each, 0);
   if (!frames) return say(`Nothing to export: ${what} has no frames, or all are cut.`);
-  element("selection").textContent = `${what}: ${many(frames, "frame")}`;
-  element("export-name").value ||= `${page.open.details.name}-part`;
-  element("export").returnValue = "";
-  element("export").showModal();
+  const {id, details: {name, version}} = page.open, rows = stretches.map(([first, end]) => `${first}-${end}`).join();
+  askForName({what: `${what}: ${many(frames, "frame")}`, name: `${name}-part`, id, version, rows, tell: say});
 }
-
-element("export").onclose = async () => {
-  const now = page.open, kind = element("export").returnValue, name = element("export-name").value;
-  if (!kind || !now) return;
-  const rows = selected()[1].map(([first, end]) => `${first}-${end}`).join(), {version} = now.details;
-  try {
-    if (kind == "film") {
-      say("Making the film …");
-      const query = new URLSearchParams({rows, version});
-      const film = await request(`/recordings/${now.id}/film.mp4?${query}`, {binary: true});
-      const address = URL.createObjectURL(new Blob([film], {type: "video/mp4"}));
-      make("a", "", {href: address, download: `${name}.mp4`}).click();
-      setTimeout(() => URL.revokeObjectURL(address), 60000);
-      return say(`The film is saved: ${name}.mp4.`);
-    }
-    const {folder} = await ask(`/${now.id}/export?version=${version}`, {
-      method: "POST", headers: {"Content-Type": "application/json"}, body: JSON.stringify({rows, name}),
-    });
-    say(`Written: ${folder}. The list has it.`);
-  } catch (error) {
-    notice(error.message);
-  }
-};

@@ -51,9 +51,12 @@ export class Frames {
 
   // Decoded pictures are freed at once: they take more memory than the browser knows of.
   forget(row) {
-    const {whole} = this.loaded.get(row);
+    const forgotten = this.loaded.get(row);
     this.loaded.delete(row);
-    setTimeout(() => whole.then(all => all.forEach(({layers}) => layers.forEach(layer => layer.close()))), FORGOTTEN);
+    setTimeout(() => forgotten.whole.then(all => {
+      forgotten.isFreed = true;
+      all.forEach(({layers}) => layers.forEach(layer => layer.close()));
+    }), FORGOTTEN);
   }
 
   close() {
@@ -66,15 +69,19 @@ export class Frames {
     while (this.wanted != undefined && !this.closed) {
       const row = this.wanted, number = ++this.asked, {pictures} = this;
       this.wanted = undefined;
-      const {frames, whole} = this.load(row);
+      const entry = this.load(row), {frames, whole} = entry;
       const loaded = await Promise.race([whole, frames.then(pause)]);
       if (this.closed || number < this.drawn || pictures != this.pictures) continue;
+      if (entry.isFreed) { // so many others were loaded meanwhile
+        this.wanted ??= this.row;
+        continue;
+      }
       this.drawn = number;
       pictures.forEach((picture, at) =>
         paint(picture, row, loaded[at], picture.looks.length && loaded[at].layers.length == 1));
       whole.then(all => { // the attention may take long: it is laid over the frames when it comes
         if (all.some(({message}) => message)) this.loaded.delete(row); // it is asked for again the next time
-        if (all == loaded || this.closed || number != this.drawn || pictures != this.pictures) return;
+        if (all == loaded || entry.isFreed || this.closed || number != this.drawn || pictures != this.pictures) return;
         pictures.forEach((picture, at) => paint(picture, row, all[at]));
       });
     }

@@ -1,5 +1,6 @@
 // All recordings at a glance.
 import {ask, element, make, many, notice, onClick, renew, request} from "./common.js";
+import {askForName} from "./export.js";
 import {stateOf} from "./run.js";
 
 const AGAIN = 3000; // ms until a recording that cannot be read, or whose lane is being analysed, is asked for again
@@ -9,6 +10,7 @@ const DIRECTIONS = {cw: "clockwise", ccw: "counter-clockwise"};
 let shown = 0; // counted up when the list is left, so that answers that come later are dropped
 const known = new Map(); // card -> its recording's overview
 const histograms = new Map(); // card -> its histogram
+let selected = new Set(); // ids of recordings
 
 export function leaveList() {
   shown += 1;
@@ -22,7 +24,9 @@ export async function showList(state) {
   if (now != shown) return;
   element("list").hidden = false;
   element("query").value = state.get("find") ?? "";
-  element("sort").value = state.get("sort") ?? "name";
+  selected = new Set(state.get("select")?.split(","));
+  element("sort").value = state.get("sort");
+  if (!element("sort").value) element("sort").value = "name";
   showRuns(now);
   const cards = recordings.map(({folder}) => make("article", folder));
   element("cards").replaceChildren(...cards);
@@ -74,7 +78,9 @@ function arrange() {
     `, ${many(sum("frames"), "frame")}, ${(sum("seconds") / 60).toFixed(1)} minutes` +
     (cut ? `, ${many(cut, "frame")} cut` : "");
   element("compare").disabled = !all.length;
-  const state = new URLSearchParams({...query && {find: query}, ...by != "name" && {sort: by}});
+  element("merge").disabled = together().length < 2;
+  const state = new URLSearchParams({
+    ...query && {find: query}, ...by != "name" && {sort: by}, ...selected.size && {select: [...selected]}});
   history.replaceState(null, "", state.size ? `#?${state}` : "#");
   const states = [...known.values()].map(({lane}) => lane?.state), isPaused = states.includes("paused");
   const left = states.filter(state => PENDING.includes(state)).length;
@@ -91,6 +97,19 @@ function arrange() {
 new ResizeObserver(() => histograms.forEach(plot =>
   plot.setSize({width: widthOf(plot.root.parentNode), height: HEIGHT}))).observe(element("cards"));
 element("query").oninput = element("sort").onchange = arrange;
+// The selected recordings that are shown, in their order.
+const together = () => [...element("cards").children].filter(card => !card.hidden).map(card => known.get(card))
+  .filter(each => selected.has(each?.id));
+element("merge").onclick = () => {
+  const all = together(), [{id, version, frames, name}, ...others] = all;
+  const sum = all.reduce((total, each) => total + each.frames - each.cut_frames, 0);
+  askForName({
+    what: `${many(all.length, "recording")} as one: ${many(sum, "frame")}`, name: `${name}-and-more`,
+    id, version, rows: `0-${frames}`, others: others.map(({id}) => id),
+    tell: words => element("merged").textContent = words,
+    written: () => element("list").hidden || dispatchEvent(new HashChangeEvent("hashchange")), // which shows it
+  });
+};
 element("compare").onclick = () => {
   const all = [...known].filter(([card]) => !card.hidden);
   location.hash = all.length == known.size ? "#/compare" : `#/compare?ids=${all.map(([, {id}]) => id)}`;
@@ -143,7 +162,14 @@ function words(overview) {
 }
 
 function draw(overview, card) {
-  const {id, name, message, lane} = overview, heading = make("h2", "", {}, make("a", name, {href: `#/${id}`}));
+  const {id, name, message, lane} = overview, title = `Select ${name}`;
+  const box = make("input", "", {type: "checkbox", title, "aria-label": title});
+  box.checked = selected.has(id);
+  box.onchange = () => {
+    selected[box.checked ? "add" : "delete"](id);
+    arrange();
+  };
+  const heading = make("h2", "", {}, make("a", name, {href: `#/${id}`}), ...message ? [] : [box]);
   if (message) {
     card.replaceChildren(heading, make("p", message, {class: "bad"}));
     return;

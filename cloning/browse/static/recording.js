@@ -5,7 +5,7 @@ import {askToExport, find, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
 import {changeSpeed, goTo, jump, JUMPS, play, seek, setLoop, setSpeed} from "./moving.js";
 import {Plots} from "./plots.js";
-import {cameras, nextAttention, nextLimit, offerModels, showReplays} from "./replays.js";
+import {cameras, LIMITS, nextAttention, nextLimit, offerModels, showReplays} from "./replays.js";
 import {orderButton, note, page, remember, say, TITLES} from "./state.js";
 
 const SECOND = 15; // rows, of the larger step
@@ -52,21 +52,23 @@ export function leaveRecording() {
 
 // shown: the rest of the state, as `remember` writes it.
 export async function showRecording(id, row, shown) {
-  const mine = ++latest, limits = shown.get("limit");
+  const mine = ++latest, limits = LIMITS.find(each => each == shown.get("limit")), columns = {};
   const details = await ask(`/${id}/details${limits ? `?limit=${limits}` : ""}`);
-  const names = ["steering", "throttle", "speed", "seconds", ...analysed(details, {})], columns = {};
-  const parts = await Promise.all(names.map(name => column(id, details.version, name)));
+  const load = async name => columns[name] = await column(id, details.version, name);
+  const analyses = Promise.allSettled(analysed(details, {}).map(load));
+  await Promise.all(["steering", "throttle", "speed", "seconds"].map(load));
+  const isStale = (await analyses).some(({status}) => status == "rejected"); // a file has changed since the details
   if (mine != latest) return;
-  names.forEach((name, at) => columns[name] = parts[at]);
   leaveRecording();
   element("recording").hidden = false;
   offerModels(details);
   for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
-  const count = columns.seconds.length, marks = (shown.get("mark") ?? "").split("-");
-  const [first, last] = marks.map(at => at ? Math.min(Number(at), count - 1) : undefined);
+  const count = columns.seconds.length, marks = (shown.get("mark") ?? "").match(/^(\d*)-(\d*)$/) ?? [];
+  const [first, last] = marks.slice(1).map(at => at ? Math.min(Number(at), count - 1) : undefined);
+  const looked = shown.get("look"), attention = details.models[looked] ? Number(looked) : null;
   const now = page.open = {
     id, details, columns, count, marks: {first, last}, ...changes(id), row: Math.min(row, count - 1), playing: 0, orders: 0,
-    jumps: {...details.jumps}, limit: limits, attention: shown.get("look") && Number(shown.get("look")), replays: [], update,
+    jumps: {...details.jumps}, limit: limits, attention, replays: [], update,
     condition: shown.get("find") ?? "", of: shown.get("of") ?? "steering", paths: shown.get("paths") != "0",
     query: () => now.limit ? `?limit=${now.limit}` : "",
     column: name => column(id, details.version, name),
@@ -82,7 +84,7 @@ export async function showRecording(id, row, shown) {
   setLoop(shown.get("loop") == "1");
   setPaths(now.paths);
   goTo(now.row);
-  await refresh(now, details);
+  await refresh(now, isStale ? undefined : details);
   await find();
 }
 

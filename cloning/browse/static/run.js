@@ -8,7 +8,8 @@ const PICTURES = ["LRC_", "augmented-"]; // of pictures, in the order of the pag
 const HEIGHT = 260; // px of a plot
 const UNKNOWN = "Not known: no two seconds of driving were kept for validation.";
 const LOSSES = 0.98; // share of the losses within the epochs that the plot shows: the first ones are far higher
-// {id, run, runs, others, at, plots, timer}; at: observations of the picture that was chosen, undefined for the latest
+// {id, run, runs, others, smooth, at, plots, timer}; smooth: 0..0.99, of the losses' moving average; at: observations of
+// the picture that was chosen, undefined for the latest
 let open;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 
@@ -19,20 +20,32 @@ export function leaveRun() {
   open = undefined;
 }
 
-// shown: `with`, the other runs that are laid over this one.
+// shown: `with`, the other runs that are laid over this one, and `smooth`.
 export async function showRun(id, shown) {
   const others = (shown.get("with") ?? "").split(",").filter(Boolean), now = open = {id, others, plots: [], runs: []};
+  element("smooth").value = Number(shown.get("smooth")) || 0;
+  showSmooth();
   const runs = await load(now);
   if (open != now) return;
   element("run").hidden = false;
   update(runs);
 }
 
+function addressOf({id, smooth}, others) {
+  const state = new URLSearchParams({...others.length && {with: others}, ...smooth && {smooth}});
+  return `#/run/${id}${state.size ? `?${state}` : ""}`;
+}
+
+function showSmooth() {
+  open.smooth = Number(element("smooth").value);
+  element("smoothed").textContent = open.smooth.toFixed(2);
+}
+
 // This run, and those laid over it; the others that there are.
-async function load({id, others}) {
-  const shown = [id, ...others].map(each => request(`/runs/${each}`));
-  const [all, ...runs] = await Promise.all([request("/runs"), ...shown]);
-  return {all, runs};
+async function load(now) {
+  const all = await request("/runs");
+  now.others = now.others.filter(other => all.some(({id}) => id == other)); // the address may be of an earlier server
+  return {all, runs: await Promise.all([now.id, ...now.others].map(each => request(`/runs/${each}`)))};
 }
 
 const nameOf = ({folder}) => folder.split(/[\\/]/).at(-1);
@@ -107,10 +120,10 @@ function update({all, runs}) {
     const isShown = now.others.includes(String(each.id));
     const button = make("button", nameOf(each), {"aria-pressed": isShown, title: each.folder});
     const chosen = isShown ? now.others.filter(id => id != each.id) : [...now.others, each.id];
-    onClick(button, () => location.hash = `#/run/${now.id}${chosen.length ? `?with=${chosen}` : ""}`);
+    onClick(button, () => location.hash = addressOf(now, chosen));
     return button;
   };
-  renew(element("run-others"), [now.others, others.map(({id, folder}) => [id, folder])], () =>
+  renew(element("run-others"), [now.others, now.smooth, others.map(({id, folder}) => [id, folder])], () =>
     others.length ? ["Lay over it", ...others.map(overlay)] : []);
   showOptions(runs);
   const shown = all => JSON.stringify(all.map(({history, trail, loss}) => [history, trail, loss]));
@@ -134,6 +147,25 @@ function showOptions(runs) {
 
 const loss = value => value == null ? "not a number" : value.toFixed(4);
 
+// The exponential moving average, as TensorBoard draws it: of the values so far alone, so that it begins where they do.
+export function average(values, weight) {
+  let sum = 0, total = 0;
+  return values.map(value => {
+    if (value == null) return null;
+    sum = weight * sum + (1 - weight) * value;
+    total = weight * total + (1 - weight);
+    return sum / total;
+  });
+}
+
+// A curve, and before it the same one pale if it is smoothed; the legend has the values as they are, in its full colour.
+function smoothed([[epochs, values], looks]) {
+  if (!open.smooth) return [[[epochs, values], looks]];
+  const stroke = `color-mix(in srgb, ${looks.stroke} 30%, transparent)`;
+  return [[[epochs, values], {...looks, stroke, full: looks.stroke, points: {...looks.points, stroke, fill: stroke}}],
+    [[epochs, average(values, open.smooth)], {...looks, class: "smoothed", points: {show: false}}]];
+}
+
 // Drift and losses by epoch, of all runs, and the losses within the epochs.
 function draw() {
   const {runs, plots} = open, colours = getComputedStyle(document.body);
@@ -147,13 +179,14 @@ function draw() {
     const of = runs.length > 1 ? `${nameOf(run)} ` : "", points = {show: true, size: 7, fill: stroke};
     const values = key => [history.map(({epoch}) => epoch), history.map(row => row[key])];
     drift.push([values("val_drift"), {label: `${of}drift`, stroke, width: 2, points}]);
-    losses.push(
+    const curves = [
       [values("val_loss"), {label: `${of}validation`, stroke, width: 2, points}],
       [values("loss"), {label: `${of}training`, stroke, width: 1, dash: [5, 3],
         points: {...points, fill: colour("--paper")}}],
       [[trail.map(([done]) => done), trail.map(([, loss]) => loss)], {label: `${of}within the epoch`, isWithin: true,
         stroke: `color-mix(in srgb, ${stroke} 55%, transparent)`, width: 1, points: {show: false}}],
-    );
+    ];
+    losses.push(...curves.flatMap(smoothed));
     if (!best) return;
     const ring = {show: true, size: 15, width: 3, fill: "transparent", stroke: good};
     (best.by == "val_drift" ? drift : losses).push(
@@ -170,6 +203,7 @@ function draw() {
     const most = curves.flatMap(([[, values], {isWithin}]) => isWithin ? usual(values) : values);
     return new uPlot({
       width: Math.max(200, holder.clientWidth), height: HEIGHT, cursor: {y: false, drag: {x: false, y: false}},
+      legend: {markers: {stroke: (plot, at) => plot.series[at].full ?? plot.series[at].stroke(plot, at)}},
       hooks: {ready: [plot => setTimeout(() => plot.setLegend({idx: plot.data[0].length - 1}))]}, // till the mouse points
       scales: {x: {time: false, range: [0, Math.max(...runs.map(({epochs}) => epochs))]},
         y: {range: [0, Math.max(...most, 0) * 1.08 || 0.1]}},
@@ -213,6 +247,11 @@ export function pressedInRun(key) {
 
 element("run-earlier").onclick = () => step(-1);
 element("run-later").onclick = () => step(1);
+element("smooth").oninput = () => {
+  showSmooth();
+  draw();
+};
+element("smooth").onchange = () => history.replaceState(null, "", addressOf(open, open.others));
 dark.addEventListener("change", () => open?.run && draw());
 new ResizeObserver(() => open?.plots.forEach(({root, setSize}) =>
   setSize({width: Math.max(200, root.parentNode.clientWidth), height: HEIGHT}))).observe(element("losses"));

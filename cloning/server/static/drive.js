@@ -97,7 +97,10 @@ async function showMap() {
     road = live.track;
     element("track").textContent = `${road}, north is up; the car in red, its last minute in blue`;
     lane.setAttribute("d", "");
-    const points = await (await fetch("/road")).json();
+    const points = await fetch("/road").then(answer => answer.json()).catch(() => {
+      road = undefined; // it is asked for again with the next event
+      return [];
+    });
     const across = [0, 1].map(axis => points.map(point => point[axis] * (axis ? -1 : 1)));
     if (!points.length) return;
     const least = across.map(values => Math.min(...values) - 15), most = across.map(values => Math.max(...values) + 15);
