@@ -21,7 +21,7 @@ MARKING_NOISE = 0.02 + 0.03 * marking.DISTANCES  # likewise, of a painted line's
 # The network errs alike in successive rows, so where the line is found, up to so many rows away, its noise counts more.
 LINE_ROWS, BESIDE_LINE = 40, 8.0
 OUTLIER_THRESHOLD = 2.0  # standard deviations beyond which a detection gets less weight
-MISSING_DETECTION = 3.0  # standard deviations that are counted where the track is out of the camera's view
+MISSING_DETECTION = 3.0  # standard deviations that are counted at most where the track is out of the camera's view
 # Process noise: standard deviations of (s, lateral offset, heading error) that each row adds: per metre driven, per
 # radian turned (a car that turns hard slides), and per row.
 NOISE_PER_METRE, NOISE_PER_RADIAN = np.array([0.03, 0.02, 0]), np.array([0, 0.4, 0.2])
@@ -116,6 +116,18 @@ class TrackFilter:
         return centre, np.stack([by_s, (slope * np.sin(yaw) - np.cos(yaw)) * factor, by_yaw], axis=1)
 
 
+def short_of_bend(measured: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return how far detections fall short of a bend beyond which the track is out of the camera's view, (k,), m.
+
+    In a hairpin the track turns back a few metres ahead. What is detected further ahead agrees with it if it is at
+    least as far to that side as the track is where it is last seen. seen: (at most k,), the track as far as it is seen.
+    """
+    if not len(seen):
+        return np.full(len(measured), np.inf)
+    side = np.sign(seen[-1] - (seen[-2] if len(seen) > 1 else 0))
+    return np.maximum(0, side * (seen[-1] - measured))
+
+
 class Candidate:
     """A candidate position in a row of a stretch, which a filter follows along the track row by row.
 
@@ -151,10 +163,13 @@ class Candidate:
             about = x if around is None else around[at]
             expected, jacobian = follower.expect(about)
             measured, noise = follower.measured[row], follower.noise[row]
-            visible = ~np.isnan(jacobian[:, 0])
-            counted = ~np.isnan(measured)
+            visible, counted = ~np.isnan(jacobian[:, 0]), ~np.isnan(measured)
             # By a distribution of twice the noise's width.
-            error = np.where(visible, (measured - expected) / (2 * noise), MISSING_DETECTION)[counted]
+            error = (measured - expected) / (2 * noise)
+            if not visible.all():
+                short = short_of_bend(measured, expected[visible]) / (2 * noise)
+                error = np.where(visible, error, np.minimum(short, MISSING_DETECTION))
+            error = error[counted]
             self.fits.append(-float(np.log1p(error * error).sum()) / len(error))
             for k in np.flatnonzero(visible & counted):
                 h = jacobian[k]
