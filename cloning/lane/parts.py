@@ -8,7 +8,7 @@ rows after it are sought near its end, where the car must be.
 import copy
 import functools
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ START_COVARIANCE = np.diag([4.0, 0.5, 0.01])  # of its first row's state, once i
 FARTHEST_START = np.array([np.inf, 3.0, 0.3])  # that state at most: further off, its rows may leave the road
 LENIENCE = 0.7  # added to the scores to find where a fall begins: rows before a mishap may agree less, as at a brow
 PROBE, FIRST_PROBE = 40, 15  # rows over which candidates near a neighbour are followed
+LONGEST_END = 60  # rows at an end of a part that may be a mishap
 KEPT = 4  # candidates that are followed over all of PROBE
 PROBES = (0, 10, 20, 30, 45, 60, 80, 100, 130, 160, 200, 250)  # rows after a neighbour, from which to try
 # What a part beside another one needs, where the car should be and anywhere near: rows, log-likelihood, turn residual.
@@ -220,6 +221,9 @@ class Placing:
                 rivals = [part for part in parts if found.overlaps(part)]
                 if not rivals or found.quality() <= AMBIGUOUS * sum(part.quality() for part in rivals):
                     break
+                fewer = found.end - found.start < sum(part.end - part.start for part in rivals)
+                if fewer and all(found.away_from(part, ALONG) <= SAME_PLACE[ALONG] for part in rivals):
+                    break
                 parts = [part for part in parts if part not in rivals]
                 self.parts.append(found)
         self.parts = self.parts[:: 1 if forward else -1]
@@ -280,14 +284,29 @@ class Placing:
                 start = first + skipped if forward else end - PROBE - skipped
                 if not first <= start <= end - PROBE:
                     break
-                reach = self.reach(part, index, start if forward else start + PROBE - 1, forward)
+                reach, paused = self.reach(part, index, start if forward else start + PROBE - 1, forward)
                 if reach > MAX_REACH:
                     return None
-                if found := self.near(part, index, (start, first, end), reach, forward):
-                    if all(self.may_drive_between(found, each) for each in (part, other) if each):
-                        return found
+                if found := self.near(part, index, (start, first, end), reach, forward, paused):
+                    beside = [found, *(each for each in (part, other) if each)]
+                    for found, *others in (beside, map(self.without_mishaps, beside)):
+                        if all(self.may_drive_between(found, each) for each in others):
+                            return found
                     break
         return None
+
+    def without_mishaps(self, part: Part) -> Part:
+        """Return a part without the rows at its ends that do not agree: it may have gone on in a mishap, or begun in it."""
+        follower, (rows, fit, turn) = self.followers[part.stretch].ahead[part.track], EXPECTED[part.found.track.name]
+        whole = Candidate(follower, part.found.states[0], part.start, START_COVARIANCE)
+        whole.follow(part.end)
+        excess = np.array(whole.fits) / fit + (np.r_[0, whole.turns(whole.smooth())] / turn) ** 2 - 2
+        first, last = (int(np.cumsum(np.r_[0, end[:LONGEST_END]]).argmax()) for end in (excess, excess[::-1]))
+        if part.end - last - part.start - first < rows:
+            return part
+        inside = Candidate(follower, part.found.states[first], part.start + first, START_COVARIANCE)
+        found = followed(inside, part.end - last)
+        return replace(part, start=part.start + first, end=part.end - last, found=found)
 
     def may_drive_between(self, part: Part, other: Part) -> bool:
         """Return whether a car has the time to drive, or to be pushed, from one part to the other.
@@ -317,19 +336,21 @@ class Placing:
             if end - first >= PROBE:
                 yield index, first, end
 
-    def reach(self, part: Part, index: int, row: int, forward: bool) -> float:
-        """Return how many metres the car may have driven between a part's end, or start, and a row of a stretch."""
+    def reach(self, part: Part, index: int, row: int, forward: bool) -> tuple[float, bool]:
+        """Return how many metres the car may have driven between a part's end, or start, and a row of a stretch.
+
+        And whether it may have been put anywhere meanwhile, in a pause: that counts no metres.
+        """
         recording = self.recording
         inside = self.followers[part.stretch].stretch.rows.start + (part.end - 1 if forward else part.start)
         outside = self.followers[index].stretch.rows.start + row
         rows = slice(min(inside, outside), max(inside, outside) + 1)
         pause = np.diff(recording.time[rows])
-        if len(pause) and (pause.max() > MAX_PAUSE or pause.min() < 0):
-            return np.inf
+        drives = (pause >= 0) & (pause <= MAX_PAUSE)
         speed = np.abs(recording.speed[rows].astype(float)) * MPH
-        return float((np.maximum(speed[1:], speed[:-1]) * pause).sum())
+        return float((np.maximum(speed[1:], speed[:-1]) * pause)[drives].sum()), not drives.all()
 
-    def near(self, part: Part, index: int, rows: tuple[int, int, int], reach: float, forward: bool) -> Part | None:
+    def near(self, part: Part, index: int, rows: tuple[int, int, int], reach: float, forward: bool, paused: bool) -> Part | None:
         """Return the part around some rows of a stretch if it certainly is near another one.
 
         First it is sought where the car should be by its speed, then wherever it may be after a mishap. rows: the first
@@ -339,15 +360,18 @@ class Placing:
         probed = float(self.followers[index].ahead[part.track].step[start : start + PROBE].sum())
         s = part.found.states[-1, 0] if forward else part.found.states[0, 0] - probed
         slack = SLACK + SLACK_PER_METRE * reach
-        for limits, least, most in ((EXPECTED, reach - slack, reach + slack), (MISHAP, -BACK, reach + BEYOND)):
+        anywhere_near = -BACK, reach + BEYOND
+        expected = EXPECTED, reach - slack, reach + slack
+        for limits, least, most in [(ALONE, *anywhere_near)] if paused else [expected, (MISHAP, *anywhere_near)]:
             least, most = (least, most) if forward else (-most, -least)
             positions = s + np.arange(least, most + PROBE_STEP / 2, PROBE_STEP)
             found = self.best_of(positions, part.track, index, rows)
-            if found and found.is_beyond(limits[found.found.track.name]):
-                return found
             # Where the car should be, a long part needs no more than what would be certain anywhere.
-            if found and limits is EXPECTED and found.metres() >= ALONE_METRES and is_anchor(found.found):
+            if found and limits is not MISHAP and found.metres() >= ALONE_METRES and is_anchor(found.found):
                 return found
+            for each in (found, found and self.without_mishaps(found)):
+                if each and each.is_beyond(limits[each.found.track.name]):
+                    return each
         return None
 
     def best_of(self, positions: np.ndarray, track: int, index: int, rows: tuple[int, int, int]) -> Part | None:
@@ -376,8 +400,11 @@ def certain_parts(
     placing.anchors()
     for forward in (True, False):
         placing.correct(forward)
-    for forward in (True, False):
-        placing.spread(forward)
+    before = -1
+    while len(placing.parts) > before:  # what was found from one side may lead on to the other
+        before = len(placing.parts)
+        for forward in (True, False):
+            placing.spread(forward)
     placing.together()
     placing.leave_out_other_roads()
     found = []
