@@ -7,10 +7,10 @@ from rendered import without_files
 from cloning.lane.ahead import centre_ahead
 from cloning.lane.cuts import find_cuts
 from cloning.lane.localise import localise_all
-from cloning.lane.parts import ALONG, Part, certain_parts, unrivalled
+from cloning.lane.parts import certain_parts, unrivalled
 from cloning.lane.reader import DISTANCES_AHEAD, MOUNT_OFFSETS, fuse_detections
 from cloning.lane.recovery import MISHAP, LanePosition
-from cloning.lane.search import Localisation
+from cloning.lane.search import ALONG, Localisation, Part
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, steering_for, stretches

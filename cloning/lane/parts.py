@@ -8,12 +8,12 @@ rows after it are sought near its end, where the car must be.
 import copy
 import functools
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from cloning.lane.follow import Candidate, TrackFilter
-from cloning.lane.search import MAX_TURN_RESIDUAL, MIN_LOG_LIKELIHOOD, Localisation, followed, known_tracks, search
+from cloning.lane.search import ACROSS, ALONG, Localisation, Part, followed, known_tracks, search
 from cloning.recordings.log import Recording
 from cloning.road.motion import MIN_STRETCH_ROWS, MPH, TOP_SPEED_MPH, Stretch
 
@@ -47,56 +47,7 @@ BACK, BEYOND = 30.0, 20.0  # m: further back, or further on than it drove, the c
 MAX_REACH, MAX_PAUSE = 200.0, 10.0  # m, s: after more, it may be anywhere
 MOSTLY = 0.5  # share of a stretch's rows: where fewer fit beside its neighbours, it is another road's
 AMBIGUOUS = 0.8  # share of the best part's quality: a part as good as this, but elsewhere, leaves it uncertain
-ALONG, ACROSS = 0, 1  # the road: columns of `Localisation.states`
 SAME_PLACE = {ALONG: 10.0, ACROSS: 0.3}  # m: what is further apart is elsewhere
-
-
-@dataclass(frozen=True)
-class Part:
-    """Rows of a stretch that certainly are on a track.
-
-    stretch, track  their indices
-    start, end      rows of the stretch
-    found           in these rows
-    """
-
-    stretch: int
-    track: int
-    start: int
-    end: int
-    found: Localisation
-
-    def quality(self) -> float:
-        """Return a measure of how many rows agree with the track, and how well."""
-        found = self.found
-        fit = found.log_likelihood / -MIN_LOG_LIKELIHOOD
-        return (self.end - self.start) * (2 + fit - (found.turn_residual / MAX_TURN_RESIDUAL[found.track.name]) ** 2)
-
-    def is_beyond(self, limits: tuple[int, float, float]) -> bool:
-        """Return whether the part has more rows, a higher log-likelihood and a lower turn residual than these."""
-        rows, log_likelihood, turn_residual = limits
-        found = self.found
-        fits = found.log_likelihood > log_likelihood and found.turn_residual < turn_residual
-        return fits and self.end - self.start >= rows
-
-    def metres(self) -> float:
-        """Return how far the car drives in the part, m."""
-        return float(self.found.states[-1, 0] - self.found.states[0, 0])
-
-    def overlaps(self, other: "Part") -> bool:
-        """Return whether the parts have rows in common."""
-        return self.stretch == other.stretch and self.start < other.end and other.start < self.end
-
-    def away_from(self, other: "Part", axis: int) -> float:
-        """Return how far from here another part is placed in the rows of both, on average, m.
-
-        axis: ALONG or ACROSS the road; inf on another track or in its other direction, or without a common row.
-        """
-        if self.track != other.track or not self.overlaps(other):
-            return np.inf
-        start, end = max(self.start, other.start), min(self.end, other.end)
-        here, there = (part.found.states[start - part.start : end - part.start, axis] for part in (self, other))
-        return float(np.abs(here - there).mean())
 
 
 class Followers:
@@ -189,6 +140,7 @@ class Placing:
         self.recording = recording
         self.followers = [Followers(stretch, centres[stretch.rows]) for stretch in stretches]
         self.parts: list[Part] = []
+        self.cuts_ends = False  # whether a part that is not certain may be so without rows at its ends
 
     def anchors(self) -> None:
         """Find the parts that are certain by themselves."""
@@ -220,9 +172,6 @@ class Placing:
             while parts and (found := self.next_to(self.parts[-1], None, forward)):
                 rivals = [part for part in parts if found.overlaps(part)]
                 if not rivals or found.quality() <= AMBIGUOUS * sum(part.quality() for part in rivals):
-                    break
-                fewer = found.end - found.start < sum(part.end - part.start for part in rivals)
-                if fewer and all(found.away_from(part, ALONG) <= SAME_PLACE[ALONG] for part in rivals):
                     break
                 parts = [part for part in parts if part not in rivals]
                 self.parts.append(found)
@@ -289,14 +238,14 @@ class Placing:
                     return None
                 if found := self.near(part, index, (start, first, end), reach, forward, paused):
                     beside = [found, *(each for each in (part, other) if each)]
-                    for found, *others in (beside, map(self.without_mishaps, beside)):
+                    for found, *others in (beside, map(self.without_mishaps, beside))[: 1 + self.cuts_ends]:
                         if all(self.may_drive_between(found, each) for each in others):
                             return found
                     break
         return None
 
     def without_mishaps(self, part: Part) -> Part:
-        """Return a part without the rows at its ends that do not agree: it may have gone on in a mishap, or begun in it."""
+        """Return a part without the rows at its ends that do not agree: a mishap need not end it."""
         follower, (rows, fit, turn) = self.followers[part.stretch].ahead[part.track], EXPECTED[part.found.track.name]
         whole = Candidate(follower, part.found.states[0], part.start, START_COVARIANCE)
         whole.follow(part.end)
@@ -350,7 +299,9 @@ class Placing:
         speed = np.abs(recording.speed[rows].astype(float)) * MPH
         return float((np.maximum(speed[1:], speed[:-1]) * pause)[drives].sum()), not drives.all()
 
-    def near(self, part: Part, index: int, rows: tuple[int, int, int], reach: float, forward: bool, paused: bool) -> Part | None:
+    def near(
+        self, part: Part, index: int, rows: tuple[int, int, int], reach: float, forward: bool, paused: bool
+    ) -> Part | None:
         """Return the part around some rows of a stretch if it certainly is near another one.
 
         First it is sought where the car should be by its speed, then wherever it may be after a mishap. rows: the first
@@ -366,12 +317,16 @@ class Placing:
             least, most = (least, most) if forward else (-most, -least)
             positions = s + np.arange(least, most + PROBE_STEP / 2, PROBE_STEP)
             found = self.best_of(positions, part.track, index, rows)
+            # It may have grown from rows that were followed along the track, or back.
+            if not found or not least - SLACK <= found.position(start) - s <= most + SLACK:
+                continue
             # Where the car should be, a long part needs no more than what would be certain anywhere.
-            if found and limits is not MISHAP and found.metres() >= ALONE_METRES and is_anchor(found.found):
+            if limits is not MISHAP and found.metres() >= ALONE_METRES and is_anchor(found.found):
                 return found
-            for each in (found, found and self.without_mishaps(found)):
-                if each and each.is_beyond(limits[each.found.track.name]):
-                    return each
+            if not found.is_beyond(limits[found.found.track.name]) and self.cuts_ends:
+                found = self.without_mishaps(found)
+            if found.is_beyond(limits[found.found.track.name]):
+                return found
         return None
 
     def best_of(self, positions: np.ndarray, track: int, index: int, rows: tuple[int, int, int]) -> Part | None:
@@ -400,11 +355,12 @@ def certain_parts(
     placing.anchors()
     for forward in (True, False):
         placing.correct(forward)
-    before = -1
-    while len(placing.parts) > before:  # what was found from one side may lead on to the other
-        before = len(placing.parts)
-        for forward in (True, False):
-            placing.spread(forward)
+    for placing.cuts_ends in (False, True):
+        before = -1
+        while len(placing.parts) > before:  # what was found from one side may lead on to the other
+            before = len(placing.parts)
+            for forward in (True, False):
+                placing.spread(forward)
     placing.together()
     placing.leave_out_other_roads()
     found = []

@@ -18,6 +18,7 @@ MIN_LOG_LIKELIHOOD = -0.35
 # roads, which a position on a track can follow nearly as well, have at least 1.5; 315 m along the middle of gentle ones
 # at least 0.67. Of 135 m along the middle, a quarter of the roads still has less than 0.5.
 MAX_TURN_RESIDUAL = {"lake": 0.5, "jungle": 1.2}
+ALONG, ACROSS = 0, 1  # the road: columns of `Localisation.states`
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,58 @@ class Localisation:
         """Return whether the stretch certainly is on this track."""
         likely = self.log_likelihood > MIN_LOG_LIKELIHOOD
         return likely and self.turn_residual < MAX_TURN_RESIDUAL[self.track.name]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Rows of a stretch that certainly are on a track.
+
+    stretch, track  their indices
+    start, end      rows of the stretch
+    found           in these rows
+    """
+
+    stretch: int
+    track: int
+    start: int
+    end: int
+    found: Localisation
+
+    def quality(self) -> float:
+        """Return a measure of how many rows agree with the track, and how well."""
+        found = self.found
+        fit = found.log_likelihood / -MIN_LOG_LIKELIHOOD
+        return (self.end - self.start) * (2 + fit - (found.turn_residual / MAX_TURN_RESIDUAL[found.track.name]) ** 2)
+
+    def is_beyond(self, limits: tuple[int, float, float]) -> bool:
+        """Return whether the part has more rows, a higher log-likelihood and a lower turn residual than these."""
+        rows, log_likelihood, turn_residual = limits
+        found = self.found
+        fits = found.log_likelihood > log_likelihood and found.turn_residual < turn_residual
+        return fits and self.end - self.start >= rows
+
+    def metres(self) -> float:
+        """Return how far the car drives in the part, m."""
+        return float(self.found.states[-1, 0] - self.found.states[0, 0])
+
+    def position(self, row: int) -> float:
+        """Return where on the track the car is in a row of the stretch, or in the nearest one of the part, m."""
+        return float(self.found.states[min(max(row, self.start), self.end - 1) - self.start, ALONG])
+
+    def overlaps(self, other: "Part") -> bool:
+        """Return whether the parts have rows in common."""
+        return self.stretch == other.stretch and self.start < other.end and other.start < self.end
+
+    def away_from(self, other: "Part", axis: int) -> float:
+        """Return how far from here another part is placed in the rows of both, on average, m.
+
+        axis: ALONG or ACROSS the road; inf on another track or in its other direction, or without a common row.
+        """
+        if self.track != other.track or not self.overlaps(other):
+            return np.inf
+        start, end = max(self.start, other.start), min(self.end, other.end)
+        here, there = (part.found.states[start - part.start : end - part.start, axis] for part in (self, other))
+        return float(np.abs(here - there).mean())
 
 
 @functools.cache
