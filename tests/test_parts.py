@@ -6,14 +6,15 @@ from rendered import without_files
 
 from cloning.lane.ahead import centre_ahead
 from cloning.lane.cuts import find_cuts
+from cloning.lane.follow import Candidate, TrackFilter, short_of_bend
 from cloning.lane.localise import localise_all
-from cloning.lane.parts import certain_parts, unrivalled
+from cloning.lane.parts import EXPECTED, Placing, certain_parts, unrivalled
 from cloning.lane.reader import DISTANCES_AHEAD, MOUNT_OFFSETS, fuse_detections
 from cloning.lane.recovery import MISHAP, LanePosition
-from cloning.lane.search import ALONG, Localisation, Part
+from cloning.lane.search import ALONG, Localisation, Part, followed, known_tracks
 from cloning.recordings.log import Recording
 from cloning.road.camera import camera_position
-from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, steering_for, stretches
+from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, Stretch, steering_for, stretches
 from cloning.road.track import Track
 
 PAUSE = 0.0714  # s between rows
@@ -33,7 +34,10 @@ def driven(
         camera = camera_position(np.array([at.x, at.y]), np.array([np.cos(at.heading), np.sin(at.heading)]))
         centres.append(centre_ahead(track, s, camera, at.heading))
     noise = np.random.default_rng(0).normal(0, 0.15, (rows, len(DISTANCES_AHEAD)))
-    return recording, ((np.nan_to_num(centres) + noise)[:, None] - MOUNT_OFFSETS[:, None]).astype(np.float32)
+    seen = np.array(centres)
+    for hidden in range(1, len(DISTANCES_AHEAD)):  # a network detects that the road turns away
+        seen[:, hidden] = np.where(np.isnan(seen[:, hidden]), 1.2 * seen[:, hidden - 1], seen[:, hidden])
+    return recording, ((seen + noise)[:, None] - MOUNT_OFFSETS[:, None]).astype(np.float32)
 
 
 def placed(recording: Recording, centres: np.ndarray) -> np.ndarray:
@@ -57,6 +61,23 @@ def test_an_s_bend_after_a_pause_is_not_driven_the_wrong_way():
         (part.rows, each.track.direction) for part, each in certain_parts(recording, stretches(recording), centres)
     ]
     assert found == [(slice(0, 400), "cw"), (slice(400, 701), "cw")]
+
+
+def test_an_s_bend_after_a_long_pause_is_placed_where_the_part_before_it_ended():
+    """By itself it may be in either direction, and after a minute the car may be anywhere."""
+    recording, centres = driven("jungle", 701, 128, 10, "cw")
+    recording = recording.take(slice(None), time=recording.time + 60 * (np.arange(701) >= 400))
+    check(placed(recording, centres), np.ones(701, bool))
+
+
+def test_what_a_hairpin_hides_does_not_count_against_the_track():
+    """It turns back 8 m ahead, to the left. A network detects something there, too: further to that side, or not."""
+    seen, measured = np.array([-1.0, -3.0, -7.0]), np.array([-1.0, -3.0, -7.0, -9.0, -4.0])
+    assert short_of_bend(measured, seen)[3:].tolist() == [0, 3]
+    assert short_of_bend(-measured, -seen)[3:].tolist() == [0, 3]
+    recording, centres = driven("jungle", 60, 665, 10, "cw")
+    follower = TrackFilter(stretches(recording)[0], centres, Track("jungle", "cw"))
+    assert Candidate(follower, np.array([665.0, 0, 0])).follow(60) > -0.1  # was -0.7
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +174,40 @@ def test_a_stretch_of_which_only_the_start_fits_is_another_road(lake):
     offset = placed(recording, centres)
     assert np.isnan(offset[foreign]).all()
     check(offset, ~foreign)
+
+
+def test_rows_of_a_crash_are_cut_off_the_end_of_a_piece(lake):
+    """With them it turns otherwise than it steers; without them it is certain beside another one."""
+    order = np.r_[0:100, np.full(10, 99), 99:79:-1]
+    recording = lake[0].take(order, time=np.arange(130) * PAUSE)
+    recording.steering[100:], recording.speed[100:] = 1, 6
+    placing = Placing(recording, [Stretch.of(recording, slice(0, 130))], lake[1][order])
+    follower = placing.followers[0].ahead[0]
+    assert (follower.track.name, follower.track.direction) == ("lake", "ccw")
+    whole = Part(0, 0, 0, 130, followed(Candidate(follower, np.array([30.0, 0, 0])), 130))
+    assert not whole.is_beyond(EXPECTED["lake"])
+    cut = placing.without_mishaps(whole)
+    assert cut.start == 0 and abs(cut.end - 100) < 10 and cut.is_beyond(EXPECTED["lake"])
+
+
+@pytest.mark.parametrize(("away", "certain"), [(0.0, True), (-15.0, False)])
+def test_a_short_piece_that_was_followed_away_from_where_the_car_should_be_is_not_certain(monkeypatch, away, certain):
+    """A piece of a generated road was, 27 m back, and was taken for the jungle."""
+    recording, centres = driven("lake", 100)
+    track, reach = (
+        next(i for i, each in enumerate(known_tracks()) if (each.name, each.direction) == ("lake", "ccw")),
+        22.0,
+    )
+
+    def part(stretch, start):
+        states = np.stack([start + 0.8 * np.arange(70.0), np.zeros(70), np.zeros(70)], axis=1)
+        return Part(stretch, track, 0, 70, Localisation(known_tracks()[track], states, 0.0, 0.1))
+
+    before = part(0, 30.0)
+    found = part(1, before.found.states[-1, 0] + reach + away)
+    placing = Placing(recording, stretches(recording) * 2, centres)
+    monkeypatch.setattr(placing, "best_of", lambda *_: found)
+    assert placing.near(before, 1, (0, 0, 70), reach, True, False) is (found if certain else None)
 
 
 @pytest.mark.parametrize(("blocks", "rows", "cuts"), [(80, 1, [29]), (60, 1, []), (80, 3, [])])
