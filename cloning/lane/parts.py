@@ -29,6 +29,7 @@ FARTHEST_START = np.array([np.inf, 3.0, 0.3])  # that state at most: further off
 LENIENCE = 0.7  # added to the scores to find where a fall begins: rows before a mishap may agree less, as at a brow
 PROBE, FIRST_PROBE = 40, 15  # rows over which candidates near a neighbour are followed
 LONGEST_END = 60  # rows at an end of a part that may be a mishap
+STOPS = 5.0  # mph: slower, the car has nearly stopped
 KEPT = 4  # candidates that are followed over all of PROBE
 PROBES = (0, 10, 20, 30, 45, 60, 80, 100, 130, 160, 200, 250)  # rows after a neighbour, from which to try
 # What a part beside another one needs, where the car should be and anywhere near: rows, log-likelihood, turn residual.
@@ -250,8 +251,19 @@ class Placing:
         whole = Candidate(follower, part.found.states[0], part.start, START_COVARIANCE)
         whole.follow(part.end)
         excess = np.array(whole.fits) / fit + (np.r_[0, whole.turns(whole.smooth())] / turn) ** 2 - 2
-        first, last = (int(np.cumsum(np.r_[0, end[:LONGEST_END]]).argmax()) for end in (excess, excess[::-1]))
-        if part.end - last - part.start - first < rows:
+        # A mishap lies before the next part of the stretch, or stops the car; else the frames may be cut where the
+        # stretch ends, and its last rows be of another road.
+        stretch = self.followers[part.stretch].stretch
+        speed = np.abs(self.recording.speed[stretch.rows])[part.start : part.end]
+        may_cut = (
+            part.start > 0 or speed[:LONGEST_END].min() < STOPS,
+            part.end < len(stretch) or speed[-LONGEST_END:].min() < STOPS,
+        )
+        first, last = (
+            int(np.cumsum(np.r_[0, end[: LONGEST_END * may]]).argmax())
+            for end, may in zip((excess, excess[::-1]), may_cut, strict=True)
+        )
+        if not first + last or part.end - last - part.start - first < rows:
             return part
         inside = Candidate(follower, part.found.states[first], part.start + first, START_COVARIANCE)
         found = followed(inside, part.end - last)
