@@ -180,7 +180,7 @@ def test_a_stretch_of_which_only_the_start_fits_is_another_road(lake):
 def test_rows_of_a_crash_are_cut_off_the_end_of_a_piece(lake, slowest):
     """With them it turns otherwise than it steers; without them it is certain beside another one.
 
-    Not if the car does not stop: rows of another road, between two cuts, would become certain without those that differ.
+    Not if the car does not stop: another road, between two cuts, would become certain without the rows that differ.
     """
     order = np.r_[0:100, np.full(10, 99), 99:79:-1]
     recording = lake[0].take(order, time=np.arange(130) * PAUSE)

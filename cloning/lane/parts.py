@@ -368,11 +368,8 @@ def certain_parts(
     for forward in (True, False):
         placing.correct(forward)
     for placing.cuts_ends in (False, True):
-        before = -1
-        while len(placing.parts) > before:  # what was found from one side may lead on to the other
-            before = len(placing.parts)
-            for forward in (True, False):
-                placing.spread(forward)
+        for forward in (True, False):
+            placing.spread(forward)
     placing.together()
     placing.leave_out_other_roads()
     found = []
