@@ -251,13 +251,14 @@ class Placing:
         whole = Candidate(follower, part.found.states[0], part.start, START_COVARIANCE)
         whole.follow(part.end)
         excess = np.array(whole.fits) / fit + (np.r_[0, whole.turns(whole.smooth())] / turn) ** 2 - 2
-        # A mishap lies before the next part of the stretch, or stops the car; else the frames may be cut where the
-        # stretch ends, and its last rows be of another road.
+        # A mishap lies between two parts of a stretch, or stops the car; else the frames may be cut where the stretch
+        # ends, and its last rows be of another road.
         stretch = self.followers[part.stretch].stretch
         speed = np.abs(self.recording.speed[stretch.rows])[part.start : part.end]
+        others = [each for each in self.parts if each.stretch == part.stretch]
         may_cut = (
-            part.start > 0 or speed[:LONGEST_END].min() < STOPS,
-            part.end < len(stretch) or speed[-LONGEST_END:].min() < STOPS,
+            any(each.end <= part.start for each in others) or speed[:LONGEST_END].min() < STOPS,
+            any(each.start >= part.end for each in others) or speed[-LONGEST_END:].min() < STOPS,
         )
         first, last = (
             int(np.cumsum(np.r_[0, end[: LONGEST_END * may]]).argmax())
