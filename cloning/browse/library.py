@@ -283,7 +283,7 @@ class ShownRecording:
         return cuts
 
     def restore(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
-        """Undo cuts or tags, and return them. Raises RecordingError, OSError."""
+        """Undo cuts or tags, and return them. Raises GoneError, RecordingError, OSError."""
         cuts = list(cuts)
         delete_cuts(self.folder, *cuts, file=file)
         return cuts

@@ -12,7 +12,7 @@ from cloning.base.errors import UserError, message_of
 from cloning.browse.library import Library, ShownRecording, UnknownError
 from cloning.browse.replays import NotReplayedError
 from cloning.browse.runs import Runs
-from cloning.recordings.excluded import BYTES, EXCLUDED, TAGS, Cut
+from cloning.recordings.excluded import BYTES, EXCLUDED, TAGS, Cut, GoneError
 from cloning.road.autonomy import LIMITS
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
 from cloning.road.motion import FULL_LOCK, WHEELBASE
@@ -29,7 +29,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     `columns/NAME`, little-endian float32 (n,), and POST tries its analysis again, which failed; `rows/N`, JSON,
     `rows/N/PICTURE.jpg`, and what a model looks at on it, `rows/N/PICTURE/MODEL.png`; `cuts` and `tags`, to which POST
     adds and DELETE deletes some, [{"first", "last", "reason"}, …]; they answer with the details, and with the changed
-    ones as "changed".
+    ones as "changed", or with 410 if one to be deleted is not there any more.
     `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are.
     `matches?condition=` has the stretches that meet a condition, `compared?limit=` the models' figures, and POST begins
     what they need. `export` writes a recording, {"rows", "name", "others"}, with all of these other recordings, "ID,…";
@@ -57,7 +57,8 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     @app.errorhandler(UserError)
     @app.errorhandler(OSError)
     def explain(error: UserError | OSError) -> tuple[dict[str, str], int]:
-        return {"message": message_of(error)}, 404 if isinstance(error, UnknownError | NotReplayedError) else 409
+        is_unknown = isinstance(error, UnknownError | NotReplayedError)
+        return {"message": message_of(error)}, 404 if is_unknown else 410 if isinstance(error, GoneError) else 409
 
     @app.after_request
     def keep(response: flask.Response) -> flask.Response:

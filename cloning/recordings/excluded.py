@@ -106,17 +106,21 @@ def add_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> None:
     _change(folder / file, append)
 
 
+class GoneError(RecordingError):
+    """A cut or tag that is to be deleted and is not there any more."""
+
+
 def delete_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> None:
     """Delete the lines of cuts or tags; the other lines stay as they are.
 
-    Raises RecordingError if one of them is not there, and the errors of `add_cuts`; then none is deleted.
+    Raises GoneError if one of them is not there, and the errors of `add_cuts`; then none is deleted.
     """
 
     def delete(lines: list[str], there: list[Cut]) -> list[str]:
         at = {each.row(): each.line for each in there}
         for cut in cuts:
             if cut.row() not in at:
-                raise RecordingError(
+                raise GoneError(
                     f"{folder / file}: the stretch from {cut.first} to {cut.last} is not there any more; it was "
                     "deleted elsewhere"
                 )

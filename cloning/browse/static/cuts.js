@@ -4,7 +4,7 @@ import {find} from "./filter.js";
 import {seek, stop} from "./moving.js";
 import {page, remember, say} from "./state.js";
 
-const OPPOSITE = {POST: "DELETE", DELETE: "POST"};
+const OPPOSITE = {POST: "DELETE", DELETE: "POST"}, GONE = 410; // the status of an answer
 let turn = Promise.resolve(); // ends when all changes that were begun are made
 let asked; // the cuts that the dialog asks a reason for, without it: [first, row after the last] or names of images
 
@@ -104,7 +104,7 @@ function change(...what) {
 }
 
 // Add or delete cuts or tags; what: for the message; from: the list whose last entry is undone or done again, which stays
-// there if that fails.
+// there if that fails, unless what it would delete has been deleted elsewhere.
 async function act(now, kind, method, cuts, what, from = "") {
   try {
     const details = await ask(`/${now.id}/${kind}${now.query()}`, {
@@ -115,7 +115,7 @@ async function act(now, kind, method, cuts, what, from = "") {
     if (from) now[from].pop();
     else now.undone = [];
     now[from == "done" ? "undone" : "done"].push({kind, method: OPPOSITE[method], cuts: changed});
-    localStorage.setItem(`cuts-${now.id}`, JSON.stringify({done: now.done, undone: now.undone}));
+    keep(now);
     if (page.open != now) return;
     if (method == "POST") now.marks = {};
     notice();
@@ -124,7 +124,14 @@ async function act(now, kind, method, cuts, what, from = "") {
     find();
   } catch (error) {
     notice(error.message);
+    if (!from || error.status != GONE) return;
+    now[from].pop();
+    keep(now);
   }
+}
+
+function keep({id, done, undone}) {
+  localStorage.setItem(`cuts-${id}`, JSON.stringify({done, undone}));
 }
 
 // What was changed on this page earlier, to be undone: {done, undone}.
