@@ -26,7 +26,9 @@ REMEDY = (
     f"name the columns in a header line above the rows: {','.join(COLUMNS)}, in their order, other words for others; "
     "convert what is not steering -1..1, right positive, pedals 0..1, speed in mph"
 )
-NUMBER = re.compile(r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
+# Before an exponent all programs write one digit, and then a point: 175494E-38 is a half of 1,175494E-38.
+NUMBER = re.compile(r"[-+]?(?:(?:\d(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|\d+(?:\.\d*)?)", re.ASCII)
+WHOLE_NUMBER = re.compile(r"[-+]?\d+(?:[eE][-+]?\d+)?", re.ASCII)  # or half a number, split at a decimal comma
 SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 IMAGE = re.compile(r"(center|centre|left|right)([\W\d_]*\.jpe?g)", re.IGNORECASE)  # no letters but these
 FASTEST = 32  # mph: the simulator's car is clamped to 30; the largest speed in 6,706 rows of real recordings is 30.7

@@ -12,6 +12,7 @@ from cloning.base.errors import RecordingError
 from cloning.recordings.columns import (
     NUMBER,
     REMEDY,
+    WHOLE_NUMBER,
     Finding,
     Rejected,
     UnclearRowError,
@@ -198,7 +199,7 @@ class RowReader:
         names, extra = [base_name(image) for image in images], fields[len(columns) :]
         check_names(names)
         tokens = [*numbers, *extra]
-        if extra and has_decimal_commas and all(NUMBER.fullmatch(token) and "." not in token for token in tokens):
+        if extra and has_decimal_commas and all(map(WHOLE_NUMBER.fullmatch, tokens)):
             self._with_commas.append((line, names, tokens))
             return
         self._has_points = self._has_points or any("." in token and NUMBER.fullmatch(token) for token in tokens)
