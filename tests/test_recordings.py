@@ -204,6 +204,16 @@ def test_rows_that_are_left_out_and_reported(log, bad, finding, words):
         assert findings(found) == [(len(above) + 3, finding)] and words in found.rejected[0].detail
 
 
+def test_half_of_a_number_with_a_decimal_comma_is_left_out(log):
+    """Beside rows of three numbers, 1,5E-05 makes four; where numbers have decimal points, 5E-05 is one."""
+    rows = [f"{images(n)},0,1,0,9" for n in range(3)]
+    found = log(*rows, f"{images(9)},1,5E-05,0,0")
+    assert findings(found) == [(4, Finding.COLUMNS)] and len(found) == 3
+    assert "'1,5E-05,0,0' may be fewer numbers" in found.rejected[0].detail
+    found = log(*rows, f"{images(9)},0,5E-05,0,9.5")
+    assert findings(found) == [] and found.throttle[3] == np.float32(5e-5)
+
+
 def test_decimal_commas_that_can_be_read_in_two_ways_are_left_out(log):
     found = log(*usual(numbers=["-0,004694836,1,0,30,19023", "0,1,0,30,19", "0,0,1,0,5"]))
     np.testing.assert_array_equal(

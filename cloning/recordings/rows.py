@@ -131,8 +131,19 @@ class RowReader:
         for header in np.flatnonzero(np.bincount(below)):  # np.unique would first import numpy.ma, which takes 40 ms
             rows = below == header
             outside[rows] = check_numbers(lines[rows], numbers[rows], is_named[header])
-        usable = ~outside.any(1)
-        for row in np.flatnonzero(~usable):
+        halves = np.zeros(count, bool)
+        if not self._has_points:  # with them, no number has a decimal comma
+            for at, texts in enumerate(zip(*tokens, strict=True)):
+                text = ",".join(texts)
+                if "." not in text and "e" in text.partition(",")[2].lower():
+                    halves[at] = True
+                    detail = (
+                        f"{text!r} may be fewer numbers, one with a decimal comma; write decimal points, or {REMEDY}"
+                    )
+                    self._reject(int(lines[at]), Finding.COLUMNS, detail)
+        outside &= ~halves[:, None]
+        usable = ~outside.any(1) & ~halves
+        for row in np.flatnonzero(outside.any(1)):
             column = outside[row].argmax()
             name = NUMBERS[column]
             least, greatest = number_ranges(is_named[below[row]])[name]
