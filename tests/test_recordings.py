@@ -182,6 +182,7 @@ def test_plain_rows_are_read_as_all_others(log, monkeypatch):
         (f"{images(9)},1.2,0,0,9", Finding.OUT_OF_RANGE, "steering 1.2 is not in -1..1"),  # 19
         *((f"{images(9)},{bad},0,0,9", Finding.NOT_A_NUMBER, f"'{bad},0,0,9'") for bad in ("nan", "1_0", "1e", "")),
         (f"{images(9)},1,175494E-38,0,0", Finding.NOT_A_NUMBER, "1,175494E-38"),  # three with a decimal comma
+        (f"{images(9)},0,05,0,0", Finding.NOT_A_NUMBER, "0,05"),
         *((f"{images(9)},0,0,0,{bad}", Finding.NOT_A_NUMBER, bad) for bad in ("True", "inf", "1.2.3", "\u0661")),
         (f"{images(9)},0.1,0.2", Finding.NOT_A_NUMBER, "0.1,0.2"),
         ("\0\0\0\0", Finding.NOT_A_ROW, "cut off"),

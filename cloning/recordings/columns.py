@@ -26,8 +26,9 @@ REMEDY = (
     f"name the columns in a header line above the rows: {','.join(COLUMNS)}, in their order, other words for others; "
     "convert what is not steering -1..1, right positive, pedals 0..1, speed in mph"
 )
-# Before an exponent all programs write one digit, and then a point: 175494E-38 is a half of 1,175494E-38.
-NUMBER = re.compile(r"[-+]?(?:(?:\d(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|\d+(?:\.\d*)?)", re.ASCII)
+# Before an exponent all programs write one digit, and then a point: 175494E-38 is a half of 1,175494E-38. Nor does one
+# write 05: it is a half of 0,05.
+NUMBER = re.compile(r"[-+]?(?:(?:\d(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|[1-9]\d*(?:\.\d*)?)", re.ASCII)
 WHOLE_NUMBER = re.compile(r"[-+]?\d+(?:[eE][-+]?\d+)?", re.ASCII)  # or half a number, split at a decimal comma
 SIMULATOR_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d*[1-9])?(E[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 IMAGE = re.compile(r"(center|centre|left|right)([\W\d_]*\.jpe?g)", re.IGNORECASE)  # no letters but these
