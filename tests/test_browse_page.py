@@ -234,7 +234,7 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         page.shows("#matches", "no frame")
         page.press("e")
         page.shows("#said", "Nothing to export: what matches has no frames")
-        page.click("#home")
+        page.run("import('/static/state.js').then(({note}) => { home.click(); note() })")
         page.wait("document.querySelector('article h2 a')")
         page.click("article h2 a")
         at(page, 0)

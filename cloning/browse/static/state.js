@@ -19,6 +19,7 @@ export function remember() {
 }
 
 export function note() {
+  if (location.hash.split(/[/?]/)[1] != page.open.id) return; // it leads elsewhere already, and the page follows at once
   const {id, row, limit, attention, condition, plots: {zoom}, marks: {first, last}, speed, loop, paths, of} = page.open;
   const state = {
     limit, look: attention, find: condition,
