@@ -111,17 +111,17 @@ class ShownRecording:
         """Return what the list shows of a recording; {"message"} instead of figures if it can't be read."""
         shown: dict[str, Any] = {"id": self.identifier, "name": self.folder.resolve().name, "folder": str(self.folder)}
         try:
-            cuts = tuple(read_cuts(self.folder))
-            shown |= {"version": self.version(), **_figures(self.folder, self.version(), cuts)}
+            cuts, version = tuple(read_cuts(self.folder)), self.version()
+            shown |= {"version": version, **_figures(self.folder, version, cuts)}
             shown["tags"] = sorted({tag.reason for tag in read_cuts(self.folder, TAGS)})
             shown["lane"] = self._state("offset")
             if shown["lane"]["state"] == "ready":
-                shown |= _road(self.folder, self.version(), cuts, stamp(self.folder, LANE))
+                shown |= _road(self.folder, version, cuts, stamp(self.folder, LANE))
         except (UserError, OSError) as error:
             shown["message"] = message_of(error)
         return shown
 
-    def _figures(self) -> dict[str, Any]:
+    def _without_map(self) -> dict[str, Any]:
         """Return the overview without what draws its map: what is asked for every few seconds need not send that."""
         return {name: value for name, value in self.overview().items() if name not in summary.MAP}
 
@@ -133,7 +133,7 @@ class ShownRecording:
         recording, cuts = self.read(), read_cuts(self.folder)
         self.analyses.urgent = self.folder
         models = [{"name": Path(model).name, **self._state(f"model-{at}")} for at, model in enumerate(self.models)]
-        shown = self._figures() | {"lane": self._state("offset"), "version": self.version()}
+        shown = self._without_map()
         for kind, some in (("cuts", cuts), ("tags", read_cuts(self.folder, TAGS))):
             covered = _rows_cut(self.folder, tuple(some), recording)
             shown[kind] = [
@@ -218,7 +218,7 @@ class ShownRecording:
 
         begin: begin the analyses that are missing. Raises UnknownError, RecordingError.
         """
-        shown, models = self._figures(), list[dict[str, Any]]()
+        shown, models = self._without_map(), list[dict[str, Any]]()
         if "message" in shown:
             return shown
         recording = self.read()

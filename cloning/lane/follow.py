@@ -117,10 +117,11 @@ class TrackFilter:
 
 
 def short_of_bend(measured: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return how far detections fall short of a bend beyond which the track is out of the camera's view, (k,), m.
+    """Return how far detections fall short of a bend beyond which the track is out of the camera's view: float (k,), m.
 
     In a hairpin the track turns back a few metres ahead. What is detected further ahead agrees with it if it is at
-    least as far to that side as the track is where it is last seen. seen: (at most k,), the track as far as it is seen.
+    least as far to that side as the track is where it is last seen. measured: float (k,), m to the camera's right, at
+    growing distances ahead; seen: float (at most k,), likewise, the track as far as it is seen.
     """
     if not len(seen):
         return np.full(len(measured), np.inf)

@@ -195,7 +195,7 @@ class Placing:
         for index in sorted(range(len(self.followers)), key=lambda i: -len(self.followers[i].stretch)):
             if index in placed or not (first := self.alone(index)):
                 continue
-            if not all(self.may_drive_between(first, part) for part in self.parts):
+            if not self.are_in_reach(first, *self.parts):
                 continue
             group = copy.copy(self)
             group.parts = [first]
@@ -239,9 +239,10 @@ class Placing:
                     return None
                 if found := self.near(part, index, (start, first, end), reach, forward, paused):
                     beside = [found, *(each for each in (part, other) if each)]
-                    for found, *others in (beside, map(self.without_mishaps, beside))[: 1 + self.cuts_ends]:
-                        if all(self.may_drive_between(found, each) for each in others):
-                            return found
+                    if self.are_in_reach(*beside):
+                        return found
+                    if self.cuts_ends and self.are_in_reach(*(cut := [self.without_mishaps(each) for each in beside])):
+                        return cut[0]
                     break
         return None
 
@@ -269,6 +270,10 @@ class Placing:
         inside = Candidate(follower, part.found.states[first], part.start + first, START_COVARIANCE)
         found = followed(inside, part.end - last)
         return replace(part, start=part.start + first, end=part.end - last, found=found)
+
+    def are_in_reach(self, part: Part, *others: Part) -> bool:
+        """Return whether a car may drive between a part and each of the others."""
+        return all(self.may_drive_between(part, other) for other in others)
 
     def may_drive_between(self, part: Part, other: Part) -> bool:
         """Return whether a car has the time to drive, or to be pushed, from one part to the other.
@@ -368,7 +373,8 @@ def certain_parts(
     placing.anchors()
     for forward in (True, False):
         placing.correct(forward)
-    for placing.cuts_ends in (False, True):
+    for cuts_ends in (False, True):  # first those that are certain as they are
+        placing.cuts_ends = cuts_ends
         for forward in (True, False):
             placing.spread(forward)
     placing.together()
