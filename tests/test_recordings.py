@@ -206,13 +206,18 @@ def test_rows_that_are_left_out_and_reported(log, bad, finding, words):
 
 
 def test_half_of_a_number_with_a_decimal_comma_is_left_out(log):
-    """Beside rows of three numbers, 1,5E-05 makes four; where numbers have decimal points, 5E-05 is one."""
+    """Beside rows of three numbers, 1,5E-05 makes four; in a row with a decimal point, 5E-05 is one.
+
+    If the column lap is empty, the halves of 30,19 make a row as long as the header.
+    """
     rows = [f"{images(n)},0,1,0,9" for n in range(3)]
     found = log(*rows, f"{images(9)},1,5E-05,0,0")
     assert findings(found) == [(4, Finding.COLUMNS)] and len(found) == 3
     assert "'1,5E-05,0,0' may be fewer numbers" in found.rejected[0].detail
     found = log(*rows, f"{images(9)},0,5E-05,0,9.5")
     assert findings(found) == [] and found.throttle[3] == np.float32(5e-5)
+    found = log(HEADER + ",lap", *(f"{row}," for row in rows), f"{images(9)},0,1,0,30,19,", f"{images(8)},0,1,0,9.5,3,")
+    assert findings(found) == [(5, Finding.COLUMNS)] and len(found) == 4
 
 
 def test_decimal_commas_that_can_be_read_in_two_ways_are_left_out(log):

@@ -99,7 +99,8 @@ class RowReader:
         Raises UnclearLogError if it is an unusable header, or the first line and neither a row nor a header.
         """
         text = text.rstrip("\r\n").removeprefix(BYTE_ORDER_MARK)
-        if self._columns == COLUMNS and (plain := PLAIN_ROW.fullmatch(text)):
+        plain = PLAIN_ROW.fullmatch(text) if self._columns == COLUMNS else None
+        if plain and ("." in text[plain.end(5) :] or "e" not in text[plain.end(6) :].lower()):
             self.rows_read += 1
             self._has_points = self._has_points or "." in text[plain.end(5) :]
             self._lines.append(line)
@@ -131,19 +132,8 @@ class RowReader:
         for header in np.flatnonzero(np.bincount(below)):  # np.unique would first import numpy.ma, which takes 40 ms
             rows = below == header
             outside[rows] = check_numbers(lines[rows], numbers[rows], is_named[header])
-        halves = np.zeros(count, bool)
-        if not self._has_points:  # with them, no number has a decimal comma
-            for at, texts in enumerate(zip(*tokens, strict=True)):
-                text = ",".join(texts)
-                if "." not in text and "e" in text.partition(",")[2].lower():
-                    halves[at] = True
-                    detail = (
-                        f"{text!r} may be fewer numbers, one with a decimal comma; write decimal points, or {REMEDY}"
-                    )
-                    self._reject(int(lines[at]), Finding.COLUMNS, detail)
-        outside &= ~halves[:, None]
-        usable = ~outside.any(1) & ~halves
-        for row in np.flatnonzero(outside.any(1)):
+        usable = ~outside.any(1)
+        for row in np.flatnonzero(~usable):
             column = outside[row].argmax()
             name = NUMBERS[column]
             least, greatest = number_ranges(is_named[below[row]])[name]
@@ -191,6 +181,7 @@ class RowReader:
     def _read_row(self, line: int, fields: list[str], has_decimal_commas: bool) -> None:
         """Read a row; has_decimal_commas: it may have been split at them. Raises UnclearRowError."""
         columns = self._columns
+        ends_empty = len(fields) > len(columns) > len(COLUMNS)
         while len(fields) > len(columns) and not fields[-1]:
             fields.pop()
         if len(fields) != len(columns):
@@ -222,6 +213,10 @@ class RowReader:
         if not all(map(NUMBER.fullmatch, numbers)):
             detail = f"{','.join(numbers)[:80]!r} is not {', '.join(NUMBERS)}; correct or delete the row"
             raise UnclearRowError(Finding.NOT_A_NUMBER, detail)
+        text = ",".join(numbers)
+        if "." not in text and (ends_empty or "e" in text.partition(",")[2].lower()):
+            detail = f"{text!r} may be fewer numbers, one with a decimal comma; write decimal points, or {REMEDY}"
+            raise UnclearRowError(Finding.COLUMNS, detail)
         if extra:
             self._repair("extra columns ignored", line)
         self._lines.append(line)
