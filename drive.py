@@ -31,7 +31,7 @@ from cloning.base.frame import FRAME
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
-from cloning.road.motion import SET_SPEED_MPH, TOP_SPEED_MPH
+from cloning.road.motion import MPH, SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.server import page, terminal
 from cloning.server.speed import SpeedController
 from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
@@ -75,7 +75,8 @@ class Session(page.Session):
             telemetry = parse_telemetry(message)
             place, risk = telemetry.place, None
             if self.foretell:
-                self.steering, risk = self.foretell(telemetry.image, place.time if place else time.monotonic())
+                now = place.time if place else time.monotonic()
+                self.steering, risk = self.foretell(telemetry.image, now, telemetry.speed * MPH)
                 self.slow_down(risk)
             else:
                 self.steering = steer(self.server.network, telemetry.image)

@@ -240,7 +240,7 @@ def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | No
         def answer(image: bytes, run: Run) -> Answer:
             if not foretell:
                 return Answer(float(format_number(steering(decode(image)))))
-            found, risk = foretell(decode(image), run.time)
+            found, risk = foretell(decode(image), run.time, run.speed_mph * MPH)
             if risk >= ALARM:
                 alarms.append(run.time)
             return Answer(float(format_number(float(found))))

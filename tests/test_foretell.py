@@ -9,7 +9,7 @@ from scipy.spatial.distance import mahalanobis
 import drive
 from cloning.base.errors import ModelError
 from cloning.lane import foretell
-from cloning.lane.foretell import ALARM, Foreteller, Limits, Normal, Observation, Observer, Ordinary, Signs
+from cloning.lane.foretell import ALARM, Blindness, Foreteller, Limits, Normal, Observation, Observer, Ordinary, Signs
 from cloning.network.network import Network, steer
 from tools import foretell as tool
 from tools.simulator_client import telemetry
@@ -82,6 +82,18 @@ def test_the_observer_sees_what_the_network_steers_by_and_both_sides_alike(netwo
     assert float(x) == pytest.approx(float(seen.steering), abs=1e-5)
 
 
+def test_a_camera_that_shows_nothing_new_while_the_car_drives_makes_it_blind(limits, network):
+    """A standing car's frames are all alike; after a pause the car has driven for a second at most."""
+    blindness = Blindness()
+    frames = [render_frame(offset, 0.0, np.random.default_rng(8)) for offset in (0.2, 0.3)]
+    drive = [(0, 0.0, 9), (0, 0.25, 8), (0, 0.5, 8), (1, 0.75, 8), (1, 99, 2), (1, 98, 2), (1, 98.5, 0), (0, 98.6, 9)]
+    found = [blindness(frames[frame].copy(), time, speed) for frame, time, speed in drive]
+    assert found == [0, 2, 4, 0, 2, 2, 2, 0]
+    foretell = Foreteller(Observer(network), limits._replace(bias=-30.0))
+    risks = [foretell(frames[0].copy(), at / 10, 10.0)[1] for at in range(8)]
+    assert risks == pytest.approx([0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6, 1, 1], abs=1e-6), "after 3 m it is an alarm"
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Fit and measure
 
@@ -94,7 +106,7 @@ def driven(rng: np.random.Generator, number: int, kind: str, strange: bool) -> t
         seen = Observation(*(np.concatenate([a[:-75], b]) for a, b in zip(seen, late, strict=True)))
     course = tool.Course(kind, "lake", number, "fog:5" if kind == tool.DISTURBED else "")
     away = 0.2 + strange * np.maximum(time - 25, 0) / 2
-    return course, tool.Drive(seen, time, away, np.array([29.95] if strange else []))
+    return course, tool.Drive(seen, 0 * time, time, away, np.array([29.95] if strange else []))
 
 
 def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
@@ -112,17 +124,17 @@ def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
 
 def test_an_alarm_counts_from_6_to_1_s_before_a_departure():
     time = np.arange(0, 20, 1 / 15)
-    part = tool.Part(tool.HARD, np.zeros((len(time), 1)), time, time, 20.0)
+    part = tool.Part(tool.HARD, np.zeros((len(time), 1)), 0 * time, time, time, 20.0)
     for first, last, wanted in ((13.5, 13.9, 0), (14.1, 14.3, 1), (18.8, 18.95, 1), (19.1, 20, 0)):
         assert tool.greatest(part, ((time >= first) & (time <= last)) * 1.0) == [wanted]
     assert tool.greatest(part._replace(departure=None), (time < 0.1) * 1.0) == [1, 0, 0], "whole windows of 5 s"
     late = np.array([19.5, 19.6])
-    assert tool.greatest(tool.Part(tool.HARD, np.zeros((2, 1)), late, late, 20.0), np.ones(2)) == []
+    assert tool.greatest(tool.Part(tool.HARD, np.zeros((2, 1)), 0 * late, late, late, 20.0), np.ones(2)) == []
 
 
 def test_what_is_fitted_is_how_far_from_the_centre_the_car_will_be():
     time = np.arange(0, 20, 1 / 15)
-    part = tool.Part(tool.HARD, np.zeros((len(time), 1)), time, np.abs(time - 10), None)
+    part = tool.Part(tool.HARD, np.zeros((len(time), 1)), 0 * time, time, np.abs(time - 10), None)
     found = part.coming[np.searchsorted(time, [0, 5.9, 13, 18.5, 19.5])]
     assert found[:4] == pytest.approx([9, 3.1, 9, 9.9], abs=0.1) and np.isnan(found[4]), "1 to 6 s later"
     leaves, before = part._replace(departure=20.0).coming, time < 13.99
@@ -157,7 +169,7 @@ def test_limits_belong_to_one_network(limits, network, tmp_path):
     foretell.save_limits(model, network, limits)
     read = foretell.load_limits(model, network)
     assert read
-    risks = [Foreteller(Observer(network), each)(frame, 0.0)[1] for each in (limits, read)]
+    risks = [Foreteller(Observer(network), each)(frame, 0.0, 0.0)[1] for each in (limits, read)]
     assert risks[0] == risks[1] and (read.bias, read.stop) == (limits.bias, limits.stop)
     assert foretell.limits_file(model).stat().st_size < 200_000
     assert foretell.load_limits(model, Network().eval()) is None, "another network has no figure"
@@ -177,7 +189,7 @@ def test_a_damaged_file_is_refused(limits, network, tmp_path):
 def test_a_car_slows_down_and_stops_when_the_network_is_lost_and_a_person_may_let_it_go_on(network, limits):
     server = drive.DriveServer(network, 20, limits=limits, stop_when_lost=True)
     session, risks = server.session("sid"), [0.0]
-    session.foretell = lambda image, time: (np.float32(0), risks[0])  # type: ignore[assignment]
+    session.foretell = lambda *frame: (np.float32(0), risks[0])  # type: ignore[assignment]
 
     def set_speed(risk: float) -> float:
         risks[0] = risk

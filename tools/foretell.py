@@ -35,6 +35,7 @@ from cloning.lane.foretell import (
     ALARM,
     EARLIEST,
     LATEST,
+    Blindness,
     Limits,
     Observation,
     Observer,
@@ -51,6 +52,7 @@ from cloning.recordings.images import decode
 from cloning.recordings.log import find_folders, read_recording
 from cloning.recordings.writer import SampleClock
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber
+from cloning.road.motion import MPH
 from cloning.road.track import Track
 from cloning.server.speed import SpeedController
 from simulator.benchmark.scores import windows
@@ -107,12 +109,14 @@ class Drive(NamedTuple):
     """What was seen in a drive, and when the car left the road.
 
     seen        observations, each array with a row for each frame
+    blind       float64 (n,): m driven since a frame showed anything new
     time        float64 (n,): s
     away        float64 (n,): m from the lane's centre
     departures  float64 (k,): s
     """
 
     seen: Observation
+    blind: np.ndarray
     time: np.ndarray
     away: np.ndarray
     departures: np.ndarray
@@ -138,17 +142,20 @@ def drive(model: Path, course: Course) -> Drive:
     run.set_back()
     disturber = Disturber(Disturbance.parse(course.disturbance), course.number) if course.disturbance else None
     controller, clock = SpeedController(15 if course.kind == ORDINARY else 25), SampleClock(1 / SAMPLE_RATE)
-    seen, time, away = [], [], []
+    blindness, seen, blind, time, away = Blindness(), [], [], [], []
     while run.time < (30 if disturber else 40) and len(run.departures) < MAX_DEPARTURES:
         frame = decode(jpeg(cameras.frames(run.car.node.get_transform())[0]))
-        seen.append(observe(disturber(frame) if disturber else frame))
+        frame = disturber(frame) if disturber else frame
+        seen.append(observe(frame))
+        blind.append(blindness(frame, run.time, run.speed_mph * MPH))
         time.append(run.time)
         away.append(abs(run.offset))
         throttle, due = controller.throttle(run.speed_mph), False
         while not due:
             run.step(float(seen[-1].steering), throttle)
             due = clock.due(run.time)
-    return Drive(joined(seen), *map(np.array, (time, away, [departure.time for departure in run.departures])))
+    departures = [departure.time for departure in run.departures]
+    return Drive(joined(seen), *map(np.array, (blind, time, away, departures)))
 
 
 def drive_into(folder: Path, model: Path, course: Course) -> None:
@@ -163,8 +170,8 @@ def drive_into(folder: Path, model: Path, course: Course) -> None:
 def load(path: Path) -> Drive:
     """Return what `drive_into` saved."""
     with np.load(path) as saved:
-        *seen, time, away, departures = saved.values()
-    return Drive(Observation(*seen), time, away, departures)
+        *seen, blind, time, away, departures = saved.values()
+    return Drive(Observation(*seen), blind, time, away, departures)
 
 
 def observe_recording(observe: Observer, folder: Path) -> Observation:
@@ -183,11 +190,12 @@ def observe_recording(observe: Observer, folder: Path) -> Observation:
 class Part(NamedTuple):
     """A part of a drive without an interruption; departure: when the car left the road at its end, None if it did not.
 
-    signs: float32 (n, k). time, away: of the drive, (n,).
+    signs: float32 (n, k). blind, time, away: of the drive, (n,).
     """
 
     kind: str
     signs: np.ndarray
+    blind: np.ndarray
     time: np.ndarray
     away: np.ndarray
     departure: float | None
@@ -217,7 +225,8 @@ def parts(ordinary: Ordinary, course: Course, driven: Drive) -> Iterator[Part]:
         if len(rows):
             each = (Observation(*(values[at] for values in driven.seen)) for at in rows)
             found = np.stack([signs(seen, driven.time[at]) for at, seen in zip(rows, each, strict=True)])
-            yield Part(course.kind, found, driven.time[rows], driven.away[rows], end if np.isfinite(end) else None)
+            blind, time, away = (values[rows] for values in (driven.blind, driven.time, driven.away))
+            yield Part(course.kind, found, blind, time, away, end if np.isfinite(end) else None)
 
 
 def greatest(part: Part, risk: np.ndarray) -> list[float]:
@@ -254,19 +263,19 @@ def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation
     tuned, rows = [part for each in drives for part in each], np.concatenate(told)
     signs = np.concatenate([part.signs for part in tuned])[rows]
     weights = STEEPNESS * regress(signs, *(np.concatenate(each)[rows] for each in (coming, share)))
-    odds = {kind: risks(tuned, kind, lambda signs: signs @ weights)[1] for kind in CONDITIONS}
+    odds = {kind: risks(tuned, kind, lambda part: part.signs @ weights)[1] for kind in CONDITIONS}
     alarm = np.quantile(np.concatenate(list(odds.values())), 1 - FALSE_ALARMS)
     clear = max(odds[kind].max() for kind in (HARD, ORDINARY))
     stop = 1 / (1 + np.exp(min(0, alarm - clear) - MARGIN))
     return Limits(ordinary, weights, -float(alarm), float(stop))
 
 
-def risks(among: Sequence[Part], kind: str, risk: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def risks(among: Sequence[Part], kind: str, risk: Callable[[Part], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the greatest risks in the windows before departures, and in those of drives without one."""
     found: tuple[list[float], list[float]] = ([], [])
     for part in among:
         if part.kind == kind:
-            found[not part.leaves].extend(greatest(part, risk(part.signs)))
+            found[not part.leaves].extend(greatest(part, risk(part)))
     return np.array(found[0]), np.array(found[1])
 
 
@@ -282,7 +291,7 @@ def table(limits: Limits, driven: Sequence[tuple[Course, Drive]]) -> str:
         rows.append(row(name, len(before), *figures, len(without), f"{100 * (without >= ALARM).mean():.1f} %"))
 
     for kind in CONDITIONS:
-        total.append(risks(found, kind, limits.risk))
+        total.append(risks(found, kind, lambda part: limits.risk(part.signs, part.blind)))
         add(kind, *total[-1])
     add("**all**", *map(np.concatenate, zip(*total, strict=True)))
     return "\n".join(rows)
@@ -299,8 +308,8 @@ def main(argv: list[str] | None = None) -> int:
     add("--folder", type=Path, default=Path("foretell"), help="for what the drives show (default %(default)s)")
     options = parser.parse_args(argv)
     observe, chosen = observer(options.model), courses()[: options.drives]
-    # Another network drives otherwise, and an earlier version of this tool saved no distances.
-    folder = options.folder / f"{fingerprint(observe.network)[:8]}-away"
+    # Another network drives otherwise, and an earlier version of this tool did not save how blind the car was.
+    folder = options.folder / f"{fingerprint(observe.network)[:8]}-blind"
     folder.mkdir(parents=True, exist_ok=True)
     recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
     work = partial(drive_into, folder, options.model)

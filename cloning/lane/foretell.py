@@ -5,7 +5,7 @@ mirror image tell it the same), steering that does not fit it or changes quickly
 are unlike those of ordinary driving (their Mahalanobis distance, arXiv 1807.03888). From the signs' means over a short
 and a longer time, a regression tells how far off the lane's centre the car will be; the farther, the greater the risk.
 Its figures are in a file beside the network's, which `python -m tools.foretell` writes and measures; they fit this one
-network.
+network. One more sign needs no figures: a camera that shows nothing new while the car drives.
 """
 
 from collections.abc import Mapping
@@ -24,6 +24,7 @@ from cloning.lane.reader import (
     load_network,
     normalize,
 )
+from cloning.lane.recovery import LOOKAHEAD
 from cloning.network import tensors
 from cloning.network.network import Network, steer
 
@@ -153,6 +154,20 @@ class Signs:
         return self.means.ravel().astype(np.float32)
 
 
+class Blindness:
+    """How far the car of one drive has come since its camera showed anything new."""
+
+    def __init__(self) -> None:
+        self.frame, self.time, self.metres = np.empty(0, np.uint8), 0.0, 0.0
+
+    def __call__(self, frame: np.ndarray, time: float, speed: float) -> float:
+        """Return it in m, after the next frame; time: s, speed: m/s."""
+        passed, self.time = min(max(time - self.time, 0.0), MAX_STEP), time
+        self.metres = self.metres + speed * passed if np.array_equal(frame, self.frame) else 0.0
+        self.frame = frame
+        return self.metres
+
+
 class Limits(NamedTuple):
     """What tells when a network is out of its depth.
 
@@ -167,21 +182,28 @@ class Limits(NamedTuple):
     bias: float
     stop: float
 
-    def risk(self, signs: np.ndarray) -> Any:
-        """Return the risk, 0..1, for signs (…, 2 k)."""
-        return 1 / (1 + np.exp(-np.clip(signs @ self.weights + self.bias, -30, 30)))
+    def risk(self, signs: np.ndarray, blind: float | np.ndarray) -> Any:
+        """Return the risk, 0..1, for signs (…, 2 k) and blindness (…), m.
+
+        After LOOKAHEAD without a new frame the car is where the last one steered it, and nothing tells what comes.
+        """
+        risk = 1 / (1 + np.exp(-np.clip(signs @ self.weights + self.bias, -30, 30)))
+        return np.maximum(risk, np.minimum(np.divide(blind, LOOKAHEAD), 1))
 
 
 class Foreteller:
     """Steers in one drive, and says at each frame how likely it is that the car will leave the road."""
 
     def __init__(self, observer: Observer, limits: Limits):
-        self.observer, self.limits, self.signs = observer, limits, Signs(limits.ordinary)
+        self.observer, self.limits, self.signs, self.blindness = observer, limits, Signs(limits.ordinary), Blindness()
 
-    def __call__(self, frame: np.ndarray, time: float) -> tuple[np.float32, float]:
-        """Return the steering and the risk, 0..1, for a drive's next frame, uint8 (160, 320, 3) RGB; time: s."""
-        observed = self.observer(frame)
-        return np.float32(observed.steering), float(self.limits.risk(self.signs(observed, time)))
+    def __call__(self, frame: np.ndarray, time: float, speed: float) -> tuple[np.float32, float]:
+        """Return the steering and the risk, 0..1, for a drive's next frame, uint8 (160, 320, 3) RGB.
+
+        time: s; speed: m/s.
+        """
+        observed, blind = self.observer(frame), self.blindness(frame, time, speed)
+        return np.float32(observed.steering), float(self.limits.risk(self.signs(observed, time), blind))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
