@@ -12,6 +12,7 @@ from cloning.base.program import DONE, INCOMPLETE
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import IMAGE_FOLDER, PROBLEM_AREAS
 from cloning.recordings.log import read_recording, read_uncut
+from cloning.road.points import make_road
 from simulator.scenery.looks import SHADOWED
 from tools import shipped
 from tools.lane_frames import FIRST_ROAD, scenes
@@ -21,7 +22,7 @@ from tools.shipped import FIRST_LOOK, Lap, drive_lap, laps, render, repeat
 def test_what_is_left_to_measure_with_is_not_trained_on():
     chosen, taught = laps(101, 100, {"road": 1000, "mountain": 1000}), scenes(101, {"road": 101, "mountain": 101}, 10)
     for rendered in (chosen, taught):
-        assert all(int(lap.track.partition("-")[2] or FIRST_ROAD) >= FIRST_ROAD for lap in rendered)
+        assert all(int(str(lap.track).partition("-")[2] or FIRST_ROAD) >= FIRST_ROAD for lap in rendered)
     assert {lap.look % SHADOWED for lap in chosen}.isdisjoint(range(1, FIRST_LOOK))
     assert all(scene.look % SHADOWED <= 100 for scene in taught)
     some = [lap.name for lap in laps(21, 10, {"road": 40, "mountain": 30})]
@@ -31,7 +32,7 @@ def test_what_is_left_to_measure_with_is_not_trained_on():
 def test_each_track_is_rendered_in_both_directions_and_lights():
     chosen = laps(21, 20, {"road": 40, "mountain": 40})
     for start in ("lake", "jungle", "road-", "mountain-"):
-        some = [lap for lap in chosen if lap.track.startswith(start)]
+        some = [lap for lap in chosen if str(lap.track).startswith(start)]
         combined = {(lap.direction, lap.look >= SHADOWED) for lap in some}
         assert combined == {(direction, shadows) for direction in ("ccw", "cw") for shadows in (False, True)}
         assert {lap.look // SHADOWED for lap in some} == {0, 1, 2}, "without shadows, and with both kinds"
@@ -54,6 +55,17 @@ def test_rendering_goes_on_where_it_was_interrupted(tmp_path, capsys, monkeypatc
     assert sorted(folder.name for folder in tmp_path.iterdir()) == sorted(NAMES)
     rows = read_recording(tmp_path / NAMES[2])
     assert np.diff(rows.time) == pytest.approx(1 / shipped.RATE, abs=0.02)
+
+
+def test_roads_that_a_search_found_are_rendered_in_both_directions(tmp_path, monkeypatch):
+    monkeypatch.setattr(shipped, "started_workers", Here)
+    road = make_road([(0, 0), (20, 0), (40, 5)], name="evolution-1-17")
+    chosen = laps(1, 0, {}, [road])[-2:]
+    names = ["evolution-1-17-ccw-look21001", "evolution-1-17-cw-look21001"]
+    assert [lap.name for lap in chosen] == names
+    assert all(len(read_recording(recording)) > 20 for recording in render(tmp_path, chosen))
+    with pytest.raises(RecordingError, match="evolution-1-17-ccw-look21001: two roads have the same name; rename"):
+        render(tmp_path, [chosen[0], *chosen])
 
 
 def test_a_fast_lap_has_a_name_of_its_own():

@@ -2,6 +2,7 @@
 
     make shipped RECORDINGS="data/lake-ccw data/lake-cw data/jungle data/jungle-shadows"     # or the same without make:
     python -m tools.shipped data/lake-ccw data/lake-cw data/jungle data/jungle-shadows
+    python -m tools.shipped data/lake-ccw … --road found/evolution-*.json   # and on failures of tools.search
 
 Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
 The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Roads and
@@ -19,6 +20,7 @@ if __name__ == "__main__":
 
 import shutil
 import time
+from collections.abc import Sequence
 from concurrent.futures import as_completed
 from datetime import timedelta
 from pathlib import Path
@@ -31,6 +33,8 @@ from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE, PROBLEM_AREAS
 from cloning.recordings.log import find_folders
 from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleClock
+from cloning.road.generated import PointRoad
+from cloning.road.points import read_road
 from cloning.road.track import ROADS, Track
 from simulator import scenery
 from simulator.cameras import Cameras
@@ -57,9 +61,9 @@ FAST = (
 
 
 class Lap(NamedTuple):
-    """A lap that is rendered."""
+    """A lap that is rendered; track: as `Track` takes it."""
 
-    track: str
+    track: str | PointRoad
     direction: str
     look: int
     laps: float = 1.0
@@ -69,15 +73,16 @@ class Lap(NamedTuple):
     def name(self) -> str:
         """The name of its recording."""
         fast = "" if self.lateral == LATERAL_ACCELERATION else "-fast"
-        return f"{self.track}-{self.direction}-look{self.look}{fast}"
+        track = self.track if isinstance(self.track, str) else self.track.name
+        return f"{track}-{self.direction}-look{self.look}{fast}"
 
 
-def laps(looks: int, fast: int, number_of: dict[str, int]) -> list[Lap]:
+def laps(looks: int, fast: int, number_of: dict[str, int], roads: Sequence[PointRoad] = ()) -> list[Lap]:
     """Return the laps to render: of both tracks in so many looks, fast ones of the jungle, and of generated roads.
 
-    number_of: generated roads of each kind; each has a look of its own. Look 0, which resembles the real simulator, is
-    driven in both directions, without and with both kinds of shadows, any other look in one direction; every second one
-    has shadows.
+    number_of: generated roads of each kind; each has a look of its own. roads: others, driven in both directions. Look
+    0, which resembles the real simulator, is driven in both directions, without and with both kinds of shadows, any
+    other look in one direction; every second one has shadows.
     """
     twins = (0, SHADOWED, 2 * SHADOWED)
     chosen = [Lap(track, direction, look) for track in ROADS for direction in DIRECTIONS for look in twins]
@@ -85,9 +90,11 @@ def laps(looks: int, fast: int, number_of: dict[str, int]) -> list[Lap]:
         chosen += [Lap(track, DIRECTIONS[look % 2], every_second_shadowed(look)) for track in ROADS]
     for look in range(FIRST_LOOK, FIRST_LOOK + fast):  # not the direction in which the same look is driven slowly
         chosen.append(Lap("jungle", DIRECTIONS[1 - look % 2], every_second_shadowed(look), lateral=FAST))
-    for kind, roads in number_of.items():
-        for road in range(FIRST_ROAD, FIRST_ROAD + roads):
+    for kind, count in number_of.items():
+        for road in range(FIRST_ROAD, FIRST_ROAD + count):
             chosen.append(Lap(f"{kind}-{road}", DIRECTIONS[road % 2], every_second_shadowed(road), LAPS))
+    for look, points in enumerate(roads, FIRST_LOOK):
+        chosen += [Lap(points, direction, every_second_shadowed(look)) for direction in DIRECTIONS]
     return chosen
 
 
@@ -112,9 +119,11 @@ def drive_lap(folder: Path, lap: Lap, seed: int) -> int:
 def render(folder: Path, chosen: list[Lap]) -> list[Path]:
     """Record the laps that are not there yet, each in a process of its own, and return all recordings.
 
-    Raises SimulatorError if a process is killed, and the errors of `drive_lap`.
+    Raises RecordingError for two of one name, SimulatorError if a process is killed, and the errors of `drive_lap`.
     """
     wanted = [folder / lap.name for lap in chosen]
+    if twice := {path.name for path in wanted if wanted.count(path) > 1}:
+        raise RecordingError(f"{', '.join(sorted(twice))}: two roads have the same name; rename one of their files")
     shutil.rmtree(unfinished := folder / "unfinished", ignore_errors=True)
     begin = time.perf_counter()
     with started_workers(threads()) as pool:
@@ -163,14 +172,15 @@ def main(argv: list[str] | None = None) -> int:
     add("--fast", type=number(int, 0, 100), default=8, help="fast laps of the jungle (default %(default)s)")
     add("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
     add("--mountains", type=number(int, 0, 1000), default=100, help="generated mountain roads (default %(default)s)")
+    add("--road", nargs="+", default=[], metavar="FILE", help="roads by points, such as those that tools.search found")
     add("--epochs", type=number(int, 1), default=22, help=f"of {EPOCH:,} images (default %(default)s)")
     add("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
     add("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
     options = parser.parse_args(argv)
-    model = options.folder / "model.pt"
+    model, points = options.folder / "model.pt", [read_road(file) for file in options.road]
     real = repeat(options.folder / "real", find_folders(options.recordings))  # first, since rendering takes long
     number_of = {"road": options.roads, "mountain": options.mountains}
-    rendered = render(options.folder / "rendered", laps(options.looks, options.fast, number_of))
+    rendered = render(options.folder / "rendered", laps(options.looks, options.fast, number_of, points))
     length = ("--epochs", options.epochs, "--samples-per-epoch", EPOCH, "--learning-rate", LEARNING_RATE)
     training = ("--robust", *length, "--repeats", REPEATS, "--disturbed", DISTURBED, "--seed", options.seed, "--resume")
     # By name, since the folders may also hold what an earlier run with other options left there.
