@@ -96,7 +96,7 @@ def test_a_set_speed_of_0_brakes_until_the_car_is_at_rest_and_never_drives_it_ba
     controller.throttle(9)
     controller.set_speed = 0
     assert [controller.throttle(speed) for speed in (9, 6, 4, 4, 4.4, 2, 1, 0.4)] == [-1] * 7 + [0]
-    assert controller.throttle(0.1) == controller.throttle(3) == 0, "a car that rolls may roll backwards"
+    assert controller.throttle(0.1) == controller.throttle(3) == 0, "nothing brakes a car that rolls so slowly"
     controller.set_speed = 9
     assert controller.throttle(1) == pytest.approx(0.8, abs=0.02)
     controller.set_speed = 0

@@ -3,14 +3,21 @@
 import math
 
 STILL, ALMOST_STILL = 0.5, 2.0  # mph: the stand-in simulator tells 0.44 of a car at rest
+BRAKING = 5.0  # mph: below it the simulator's brake is its weak reverse gear
+UPHILL = 0.4  # throttle: a car that is driven with more would roll backwards
+PUSH = 0.7  # throttle that stops it on the steepest grade, and does not throw it forwards
+LOST_FRAMES = {
+    -1.0: 4,
+    PUSH: 12,
+}  # in which the car becomes faster until the other throttle is tried: torque comes late
 
 
 class SpeedController:
     """The PI controller of Udacity's drive.py: throttle = 0.1 e + 0.002 Σe, where e = set speed - speed in mph.
 
     The sum is not changed while the throttle is at its limit, so that it does not wind up on a hill. A set speed of 0
-    brakes until the car is at rest, or almost and no longer becomes slower: below 5 mph the simulator's brake is its
-    reverse gear, which first slows the car down. Then there is none that could hold it on a slope.
+    brakes until the car is at rest, or almost and no longer becomes slower. On a slope nothing holds it there, and what
+    the simulator tells has no sign: a car that rolls downhill is braked again, one that rolls backwards is pushed.
     """
 
     PROPORTIONAL, INTEGRAL = 0.1, 0.002
@@ -18,17 +25,33 @@ class SpeedController:
     def __init__(self, set_speed: float):
         """set_speed: mph."""
         self.set_speed, self.error_sum = set_speed, 0.0
-        self.speed, self.stands = math.inf, False  # mph in the last frame while it stops; whether it has
+        self._begin(0.0)
+
+    def _begin(self, throttle: float) -> None:
+        """Forget what `stop` did; throttle: with which the car was driven."""
+        self.is_uphill, self.stands, self.stop_throttle = throttle > UPHILL, False, -1.0
+        self.speed, self.faster = math.inf, 0  # in the last frame, mph; frames in which it rose
 
     def throttle(self, speed: float) -> float:
         """Return the throttle, -1..1, at this speed in mph; call it once per frame."""
         if self.set_speed == 0:
-            self.stands = self.stands or speed < STILL or self.speed < speed < ALMOST_STILL
-            self.speed = speed
-            return 0.0 if self.stands else -1.0
-        self.speed, self.stands = math.inf, False
+            return self._stop(speed)
         error = self.set_speed - speed
         throttle = self.PROPORTIONAL * error + self.INTEGRAL * (self.error_sum + error)
         if abs(throttle) <= 1:
             self.error_sum += error
+        self._begin(throttle)
         return min(1.0, max(-1.0, throttle))
+
+    def _stop(self, speed: float) -> float:
+        before, self.speed = self.speed, speed
+        if self.stands:
+            self.stands, self.faster = speed < (ALMOST_STILL if self.is_uphill else BRAKING), 0
+            self.stop_throttle = PUSH if self.is_uphill else -1.0
+        elif speed < STILL or before < speed < ALMOST_STILL:
+            self.stands = True
+        else:
+            self.faster = self.faster + 1 if speed > max(before, BRAKING) else 0
+            if self.faster == LOST_FRAMES[self.stop_throttle]:
+                self.is_uphill, self.stands = not self.is_uphill, True
+        return 0.0 if self.stands else self.stop_throttle
