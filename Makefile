@@ -14,10 +14,13 @@ BIN = .venv/bin
 # The tests look at the pages in Chromium and at the window on Xvfb's screen, and skip what they can't look at.
 APT = ./.ci/apt
 
-test: lint
+test:
+	@$(MAKE) --no-print-directory -j 2 lint screen
+	$(BIN)/python -m pytest -n 3 --dist worksteal
+
+screen:
 	@(for command in chromium Xvfb xdotool; do command -v $$command || exit; done) > /dev/null \
 		|| $(APT) --optional chromium xvfb xdotool
-	$(BIN)/python -m pytest -n 3 --dist worksteal
 
 lint: .venv/installed
 	$(BIN)/ruff check .
@@ -30,12 +33,12 @@ lint: .venv/installed
 	@$(PYTHON) -c "import sys; sys.exit('Python 3.11 or later is needed, and $(PYTHON) is Python ' + sys.version.split()[0] \
 		+ ': name another, as in make demo PYTHON=python3.12' if sys.version_info < (3, 11) else 0)"
 	@$(PYTHON) -c "import ensurepip" 2>/dev/null || $(APT) python3-venv
-	@[ "$$(uname)" != Linux ] || PATH="$$PATH:/sbin" ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
 	@echo "install into .venv: some minutes; 2 GB on disk, or 5.5 GB where PyTorch brings NVIDIA's libraries: see README.md"
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -r requirements.txt
 	@# By itself, pip would compile on one core, libraries' own tests too. A few of their files are not for this Python.
 	$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' .venv/lib || true
+	@[ "$$(uname)" != Linux ] || PATH="$$PATH:/sbin" ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
 	touch $@
 
 lock:
@@ -52,4 +55,4 @@ demo: .venv/installed
 shipped: .venv/installed
 	$(BIN)/python -m tools.shipped $(RECORDINGS)
 
-.PHONY: test lint lock demo shipped
+.PHONY: test screen lint lock demo shipped
