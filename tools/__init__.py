@@ -1,1 +1,9 @@
-"""Tools: benchmarks and the training of the lane network; run one with `python -m tools.NAME`."""
+"""Tools: benchmarks and the training of the networks; run one with `python -m tools.NAME`."""
+
+import sys
+
+from cloning.base import program
+
+if sys.argv[0] == "-m":  # as long as Python looks for the tool: Ctrl-C needs no traceback while its libraries load, too
+    name = next(word for word in sys.orig_argv if "tools." in word).rpartition("tools.")[2]
+    program.end_on_interrupt(name, "stopped" + "; start it again to continue" * (name == "demo"))

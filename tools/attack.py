@@ -8,11 +8,6 @@ one telemetry in flight, must get the right answer to each of its frames, and in
 answered, and the attack's connections must be closed. Needs Linux, because memory is read from /proc.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("attack")  # also while the libraries below are loaded
-
 import itertools
 import multiprocessing
 import os
@@ -22,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.processes import interrupt_deferred
 from cloning.network.network import SHIPPED_MODEL

@@ -9,11 +9,6 @@ thread). The servers take turns, so that other load on the machine affects all o
 time and memory are read from /proc.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("bench_driving")  # also while the libraries below are loaded
-
 import itertools
 import json
 import subprocess
@@ -28,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
@@ -120,7 +116,7 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
             "drive.py": drive,
             "drive.py, saving frames": (*drive, Path(folder) / "run1"),
             PAGE_OPEN: drive,
-            TYPICAL: ("-m", "tools.classic_server", model),
+            TYPICAL: ("-c", "from tools.classic_server import main; main()", model),
         }
         servers = [stack.enter_context(Server(name, *command)) for name, command in commands.items()]
         for server in servers:

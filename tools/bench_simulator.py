@@ -9,11 +9,6 @@ other load on the machine disturbs it less than wall time. Memory is that of all
 counted once. Needs Linux, because memory is read from /proc.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("bench_simulator")  # also while the libraries below are loaded
-
 import contextlib
 import os
 import re
@@ -25,6 +20,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import SimulatorError
 from cloning.recordings.format import DRIVING_LOG, SAMPLE_RATE

@@ -13,11 +13,6 @@ process of its own; the parts take turns, so that a change of the machine's spee
 training images per second.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("bench_training")  # also while the libraries below are loaded
-
 import argparse
 import itertools
 import json
@@ -36,6 +31,7 @@ import numpy as np
 import torch
 
 import model
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.frame import FRAME

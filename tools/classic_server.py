@@ -73,7 +73,3 @@ def main() -> None:
     listener = eventlet.listen(("127.0.0.1", 0))
     print(f"Listening on 127.0.0.1:{listener.getsockname()[1]}.", file=sys.stderr, flush=True)
     eventlet.wsgi.server(listener, socketio.WSGIApp(server, flask.Flask(__name__)), log_output=False)
-
-
-if __name__ == "__main__":
-    main()

@@ -11,11 +11,6 @@ stopped continues when it is started again; without the folder it begins anew.
 Exit status: 0 if every lap was driven without leaving the road, 1 if the car left it, 2 if a step failed.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("demo", "stopped; start it again to continue")  # also while the libraries below are loaded
-
 import json
 import subprocess
 import time
@@ -26,6 +21,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+from cloning.base import program
 from cloning.base.arguments import command_line
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError, UserError

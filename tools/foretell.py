@@ -14,11 +14,6 @@ counted in windows of 5 s in drives without a departure. An interrupted run cont
 takes about 5 s on a core.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("foretell")  # also while the libraries below are loaded
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from itertools import pairwise
@@ -27,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME, ROAD_ROWS

@@ -7,16 +7,12 @@ that the network was not trained on. For real recordings only the position of th
 in the jungle the line that is painted along the road's centre.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("lane_accuracy")  # also while the libraries below are loaded
-
 import tempfile
 import time
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.lane import marking
 from cloning.lane.follow import TrackFilter

@@ -7,16 +7,12 @@ table compares mean colours, also of image rows, and what a network may notice i
 dark, the saturation, and how sharp the frames are.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("likeness")  # also while the libraries below are loaded
-
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import RecordingError
 from cloning.base.frame import ROAD_ROWS

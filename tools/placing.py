@@ -7,11 +7,6 @@ Damage may cost its own rows alone. The truth is where the undamaged recording i
 generated roads, alone or within a recording of a known track, nothing may be placed.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("placing")  # also while the libraries below are loaded
-
 import copy
 import tempfile
 from collections.abc import Callable
@@ -19,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.table import Column, Table
 from cloning.lane.known import known_position

@@ -11,11 +11,6 @@ What is different: rows are drawn at random in place of shuffled passes over all
 theirs overflows; and commaai, made for real roads, is trained for 10 of its 200 epochs.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("public_networks")  # also while the libraries below are loaded
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,6 +23,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from cloning.base import program
 from cloning.base.arguments import command_line
 from cloning.base.cores import threads
 from cloning.base.files import written_whole

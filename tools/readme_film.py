@@ -7,11 +7,6 @@ Left the car from behind, right what its camera sees: first on the lake, then in
 as the stand-in simulator renders them. The film is an animated WebP, which web pages show like a picture.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("readme_film")
-
 import io
 
 import cv2
@@ -21,6 +16,7 @@ import torch
 from PIL import Image
 
 import simulator.environment as environment
+from cloning.base import program
 from cloning.base.arguments import command_line
 from cloning.base.errors import UserError
 from cloning.base.outputs import check_folders, write_output

@@ -12,11 +12,6 @@ same options give the same results, on any number of processes. The folder gets 
 (robustness.png), and the result of each drive (robustness.json) as it comes: a run that was interrupted goes on there.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("robustness")  # also while the libraries below are loaded
-
 import functools
 import hashlib
 import itertools
@@ -30,6 +25,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.figure import png

@@ -14,11 +14,6 @@ The folder gets a file for each failure, which `--road` of `python -m simulator`
 printed; and failures.png: the roads from above, and where the car left them.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("search")  # also while the libraries below are loaded
-
 import functools
 import itertools
 import time
@@ -28,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import TrackError, UserError
 from cloning.base.figure import png

@@ -13,11 +13,6 @@ The network that comes with the project was made so; cloning/network/shipped.md,
 what came out.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("shipped")  # also while the libraries below are loaded
-
 import shutil
 import time
 from collections.abc import Sequence
@@ -26,6 +21,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError

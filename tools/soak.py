@@ -9,11 +9,6 @@ an answer was lost or wrong, if memory grew by more than 20 MB after the first t
 left open. Needs Linux, because memory is read from /proc.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("soak")  # also while the libraries below are loaded
-
 import http.client
 import random
 import tempfile
@@ -25,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL

@@ -7,11 +7,6 @@ Each run trains with --robust and counts everything until its model is saved: lo
 checking the recordings, estimating the lane, training, validation, pictures. Then a replay drives with the model.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("speedrun")
-
 import argparse
 import os
 import statistics
@@ -24,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.recordings.log import Recording, find_folders

@@ -14,11 +14,6 @@ from the two tracks without shadows. For both, the jungle was first rendered wit
 lines.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("train_lane")  # also while the libraries below are loaded
-
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -28,6 +23,7 @@ import cv2
 import numpy as np
 import torch
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.lane.reader import (
     DIRECTION_TO_STRIP,

@@ -13,11 +13,6 @@ The folder then holds study.csv, a row for each network, study.md with the rank 
 driving, and pictures. An interrupted study continues when it is started again with the same options.
 """
 
-from cloning.base import program
-
-if __name__ == "__main__":
-    program.end_on_interrupt("study")  # also while the libraries below are loaded
-
 import argparse
 import json
 import multiprocessing
@@ -27,6 +22,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolEx
 from functools import partial
 from pathlib import Path
 
+from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
