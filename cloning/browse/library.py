@@ -283,10 +283,8 @@ class ShownRecording:
         return cuts
 
     def restore(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
-        """Undo cuts or tags, and return them. Raises GoneError, RecordingError, OSError."""
-        cuts = list(cuts)
-        delete_cuts(self.folder, *cuts, file=file)
-        return cuts
+        """Undo cuts or tags, and return those that were there. Raises GoneError, RecordingError, OSError."""
+        return delete_cuts(self.folder, *cuts, file=file)
 
     def _selected(self, stretches: list[list[int]] | None = None, version: str | None = None) -> Recording:
         """Return the rows of stretches, [first, row after the last], without those that are cut. Raises UserError.

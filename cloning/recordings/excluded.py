@@ -110,24 +110,26 @@ class GoneError(RecordingError):
     """A cut or tag that is to be deleted and is not there any more."""
 
 
-def delete_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> None:
-    """Delete the lines of cuts or tags; the other lines stay as they are.
+def delete_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> list[Cut]:
+    """Delete the lines of cuts or tags, and return those that were there; the other lines stay as they are.
 
-    Raises GoneError if one of them is not there, and the errors of `add_cuts`; then none is deleted.
+    Raises GoneError if none of them is there, and the errors of `add_cuts`.
     """
+    found: list[Cut] = []
 
     def delete(lines: list[str], there: list[Cut]) -> list[str]:
         at = {each.row(): each.line for each in there}
-        for cut in cuts:
-            if cut.row() not in at:
-                raise GoneError(
-                    f"{folder / file}: the stretch from {cut.first} to {cut.last} is not there any more; it was "
-                    "deleted elsewhere"
-                )
-        deleted = {at[cut.row()] for cut in cuts}
+        found[:] = (cut for cut in cuts if cut.row() in at)
+        deleted = {at[cut.row()] for cut in found}
         return [line for number, line in enumerate(lines, 1) if number not in deleted]
 
     _change(folder / file, delete)
+    if cuts and not found:
+        raise GoneError(
+            f"{folder / file}: the stretch from {cuts[0].first} to {cuts[0].last} is not there any more; it was "
+            "deleted elsewhere"
+        )
+    return found
 
 
 def one_line(reason: str) -> str:
