@@ -274,7 +274,7 @@ class TrainingRun:
         self.device, self.files = choose_device(process.device), RunFiles(process.output)
         self.precision = choose_precision(self.device)
         manual_seed(run.seed)
-        network = NETWORKS[recipe.network]()
+        network = NETWORKS[recipe.network](exposure=recipe.exposure)
         self.network = network.to(self.device, memory_format=channels_last)  # type: ignore[call-overload]
         repeatable(self.device)
         one_thread()

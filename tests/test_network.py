@@ -18,7 +18,7 @@ from cloning.base.errors import ModelError
 from cloning.network import fast_layers, tensors
 from cloning.network.fast_layers import OverPairs
 from cloning.network.layer_table import layer_table
-from cloning.network.network import SHIPPED_MODEL, Network, load_model, save_model, steer
+from cloning.network.network import SHIPPED_MODEL, Network, exposed, load_model, save_model, steer
 from cloning.recordings.images import decode
 from cloning.road.track import Track
 from cloning.training.pieces import Batch, SquaredErrors
@@ -175,11 +175,47 @@ def test_bfloat16_steps_where_float32_does(network, monkeypatch, amx):
     assert torch.cosine_similarity(gradients[0], gradients[1], dim=0) > 0.99
 
 
+def test_dark_images_and_those_without_contrast_are_lifted_when_it_drives(tmp_path, frames):
+    """By 5 and 8 times at most; ordinary ones stay, to the bit."""
+    plain = Network().eval()
+    save_model(tmp_path / "model.pt", plain)
+    lifting = load_model(tmp_path / "model.pt")
+    lifting.exposure = (80.0, 20.0)
+    save_model(tmp_path / "lifting.pt", lifting)
+    lifting = load_model(tmp_path / "lifting.pt")
+    images = frames[:, 60:135].float()
+    images -= images.mean((1, 2, 3), keepdim=True)
+    images *= 30 / images.square().mean((1, 2, 3), keepdim=True).sqrt()
+
+    def image(mean, contrast):
+        return (mean + contrast * images).clamp(0, 255).byte()
+
+    ordinary, dark, black, foggy, grey = (
+        image(*of) for of in ((120, 1), (50, 0.6), (10, 0.1), (150, 0.3), (150, 0.04))
+    )
+    with torch.inference_mode():
+        assert torch.equal(lifting(ordinary), plain(ordinary))
+        for changed, mean, deviation in ((dark, 80, 28.8), (black, 50, 20), (foggy, 150, 20), (grey, 150, 9.6)):
+            lifted = exposed(changed.permute(0, 3, 1, 2).float(), (80, 20))
+            assert lifted.mean((1, 2, 3)).numpy() == pytest.approx(mean, abs=3)
+            assert lifted.std((1, 2, 3)).numpy() == pytest.approx(deviation, rel=0.15)
+            torch.testing.assert_close(lifting(changed), plain(lifted.permute(0, 2, 3, 1).clone()))
+            assert (lifting(changed) - plain(changed)).abs().max() > 1e-4
+        assert torch.equal(lifting.train()(dark), plain.train()(dark)), "in training all are as they are"
+
+
 def test_model_file_carries_what_driving_needs(network, frames, tmp_path):
     path = tmp_path / "model.pt"
     save_model(path, network.eval(), arguments={"seed": 1})
     saved = torch.load(path, weights_only=True)
-    assert saved["recipe"] == {"frame": (160, 320, 3), "colour": "RGB", "crop": (60, 25), "scale": 127.5, "offset": 1.0}
+    assert saved["recipe"] == {
+        "frame": (160, 320, 3),
+        "colour": "RGB",
+        "crop": (60, 25),
+        "scale": 127.5,
+        "offset": 1.0,
+        "exposure": (0.0, 0.0),
+    }
     assert saved["arguments"] == {"seed": 1}
     assert {"torch", "opencv", "numpy", "python"} <= set(saved["versions"])
     torch.testing.assert_close(load_model(path)(frames), network(frames))
@@ -283,6 +319,8 @@ HUGE = torch.full((100, 4224), 1e38) * torch.tensor([1.0, -1.0]).repeat(50)[:, N
         ("scale", torch.tensor(127.5), "scale"),
         ("scale", 10**400, "scale"),
         ("offset", float("inf"), "offset"),
+        ("exposure", (80.0, 256.0), "exposure"),
+        ("exposure", 80.0, "exposure"),
         ("network", None, "missing or unknown"),
         ("network", [torch.zeros(3)], "missing or unknown"),
         ("more", torch.zeros(3), "missing or unknown: 'more'"),

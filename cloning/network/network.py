@@ -17,10 +17,12 @@ from cloning.network.fast_layers import BlockConv2d, elu
 
 FORMAT, VERSION = "behavioral-cloning", 1  # of the model file
 SHIPPED_MODEL = Path(__file__).with_name("shipped.pt")  # comes with the project
-PREPROCESSING = "recipe"  # the key of frame, colour, crop, scale and offset in the file
+PREPROCESSING = "recipe"  # the key of frame, colour, crop, scale, offset and exposure in the file
 COLOUR = "RGB"  # order of a frame's colours
 CROP = (60, 25)  # rows cut off the top and the bottom of a frame
 SEEN_ROWS = slice(CROP[0], FRAME[0] - CROP[1])  # the rows of a frame that the network sees
+MOST_LIGHT, MOST_CONTRAST = 5.0, 8.0  # times: more would show little but the JPEG's errors
+Exposure = tuple[float, float]  # least mean and standard deviation of an image's values, 0..255: see `exposed`
 SEEN_SHAPE = (SEEN_ROWS.stop - SEEN_ROWS.start, *FRAME[1:])  # (75, 320, 3)
 
 
@@ -36,14 +38,21 @@ class Network(nn.Module):
 
     units = 4224  # of the flattened layer; dropout keeps half of them
 
-    def __init__(self, crop: tuple[int, int] = CROP, scale: float = 127.5, offset: float = 1.0):
+    def __init__(
+        self,
+        crop: tuple[int, int] = CROP,
+        scale: float = 127.5,
+        offset: float = 1.0,
+        exposure: Exposure = (0.0, 0.0),
+    ):
         """Make the layers with random weights, from torch's generator.
 
-        crop: rows cut off the top and the bottom; a pixel value x enters as x / scale - offset.
+        crop: rows cut off the top and the bottom; a pixel value x enters as x / scale - offset. exposure: that of the
+        images by which it drives, not of those that it learns from.
         """
         super().__init__()
         top, bottom = crop
-        self.crop, self.scale, self.offset = (top, bottom), scale, offset
+        self.crop, self.scale, self.offset, self.exposure = (top, bottom), scale, offset, exposure
         convolutions, dense = self.layers()
         self.convolutions, self.dense = nn.ModuleList(convolutions), nn.ModuleList(dense)
 
@@ -61,7 +70,10 @@ class Network(nn.Module):
         """Compute the steering for frames; shapes and ranges are in the class's docstring."""
         if frames.shape[1] == FRAME[0]:
             frames = frames[:, self.crop[0] : FRAME[0] - self.crop[1]]
-        x = frames.permute(0, 3, 1, 2).float().div_(self.scale).sub_(self.offset)  # in memory still channels last
+        x = frames.permute(0, 3, 1, 2).float()  # in memory still channels last
+        if any(self.exposure) and not self.training:
+            x = exposed(x, self.exposure)
+        x = x.div_(self.scale).sub_(self.offset)
         x = x.to(next(self.parameters()).dtype)
         for convolution in self.convolutions:
             x = elu(convolution(x))
@@ -71,6 +83,23 @@ class Network(nn.Module):
         for layer in self.dense[:-1]:
             x = elu(layer(x))
         return self.dense[-1](x).squeeze(1).float()
+
+
+def exposed(images: torch.Tensor, exposure: Exposure) -> torch.Tensor:
+    """Return images of which the dark ones are brightened, and then those with little contrast get more.
+
+    images: float32 (N, 3, rows, columns), 0..255. At most MOST_LIGHT and MOST_CONTRAST times; others stay as they are.
+    """
+    some, dimensions, (mean, deviation) = images[..., ::4, ::4], (1, 2, 3), exposure  # enough to measure
+    light = (mean / some.mean(dimensions, keepdim=True).clamp(min=1.0)).clamp(1.0, MOST_LIGHT)
+    some = (some * light).clamp(max=255.0)
+    middle = some.mean(dimensions, keepdim=True)
+    contrast = (some - middle).square().mean(dimensions, keepdim=True).sqrt()
+    gain = (deviation / contrast.clamp(min=0.1)).clamp(1.0, MOST_CONTRAST)
+    if not torch.compiler.is_exporting() and max(light.max(), gain.max()) == 1:
+        return images
+    images = (images * light).clamp(max=255.0)
+    return (images + (images - middle) * (gain - 1)).clamp(0.0, 255.0)
 
 
 NETWORKS: dict[str, type[Network]] = {"nvidia": Network}  # by the name that a recipe and a model file have
@@ -88,6 +117,7 @@ def save_model(path: Path, network: Network, **more: object) -> None:
         "crop": network.crop,
         "scale": network.scale,
         "offset": network.offset,
+        "exposure": network.exposure,
     }
     name = next(name for name, kind in NETWORKS.items() if kind is type(network))
     about = {"format": FORMAT, "version": VERSION, "layers": name, PREPROCESSING: preprocessing, "versions": versions()}
@@ -142,8 +172,8 @@ def read_network(saved: dict[str, Any]) -> type[Network]:
     return NETWORKS[name]
 
 
-def read_preprocessing(saved: dict[str, Any]) -> tuple[tuple[int, int], float, float]:
-    """Return crop, scale and offset, as `Network` takes them, from a model file's contents.
+def read_preprocessing(saved: dict[str, Any]) -> tuple[tuple[int, int], float, float, Exposure]:
+    """Return crop, scale, offset and exposure, as `Network` takes them, from a model file's contents.
 
     Raises ValueError for frames of another shape or order of colours, which no caller has, and for unusable values.
     """
@@ -160,11 +190,14 @@ def read_preprocessing(saved: dict[str, Any]) -> tuple[tuple[int, int], float, f
     crop: Any = found.get("crop")
     scale: Any = found.get("scale")
     offset: Any = found.get("offset")
+    exposure: Any = found.get("exposure", (0.0, 0.0))  # an earlier version had none
     is_pair = isinstance(crop, tuple) and [type(rows) for rows in crop] == [int, int]
     check("crop", is_pair and min(crop) >= 0 and sum(crop) == sum(CROP), f"two counts of rows, {sum(CROP)} in all")
     check("scale", tensors.is_number(scale, 1e-6, 1e6), "a number above 0")
     check("offset", tensors.is_number(offset, -1e6, 1e6), "a number")
-    return crop, scale, offset
+    is_pair = isinstance(exposure, tuple) and len(exposure) == 2
+    check("exposure", is_pair and all(tensors.is_number(least, 0, 255) for least in exposure), "two numbers, 0..255")
+    return crop, scale, offset, exposure
 
 
 def restore_weights(network: Network, saved: dict[str, Any]) -> None:

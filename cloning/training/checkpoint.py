@@ -235,7 +235,8 @@ def _restore_network(network: Network, saved: dict[str, Any]) -> None:
     """Give the network the weights of a checkpoint. Raises ValueError if they, or their preprocessing, do not fit."""
     if read_network(saved) is not type(network):
         raise ValueError(f"its layers are {shown(saved.get('layers'))}")
-    if read_preprocessing(saved) != (network.crop, network.scale, network.offset):
+    *preprocessing, network.exposure = read_preprocessing(saved)
+    if preprocessing != [network.crop, network.scale, network.offset]:
         raise ValueError("its preprocessing is not that of this program's network")
     restore_weights(network, saved)
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cloning.network.network import NETWORKS
+from cloning.network.network import NETWORKS, Exposure
 from cloning.network.tensors import shown
 from cloning.training.muon import OPTIMIZERS
 
@@ -119,6 +119,7 @@ class Recipe:
     validation_sets: Callable[..., list[Any]]
     best_by: str  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
     # Recovery steering from other poses, in other light (--robust); the report has neither.
+    exposure: Exposure = (0.0, 0.0)  # least mean and standard deviation of the images by which the network drives
     straight_weight: float = 1.0  # sampling weight on a straight; elsewhere |steering along the lane| is added
     mirrored: float = 0.0  # share of the poses seen in a mirrored world
     pose_offset: float = 0.0  # m: poses are at most this far from the lane's centre, most often near it
