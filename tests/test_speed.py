@@ -32,8 +32,9 @@ def test_a_stopped_car_hardly_rolls_on_a_slope(grade, fastest):
 def test_a_stopped_car_that_rolls_the_other_way_than_it_seemed_is_stopped_too():
     """It braked on a slope that it seemed to come down, or was driven with a throttle as if uphill."""
     controller = SpeedController(9)
-    for driven, tried, then in ((9.0, -1, PUSH), (2.0, PUSH, -1)):
+    for before, driven, tried, then in ((9, 9, -1, PUSH), (0, 2, -1, PUSH), (2, 2, PUSH, -1)):
         controller.set_speed, controller.error_sum = 9, 0.0
+        controller.throttle(before)
         controller.throttle(driven)
         controller.set_speed = 0
         found = [controller.throttle(speed) for speed in (1, 0.4, *np.arange(5.5, 15, 0.5))]

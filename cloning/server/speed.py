@@ -4,7 +4,7 @@ import math
 
 STILL, ALMOST_STILL = 0.5, 2.0  # mph: the stand-in simulator tells 0.44 of a car at rest
 BRAKING = 5.0  # mph: below it the simulator's brake is its weak reverse gear
-UPHILL = 0.4  # throttle: a car that is driven with more would roll backwards
+UPHILL, STEADY = 0.4, 0.1  # throttle, mph a frame: a car that needs more, and gains no more speed, would roll backwards
 PUSH = 0.7  # throttle that stops it on the steepest grade, and does not throw it forwards
 LOST_FRAMES = {
     -1.0: 4,
@@ -24,12 +24,13 @@ class SpeedController:
 
     def __init__(self, set_speed: float):
         """set_speed: mph."""
-        self.set_speed, self.error_sum = set_speed, 0.0
-        self._begin(0.0)
+        self.set_speed, self.error_sum, self.driven = set_speed, 0.0, math.inf
+        self._begin(0.0, math.inf)
 
-    def _begin(self, throttle: float) -> None:
-        """Forget what `stop` did; throttle: with which the car was driven."""
-        self.is_uphill, self.stands, self.stop_throttle = throttle > UPHILL, False, -1.0
+    def _begin(self, throttle: float, speed: float) -> None:
+        """Forget what `_stop` did; throttle, speed: of a car that is driven."""
+        self.is_uphill, self.driven = throttle > UPHILL and speed < self.driven + STEADY, speed
+        self.stands, self.stop_throttle = False, -1.0
         self.speed, self.faster = math.inf, 0  # in the last frame, mph; frames in which it rose
 
     def throttle(self, speed: float) -> float:
@@ -40,7 +41,7 @@ class SpeedController:
         throttle = self.PROPORTIONAL * error + self.INTEGRAL * (self.error_sum + error)
         if abs(throttle) <= 1:
             self.error_sum += error
-        self._begin(throttle)
+        self._begin(throttle, speed)
         return min(1.0, max(-1.0, throttle))
 
     def _stop(self, speed: float) -> float:
