@@ -243,10 +243,7 @@ def given_for_road(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def chosen_track(arguments: argparse.Namespace, needs_file: bool = True) -> Track:
-    """Return the track that the ROAD options name; needs_file: for options about a road of one's own.
-
-    Raises UserError.
-    """
+    """Return the track of the ROAD options; needs_file: for options of a road of one's own. Raises UserError."""
     given = given_for_road(arguments)
     if arguments.road is None:
         if given and needs_file:

@@ -57,10 +57,7 @@ class Buffer:
             region.set_camera(camera)
 
     def render(self, halve: bool = False) -> np.ndarray:
-        """Render the regions and return them: uint8 (regions, rows, columns, 3), RGB.
-
-        halve: return the mean of every two rows.
-        """
+        """Render the regions: uint8 (regions, rows, columns, 3), RGB; halve: return the mean of every two rows."""
         self.engine.render_frame()
         image = np.frombuffer(self.image.get_ram_image(), np.uint8)
         pixels: np.ndarray = image.reshape(-1, self.shape[2], 4)  # bottom row first
@@ -99,10 +96,7 @@ class Cameras:
         free_unused()
 
     def frames(self, transform: core.TransformState) -> np.ndarray:
-        """Render a drive's next frames: uint8 (cameras, 160, 320, 3), RGB, in the names' order.
-
-        transform: where the car is.
-        """
+        """Render the next frames, with the car at a transform: uint8 (cameras, 160, 320, 3), RGB."""
         self.scene.move_car(transform)
         frames, tone = self.buffer.render(halve=True), self.scene.scenery.tone
         if tone is not None:

@@ -18,10 +18,7 @@ MIN_DIRECTION = 0.05  # share of the rows with a known road below which a road o
 
 
 def driven_seconds(time: np.ndarray) -> np.ndarray:
-    """Return the seconds driven until each row, float64 (n,): a break counts as long as a row.
-
-    time: float64 (n,), s, ascending.
-    """
+    """Return the seconds driven until each row, float64 (n,), as time is; a break counts as long as a row."""
     pause = np.diff(time)
     pause[pause > MAX_GAP] = 1 / SAMPLE_RATE
     return np.r_[0.0, np.cumsum(pause)]
