@@ -96,7 +96,10 @@ class Cameras:
         free_unused()
 
     def frames(self, transform: core.TransformState) -> np.ndarray:
-        """Render the next frames, with the car at a transform: uint8 (cameras, 160, 320, 3), RGB."""
+        """Render a drive's next frames: uint8 (cameras, 160, 320, 3), RGB, in the names' order.
+
+        transform: where the car is.
+        """
         self.scene.move_car(transform)
         frames, tone = self.buffer.render(halve=True), self.scene.scenery.tone
         if tone is not None:

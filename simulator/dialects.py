@@ -150,23 +150,18 @@ class Measures(Dialect):
     def telemetry(self) -> str:
         """Return the usual telemetry, speed in mph, and the measures."""
         run = self.run
-        offset, heading_error = run.lane
-        return event_packet(
-            "telemetry",
-            self.state(MPH)
-            | {
-                "brake": f"{max(0.0, -self.throttle):.4f}",
-                "lapNumber": str(run.laps + 1),
-                "currentWayPoint": str(int(run.s // SECTOR)),
-                "crash": "0",
-                "tot_obes": str(len(run.departures)),
-                "tot_crashes": "0",
-                "distance": f"{run.distance:.4f}",
-                "sim_time": f"{run.time:.4f}",
-                "ang_diff": f"{math.degrees(heading_error):.4f}",
-                "cte": f"{offset:.4f}",
-            },
-        )
+        more = {
+            "brake": f"{max(0.0, -self.throttle):.4f}",
+            "lapNumber": str(run.laps + 1),
+            "currentWayPoint": str(int(run.s // SECTOR)),
+            "crash": "0",
+            "tot_obes": str(len(run.departures)),
+            "tot_crashes": "0",
+            "distance": f"{run.distance:.4f}",
+            "sim_time": f"{run.time:.4f}",
+            "ang_diff": f"{math.degrees(run.lane[1]):.4f}",
+        }
+        return event_packet("telemetry", self.state(MPH) | more)
 
 
 class Roads(Dialect):

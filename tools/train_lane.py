@@ -58,7 +58,10 @@ STRIP_TO_DIRECTION = np.linalg.inv(LEVEL_CAMERA_MATRIX) @ STRIP_TO_LEVEL
 
 
 def strip_homography(right: float, yaw: float) -> np.ndarray:
-    """Return the ground's homography, (3, 3), from a strip to one `right` m to the right, turned by `yaw` radians."""
+    """Return the homography of the ground from a strip to that of another pose: float64 (3, 3).
+
+    right: m further right; yaw: radians, turned right.
+    """
     return homographies(right, 0.0, yaw, DIRECTION_TO_STRIP, STRIP_TO_DIRECTION)[0]
 
 

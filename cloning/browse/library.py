@@ -289,7 +289,10 @@ class ShownRecording:
         return cuts
 
     def _selected(self, stretches: list[list[int]] | None = None, version: str | None = None) -> Recording:
-        """Return the rows of stretches, [first, row after the last], None: all, that are not cut. Raises UserError."""
+        """Return the rows of stretches, [first, row after the last], without those that are cut. Raises UserError.
+
+        stretches: None for all rows.
+        """
         recording = self.read(version)
         stretches = [[0, len(recording)]] if stretches is None else stretches
         chosen = np.zeros(len(recording), bool)

@@ -152,7 +152,10 @@ def _flat(options: dict[str, Any]) -> dict[str, str]:
 
 
 def _json(path: Path, kinds: dict[str, Any], least: int, within: str = "") -> dict[str, Any]:
-    """Return a JSON object and its part `within`, values of these types from `least` on. Raises UserError, OSError."""
+    """Return a JSON object with values of these types, numbers from `least` on; they may also be in its part `within`.
+
+    Raises UserError, OSError.
+    """
     try:
         found = json.loads(path.read_bytes())
     except ValueError as error:

@@ -18,24 +18,26 @@ MIN_DIRECTION = 0.05  # share of the rows with a known road below which a road o
 
 
 def driven_seconds(time: np.ndarray) -> np.ndarray:
-    """Return the seconds driven until each row, float64 (n,), as time is; a break counts as long as a row."""
+    """Return the seconds driven until each row, float64 (n,): a break counts as long as a row.
+
+    time: float64 (n,), s, ascending.
+    """
     pause = np.diff(time)
     pause[pause > MAX_GAP] = 1 / SAMPLE_RATE
     return np.r_[0.0, np.cumsum(pause)]
 
 
-def largest(values: np.ndarray, count: int = JUMPS, apart: int = APART) -> list[int]:
-    """Return the rows with the largest absolute values, in this order: at most `count`, at least `apart` rows apart.
+def largest(values: np.ndarray) -> list[int]:
+    """Return the rows with the largest absolute values, in this order: at most JUMPS, at least APART rows apart.
 
-    After the largest comes the largest of those far enough away from it, and so on. values: float (n,), nan where there
-    is none.
+    After the largest comes the largest of those far enough away from it, and so on. values: float (n,), nan for none.
     """
     size = np.where(np.isnan(values), -1.0, np.abs(values))
     rows: list[int] = []
-    while len(rows) < count and size.max(initial=0) > 0:
+    while len(rows) < JUMPS and size.max(initial=0) > 0:
         row = int(size.argmax())
         rows.append(row)
-        size[max(0, row - apart + 1) : row + apart] = -1
+        size[max(0, row - APART + 1) : row + APART] = -1
     return rows
 
 

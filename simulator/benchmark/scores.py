@@ -51,7 +51,7 @@ def foretelling(drives: Sequence[Figures]) -> str | None:
 
 
 def driven(task: Task, drive: Drive) -> Figures:
-    """Return what is told of a drive; departures: s after the start; alarms: as `alarmed`, None if none is known."""
+    """Return what is told of a drive; departures: s after the start; alarms: of `alarmed`, or None."""
     departures = [round(departure.time, 2) for departure in drive.departures]
     return {
         "group": task.group,

@@ -101,7 +101,10 @@ def make_shade_style(look: int) -> ShadeStyle | None:
 
 
 def expose(tone: np.ndarray | None, darkest: np.ndarray) -> np.ndarray | None:
-    """Return a tone as in `Look`, brighter if else the road's darkest colour, (3,), 0..255, would be below DARKEST."""
+    """Return a tone as in `Look`, brighter if it would make the road darker than DARKEST.
+
+    darkest: the road's colour where it is darkest, (3,), 0..255.
+    """
     matrix = np.eye(3, 4, dtype=np.float32) if tone is None else tone
     lacking = DARKEST - float((matrix @ np.r_[darkest, 1]).mean())
     return tone if lacking <= 0 else np.c_[matrix[:, :3], matrix[:, 3] + lacking].astype(np.float32)

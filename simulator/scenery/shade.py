@@ -149,7 +149,10 @@ class Shade:
         return np.where(shaded[:, None], factors, 1.0)
 
     def under_car(self, position: np.ndarray) -> np.ndarray | None:
-        """Return how far the car's shadow lies beside the car's position, (3,): (2,), m; None in other shade."""
+        """Return how far the car's shadow lies beside the car, (2,), m; None in the shade of hills or buildings.
+
+        position: the car's, (3,), m.
+        """
         shaded = self.map.shaded(self.project(position[None]), COARSE_MARGIN)[0]
         return None if shaded else -CAR_HEIGHT * self.slope
 

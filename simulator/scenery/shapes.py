@@ -219,7 +219,10 @@ def box(
     colour: Colour,
     texture: np.ndarray,
 ) -> Mesh:
-    """Return an upright box, open below; foot: its middle; size: length along `heading` (radians), width, height; m."""
+    """Return an upright box without a bottom.
+
+    foot: centre of its base, m; size: length along `heading` (radians), width and height, m.
+    """
     corner = np.array([[x, y, z] for z in (0, 1) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))])
     sides = np.array([(0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7), (4, 5, 6, 7)])
     points = corner[sides.ravel()] * size
