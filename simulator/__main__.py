@@ -256,16 +256,8 @@ def run_record(arguments: argparse.Namespace) -> int:
 
     track = chosen_track(arguments)
     begin = time.perf_counter()
-    run, rows = record(
-        arguments.folder,
-        track,
-        arguments.laps,
-        arguments.speed,
-        arguments.seed,
-        arguments.look,
-        arguments.recovery,
-        arguments.disturb,
-    )
+    how = (arguments.laps, arguments.speed, arguments.seed, arguments.look, arguments.recovery, arguments.disturb)
+    run, rows = record(arguments.folder, track, *how)
     pace = run.time / (time.perf_counter() - begin)
     for departure in run.departures:
         print(f"left the road at {departure.s:.0f} m after {departure.time:.1f} s")
