@@ -105,8 +105,7 @@ def add_command(
     return parser
 
 
-def add_record(commands: "Subparsers") -> None:
-    """Add `record`."""
+def _add_record(commands: "Subparsers") -> None:
     parser = add_command(commands, run_record, "record an expert driver, faster than real time", LAPS, ROAD, DISTURB)
     add, mph = parser.add_argument, number(float, 1, TOP_SPEED_MPH)
     add("folder", help="folder for the new recording: IMG/ and driving_log.csv")
@@ -117,8 +116,7 @@ def add_record(commands: "Subparsers") -> None:
     add("--seed", type=number(int, 0), default=0, help=text)
 
 
-def add_drive(commands: "Subparsers") -> None:
-    """Add `drive`."""
+def _add_drive(commands: "Subparsers") -> None:
     parser = add_command(
         commands,
         run_drive,
@@ -135,8 +133,7 @@ def add_drive(commands: "Subparsers") -> None:
     add("--film", metavar="FILE.mp4", help="film the drive from behind the car, with what its camera sees")
 
 
-def add_correct(commands: "Subparsers") -> None:
-    """Add `correct`."""
+def _add_correct(commands: "Subparsers") -> None:
     text = "let drive.py drive, and record the expert, who takes over where the car is off the lane's centre"
     shared = LAPS, SERVER, WAIT, ROAD, DISTURB
     parser = add_command(commands, run_correct, text, *shared, epilog="Exit status: as that of drive.")
@@ -149,8 +146,7 @@ def add_correct(commands: "Subparsers") -> None:
     parser.add_argument("--speed", type=mph, default=SET_SPEED_MPH, help=text)
 
 
-def add_replay(commands: "Subparsers") -> None:
-    """Add `replay`."""
+def _add_replay(commands: "Subparsers") -> None:
     text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
     add = add_command(commands, run_replay, text, SERVER, WAIT, DISTURB).add_argument
     add("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
@@ -168,8 +164,7 @@ def add_replay(commands: "Subparsers") -> None:
     add("--film", metavar="FILE.mp4", help="film what the model sees in the drives at the last limit")
 
 
-def add_window(commands: "Subparsers") -> None:
-    """Add `window`."""
+def _add_window(commands: "Subparsers") -> None:
     text = "drive and record by hand, or watch drive.py drive"
     add = add_command(commands, run_window, text, SERVER, ROAD, DISTURB).add_argument
     text = (
@@ -181,8 +176,7 @@ def add_window(commands: "Subparsers") -> None:
     add("--autonomous", action="store_true", help=text)
 
 
-def add_join(commands: "Subparsers") -> None:
-    """Add `join`."""
+def _add_join(commands: "Subparsers") -> None:
     parser = add_command(
         commands,
         run_join,
@@ -213,8 +207,7 @@ def add_join(commands: "Subparsers") -> None:
     add("-batchmode", action="store_true", help=argparse.SUPPRESS)
 
 
-def add_benchmark(commands: "Subparsers") -> None:
-    """Add `benchmark`."""
+def _add_benchmark(commands: "Subparsers") -> None:
     parser = add_command(commands, run_benchmark, "score a driver on fixed tasks: see LEADERBOARD.md")
     add = parser.add_argument
     add("entry", help="model file, .onnx file, HOST:PORT of a server, straight (steering 0) or expert")
@@ -231,7 +224,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
         prog=program.in_commands("python -m simulator"), description="A stand-in for Udacity's driving simulator."
     )
     commands = parser.add_subparsers(required=True)
-    for add in (add_replay, add_record, add_drive, add_correct, add_window, add_join, add_benchmark):
+    for add in (_add_replay, _add_record, _add_drive, _add_correct, _add_window, _add_join, _add_benchmark):
         add(commands)
     return parser.parse_args(argv)
 
@@ -243,10 +236,7 @@ def given_for_road(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def chosen_track(arguments: argparse.Namespace, needs_file: bool = True) -> Track:
-    """Return the track that the ROAD options name; needs_file: for options about a road of one's own.
-
-    Raises UserError.
-    """
+    """Return the track of the ROAD options; needs_file: for options of a road of one's own. Raises UserError."""
     given = given_for_road(arguments)
     if arguments.road is None:
         if given and needs_file:
@@ -266,16 +256,8 @@ def run_record(arguments: argparse.Namespace) -> int:
 
     track = chosen_track(arguments)
     begin = time.perf_counter()
-    run, rows = record(
-        arguments.folder,
-        track,
-        arguments.laps,
-        arguments.speed,
-        arguments.seed,
-        arguments.look,
-        arguments.recovery,
-        arguments.disturb,
-    )
+    how = (arguments.laps, arguments.speed, arguments.seed, arguments.look, arguments.recovery, arguments.disturb)
+    run, rows = record(arguments.folder, track, *how)
     pace = run.time / (time.perf_counter() - begin)
     for departure in run.departures:
         print(f"left the road at {departure.s:.0f} m after {departure.time:.1f} s")

@@ -57,10 +57,7 @@ class Buffer:
             region.set_camera(camera)
 
     def render(self, halve: bool = False) -> np.ndarray:
-        """Render the regions and return them: uint8 (regions, rows, columns, 3), RGB.
-
-        halve: return the mean of every two rows.
-        """
+        """Render the regions: uint8 (regions, rows, columns, 3), RGB; halve: return the mean of every two rows."""
         self.engine.render_frame()
         image = np.frombuffer(self.image.get_ram_image(), np.uint8)
         pixels: np.ndarray = image.reshape(-1, self.shape[2], 4)  # bottom row first

@@ -4,7 +4,6 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import Literal
 
 from tqdm import tqdm
 
@@ -15,9 +14,9 @@ from cloning.recordings.writer import SampleClock
 from cloning.wire.client import (
     CONNECT,
     MANUAL_TELEMETRY,
-    Answer,
     Connection,
     ConnectionLost,
+    Driven,
     parse_answer,
     telemetry_packet,
 )
@@ -33,25 +32,10 @@ RECONNECT_INTERVAL = 1.0  # s between two attempts of the window to connect
 WINDOW_SEND_TIMEOUT = 0.1  # s that the window waits for a server that does not read
 
 
-# Why a drive ended: its laps were driven; the server answers, but the car stays where it is; another error, or Ctrl-C.
-DriveEnd = Literal["laps", "stood_still", "failed"]
-
-
 def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
     """Return the telemetry packet for the present state; steering and throttle: as last commanded, -1..1."""
     frame = cameras.frames(run.car.node.get_transform())[0]
     return telemetry_packet(steering, throttle, run.speed_mph, jpeg(frame), run.place)
-
-
-class Driven:
-    """What a server has a car do: steering and throttle as last commanded, -1..1."""
-
-    steering = throttle = 0.0
-
-    def apply(self, answer: Answer) -> None:
-        """Use the steering and throttle of an answer from now on, if it has any."""
-        if answer.steering is not None and answer.throttle is not None:
-            self.steering, self.throttle = answer.steering, answer.throttle
 
 
 class Client(Driven, ClientSession):
@@ -63,7 +47,7 @@ class Client(Driven, ClientSession):
         self.run, self.cameras, self.realtime = run, cameras, realtime
         self.watch: Callable[[], None] | None = None  # called after each physics step
         self.frames = 0  # number of frames sent
-        self.ended: DriveEnd = "failed"  # until it has ended in another way
+        self.ended = "failed"  # until it has ended in another way: "laps", or "stood_still" though the server answers
         self.own_time = 0.0  # s of wall time that the simulator itself used, in lock-step
         self._moved_at, self._moved_to = 0.0, 0.0  # s and m travelled when the car had last moved by a metre
 

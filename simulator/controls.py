@@ -110,8 +110,7 @@ class Controls:
     ) -> None:
         """Update the commands for one physics step.
 
-        held: the keys that are down; mouse: its horizontal position in the window, -1..1, while its button is down;
-        speed: of the car, mph.
+        held: the keys that are down; mouse: its horizontal position, -1..1, while its button is down; speed: mph.
         """
         for button in sorted(pad.buttons - self.buttons) if pad else ():
             self.press(f"pad {button}")

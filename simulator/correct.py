@@ -87,7 +87,5 @@ class CorrectedClient(Client):
     def summary(self) -> str:
         """Return a line about the corrections."""
         share = 100 * self.expert_time / self.run.time if self.run.time else 0.0
-        return (
-            f"corrections: {self.corrections}, the expert drove {share:.1f} % of the time; "
-            f"{self.recording.rows} rows in {self.recording.folder}"
-        )
+        recorded = f"{self.recording.rows} rows in {self.recording.folder}"
+        return f"corrections: {self.corrections}, the expert drove {share:.1f} % of the time; {recorded}"

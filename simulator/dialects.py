@@ -24,7 +24,7 @@ from cloning.road.generated import PointRoad
 from cloning.road.motion import FULL_LOCK, MPH
 from cloning.road.points import make_road, parse_track_string
 from cloning.road.track import Track
-from cloning.wire.client import Answer, event_packet, parse_commands
+from cloning.wire.client import Driven, event_packet, parse_commands
 from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
@@ -57,7 +57,7 @@ class Stage:
     disturbance: Disturbance | None = None
 
 
-class Dialect:
+class Dialect(Driven):
     """A track with a car that a program drives; a subclass says in which words.
 
     run    the present drive
@@ -74,7 +74,6 @@ class Dialect:
         self.stage, self.still, self.ready, self.episodes = stage, False, True, 0
         self.disturbance = stage.disturbance
         self.views: list[Cameras] = []
-        self.steering = self.throttle = 0.0
         self.replies: list[str] = []  # packets to send besides telemetry
         self.open(stage.source, stage.direction)
 
@@ -107,13 +106,12 @@ class Dialect:
         """Drive for one physics step, after which a car that has left the road is set back."""
         self.run.step(self.steering, self.throttle)
 
-    def apply(self, answer: Answer | None) -> bool:
-        """Drive as a program commands; return whether it can be used."""
-        if answer is None:
-            return False
-        if answer.steering is not None and answer.throttle is not None:
-            self.steering, self.throttle = answer.steering, answer.throttle
-        return True
+    def obey(self, data: Any) -> bool:
+        """Drive as an event's data say; return whether they can be used."""
+        answer = parse_commands(data)
+        if answer:
+            self.apply(answer)
+        return answer is not None
 
     def handle(self, event: str, data: Any) -> bool:
         """Do what an event says; return whether it answers a telemetry. Raises UserError."""
@@ -147,28 +145,23 @@ class Measures(Dialect):
 
     def handle(self, event: str, data: Any) -> bool:
         """Steer, or drive on as before."""
-        return event == "manual" or (event == "steer" and self.apply(parse_commands(data)))
+        return event == "manual" or (event == "steer" and self.obey(data))
 
     def telemetry(self) -> str:
         """Return the usual telemetry, speed in mph, and the measures."""
         run = self.run
-        offset, heading_error = run.lane
-        return event_packet(
-            "telemetry",
-            self.state(MPH)
-            | {
-                "brake": f"{max(0.0, -self.throttle):.4f}",
-                "lapNumber": str(run.laps + 1),
-                "currentWayPoint": str(int(run.s // SECTOR)),
-                "crash": "0",
-                "tot_obes": str(len(run.departures)),
-                "tot_crashes": "0",
-                "distance": f"{run.distance:.4f}",
-                "sim_time": f"{run.time:.4f}",
-                "ang_diff": f"{math.degrees(heading_error):.4f}",
-                "cte": f"{offset:.4f}",
-            },
-        )
+        more = {
+            "brake": f"{max(0.0, -self.throttle):.4f}",
+            "lapNumber": str(run.laps + 1),
+            "currentWayPoint": str(int(run.s // SECTOR)),
+            "crash": "0",
+            "tot_obes": str(len(run.departures)),
+            "tot_crashes": "0",
+            "distance": f"{run.distance:.4f}",
+            "sim_time": f"{run.time:.4f}",
+            "ang_diff": f"{math.degrees(run.lane[1]):.4f}",
+        }
+        return event_packet("telemetry", self.state(MPH) | more)
 
 
 class Roads(Dialect):
@@ -190,7 +183,7 @@ class Roads(Dialect):
         self.same, self._last = event == "steer" and data == self._last, data
         if event == "steer":
             self.still = self.run.at_end
-            return self.apply(parse_commands(data))
+            return self.obey(data)
         if event == "reset":
             if self.run.time:
                 self.restart()
@@ -253,7 +246,7 @@ class Episodes(Dialect):
     def handle(self, event: str, data: Any) -> bool:
         """Steer, start or end an episode, pause or go on. Raises UserError for an unknown track or weather."""
         if event == "action":
-            return self.apply(parse_commands(data))
+            return self.obey(data)
         if event in ("pause_sim", "resume_sim"):
             self.still = event == "pause_sim"
             self.replies.append(event_packet("sim_paused" if self.still else "sim_resumed", {}))

@@ -50,6 +50,7 @@ BUILT_IN = ("straight", "expert")  # drivers that need no camera: steering 0, an
 COLOURS = {"RGB": None, "BGR": cv2.COLOR_RGB2BGR, "YUV": cv2.COLOR_RGB2YUV, "HSV": cv2.COLOR_RGB2HSV}
 PREPROCESSING = {"crop": [0, 0, 0, 0], "colour": "RGB", "range": [0, 255]}  # of an ONNX file that says nothing else
 _ALONE = threading.Lock()  # drives of one process share its cameras; a Dask worker may have several threads
+_cameras: list[Cameras] = []  # this process's, which move from road to road: new ones for each would add up
 Steering = Callable[[np.ndarray], float]  # -1..1, from a frame, uint8 (160, 320, 3), RGB
 Watch = Callable[[Run, Cameras | None], None]
 
@@ -264,12 +265,6 @@ def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | No
             raise SimulatorError(f"{conditions.driver}: {error}; restart the server") from None
 
 
-@functools.cache
-def _cameras() -> list[Cameras]:
-    """Return the list for this process's cameras, which move from road to road: new ones for each would add up."""
-    return []
-
-
 @functools.lru_cache(maxsize=1)  # of several drives of a road one after another
 def scene_of(road: str | PointRoad, look: int) -> Scene:
     """Return a road's scene; the same as for the last call, if that was for the same one."""
@@ -278,12 +273,12 @@ def scene_of(road: str | PointRoad, look: int) -> Scene:
 
 def cameras_at(road: str | PointRoad, look: int) -> Cameras:
     """Return this process's cameras, on the car in this scene."""
-    scene, kept = scene_of(road, look), _cameras()
-    if not kept:
-        kept.append(Cameras(scene, ("center",)))
-    elif kept[0].scene is not scene:
-        kept[0].move(scene)
-    return kept[0]
+    scene = scene_of(road, look)
+    if not _cameras:
+        _cameras.append(Cameras(scene, ("center",)))
+    elif _cameras[0].scene is not scene:
+        _cameras[0].move(scene)
+    return _cameras[0]
 
 
 def _drive(

@@ -21,10 +21,7 @@ PREVIEW_TIME = 0.1  # s: the speed limit is that of the point so far ahead
 
 
 def speed_limits(track: Track, top_speed: float, lateral: float) -> np.ndarray:
-    """Return the speed limit at each of the track's points, (n,) m/s: low enough for its bend and those ahead.
-
-    lateral: the greatest acceleration sideways, m/s².
-    """
+    """Return the speed limits at the track's points for their bends and those ahead: (n,), m/s; lateral: m/s²."""
     limit = np.minimum(top_speed, np.sqrt(lateral / np.maximum(np.abs(track.curvature), 1e-6)))
     for _ in range(2):  # the second pass continues the braking across the first point
         for i in range(len(limit) - 1, -1, -1):

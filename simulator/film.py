@@ -63,10 +63,7 @@ class ChaseFilm(DriveFilm):
     """A film of 15 frames per simulated second."""
 
     def __init__(self, path: str, scene: Scene, cameras: Cameras | None = None, start: float = 0.0):
-        """Open the film; cameras: the first one's last frame is shown in a corner; start: simulated s when it begins.
-
-        Raises OutputError.
-        """
+        """Open the film; cameras: the first one's frames are in a corner; start: simulated s. Raises OutputError."""
         super().__init__(path, SAMPLE_RATE, quality=28, max_bits=MAX_BITS)
         self.view, self.clock, self.cameras = ChaseView(scene), SampleClock(start), cameras
 

@@ -190,8 +190,7 @@ class Joined(ClientSession):
 def join(arguments: argparse.Namespace, track: Track, own: dict[str, Any]) -> int:
     """Let a server drive, print what was driven, into `arguments.log` if that is given, and return the exit status.
 
-    track: the first; own: the options about a road of one's own, which hold for roads that the server sends, too.
-    Raises UserError, OSError.
+    track: the first; own: options of a road of one's own, for sent roads, too. Raises UserError, OSError.
     """
     with open(arguments.log or os.devnull, "w", encoding="utf-8", buffering=1) as log, contextlib.ExitStack() as stack:
         if arguments.log:
@@ -215,10 +214,7 @@ def join(arguments: argparse.Namespace, track: Track, own: dict[str, Any]) -> in
 
 
 def write_launcher(arguments: argparse.Namespace) -> None:
-    """Write the program `arguments.launcher`, which runs `join` with the other arguments and with its own after them.
-
-    Raises SimulatorError.
-    """
+    """Write `arguments.launcher`, a program that runs `join` with these options and its own. Raises SimulatorError."""
     options = ["join", "--dialect", arguments.dialect]
     road = ("track", "road", "width", "marking", "land", "direction", "look", "disturb")
     for name in ("host", "port", "wait", *road, "pace", "fps"):

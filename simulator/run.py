@@ -109,20 +109,14 @@ class Run:
         return len(self.lap_times)
 
     def step(self, steering: float, throttle: float) -> bool:
-        """Drive for one physics step; return False if the car left the road and was set back on its centre line.
-
-        steering, throttle: see `Car.step`.
-        """
+        """Drive a physics step, see `Car.step`; return False if the car left the road and was set back."""
         stayed = self.advance(steering, throttle)
         if not stayed:
             self.set_back()
         return stayed
 
     def advance(self, steering: float, throttle: float) -> bool:
-        """Drive for one physics step; return False if the car left the road, and leave it where it is.
-
-        steering, throttle: see `Car.step`.
-        """
+        """Drive a physics step, see `Car.step`; return False if the car left the road, and leave it where it is."""
         if self.at_end:
             self.s, self.travelled, self.at_end = self.start, self.laps * self.track.length, False
             self.set_back()

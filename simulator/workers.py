@@ -20,6 +20,7 @@ from cloning.base.arguments import number
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.processes import interrupt_deferred
+from cloning.base.progress import progress_bar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -65,13 +66,14 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
             raise
 
 
-def results(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Return the results of all items in their order.
+def results(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item], unit: str = "") -> Iterable[Result]:
+    """Return the results of all items in their order; unit: what a bar that shows how far they are calls them.
 
     As `pool.map`, but for Ctrl-C: that would cancel what runs, and Python 3.11 fails on it when its processes end.
     """
     coming = [pool.submit(work, item) for item in items]
-    return (each.result() for each in coming)
+    done = (each.result() for each in coming)
+    return progress_bar(len(coming), unit, iterable=done) if unit else done
 
 
 def _context() -> BaseContext:

@@ -206,10 +206,7 @@ def free_unused() -> None:
 
 
 class Scene:
-    """The scenery, the car and its shadow in the engine.
-
-    The software renderer has no fog, so haze is mixed into the points' colours.
-    """
+    """The scenery, the car and its shadow in the engine; its renderer has no fog, so points' colours have the haze."""
 
     def __init__(self, scenery: Scenery):
         configure_engine()
@@ -256,20 +253,14 @@ class Scene:
         return shadow
 
     def move_parts(self, steering: float = 0.0, distance: float = 0.0, throttle: float = 0.0) -> None:
-        """Turn the wheels and switch the brake lights, as seen from outside.
-
-        steering, throttle: -1..1; distance: m that the car has driven.
-        """
+        """Turn the wheels, switch the brake lights; steering, throttle: -1..1; distance: m that the car has driven."""
         for wheel, (_, y) in zip(self.wheels, WHEELS, strict=True):
             turned = -FULL_LOCK * steering if y > 0 else 0.0
             wheel.set_hpr(turned, -math.degrees(distance / RADIUS % math.tau), 0)
         (self.brake_lights.show if throttle < 0 else self.brake_lights.hide)()
 
     def move_car(self, transform: core.TransformState) -> None:
-        """Move the car, and update haze, sheen and sky for its position.
-
-        They depend on this position alone, not on earlier ones.
-        """
+        """Move the car; haze, sheen and sky follow its position alone, not earlier ones."""
         self.car.set_transform(transform)
         x, y, z = transform.get_pos()
         self.sky.set_pos(x, y, z)

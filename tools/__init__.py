@@ -5,5 +5,6 @@ import sys
 from cloning.base import program
 
 if sys.argv[0] == "-m":  # as long as Python looks for the tool: Ctrl-C needs no traceback while its libraries load, too
-    name = next(word for word in sys.orig_argv if "tools." in word).rpartition("tools.")[2]
+    tool = next((word for word in sys.orig_argv if word.startswith(("tools.", "-mtools."))), "tools")
+    name = tool.removeprefix("-m").removeprefix("tools.")
     program.end_on_interrupt(name, "stopped" + "; start it again to continue" * (name == "demo"))

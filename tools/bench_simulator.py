@@ -18,7 +18,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 from cloning.base import program
 from cloning.base.arguments import command_line, number
@@ -36,14 +35,6 @@ from tools.command import ROOT
 WARM_UP = 20  # frames before the lock-step measurement
 
 
-class Speed(NamedTuple):
-    """Simulated seconds per second of wall time and of processor time, and the peak memory use in MB."""
-
-    wall: float
-    cpu: float
-    memory: float
-
-
 def memory(pid: int) -> float:
     """Return the memory that a process and its children use, in MB."""
     total = 0
@@ -53,8 +44,11 @@ def memory(pid: int) -> float:
     return total / 1024
 
 
-def recording(track: str, laps: float) -> Speed:
-    """Record laps in a process of its own and measure it. Raises SimulatorError."""
+def recording(track: str, laps: float) -> tuple[float, float, float]:
+    """Record laps in a process of its own. Raises SimulatorError.
+
+    Returns the simulated seconds per second of wall time and of processor time, and the peak memory use in MB.
+    """
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "simulator", "record", f"{folder}/out", "--track", track, "--laps", str(laps)]
         begin = time.perf_counter()
@@ -73,7 +67,7 @@ def recording(track: str, laps: float) -> Speed:
             )
         rows = (Path(folder) / "out" / DRIVING_LOG).read_text(encoding="utf-8").count("\n")
     simulated = rows / SAMPLE_RATE
-    return Speed(simulated / wall, simulated / (usage.ru_utime + usage.ru_stime), peak)
+    return simulated / wall, simulated / (usage.ru_utime + usage.ru_stime), peak
 
 
 def lockstep(track: str, frames: int) -> tuple[float, float]:

@@ -80,10 +80,7 @@ def flops(network: Network) -> int:
 
 
 def part_ab(run: model.TrainingRun, _: int) -> dict[str, float]:
-    """Measure (a) and (b) in one process, with a step of (b) after every fourth batch of (a).
-
-    So other load on the machine affects both equally.
-    """
+    """Measure (a) and (b) together, a step of (b) after every fourth batch of (a): other load affects both alike."""
     fixed_batch, write_pictures, turns = run.generator.start_batch(0)(), run.write_pictures, itertools.count(1)
     spent, steps = 0.0, 0
 
@@ -107,10 +104,7 @@ def part_ab(run: model.TrainingRun, _: int) -> dict[str, float]:
 
 
 def one_by_one(generator: model.Generator, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a batch made as in a typical generator, one image at a time from its file.
-
-    images: uint8 (n, 75, 320, 3); labels: float32 (n,).
-    """
+    """Make a batch as a typical generator does, one image at a time: uint8 (n, 75, 320, 3), labels float32 (n,)."""
     choices, images, angles = generator.sample(number), [], []
     for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
         seen = generator.observations.read(at, camera)[SEEN_ROWS]

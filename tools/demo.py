@@ -149,10 +149,7 @@ def parse_arguments(argv: list[str] | None) -> Namespace:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Take the steps that are not done yet, write the page and print what to do next; return the exit status.
-
-    Raises UserError, OSError.
-    """
+    """Take the steps that are left, and print what to do next; return the exit status. Raises UserError, OSError."""
     arguments = parse_arguments(argv)
     own, track, folder = arguments.recordings, arguments.track, OWN if arguments.recordings else FOLDER
     recordings = find_folders(own) if own else [FOLDER / "recorded"]

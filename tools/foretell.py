@@ -26,7 +26,6 @@ from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME, ROAD_ROWS
-from cloning.base.progress import progress_bar
 from cloning.lane.foretell import (
     ALARM,
     EARLIEST,
@@ -310,7 +309,7 @@ def main(argv: list[str] | None = None) -> int:
     recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
     work = partial(drive_into, folder, options.model)
     with started_workers(threads()) as pool:
-        for _ in progress_bar(len(chosen), "drives", iterable=results(pool, work, chosen)):
+        for _ in results(pool, work, chosen, "drives"):
             pass  # its errors are raised here
     driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]
     limits = fit([each for each in driven if each[0].tunes], recordings)

@@ -42,10 +42,7 @@ def shadowed(look: int) -> int:
 
 
 def every_second_shadowed(look: int) -> int:
-    """Return the look or its twin with shadows: of looks in a row, two have shadows and two have none.
-
-    So laps in alternating directions come with and without shadows in both.
-    """
+    """Return the look or its shadowed twin, two of four in a row, so that both directions have looks of either kind."""
     return shadowed(look) if look % 4 < 2 else look
 
 

@@ -261,19 +261,17 @@ def stacked(examples: Sequence[tuple[np.ndarray, float]]) -> tuple[torch.Tensor,
 
 def save(network: nn.Sequential, how: Published, file: Path) -> None:
     """Write a network as an ONNX file. Raises OSError."""
-    exported = onnx_program(network, torch.zeros(1, 3, *how.size))
     with written_whole(file) as temporary:
-        exported.save(temporary)
+        onnx_program(network, torch.zeros(1, 3, *how.size)).save(temporary)
 
 
 def main() -> int:
     """Rebuild the networks; return the exit status."""
     parser = command_line("public_networks", __doc__)
-    parser.add_argument("recordings", nargs="+", help="folders of recordings")
-    parser.add_argument(
-        "--networks", nargs="+", choices=PUBLISHED, default=list(PUBLISHED), help="which (default: all)"
-    )
-    parser.add_argument("--folder", type=Path, default=Path("public"), help="for the results (default: public)")
+    add = parser.add_argument
+    add("recordings", nargs="+", help="folders of recordings")
+    add("--networks", nargs="+", choices=PUBLISHED, default=list(PUBLISHED), help="which (default: all)")
+    add("--folder", type=Path, default=Path("public"), help="for the results (default: public)")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     recordings = [check_images(read_recording(folder)) for folder in find_folders(options.recordings)]

@@ -33,7 +33,7 @@ from cloning.base.outputs import write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.images import decode, encode
+from cloning.recordings.images import encode
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay import replay
 from cloning.replay.score import driving_metrics
@@ -42,6 +42,8 @@ from cloning.road.disturbances import HELD_OUT, KINDS, STRENGTHS, Disturbance, D
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
 from simulator import driving
+from simulator.benchmark.replays import driver_of
+from simulator.driving import Conditions
 from simulator.run import Run
 from simulator.workers import add_workers, started_workers
 from tools.command import head, row
@@ -53,32 +55,28 @@ TILE, GALLERY_SEED, GALLERY_QUALITY = (160, 80), 3, 60  # columns and rows
 
 
 class Drive(NamedTuple):
-    """A drive of a model in the stand-in, or a replay, whose speed is 0.
+    """A drive of a model in the stand-in, or a replay, which has no laps.
 
-    name    of the model in tables; sha256: of its file
-    on      track, or folder of a recording
-    number  of the course, the seed of the disturbance: so not every drive has its drops in the same place
+    name        of the model in tables; sha256: of its file
+    on          track, or folder of a recording
+    conditions  of which a replay has the driver and the disturbance only
     """
 
-    model: str
     name: str
     sha256: str
     on: str
-    number: int
-    speed: float
-    look: int
-    direction: str
     laps: float
-    disturbance: Disturbance | None
+    conditions: Conditions
 
     @property
     def where(self) -> str:
         """The title under which its figures stand."""
-        return f"{self.name}, {STAND_IN if self.speed else REPLAYS}"
+        return f"{self.name}, {STAND_IN if self.laps else REPLAYS}"
 
     def __str__(self) -> str:
-        course = f" {self.direction}, {self.speed:g} mph, look {self.look}, {self.laps:g} laps" * bool(self.speed)
-        return f"{self.name} {self.sha256[:16]}, {self.on}{course}, {self.disturbance or 'clear'}"
+        how = self.conditions
+        course = f" {how.direction}, {how.speed:g} mph, look {how.look}, {self.laps:g} laps" * bool(self.laps)
+        return f"{self.name} {self.sha256[:16]}, {self.on}{course}, {how.disturbance or 'clear'}"
 
 
 class Figures(NamedTuple):
@@ -100,26 +98,13 @@ def _recording(folder: str) -> tuple[Recording, list[replay.ReferenceLine]]:
 
 def measure(drive: Drive) -> Figures:
     """Drive, in any process. Raises UserError."""
-    if drive.speed:
-        metres = drive.laps * Track(drive.on).length
-        conditions = driving.Conditions(
-            drive.model,
-            drive.speed,
-            drive.look,
-            drive.direction,
-            metres,
-            set_back=True,
-            disturbance=drive.disturbance,
-            seed=drive.number,
-        )
-        driven = driving.drive(conditions, drive.on)
+    how = drive.conditions
+    if drive.laps:
+        driven = driving.drive(how, drive.on)
         return Figures(round(100 * driven.autonomy, 2), len(driven.departures), round(driven.mean, 3))
-    steering, (recording, lines) = driving.load_driver(drive.model), _recording(drive.on)
-
-    def driver(frame: replay.ReplayFrame) -> float:
-        return steering(decode(frame.jpeg()))
-
-    metrics = driving_metrics(replay.drive(recording, lines, LIMITS[-1], driver, disturbance=drive.disturbance))
+    recording, lines = _recording(drive.on)
+    done = replay.drive(recording, lines, LIMITS[-1], driver_of(how.driver), disturbance=how.disturbance)
+    metrics = driving_metrics(done)
     return Figures(metrics["autonomy_percent"], metrics["interventions"], metrics["distance_mean_m"])
 
 
@@ -145,7 +130,7 @@ def curves_of(found: dict[Drive, Figures]) -> Curves:
     """Return the means of autonomy and distance, and the departures, of all courses together."""
     groups: dict[str, dict[Disturbance | None, list[Figures]]] = {}
     for drive, figures in found.items():
-        groups.setdefault(drive.where, {}).setdefault(drive.disturbance, []).append(figures)
+        groups.setdefault(drive.where, {}).setdefault(drive.conditions.disturbance, []).append(figures)
     return {
         where: {
             disturbance: Figures(statistics.fmean(percents), sum(departures), statistics.fmean(metres))
@@ -246,20 +231,21 @@ def main(argv: list[str] | None = None) -> int:
         stem = Path(file).stem
         unique = [Path(other).stem for other in options.models].count(stem) == 1
         models.append((file, stem if unique else file, hashlib.sha256(Path(file).read_bytes()).hexdigest()))
-    courses: list[tuple[str, int, float, int, str, float]] = [
-        (track, 2 * TRACKS.index(track) + i, options.speeds[TRACKS.index(track)], options.look, way, options.laps)
-        for track in options.tracks
-        for i, way in enumerate(DIRECTIONS)
-    ]
+    courses: list[tuple[str, float, Conditions]] = []
+    for track in options.tracks:
+        at, metres = TRACKS.index(track), options.laps * Track(track).length
+        for seed, way in enumerate(DIRECTIONS, 2 * at):  # so not every drive has its drops in the same place
+            how = Conditions("", options.speeds[at], options.look, way, metres, set_back=True, seed=seed)
+            courses.append((track, options.laps, how))
     if options.recordings:
-        courses += [(str(folder), 0, 0, 0, "", 0) for folder in find_folders(options.recordings)]
+        courses += [(str(folder), 0, Conditions("", 0, 0)) for folder in find_folders(options.recordings)]
     if not courses:
         raise UserError("nothing to drive: name --tracks or --recordings")
     kinds, strengths = list(dict.fromkeys(options.kinds)), sorted(set(options.strengths))
     disturbances = [None, *(Disturbance(*each) for each in itertools.product(kinds, strengths))]
     drives = [
-        Drive(file, name, sha256, *course, each)
-        for course in courses
+        Drive(name, sha256, on, laps, how._replace(driver=file, disturbance=each))
+        for on, laps, how in courses
         for each in disturbances
         for file, name, sha256 in models
     ]

@@ -12,16 +12,10 @@ from cloning.base.errors import UserError
 
 
 class ServerProcess:
-    """A server, such as drive.py, in a process that is ended with the `with` statement.
-
-    port: that it listens on.
-    """
+    """A server, such as drive.py, in a process that ends with the `with` statement; port: that it listens on."""
 
     def __init__(self, *command: str | Path):
-        """Start it; command: arguments for the Python interpreter. Raises UserError if it ends before it listens.
-
-        What it prints afterwards is discarded.
-        """
+        """Run Python with these arguments until it listens; what it prints later is lost. Raises UserError."""
         self.process = subprocess.Popen(
             [sys.executable, *map(str, command)], stderr=subprocess.PIPE, text=True, encoding="utf-8"
         )

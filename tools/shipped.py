@@ -95,10 +95,7 @@ def laps(looks: int, fast: int, number_of: dict[str, int], roads: Sequence[Point
 
 
 def drive_lap(folder: Path, lap: Lap, seed: int) -> int:
-    """Record the expert's lap, rendered in this process; return the number of rows.
-
-    Raises RecordingError if the expert leaves the road, and the errors of `RecordingWriter`.
-    """
+    """Record the expert's lap in this process; return its rows. Raises RecordingError, also if it leaves the road."""
     track = Track(lap.track, lap.direction)
     run, expert, clock = Run(track), Expert(track, seed, lateral=lap.lateral), SampleClock(rate=RATE)
     cameras = Cameras(Scene(scenery.build(track.source, lap.look)))
@@ -138,10 +135,7 @@ def render(folder: Path, chosen: list[Lap]) -> list[Path]:
 
 
 def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
-    """Make a folder of each real recording, with a name for which training repeats it, and return these folders.
-
-    Raises RecordingError for two recordings of one name, OSError.
-    """
+    """Return a folder for each real recording, named so that training repeats it. Raises RecordingError, OSError."""
     twins: dict[Path, Path] = {}
     for recording in recordings:
         twin = folder / f"{recording.resolve().name}{PROBLEM_AREAS[0]}"

@@ -14,10 +14,7 @@ class Simulator:
     """The simulator's end of the websocket: blocking, without TCP_NODELAY, each fragment masked with a random key."""
 
     def __init__(self, port: int, host: str = "127.0.0.1", headers: str = "", timeout: float = 20):
-        """Connect and send the websocket's opening handshake.
-
-        headers: additional HTTP headers, each with its line end; timeout: s, for each wait.
-        """
+        """Connect, and send the opening handshake; headers: more of HTTP, with line ends; timeout: s, for each wait."""
         self.socket = socket.create_connection((host, port), timeout)
         self.socket.settimeout(timeout)
         self._buffer = b""

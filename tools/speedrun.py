@@ -65,10 +65,7 @@ def speed_run(train: Sequence[Path], courses: Sequence[Course], options: argpars
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Train and drive with every seed, print a table, and return 1 if a model drives worse than it should.
-
-    Raises UserError, OSError.
-    """
+    """Train and drive, print a table; return 1 if a model drives worse than it should. Raises UserError, OSError."""
     parser = command_line("speedrun", __doc__)
     add = parser.add_argument
     add("recordings", nargs="+", help="real recordings, or folders of recordings")

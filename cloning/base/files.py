@@ -93,10 +93,7 @@ def csv_bytes(rows: Iterable[Iterable[object]]) -> bytes:
 
 
 def write(path: str | Path, data: bytes) -> None:
-    """Write a file completely or not at all, and wait until it is on the disk.
-
-    Raises OSError with the file's name (a full disk, for example); the old file stays.
-    """
+    """Write a file completely or not at all, and wait until it is on the disk. Raises OSError; the old file stays."""
     with written_whole(path) as temporary, open(temporary, "wb") as file:
         file.write(data)
         file.flush()

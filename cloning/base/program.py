@@ -1,8 +1,9 @@
 """How a command prints and ends: its exit status, its last message, and Ctrl-C without a traceback at any moment.
 
-A command imports this first, calls `end_on_interrupt` at once, and `run` at the end of its file. Its exit status is
-DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C). Until `end_on_interrupt`,
-Ctrl-C gives Python's traceback, so nothing is loaded here that Python has not loaded at its start.
+A command imports this first, calls `end_on_interrupt` at once (for a tool, its package does), and `run` at the end of
+its file. Its exit status is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C).
+Until `end_on_interrupt`, Ctrl-C gives Python's traceback, so nothing is loaded here that Python has not loaded at its
+start.
 """
 
 from __future__ import annotations

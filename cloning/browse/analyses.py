@@ -64,10 +64,7 @@ class Result:
     about: dict[str, Any]
 
     def column(self, name: str, centres: np.ndarray) -> np.ndarray:
-        """Return a column in the rows of a recording: float32 (n,), nan in those not analysed.
-
-        centres: int32 (n,), the rows' centre images.
-        """
+        """Return a column in the rows with these centre images: float32 (n,), nan in those not analysed."""
         values = np.full(max(centres.max(initial=0), self.images.max(initial=0)) + 1, np.nan, np.float32)
         values[self.images] = self.columns[name]
         return values[centres]

@@ -1,6 +1,7 @@
 """Compute what models look at on frames, as pictures to lay over them; `attention.py` asks for them over a pipe."""
 
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -15,7 +16,6 @@ import numpy as np
 import torch
 
 from cloning.base.errors import ModelError, UserError, message_of
-from cloning.browse.attention import receive, send
 from cloning.network.attention import visual_backprop
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
@@ -34,25 +34,23 @@ def main() -> None:
         idle.daemon = True
         idle.start()
         try:
-            jpeg, model = receive(sys.stdin.buffer)
+            jpeg, model = pickle.load(sys.stdin.buffer)
         except EOFError:
             return
         idle.cancel()
         message, png = "", b""
         try:
-            png = picture(jpeg, os.fsdecode(model))
+            png = picture(jpeg, model)
         except (UserError, OSError) as error:
             message = message_of(error)
         except ValueError as error:
             message = f"the picture is unusable: {error}"
-        send(sys.stdout.buffer, message.encode(errors="replace"), png)
+        pickle.dump((message, png), sys.stdout.buffer)
+        sys.stdout.buffer.flush()
 
 
 def picture(jpeg: bytes, model: str) -> bytes:
-    """Return a PNG of a frame's size, MAGENTA, as opaque as `opacity` says.
-
-    Raises ModelError, OSError, and ValueError if the JPEG is unusable.
-    """
+    """Return a PNG of a frame's size, MAGENTA, as opaque as `opacity` says. Raises ModelError, OSError, ValueError."""
     frame = decode(jpeg)
     try:
         _, mask = visual_backprop(network(model, Path(model).stat().st_mtime_ns), frame)

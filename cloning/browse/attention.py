@@ -1,28 +1,13 @@
 """What a model looks at on a picture, computed by a process of its own: PyTorch alone takes 250 MB."""
 
-import os
+import pickle
 import subprocess
 import sys
 import threading
-from typing import IO
 
 from cloning.base.errors import ModelError
 
 COMMAND = (sys.executable, "-m", "cloning.browse.attend")
-
-
-def send(pipe: IO[bytes], first: bytes, second: bytes) -> None:
-    """Write two byte strings. Raises BrokenPipeError."""
-    pipe.write(b"%d %d\n" % (len(first), len(second)) + first + second)
-    pipe.flush()
-
-
-def receive(pipe: IO[bytes]) -> tuple[bytes, bytes]:
-    """Read two byte strings. Raises EOFError."""
-    if not (sizes := pipe.readline()):
-        raise EOFError
-    first, second = map(int, sizes.split())
-    return pipe.read(first), pipe.read(second)
 
 
 class Attention:
@@ -41,7 +26,7 @@ class Attention:
             raise ModelError(f"{model}: cannot show what it looks at: the process that computes it has ended")
         message, png = answer
         if message:
-            raise ModelError(message.decode())
+            raise ModelError(message)
         return png
 
     def close(self) -> None:
@@ -51,7 +36,7 @@ class Attention:
             self.process.kill()
             self.process.wait()
 
-    def _ask(self, jpeg: bytes, model: str) -> tuple[bytes, bytes] | None:
+    def _ask(self, jpeg: bytes, model: str) -> tuple[str, bytes] | None:
         """Return the process's message, empty without an error, and its PNG; None if it has ended. Raises OSError."""
         if self.closed:
             return None
@@ -59,8 +44,9 @@ class Attention:
             self.process = subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         assert self.process.stdin and self.process.stdout
         try:
-            send(self.process.stdin, jpeg, os.fsencode(model))
-            return receive(self.process.stdout)
-        except (BrokenPipeError, EOFError):
+            pickle.dump((jpeg, model), self.process.stdin)
+            self.process.stdin.flush()
+            return pickle.load(self.process.stdout)
+        except (BrokenPipeError, EOFError, pickle.UnpicklingError):
             self.process.wait()
             return None

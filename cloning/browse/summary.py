@@ -27,18 +27,17 @@ def driven_seconds(time: np.ndarray) -> np.ndarray:
     return np.r_[0.0, np.cumsum(pause)]
 
 
-def largest(values: np.ndarray, count: int = JUMPS, apart: int = APART) -> list[int]:
-    """Return the rows with the largest absolute values, in this order: at most `count`, at least `apart` rows apart.
+def largest(values: np.ndarray) -> list[int]:
+    """Return the rows with the largest absolute values, in this order: at most JUMPS, at least APART rows apart.
 
-    After the largest comes the largest of those far enough away from it, and so on. values: float (n,), nan where there
-    is none.
+    After the largest comes the largest of those far enough away from it, and so on. values: float (n,), nan for none.
     """
     size = np.where(np.isnan(values), -1.0, np.abs(values))
     rows: list[int] = []
-    while len(rows) < count and size.max(initial=0) > 0:
+    while len(rows) < JUMPS and size.max(initial=0) > 0:
         row = int(size.argmax())
         rows.append(row)
-        size[max(0, row - apart + 1) : row + apart] = -1
+        size[max(0, row - APART + 1) : row + APART] = -1
     return rows
 
 

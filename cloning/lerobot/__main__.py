@@ -33,17 +33,13 @@ def parse_arguments() -> argparse.Namespace:
     """Return the arguments of the command line."""
     parser = command_line("python -m cloning.lerobot", __doc__)
     source = "recordings, or folders with recordings; or one data set, tub or drive"
-    parser.add_argument("source", nargs="+", help=source)
-    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="new folder to write")
-    parser.add_argument("--camera", metavar="NAME", help="of a data set or tub: the camera that looks ahead")
-    parser.add_argument("--steering", metavar="NAME", help="of a data set: the number that is the steering")
-    parser.add_argument(
-        "--full-lock",
-        type=number(float),
-        default=1.0,
-        metavar="VALUE",
-        help="of a data set or tub: its steering at 25 degrees to the right (default 1)",
-    )
+    add = parser.add_argument
+    add("source", nargs="+", help=source)
+    add("--output", type=Path, required=True, metavar="FOLDER", help="new folder to write")
+    add("--camera", metavar="NAME", help="of a data set or tub: the camera that looks ahead")
+    add("--steering", metavar="NAME", help="of a data set: the number that is the steering")
+    lock = "of a data set or tub: its steering at 25 degrees to the right (default 1)"
+    add("--full-lock", type=number(float), default=1.0, metavar="VALUE", help=lock)
     arguments = parser.parse_args()
     if not arguments.full_lock:
         parser.error("argument --full-lock: 0 is straight ahead")

@@ -98,10 +98,7 @@ class Drive:
 
 
 def load_recording(folder: str | Path) -> CheckedRecording:
-    """Read a recording without unusable rows, which are printed, and without repetitions of the row before.
-
-    Raises RecordingError if the recording cannot be read, or no row is left.
-    """
+    """Read a recording without unusable rows, which are printed, and repetitions. Raises RecordingError."""
     recording = check_images(read_recording(folder))
     print_findings(recording)
     if not len(recording):
@@ -177,10 +174,7 @@ class ReplayedCar:
         return float(self.line.offset[at] + self.offset_from_human())
 
     def set_back(self, at: int) -> None:
-        """Put the car onto the reference line and along it, with the human driver's curvature.
-
-        If the line is the human driver's path, the pose is then exactly the human driver's.
-        """
+        """Put the car onto the reference line and along it, with the human driver's curvature."""
         self.curvature = self.human_curvature
         self.yaw = float(-self.line.yaw[at])
         self.right = float(-self.line.offset[at] - REAR_AXLE * np.sin(self.yaw))
@@ -227,10 +221,7 @@ class ReplayFrame:
         return encode(self.view, VIEW_JPEG_QUALITY)
 
     def received(self, rows: slice) -> np.ndarray:
-        """Return rows of `decode(self.jpeg())`, which a server receives: uint8 (k, 320, 3), RGB; only these are made.
-
-        rows: of the frame.
-        """
+        """Return rows of `decode(self.jpeg())`, and make no others: uint8 (k, 320, 3), RGB."""
         if self.disturber:
             return compress(self.view, VIEW_JPEG_QUALITY)[rows]
         if not any(self.pose):
@@ -262,10 +253,9 @@ def drive(
     watch: Watcher | None = None,
     disturbance: Disturbance | None = None,
 ) -> Drive:
-    """Replay a recording at one limit.
+    """Replay a recording at one limit, in m from the reference lines.
 
-    lines: of `reference_lines`; limit: m from the reference line; watch: called after each row, or None; disturbance:
-    of the warped frames, in each stretch with another seed.
+    watch: called after each row, or None; disturbance: of the warped frames, in each stretch with another seed.
     """
     done = Drive(limit)
     for number, line in enumerate(lines):

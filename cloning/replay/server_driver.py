@@ -1,17 +1,12 @@
 """The driver of a replay that is a running drive.py."""
 
 from cloning.replay.replay import ReplayFrame
-from cloning.wire.client import ConnectionLost, telemetry_packet
+from cloning.wire.client import ConnectionLost, Driven, telemetry_packet
 from cloning.wire.session import ClientSession
 
 
-class ServerDriver(ClientSession):
+class ServerDriver(Driven, ClientSession):
     """Sends drive.py the telemetry that the simulator would send, and returns the steering of its answers."""
-
-    def __init__(self, host: str, port: int, wait: float):
-        """wait: see ClientSession."""
-        super().__init__(host, port, wait)
-        self.steering = self.throttle = 0.0  # as last commanded
 
     def __call__(self, frame: ReplayFrame) -> float:
         """Return the steering, -1..1. Raises SimulatorError if the server is missing, or silent, for too long."""
@@ -22,11 +17,8 @@ class ServerDriver(ClientSession):
                     self.connect()
                     self.receive_greeting()
                 self.receive_unasked()
-                answer = self.request_answer(packet)
-                break
+                self.apply(self.request_answer(packet))
+                return self.steering
             except ConnectionLost as error:
                 self.count_reconnection(error)
                 self.close()
-        if answer.steering is not None and answer.throttle is not None:
-            self.steering, self.throttle = answer.steering, answer.throttle
-        return self.steering

@@ -31,10 +31,7 @@ class StretchViews:
         return read_image(self.recording.path(self.stretch.rows.start + at, camera))
 
     def frame(self, at: int, camera: int) -> np.ndarray:
-        """Return a recorded frame, uint8 (160, 320, 3), RGB. Raises RecordingError if it became unusable.
-
-        at: row of the stretch; camera: 0 centre, 1 left, 2 right.
-        """
+        """Return a frame, uint8 (160, 320, 3), RGB; camera: 0 centre, 1 left, 2 right. Raises RecordingError."""
         return self._image(at, camera)[1]
 
     def jpeg(self, at: int) -> bytes:

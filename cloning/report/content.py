@@ -67,10 +67,7 @@ class Lap(NamedTuple):
 
     @classmethod
     def of(cls, picture: Path, most: int) -> "Lap":
-        """Read a lap's picture, and its report and film if they are beside it; most: bytes of the film.
-
-        Raises UserError, OSError.
-        """
+        """Read a lap's picture, and report and film beside it; most: bytes of the film. Raises UserError, OSError."""
         report, film = picture.with_suffix(".json"), picture.with_suffix(".mp4")
         try:
             figures = lap_in_words(json.loads(report.read_bytes())) if report.exists() else ""
@@ -154,10 +151,7 @@ class Report:
             self.looked_at = recording  # the network has not seen it, which tells more
 
     def examples(self) -> list[dict[str, str]]:
-        """Return frames in different bends, each as recorded, and with what the network looks at.
-
-        Raises ModelError, RecordingError.
-        """
+        """Return frames in different bends, and with what the network looks at. Raises ModelError, RecordingError."""
         if self.looked_at is None:
             return []
         recording, shown = self.looked_at, []

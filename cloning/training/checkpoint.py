@@ -304,10 +304,7 @@ class Checkpoint:
             print(f"begins with the weights of {self.run.from_model}, by the recipe {self.run.recipe.name}")
 
     def save(self, progress: Progress, *models: Path) -> None:
-        """Write the network to these files, then model-resume.pt with all that --resume needs, then how far it is.
-
-        Raises OSError.
-        """
+        """Write these models, then model-resume.pt with all that --resume needs, then how far it is. Raises OSError."""
         more = {"arguments": self.run.saved(), "history": progress.history, "run": progress.run}
         position = {name: getattr(progress, name) for name in POSITION}
         position["trail"] = progress.trail

@@ -28,10 +28,7 @@ def to_device(values: np.ndarray, device: torch.device) -> torch.Tensor:
 
 
 class GpuFrames:
-    """The `ROAD_ROWS` of all frames that a training uses, in a GPU's memory.
-
-    pixels  uint8 (frames, 90, 320, 3), RGB
-    """
+    """The `ROAD_ROWS` of all frames of a training, in a GPU's memory: pixels, uint8 (frames, 90, 320, 3), RGB."""
 
     def __init__(self, used: Sequence[np.ndarray], device: torch.device):
         """used: of each recording, bool (m,): which of its images are needed. `load` reads them."""

@@ -54,10 +54,7 @@ class Lanes(LaneAhead):
 
     @classmethod
     def of(cls, recording: Recording) -> Self:
-        """Return the lane at every row of a recording, known or estimated from its frames.
-
-        Raises OSError, and the errors of `lane_position`.
-        """
+        """Return the lane at every row of a recording. Raises OSError, and the errors of `lane_position`."""
         whole = stretches(recording)
         position = lane_position(recording, whole)
         lanes = cls.unknown(len(recording))

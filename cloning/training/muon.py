@@ -41,10 +41,7 @@ def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
 
 
 class Muon(Adam):
-    """Muon for weights, Adam for all else.
-
-    state: as Adam's, but a matrix's is its average gradient alone, "momentum"
-    """
+    """Muon for weights, Adam for all else; state: as Adam's, but a matrix's is its average gradient, "momentum"."""
 
     def __init__(self, parameters: Iterable[nn.Parameter], momentum: float = 0.95, weight_decay: float = 1.0):
         """parameters: see Adam, whose defaults are used for all that is no matrix.

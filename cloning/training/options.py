@@ -94,10 +94,7 @@ REPORT_ONLY, ROBUST_ONLY = ("throttle_threshold", "side_correction"), ("disturbe
 
 
 def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
-    """Parse the command line, of this process if argv is None.
-
-    Exits with status 2 and a message for an unusable argument.
-    """
+    """Parse the command line, of this process if argv is None; an unusable argument ends it with status 2."""
     parser = build_parser(report, robust)
     values = vars(parser.parse_intermixed_args(argv))  # recordings may follow options
     given = frozenset(values)

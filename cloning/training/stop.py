@@ -75,10 +75,7 @@ class StopSignals:
 
 
 def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:
-    """Do the work of a run, and return the exit status: 0, 2 after an error, 128 + signal if it was stopped.
-
-    Says what ended it and what to do, on stderr.
-    """
+    """Do the work of a run, say on stderr what ended it; return 0, 2 after an error, 128 + signal if stopped."""
     files, resume = RunFiles(process.output), process.resume
     status, message, before = 0, "", files.state()
     try:

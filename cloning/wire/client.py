@@ -53,6 +53,17 @@ class Answer:
     throttle: float | None = None
 
 
+class Driven:
+    """What a server has a car do: steering and throttle as last commanded, -1..1."""
+
+    steering = throttle = 0.0
+
+    def apply(self, answer: Answer) -> None:
+        """Use the steering and throttle of an answer from now on, if it has any."""
+        if answer.steering is not None and answer.throttle is not None:
+            self.steering, self.throttle = answer.steering, answer.throttle
+
+
 def parse_event(packet: str) -> tuple[str, Any] | None:
     """Return the name and the data of the event in an Engine.IO packet, or None if it holds no event."""
     if not packet.startswith(EVENT):
@@ -248,10 +259,7 @@ class Connection:
             self._send(packet)
 
     def receive(self, timeout: float) -> str | None:
-        """Return the next packet, or None if none comes within `timeout` seconds; answer and send pings meanwhile.
-
-        Raises ConnectionLost.
-        """
+        """Return the next packet, None after `timeout` s without one; answer and send pings. Raises ConnectionLost."""
         until = time.monotonic() + timeout
         with self._closed_if_lost():
             self._keep_alive()

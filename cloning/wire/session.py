@@ -122,10 +122,7 @@ class ClientSession:
                 break
 
     def receive_unasked(self) -> Answer:
-        """Return the last command that came unasked, or an empty answer if none did.
-
-        If it were not taken now, it would pass for the answer to the next telemetry.
-        """
+        """Return the last command that came unasked, which answers no later telemetry, or an empty answer."""
         latest = Answer()
         for _ in range(MAX_UNASKED):
             if (packet := self.connection.receive(0)) is None:
@@ -134,10 +131,7 @@ class ClientSession:
         return latest
 
     def request_answer(self, packet: str) -> Answer:
-        """Send a telemetry packet and return its answer.
-
-        Raises SimulatorError after `wait` seconds without one, ConnectionLost.
-        """
+        """Send a telemetry packet; return its answer. Raises SimulatorError after `wait` s without, ConnectionLost."""
         sent, until = time.perf_counter(), self.first_answer_due()
         for _ in range(self._in_flight):
             self.connection.send(packet)

@@ -3,33 +3,21 @@
 import argparse
 import functools
 import hashlib
-from collections.abc import Callable, Iterable
-from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from cloning.base.errors import UserError
 from cloning.base.outputs import write_json, write_output
-from cloning.base.progress import progress_bar
 from simulator import driving
 from simulator.benchmark import page, replays, scores, tasks
 from simulator.benchmark.tasks import Task
 from simulator.driving import Drive
 from simulator.workers import results, started_workers
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
 
 def drive(driver: str, task: Task) -> Drive:
     """Drive a task; in any process, it gives the same."""
     return driving.drive(task.conditions(driver), task.source)
-
-
-def each(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item], unit: str) -> list[Result]:
-    """Return the results of all items, and show how far they are."""
-    items = list(items)
-    return list(progress_bar(len(items), unit, iterable=results(pool, work, items)))
 
 
 def run(options: argparse.Namespace) -> None:
@@ -43,10 +31,10 @@ def run(options: argparse.Namespace) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     chosen = tasks.quick_tasks() if options.quick else tasks.all_tasks()
     with started_workers(1 if server else options.processes, options.scheduler) as pool:
-        done = each(pool, functools.partial(drive, entry), chosen, "drive")
+        done = results(pool, functools.partial(drive, entry), chosen, "drive")
         drives = [scores.driven(*pair) for pair in zip(chosen, done, strict=True)]
-        clips = each(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film")
-        drives += each(pool, functools.partial(replays.replay, entry), recordings, "recording")
+        clips = list(results(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film"))
+        drives += results(pool, functools.partial(replays.replay, entry), recordings, "recording")
     groups = scores.by_group(drives)
     file = Path(entry)
     found: dict[str, Any] = {

@@ -11,7 +11,7 @@ from cloning.recordings.format import DRIVING_LOG
 from cloning.replay.replay import Driver, ReplayFrame, drive, load_recording, reference_lines
 from cloning.replay.server_driver import ServerDriver
 from cloning.road.autonomy import LIMITS
-from simulator.benchmark.scores import Driven, percent
+from simulator.benchmark.scores import Figures, percent
 from simulator.benchmark.tasks import RECORDINGS
 from simulator.driving import WAIT, load_driver, server_address
 
@@ -25,14 +25,14 @@ def folders(parent: Path) -> list[Path]:
     return found
 
 
-def replay(driver: str, folder: Path) -> Driven:
+def replay(driver: str, folder: Path) -> Figures:
     """Let a driver, as in `Conditions`, drive a recording at the limit that is near the road's edge. Raises UserError.
 
-    The expert is the recovery steering. In any process, it gives the same.
+    In any process, it gives the same.
     """
     one_thread()
     recording = load_recording(folder)
-    done = drive(recording, reference_lines(recording), LIMITS[1], _driver_of(driver))
+    done = drive(recording, reference_lines(recording), LIMITS[1], driver_of(driver))
     offset, passed = np.abs(done.offset), np.cumsum(done.seconds)
     return {
         "group": "replays",
@@ -46,7 +46,8 @@ def replay(driver: str, folder: Path) -> Driven:
     }
 
 
-def _driver_of(driver: str) -> Driver:
+def driver_of(driver: str) -> Driver:
+    """Return a driver, as in `Conditions`, of replays; the expert is the recovery steering. Raises UserError."""
     if driver == "straight":
         return lambda frame: 0.0
     if driver == "expert":

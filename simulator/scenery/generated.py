@@ -10,27 +10,11 @@ from scipy.spatial.distance import cdist
 
 from cloning.road.generated import PointRoad
 from cloning.road.track import LEFT, RIGHT, Track
-from simulator.scenery import looks, planting, textures
+from simulator.scenery import looks, planting, shapes, textures
 from simulator.scenery.jungle import CLEAR_DISTANCE, DASH, GAP
 from simulator.scenery.looks import Look, Palette
 from simulator.scenery.parts import Haze, Scenery, assemble
-from simulator.scenery.shapes import (
-    Colour,
-    Light,
-    Material,
-    Mesh,
-    boulder,
-    box,
-    distances,
-    flatness,
-    illuminate,
-    merge,
-    plants,
-    roadside,
-    sheet,
-    surface,
-    wall,
-)
+from simulator.scenery.shapes import Colour, Light, Material, Mesh
 from simulator.scenery.textures import Line
 
 GRID_SPACING = 5.0  # m between the ground's points around the road
@@ -233,13 +217,13 @@ def grid_axis(low: float, high: float) -> np.ndarray:
 def ground(terrain: Terrain, rng: Generator, light: Light, palette: Palette, soil: np.ndarray) -> Mesh:
     """Return the ground: level or steep, in patches of two colours."""
     points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1)
-    mesh = sheet(points, (1, 1, 1), terrain.positions / 11.0, soil)
-    steep = np.clip((0.90 - flatness(mesh)) * 5, 0, 1)
+    mesh = shapes.sheet(points, (1, 1, 1), terrain.positions / 11.0, soil)
+    steep = np.clip((0.90 - shapes.flatness(mesh)) * 5, 0, 1)
     tone = sample(textures.clouds(rng, 256, 12, 5), terrain.positions).reshape(-1, 1)
     patch = np.clip(0.25 + 0.5 * tone, 0, 1)
     level = np.array(palette["ground"]) * (1 - patch) + np.array(palette["patch"]) * patch
     mesh.colours[:] = (level * (1 - steep) + np.array(palette["steep"]) * steep) * (1 + 0.08 * tone)
-    return illuminate(mesh, light, face_up=True)
+    return shapes.illuminate(mesh, light, face_up=True)
 
 
 def road(track: Track, marking: str, rng: Generator, look: Look, soil: np.ndarray) -> list[Mesh]:
@@ -255,35 +239,36 @@ def road(track: Track, marking: str, rng: Generator, look: Look, soil: np.ndarra
         "white": (Line(edge - 0.12, 0.12, palette["white"]), Line(0.0, 0.11, palette["white"], DASH / (DASH + GAP))),
     }.get(marking, ())
     asphalt = textures.asphalt(rng, grain=rng.uniform(0.03, 0.12) * look.grain, spots=look.spots)
-    s, painted = distances(*track.extent, 2.0), textures.paint_lines(asphalt, palette["asphalt"], end, lines)
+    s, painted = shapes.distances(*track.extent, 2.0), textures.paint_lines(asphalt, palette["asphalt"], end, lines)
     material = Material(palette["asphalt"], painted, DASH + GAP)
-    meshes = [replace(surface(track, s, end, material), sheen=look.sheen)]
+    meshes = [replace(shapes.surface(track, s, end, material), sheen=look.sheen)]
     for side in (LEFT, RIGHT):
         inner = (end - 0.02, end + 1.4) if marking != "dirt" else (end + 1.2, end + 2.0)
         verge = Material(palette["grass" if marking == "grass" else "ground"], soil, 6.0)
-        verge_mesh = roadside(track, s, side, (*inner, VERGE_EDGE), (-0.01, -0.06, -0.8), verge)
+        verge_mesh = shapes.roadside(track, s, side, (*inner, VERGE_EDGE), (-0.01, -0.06, -0.8), verge)
         beside = [verge_mesh, *border(track, marking, side, look, soil)]
-        meshes += [illuminate(mesh, light, face_up=True) for mesh in beside]
+        meshes += [shapes.illuminate(mesh, light, face_up=True) for mesh in beside]
     return meshes + (posts(track, look) if marking == "rail" else [])
 
 
 def border(track: Track, marking: str, side: int, look: Look, soil: np.ndarray) -> list[Mesh]:
     """Return what marks the road's edge on one side, where lines or grass do not."""
-    s, edge, palette = distances(*track.extent, 2.0), float(track.edges[0, 0]), look.palette
+    s, edge, palette = shapes.distances(*track.extent, 2.0), float(track.edges[0, 0]), look.palette
     if marking == "kerb":
         stripes = Material(palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
-        return [roadside(track, distances(*track.extent), side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
+        along = shapes.distances(*track.extent)
+        return [shapes.roadside(track, along, side, (edge - KERB_WIDTH, edge), (0.03, 0.06), stripes)]
     if marking == "dirt":
         dirt = Material(palette["dirt"], soil, 5.0)
-        return [roadside(track, s, side, (edge - 0.02, edge + 1.3), (0.0, -0.02), dirt)]
+        return [shapes.roadside(track, s, side, (edge - 0.02, edge + 1.3), (0.0, -0.02), dirt)]
     if marking == "wall":
         stone = Material(palette["wall"], soil, 3.0, across=(0, 0.3))
         outline = [(0.0, 0.0), (0.0, WALL_HEIGHT), (0.4, WALL_HEIGHT), (0.4, -2 * WALL_HEIGHT)]
-        return wall(track, s, side, np.add(outline, (edge, 0)), stone)
+        return shapes.wall(track, s, side, np.add(outline, (edge, 0)), stone)
     if marking == "rail":
         metal = Material(palette["rail"], textures.plain(), 4.0, across=(0, 1))
         rail = edge + RAIL_DISTANCE
-        return [roadside(track, s, side, (rail, rail), (0.45, 0.8), metal)]
+        return [shapes.roadside(track, s, side, (rail, rail), (0.45, 0.8), metal)]
     return []
 
 
@@ -295,8 +280,8 @@ def posts(track: Track, look: Look) -> list[Mesh]:
         for side in (LEFT, RIGHT):
             pose = track.at(s, side * offset)
             foot = (pose.x, pose.y, pose.z - 0.5)
-            boxes.append(box(foot, (0.10, 0.10, 1.3), pose.heading, look.palette["rail"], white))
-    return [illuminate(merge(boxes), look.light)]
+            boxes.append(shapes.box(foot, (0.10, 0.10, 1.3), pose.heading, look.palette["rail"], white))
+    return [shapes.illuminate(shapes.merge(boxes), look.light)]
 
 
 def vegetation(terrain: Terrain, land: Land, rng: Generator, palette: Palette, density: float) -> list[Mesh]:
@@ -313,7 +298,7 @@ def vegetation(terrain: Terrain, land: Land, rng: Generator, palette: Palette, d
         heights = rng.uniform(*plant.height, len(feet))
         colours = np.clip(np.array(palette[plant.species]) * rng.uniform(0.75, 1.25, (len(feet), 1)), 0, 1)
         texture = PLANT_TEXTURES[plant.species](rng)
-        meshes.append(plants(feet, heights, plant.width * heights, colours, texture, rng))
+        meshes.append(shapes.plants(feet, heights, plant.width * heights, colours, texture, rng))
     return meshes
 
 
@@ -326,15 +311,12 @@ def boulders(terrain: Terrain, land: Land, rng: Generator, light: Light, palette
         (x, y), size = rng.uniform(low, high), rng.uniform(2, 8)
         if size + 12 < terrain.distance_at((y, x)).item() < 90:
             z = terrain.height_at((y, x)).item()
-            meshes.append(boulder((x, y, z), (size, 0.8 * size, 0.6 * size), rng, palette["rock"], texture))
-    return [illuminate(merge(meshes), light)] if meshes else []
+            meshes.append(shapes.boulder((x, y, z), (size, 0.8 * size, 0.6 * size), rng, palette["rock"], texture))
+    return [shapes.illuminate(shapes.merge(meshes), light)] if meshes else []
 
 
 def scenery(source: PointRoad, look: int) -> Scenery:
-    """Return the scenery of a road in a look; 0 is the road's own.
-
-    The calls draw from one generator, so their order matters.
-    """
+    """Return a road's scenery in a look, 0: its own; the calls draw from one generator, so their order matters."""
     track, land = Track(source), LANDS[source.land]
     appearance = looks.make_look(look, *weather(np.random.default_rng([source.seed, 1]), land))
     light, palette = appearance.light, appearance.palette

@@ -8,25 +8,10 @@ from numpy.random import Generator
 from scipy.spatial import cKDTree
 
 from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
-from simulator.scenery import looks, textures
+from simulator.scenery import looks, shapes, textures
 from simulator.scenery.looks import Look, Palette
 from simulator.scenery.parts import Scenery, assemble
-from simulator.scenery.shapes import (
-    Light,
-    Material,
-    Mesh,
-    box,
-    distances,
-    flatness,
-    ground_grid,
-    illuminate,
-    merge,
-    plants,
-    ribbon,
-    roadside,
-    sheet,
-    surface,
-)
+from simulator.scenery.shapes import Light, Material, Mesh
 from simulator.scenery.textures import Line
 
 ROAD = ROADS["jungle"]  # its bridge crosses the road at 1350 m, 20 m below
@@ -80,9 +65,9 @@ class JungleTerrain:
 
     def __init__(self, track: Track, rng: Generator):
         self.track = track
-        self.positions = ground_grid(track, GROUND_MARGIN, GRID_SPACING)
+        self.positions = shapes.ground_grid(track, GROUND_MARGIN, GRID_SPACING)
         on_ground = np.ones(len(track.points), bool)
-        on_ground[np.round(distances(*ROAD.bridge) / track.step).astype(int)] = False
+        on_ground[np.round(shapes.distances(*ROAD.bridge) / track.step).astype(int)] = False
         self.bridge, points = track.points[~on_ground], track.points[on_ground]
         away, near = cKDTree(points[:, :2]).query(self.positions, k=24)
         weight = 1 / np.maximum(away, 1.0) ** 3
@@ -144,11 +129,11 @@ def ground(terrain: JungleTerrain, rng: Generator, light: Light, palette: Palett
     """Return the ground: grass where it is level, rock where it is steep."""
     rows, columns = terrain.distance.shape
     points = np.concatenate([terrain.positions, terrain.height[..., None]], axis=-1)
-    mesh = sheet(points, (1, 1, 1), terrain.positions / 9.0, textures.rock(rng, streak=1.0))
-    steep = np.clip((0.86 - flatness(mesh)) * 5, 0, 1)
+    mesh = shapes.sheet(points, (1, 1, 1), terrain.positions / 9.0, textures.rock(rng, streak=1.0))
+    steep = np.clip((0.86 - shapes.flatness(mesh)) * 5, 0, 1)
     tone = 1 + 0.16 * textures.clouds(rng, 256, 10, 4)[:rows, :columns].reshape(-1, 1)
     mesh.colours[:] = (np.array(palette["grass"]) * (1 - steep) + np.array(palette["cliff"]) * steep) * tone
-    return terrain.cast_shadows(illuminate(mesh, light, face_up=True), light, 0.55)
+    return terrain.cast_shadows(shapes.illuminate(mesh, light, face_up=True), light, 0.55)
 
 
 def road_texture(rng: Generator, look: Look) -> np.ndarray:
@@ -164,17 +149,17 @@ def road(terrain: JungleTerrain, rng: Generator, look: Look) -> list[Mesh]:
     track, plain, soil = terrain.track, textures.plain(), textures.soil(rng)
     light, palette = look.light, look.palette
     asphalt = Material(palette["asphalt"], road_texture(rng, look), DASH + GAP)
-    meshes = [surface(track, distances(0, track.length, 1.5), ASPHALT_EDGE, asphalt)]
+    meshes = [shapes.surface(track, shapes.distances(0, track.length, 1.5), ASPHALT_EDGE, asphalt)]
     grass, deck = Material(palette["grass"], soil, 9.0), Material(palette["deck"], plain, 4.0, across=(0, 1))
     for start, end in ((0.0, ROAD.bridge[0]), (ROAD.bridge[1], track.length)):
         for side in (LEFT, RIGHT):
-            s = distances(start, end, 2.5)
-            verge = roadside(track, s, side, (ASPHALT_EDGE, 6.2, 9.8), (-0.01, -0.08, -0.75), grass)
-            meshes.append(illuminate(verge, light, face_up=True))
-    outer = ASPHALT_EDGE + 0.25
+            s = shapes.distances(start, end, 2.5)
+            verge = shapes.roadside(track, s, side, (ASPHALT_EDGE, 6.2, 9.8), (-0.01, -0.08, -0.75), grass)
+            meshes.append(shapes.illuminate(verge, light, face_up=True))
+    on_bridge, outer = shapes.distances(*ROAD.bridge), ASPHALT_EDGE + 0.25
     for side in (LEFT, RIGHT):
         faces = (((outer, outer), (0.15, -1.3)), ((ASPHALT_EDGE, outer), (0.15, 0.15)), ((0, outer), (-1.3, -1.3)))
-        meshes += [roadside(track, distances(*ROAD.bridge), side, face, heights, deck) for face, heights in faces]
+        meshes += [shapes.roadside(track, on_bridge, side, face, heights, deck) for face, heights in faces]
     return [terrain.cast_shadows(mesh, light, 0.68) for mesh in meshes]
 
 
@@ -185,12 +170,12 @@ def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
     def add_box(s: float, right: float, bottom: float, size: tuple[float, float, float], colour: str) -> None:
         """Add a box aligned with the road; bottom: metres above the road."""
         pose = track.at(s, right)
-        meshes.append(box((pose.x, pose.y, pose.z + bottom), size, pose.heading, palette[colour], white))
+        meshes.append(shapes.box((pose.x, pose.y, pose.z + bottom), size, pose.heading, palette[colour], white))
 
     rail = Material(palette["rail"], white, 4.0, across=(0, 1))
     for section in RAILS:
-        s = distances(section.start, section.end, 2.0)
-        meshes.append(ribbon(track, s, (section.side * 5.3, section.side * 5.3), (0.45, 0.8), rail))
+        s = shapes.distances(section.start, section.end, 2.0)
+        meshes.append(shapes.ribbon(track, s, (section.side * 5.3, section.side * 5.3), (0.45, 0.8), rail))
         for post_s in np.arange(section.start, section.end, 4.0):
             add_box(post_s, section.side * 5.35, -0.2, (0.12, 0.25, 1.1), "post")
     bends = [
@@ -205,7 +190,7 @@ def rails_and_posts(track: Track, light: Light, palette: Palette) -> list[Mesh]:
     for pier_s in np.arange(ROAD.bridge[0] + 6, ROAD.bridge[1], 18.0):
         for side in (LEFT, RIGHT):
             add_box(pier_s, side * 4.6, -26, (0.7, 0.7, 25.0), "deck")
-    return [illuminate(merge(meshes), light)]
+    return [shapes.illuminate(shapes.merge(meshes), light)]
 
 
 def palms(terrain: JungleTerrain, rng: Generator, light: Light, palette: Palette) -> list[Mesh]:
@@ -228,7 +213,8 @@ def palms(terrain: JungleTerrain, rng: Generator, light: Light, palette: Palette
         bush = i == 3
         texture = textures.bush(rng) if bush else textures.palm(rng)
         height = heights[chosen] * (0.3 if bush else 1.0)
-        meshes.append(plants(feet[chosen], height, (2.0 if bush else 0.9) * height, colours[chosen], texture, rng))
+        width = (2.0 if bush else 0.9) * height
+        meshes.append(shapes.plants(feet[chosen], height, width, colours[chosen], texture, rng))
     return meshes
 
 

@@ -98,10 +98,7 @@ def sheet(
 
 
 def quads(corners: np.ndarray, colours: ArrayLike, texture: np.ndarray) -> Mesh:
-    """Return a mesh of separate quadrangles (n, 4, 3), each from the texture's bottom left corner counter-clockwise.
-
-    colours: (3,), or (n, 1, 3).
-    """
+    """Return separate quadrangles (n, 4, 3), counter-clockwise from bottom left; colours: (3,), or (n, 1, 3)."""
     count = len(corners)
     uv = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float), (count, 1))
     faces = np.arange(count)[:, None, None] * 4 + np.array([[0, 1, 2], [0, 2, 3]])
@@ -187,10 +184,7 @@ def plants(
     texture: np.ndarray,
     rng: np.random.Generator,
 ) -> Mesh:
-    """Return two crossed upright images of a plant at each foot.
-
-    feet: (n, 3), m, on the ground; heights, widths: (n,), m; colours: (n, 3).
-    """
+    """Return two crossed upright images of a plant at each foot, (n, 3); heights, widths: (n,), m; colours: (n, 3)."""
     turn = rng.uniform(0, np.pi, len(feet))[:, None] + np.array([0, np.pi / 2])
     sideways = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)  # (n, 2, 3)
     sideways = sideways * (widths / 2)[:, None, None]

@@ -67,10 +67,7 @@ def write_study(rows: list[Row], folder: Path) -> None:
 
 
 def result(variant: Variant, options: argparse.Namespace) -> dict[str, float]:
-    """Return a network's measures; if there are none yet, train and measure it in a process of its own.
-
-    Raises UserError, OSError.
-    """
+    """Return a network's measures, made in a process of its own if there are none yet. Raises UserError, OSError."""
     file = options.folder / variant.name / "result.json"
     if not file.exists():
         context = multiprocessing.get_context("spawn")

@@ -131,10 +131,7 @@ def recovery(rows: Sequence[Row]) -> dict[str, list[float]]:
 
 
 def correlation_picture(rows: Sequence[Row]) -> bytes:
-    """Return bars of each measure's correlation with driving, in each group, with their intervals.
-
-    The title counts the groups in which the whole interval is above 0.
-    """
+    """Return bars of each measure's correlation with driving, by group; the title counts intervals above 0."""
     compared, figure = groups(rows), Figure((12, 4.9), layout="constrained")
     foretelling = dict.fromkeys(MEASURES, 0)
     every_axes = figure.subplots(1, len(compared), sharey=True)

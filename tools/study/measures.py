@@ -130,10 +130,7 @@ class Simulator:
         return float(steer(self.network, self.cameras.frames(run.car.node.get_transform())[0]))
 
     def lap(self, laps: float) -> tuple[Run, list[float]]:
-        """Drive; after a departure the car is set back and goes on, until the laps' end or TIME_OUT.
-
-        Returns the run and the steering, one for each frame.
-        """
+        """Drive on after departures, to the laps' end or TIME_OUT; return the run and the steering at each frame."""
         run, clock = self.start(), SampleClock(1 / SAMPLE_RATE)
         metres = laps * self.track.length
         steering, commands = self.steering(run), list[float]()
