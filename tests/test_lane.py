@@ -318,3 +318,9 @@ def test_the_accuracy_on_a_recording_is_printed(drive, capsys):
         assert float(appears) == pytest.approx(mounted, abs=0.04)
     [offset] = re.findall(r"lateral offset +([.\d]+) m", printed)
     assert float(offset) == pytest.approx(np.abs(true).mean(), abs=0.15)
+
+
+def test_how_certain_readings_are_is_counted():
+    error, certain = np.array([0.1, -0.4, 0.2, 2.0]), np.array([True, True, True, False])
+    assert lane_accuracy.certainty(error, certain) == "certain 75.0%, 66.7% of them within 0.3 m"
+    assert lane_accuracy.certainty(error, ~certain) == "certain 25.0%, 0.0% of them within 0.3 m"

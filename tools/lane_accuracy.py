@@ -3,12 +3,16 @@
     python -m tools.lane_accuracy RECORDING …    # on rendered frames, and on these real recordings
 
 For rendered frames the true position is known. Single frames from random poses and whole drives are rendered, in looks
-that the network was not trained on. For real recordings only the position of the side cameras in the car is known, and
-in the jungle the line that is painted along the road's centre.
+that the network was not trained on; with --edges, also drives along each kind of edge. For real recordings only the
+position of the side cameras in the car is known, and in the jungle the line that is painted along the road's centre.
 """
 
+import itertools
 import tempfile
 import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -30,7 +34,8 @@ from cloning.lane.reader import (
 )
 from cloning.lane.search import localise
 from cloning.recordings.log import Recording, read_recording
-from cloning.road.motion import stretches
+from cloning.road.generated import COURSES, generate
+from cloning.road.motion import MPH, stretches
 from cloning.road.track import ROADS, Track
 from simulator.car import STEP
 from simulator.record import record
@@ -38,6 +43,8 @@ from tools.lane_frames import RenderedScene, render_all, shadowed
 
 UNSEEN_LOOKS = (1000, 1001, 1002)  # the network was not trained on them, nor on these roads
 UNSEEN_ROADS = tuple(f"road-{k}" for k in range(1, 9))
+FIRST_EDGES, EDGES_SECONDS, EDGES_SPEEDS = 201, 27, (15, 25)  # number of the first road, length of a drive, mph
+NEAR = 0.3  # m: a reading no further from the truth is good
 
 
 def unseen_courses() -> dict[str, list[tuple[str, int]]]:
@@ -64,16 +71,22 @@ def measure_frames(network: LaneNetwork) -> None:
             print(f"{f'{name}, {label}':34}" + "".join(f"{value:8.2f}" for value in values))
 
 
+@contextmanager
+def rendered_drive(track: Track, laps: float, speed: float, look: int) -> Iterator[tuple[Recording, np.ndarray]]:
+    """Record a drive of the expert; give it, and the true lateral offsets, float64 (n,), m. speed: mph."""
+    with tempfile.TemporaryDirectory() as folder:
+        run, _ = record(folder, track, laps, speed, seed=look, look=look)
+        recording = read_recording(folder)
+        step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
+        yield recording, np.array(run.trajectory.offset)[step]
+
+
 def measure_drives(network: LaneNetwork, laps: float) -> None:
     """Print the errors on recordings of the stand-in simulator, which logs the true position."""
     for name, look in (course for courses in unseen_courses().values() for course in courses):
-        with tempfile.TemporaryDirectory() as folder:
-            run, _ = record(folder, Track(name), laps, 30 if name == "lake" else 15, seed=look, look=look)
-            recording = read_recording(folder)
+        with rendered_drive(Track(name), laps, 30 if name == "lake" else 15, look) as (recording, true):
             position = fuse_detections(recording, detect_centres(recording, network))
             located = estimate_lane_position(recording, stretches(recording), network)
-        step = np.round((recording.time - recording.time[0]) / STEP).astype(int)
-        true = np.array(run.trajectory.offset)[step]
         error = position.lateral_offset - true
         print(
             f"{f'rendered drive, {name}, look {look}':34}{len(error):6} rows, error {spread(error)}, "
@@ -81,6 +94,30 @@ def measure_drives(network: LaneNetwork, laps: float) -> None:
             f"slope {np.polyfit(true, position.lateral_offset, 1)[0]:.2f}; trusted {position.trusted.mean():.1%}; "
             f"localised, if possible: error {np.abs(located.lateral_offset - true).mean():.2f} m"
         )
+
+
+def measure_edges(network: LaneNetwork, roads: int) -> None:
+    """Print how certain and how exact readings are by what marks a road's edges; roads: of each kind."""
+    found = defaultdict(list)
+    courses = [(course, k) for course in COURSES for k in range(FIRST_EDGES, FIRST_EDGES + roads)]
+    for (course, k), speed in itertools.product(courses, EDGES_SPEEDS):
+        road, look, direction = generate(f"{course}-{k}"), k if k % 2 else shadowed(k), ("ccw", "cw")[k // 2 % 2]
+        assert road  # of a name that generates one
+        track = Track(road, direction)
+        laps = EDGES_SECONDS * speed * MPH / track.length
+        with rendered_drive(track, laps, speed, look) as (recording, true):
+            position = fuse_detections(recording, detect_centres(recording, network))
+        for group in (f"{course}s", f"{course}s, {road.marking}, {speed} mph"):
+            found[group].append((position.lateral_offset - true, position.trusted))
+    for group, drives in sorted(found.items()):
+        error, certain = (np.concatenate(each) for each in zip(*drives, strict=True))
+        print(f"{group:34}{len(error):6} rows, error {spread(error)}; {certainty(error, certain)}")
+
+
+def certainty(error: np.ndarray, certain: np.ndarray) -> str:
+    """Return the share of certain readings, bool (n,), and how many of these have an error, in m, of at most NEAR."""
+    near = np.mean(np.abs(error[certain]) <= NEAR) if certain.any() else np.nan
+    return f"certain {certain.mean():.1%}, {near:.1%} of them within {NEAR:g} m"
 
 
 def spread(values: np.ndarray) -> str:
@@ -145,11 +182,15 @@ def main(argv: list[str] | None = None) -> int:
     add("--network", metavar="lane.pt", help="file with the weights (default: those that come with the project)")
     laps = "length of each rendered drive; 0: none (default %(default)s)"
     add("--laps", type=number(float, 0, 1e5), default=0.3, help=laps)
+    edges = "generated roads of each kind to render by their edges, two drives each (default %(default)s)"
+    add("--edges", type=number(int, 0), default=0, metavar="ROADS", help=edges)
     options = parser.parse_args(argv)
     network = load_network(options.network)
     if options.laps:
         measure_frames(network)
         measure_drives(network, options.laps)
+    if options.edges:
+        measure_edges(network, options.edges)
     for folder in options.recordings:
         measure_recording(folder, network)
     return program.DONE
