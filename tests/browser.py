@@ -97,10 +97,13 @@ class Page:
 
     def open(self, address: str) -> None:
         """Load a page anew; what an earlier one asked for and said is forgotten."""
-        self.send("Page.navigate", url="about:blank")
-        self.wait("location.href == 'about:blank' && document.readyState == 'complete'")
+        self.empty()
         self.events.clear()
         self.send("Page.navigate", url=address)
+
+    def empty(self) -> None:
+        self.send("Page.navigate", url="about:blank")
+        self.wait("location.href == 'about:blank' && document.readyState == 'complete'")
 
     def text(self, selector: str = "body") -> str:
         return self.run(f"document.querySelector({selector!r}).innerText")
@@ -206,6 +209,11 @@ class Page:
             for each in found
             for node in each["nodes"]
         ]
+
+    def check_look(self, width: int, dark: bool) -> None:
+        """The page fits one of LOOKS and bars nobody; the widest has no barrier that the others have not."""
+        assert self.fits() and self.has_colours(dark)
+        assert width == LOOKS[-1][0] or self.barriers() == []
 
     def addresses(self) -> list[str]:
         """What the page has asked for."""

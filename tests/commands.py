@@ -10,6 +10,8 @@ import unittest.mock
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 import warm
 
@@ -17,6 +19,7 @@ from cloning.base import program
 
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
+PICTURE = cv2.imencode(".png", np.zeros((100, 160, 3), np.uint8))[1].tobytes()  # for one that takes 0.2 s to draw
 HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from another folder
 
 
@@ -34,13 +37,15 @@ def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
 
 
 def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
-    """The same as `run_model`, in this process: it saves two seconds of imports."""
+    """The same as `run_model`, in this process: it saves two seconds of imports. No curves are drawn: see PICTURE."""
     import model
+    from cloning.training import pictures
 
     command = list(map(str, arguments))
     out, err = io.StringIO(), io.StringIO()
     named = unittest.mock.patch.object(program, "name", "model.py")
-    with named, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
+    small = unittest.mock.patch.multiple(pictures, SCALE=1, png=lambda figure, dpi: PICTURE)
+    with named, small, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
         try:
             status: Any = model.main(command)
         except SystemExit as error:  # argparse's

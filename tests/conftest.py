@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
+import warm
 from browser import chromium
 from commands import SHORT, finished_run
 from rendered import render_frame, render_recording
@@ -21,7 +22,7 @@ from cloning.recordings.images import decode
 from simulator import scenery
 
 
-def pytest_configure():
+def pytest_configure(config):
     """Ctrl-C reaches the commands that tests start, even if the tests run in a shell's background, which ignores it.
 
     Here PyTorch computes in one thread: those of several processes would wait for each other.
@@ -29,6 +30,8 @@ def pytest_configure():
     torch.set_num_threads(1)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if warm.FORKS and not hasattr(config, "workerinput"):  # once for all workers of pytest
+        warm.start()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -130,9 +133,15 @@ def finished(sample_recording, tmp_path_factory) -> tuple[subprocess.CompletedPr
     return finished_run(sample_recording, tmp_path_factory.mktemp("run"), *SHORT)
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory):
-    """A page of Chromium, empty at first."""
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
     with chromium(tmp_path_factory.mktemp("profile")) as page:
-        page.look(1280, 900)
         yield page
+
+
+@pytest.fixture
+def page(browser):
+    """A page of Chromium, empty at first; afterwards it asks no server for anything any more."""
+    browser.look(1280, 900)
+    yield browser
+    browser.empty()

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import warm
-from commands import HERE, ROOT
+from commands import HERE, PICTURE, ROOT
 
 CHANGES = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate", "os.link", "os.symlink")
 OPEN = io.open
@@ -118,13 +118,19 @@ def main() -> None:
 # ----------------------------------------------------------------------------------------------------------------------
 # In the test
 
-# Costs a child a tenth of what its own imports and a scenery of its own would.
+# Costs a child a tenth of what its own imports, a scenery of its own, large pictures and drawn curves would. A renderer
+# is a copy of the child, which has no thread yet; another way to start it takes a second.
 PREPARE = f"""
-import functools, sys
+import functools, multiprocessing, sys
 sys.path.append({str(ROOT)!r})
 import av, matplotlib.figure, model, video, drive, simulator.client, simulator.film, simulator.record, simulator.report
 import cloning.network.attention, cloning.replay.command
-from simulator import scenery
+from cloning.report import pictures as charts
+from cloning.training import pictures
+from simulator import record, scenery, workers
+pictures.SCALE, pictures.png, record.MAX_RENDERERS = 1, lambda figure, dpi: {PICTURE!r}, 1
+charts.chart = lambda *draws: charts.Chart("", "")
+workers._context = lambda: multiprocessing.get_context("fork")
 scenery.build = functools.cache(scenery.build)
 scenery.build("lake", 0)
 """

@@ -113,15 +113,15 @@ class Trial:
     """A folder in which a command runs again and again from the same beginning.
 
     command   to kill
-    again     the next run
     begin     a folder: what is there before the command
+    more      options of the next run
     checked   called after each kill
     """
 
     folder: Path
     command: list
-    again: list
     begin: Path | None = None
+    more: tuple[str, ...] = ()
     checked: Callable[[], None] = lambda: None
     companion: Callable[[Watched], None] = lambda running: None  # does its part while the command runs
     done: int = 0  # the command's exit status; a server's is that of the Ctrl-C with which its companion ends it
@@ -177,7 +177,7 @@ class Trial:
 
     def goes_on(self, wanted: dict[str, object]) -> None:
         """The next run ends as if the one before had not been killed, and leaves no temporary file."""
-        ended = self.run(self.again)
+        ended = self.run([*self.command, *self.more])
         assert ended.status == self.done, ended.printed
         self.checked()
         assert differences(contents(self.folder), wanted) == []

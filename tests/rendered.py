@@ -20,11 +20,11 @@ def render_frame(bend: float, offset: float, rng: np.random.Generator) -> np.nda
     far = (160 - rows) / 100
     middle = 160 + 120 * bend * far**2 - offset * (rows - 60) * 1.2
     half = 3.5 * (rows - 60) * 1.2 + 4
-    for row, centre, width in zip(rows, middle, half, strict=True):
-        left, right = int(centre - width), int(centre + width)
-        frame[row, max(left, 0) : max(right, 0)] = (110, 110, 105)
-        for edge in (left, right):
-            frame[row, max(edge - 3, 0) : max(edge + 3, 0)] = (210, 180, 60)
+    left, right = ((middle + side * half).astype(int)[:, None] for side in (-1, 1))
+    columns = np.arange(320)
+    frame[60:][(left <= columns) & (columns < right)] = (110, 110, 105)
+    for edge in (left, right):
+        frame[60:][(edge - 3 <= columns) & (columns < edge + 3)] = (210, 180, 60)
     return np.clip(frame + rng.normal(0, 6, frame.shape), 0, 255).astype(np.uint8)
 
 

@@ -102,7 +102,8 @@ class Server:
             if size == 126:
                 size = struct.unpack(">H", exactly(stream, 2))[0]
             mask = exactly(stream, 4)
-            data = bytes(a ^ mask[i % 4] for i, a in enumerate(exactly(stream, size)))
+            masked = np.frombuffer(exactly(stream, size), np.uint8)
+            data = (masked ^ np.resize(np.frombuffer(mask, np.uint8), size)).tobytes()
             if first & 0x0F == 8:
                 self.closed = True
                 return

@@ -18,7 +18,6 @@ def test_what_failed_is_tried_again(linked, page, tmp_path, model_file):
     model = shutil.copy(model_file, tmp_path / "one.pt")
     (tmp_path / "torch.py").write_text("raise ImportError('no PyTorch today')", encoding="utf-8")
     with browsing(linked, "--model", model, modules=tmp_path) as server:
-        page.look(1280, 900)
         page.open(server.base)
         page.wait("document.querySelector('article button')")
         assert "not known, the analysis failed: ImportError: no PyTorch today" in page.text()
@@ -91,7 +90,6 @@ def test_an_undo_that_fails_can_be_tried_again(linked, page):
     file, header = linked / "excluded.csv", "first image,last image,reason\n"
     cuts = [f"{center(linked, row)},{center(linked, row)},off\n" for row in (0, 1)]
     with browsing(linked) as server:
-        page.look(1280, 900)
         page.open(f"{server.base}{server.hash('lake')}")
         for row in range(2):
             at(page, row)

@@ -196,7 +196,6 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     page.look(390, 844)
     page.wait("innerWidth == 390")
     assert page.run("document.querySelector('#where').getBoundingClientRect().bottom") <= 844
-    page.look(1280, 900)
     assert page.complaints() == []
 
 
@@ -204,7 +203,6 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
     """By a condition and on the histogram; undoing outlives the page, whose address has all that it shows."""
     placed(linked, np.where(np.arange(60) > 40, 1.5, 0.0))
     recording, cuts = read_recording(linked), linked / "excluded.csv"
-    page.look(1280, 900)
     with browsing(linked) as server:
         page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4&of=offset")
         page.shows("#matches", "19 frames in 1 stretch")
@@ -266,7 +264,6 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
 
 
 def test_curves_are_zoomed_with_wheel_window_and_fingers(served, page):
-    page.look(1280, 900)
     page.open(f"{served.base}{served.hash('lake sample')}/30")
     at(page, 30)
     assert page.run("document.querySelector('#window').hidden && document.querySelector('#whole').hidden")
@@ -376,7 +373,7 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
         else:
             page.run(f"location.hash = '{hash}'")
         page.wait(condition)
-        assert page.fits() and page.has_colours(dark) and page.barriers() == []
+        page.check_look(width, dark)
         text = "map(each => `${each.tagName} ${each.id} ${each.textContent}`)"
         assert page.run(f"{CONTROLS}.filter(each => !each.title && !each.matches('a')).{text}") == []
         assert width > 600 or page.run(f"{CONTROLS}.filter(each => each.offsetHeight < 44).{text}") == []

@@ -319,7 +319,7 @@ def test_the_page_fits_every_screen_and_bars_nobody(server, jpegs, page, width, 
     with feeding(server.port, {**telemetry(jpegs[0], speed="8.5000"), "cte": "0.2500"}):
         page.shows("#state", "Driving")
         page.wait(f"{PLOTS} == 5")
-        assert page.fits() and page.has_colours(dark) and page.barriers() == []
+        page.check_look(width, dark)
         figures = "[...document.querySelectorAll('#plots figure')]"
         high = f"Math.max(...{figures}.map(each => each.getBoundingClientRect().bottom))"
         assert width < 900 or page.run(high) <= 900, "all curves on one screen"

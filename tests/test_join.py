@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import socketio
 from socketio.exceptions import ConnectionRefusedError
-from steer_server import Server, unused_port
+from steer_server import Server
 from werkzeug.serving import make_server
 
 from cloning.base.errors import TrackError
@@ -203,11 +203,6 @@ def test_a_lost_answer_stops_nothing(monkeypatch):
         assert join("measures", program) == 0
     times = [data["sim_time"] for data in program.data]
     assert times[4] == times[3] != times[5]
-
-
-def test_a_missing_server_is_reported(capsys):
-    assert main(["join", "--dialect", "roads", "--wait", "0.2", "--port", str(unused_port())]) == 2
-    assert "no server at 127.0.0.1:" in capsys.readouterr().err
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -48,8 +48,7 @@ def lake(tmp_path_factory) -> Path:
 def trained(lake, tmp_path_factory) -> Path:
     """The folder of a finished run of one epoch with seed 0, and the cache of checked images; not to be changed."""
     folder = tmp_path_factory.mktemp("earlier") / "trial"
-    trial = Trial(folder, training(lake, "--epochs", 1), [])
-    trial.whole_run()
+    Trial(folder, training(lake, "--epochs", 1)).whole_run()
     return folder
 
 
@@ -58,20 +57,17 @@ def training(lake: Path, *arguments) -> list:
 
 
 def test_training_killed_anywhere_and_on_a_full_disk(lake, tmp_path):
-    begin = training(lake, "--epochs", 1)
-    trial = Trial(tmp_path / "trial", begin, [*begin, "--resume"])
+    trial = Trial(tmp_path / "trial", training(lake, "--epochs", 1), more=("--resume",))
     trial.killed_everywhere(2)
     trial.disk_full_everywhere(2, status=2)
 
 
 def test_resumed_training_killed_anywhere(lake, trained, tmp_path):
-    command = training(lake, "--epochs", 2, "--resume")
-    Trial(tmp_path / "trial", command, command, trained).killed_everywhere(2)
+    Trial(tmp_path / "trial", training(lake, "--epochs", 2, "--resume"), trained).killed_everywhere(2)
 
 
 def test_a_report_killed_anywhere_and_on_a_full_disk(trained, tmp_path):
-    command = ["-m", "cloning.report", "."]
-    trial = Trial(tmp_path / "trial", command, command, trained)
+    trial = Trial(tmp_path / "trial", ["-m", "cloning.report", "."], trained)
     trial.killed_everywhere(1)
     trial.disk_full_everywhere(1, status=2)
 
@@ -102,11 +98,11 @@ def rows_of(folder: Path) -> list[tuple]:
 @pytest.fixture(params=["record", "correct"])
 def recording(tmp_path, request):
     if request.param == "record":
-        yield Trial(tmp_path / "trial", RECORD, RECORD)
+        yield Trial(tmp_path / "trial", RECORD)
         return
     with ServerForAll("1") as server:  # so the expert takes over after 4 m
         command = ["-m", "simulator", "correct", RECORDED, "--laps", "0.004", "--port", server.port]
-        yield Trial(tmp_path / "trial", command, command)
+        yield Trial(tmp_path / "trial", command)
 
 
 def test_recording_killed_anywhere(recording):
@@ -130,7 +126,7 @@ def test_recording_killed_anywhere(recording):
 
 def test_recording_on_a_full_disk(tmp_path):
     """The rows before it are complete, also if the process is killed while it takes back the last one."""
-    trial = Trial(tmp_path / "trial", RECORD, RECORD)
+    trial = Trial(tmp_path / "trial", RECORD)
     _, points = trial.whole_run()
     complete = rows_of(trial.folder / RECORDED)
     for full in writes(points, 2):
@@ -199,7 +195,7 @@ def driving(model_file, jpegs, tmp_path):
     (begin / "run1" / "2018_07_16_17_11_43_382.jpg").write_bytes(jpegs[7])
     (begin / "run1" / ".2018_07_16_17_11_43_383.jpg.0123abcd.part").write_bytes(jpegs[7][:100])
     command = [ROOT / "drive.py", model_file, "run1", "--port", 0]
-    trial = Trial(tmp_path / "trial", command, command, begin, done=128 + signal.SIGINT)
+    trial = Trial(tmp_path / "trial", command, begin, done=128 + signal.SIGINT)
     car = Car(jpegs)
     trial.companion = car.drive
     return trial, car
@@ -291,7 +287,7 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
     earlier, new = Cut(center[1], center[2], "off"), Cut(center[5], center[9], "off")
     add_cuts(recorded, earlier)
     command = ["-m", "cloning.browse", "lake", "--port", 0]
-    trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin", done=128 + signal.SIGINT)
+    trial = Trial(tmp_path / "trial", command, tmp_path / "begin", done=128 + signal.SIGINT)
     browser = Browser("cuts", [{"first": new.first, "last": new.last, "reason": new.reason}])
 
     def checked() -> None:
@@ -323,7 +319,7 @@ def test_an_exported_part_is_whole_or_no_recording(lake, tmp_path):
     for name in (name for names in images for name in names):
         shutil.copy(lake / "IMG" / name, recorded / "IMG")
     command = ["-m", "cloning.browse", "lake", "--port", 0]
-    trial = Trial(tmp_path / "trial", command, command, tmp_path / "begin", done=128 + signal.SIGINT)
+    trial = Trial(tmp_path / "trial", command, tmp_path / "begin", done=128 + signal.SIGINT)
     browser, part = Browser("export", {"rows": "1-3", "name": "part"}), trial.folder / "part"
     trial.companion = browser.post
 
@@ -350,20 +346,19 @@ def test_an_exported_part_is_whole_or_no_recording(lake, tmp_path):
 
 
 def test_an_analysis_of_the_lane_killed_anywhere(lake, tmp_path):
-    command = ["-m", "cloning.browse.analyse", lake, "lane"]
-    Trial(tmp_path / "trial", command, command).killed_everywhere(1)
+    Trial(tmp_path / "trial", ["-m", "cloning.browse.analyse", lake, "lane"]).killed_everywhere(1)
 
 
 @pytest.fixture(params=["to LeRobot", "from LeRobot"])
 def converting(lake, tmp_path, request):
     command = ["-m", "cloning.lerobot", lake, "--output", "lake"]
-    to_lerobot = Trial(tmp_path / "trial", command, command)
+    to_lerobot = Trial(tmp_path / "trial", command)
     if request.param == "to LeRobot":
         return to_lerobot
     to_lerobot.whole_run()
     shutil.move(tmp_path / "trial", tmp_path / "begin")
     command = ["-m", "cloning.lerobot", "lake", "--output", "recording"]
-    return Trial(tmp_path / "trial", command, command, tmp_path / "begin")
+    return Trial(tmp_path / "trial", command, tmp_path / "begin")
 
 
 def test_a_data_set_and_a_recording_of_one_killed_anywhere_and_on_a_full_disk(converting):
@@ -381,7 +376,7 @@ def filming(jpegs, tmp_path):
     folder.mkdir(parents=True)
     for n, jpeg in enumerate(jpegs):
         (folder / f"2018_07_16_17_11_43_{n:03d}.jpg").write_bytes(jpeg)
-    return Trial(tmp_path / "trial", [ROOT / "video.py", "run1"], [ROOT / "video.py", "run1"], tmp_path / "begin")
+    return Trial(tmp_path / "trial", [ROOT / "video.py", "run1"], tmp_path / "begin")
 
 
 def test_filming_saved_frames_killed_anywhere(filming):
@@ -396,7 +391,7 @@ OUTPUTS = ("--report", "drive.json", "--picture", "above.png", "--film", "film.m
 def simulator_drive(tmp_path):
     with ServerForAll() as server:
         command = ["-m", "simulator", "drive", "--laps", "0.002", "--port", server.port, *OUTPUTS]
-        yield Trial(tmp_path / "trial", command, command)
+        yield Trial(tmp_path / "trial", command)
 
 
 class ServerForAll(Server):
@@ -420,7 +415,7 @@ def test_a_simulated_drive_killed_anywhere_and_on_a_full_disk(simulator_drive):
 
 def test_writing_a_launcher_killed_anywhere_and_on_a_full_disk(tmp_path):
     command = ["-m", "simulator", "join", "--dialect", "roads", "--launcher", "sim.x86_64"]
-    trial = Trial(tmp_path / "trial", command, command)
+    trial = Trial(tmp_path / "trial", command)
     trial.killed_everywhere(3)
     trial.disk_full_everywhere(1, status=2)
 
@@ -428,7 +423,7 @@ def test_writing_a_launcher_killed_anywhere_and_on_a_full_disk(tmp_path):
 def test_a_replay_killed_anywhere_and_on_a_full_disk(lake, model_file, tmp_path):
     files = ("--report", "replay.json", "--picture", "replay.png", "--film", "replay.mp4")
     command = ["-m", "simulator", "replay", lake, "--model", model_file, "--limit", 1, "--reference", "human", *files]
-    trial = Trial(tmp_path / "trial", command, command)
+    trial = Trial(tmp_path / "trial", command)
     trial.killed_everywhere(1)
     trial.killed_at_every_length("replay.mp4", 20 if ALL else 1)
     trial.disk_full_everywhere(1, status=2)

@@ -25,6 +25,7 @@ from rendered import render_recording
 from cloning.base.errors import SimulatorError
 from cloning.lane.recovery import MISHAP, LanePosition
 from cloning.network.network import CROP, Network, load_model, save_model, steer
+from cloning.recordings.check import check_images
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
@@ -156,14 +157,14 @@ def test_the_oracle_drives_to_the_reference_line_and_along_it(recording, lane):
 
 
 def test_the_oracle_drives_the_real_jungle():
-    """Without an intervention at either limit, as nothing else does: so the measure allows it."""
+    """Three quarters of a minute, without an intervention at either limit: so the measure allows it."""
     if not (folders := [folder for folder in real_recordings.FOLDERS if folder.name == "jungle"]):
         pytest.skip(real_recordings.MISSING)
-    recording = replay.load_recording(folders[0])
+    recording = check_images(read_recording(folders[0]).take(slice(700, 1400)), show_progress=False)
     lines = replay.reference_lines(recording)
     for limit in LIMITS:
         metrics = driving_metrics(replay.drive(recording, lines, limit, ORACLE_DRIVER))
-        assert metrics["interventions"] == 0 and metrics["distance_mean_m"] == pytest.approx(0.15, abs=0.02)
+        assert metrics["interventions"] == 0 and metrics["distance_mean_m"] == pytest.approx(0.18, abs=0.02)
 
 
 def road_column(frame: np.ndarray) -> float:

@@ -1,9 +1,10 @@
 """Python commands in children of a warm process, which has loaded the libraries: a start costs 0.1 instead of 2 to 4 s.
 
-`run` and `Popen` take a command that begins with sys.executable, as those of subprocess do. Each worker of pytest has
-one warm process, `python tests/warm.py FD`, which forks a child for each command: with the command's own working
-folder, environment, input and outputs, and with the libraries loaded, but never used. A command that looks at how
-libraries are loaded, at its memory or at itself in the list of processes needs a process of its own, from subprocess.
+`run` and `Popen` take a command that begins with sys.executable, as those of subprocess do. A run of pytest has one
+process, `python tests/warm.py`, that loads the libraries, and never uses them, once a test wants it. It forks a server
+for each worker of pytest, and that a child for each command: with the command's own working folder, environment, input
+and outputs. A command that looks at how libraries are loaded, at its memory or at itself in the list of processes, or
+whose end is tested, needs a process of its own, from subprocess.
 """
 
 import atexit
@@ -15,10 +16,12 @@ import json
 import multiprocessing.connection
 import os
 import runpy
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import types
 import warnings
@@ -33,6 +36,7 @@ LIBRARIES = (
     *("matplotlib.backends.backend_agg", "matplotlib.figure", "matplotlib.pyplot", "panda3d.core", "multiprocessing"),
     *("engineio.async_drivers.eventlet", "socketio", "eventlet.websocket", "eventlet.wsgi", "flask", "wsproto"),
 )
+ADDRESS = "WARM_PROCESS"  # the variable of the environment with the socket's path
 FORKS = sys.platform == "linux"  # elsewhere there is no fork, or libraries do not survive it
 Command = Sequence[str | os.PathLike[str]]
 
@@ -40,16 +44,30 @@ Command = Sequence[str | os.PathLike[str]]
 # In the warm process
 
 
-def load(prepare: str) -> None:
-    """Import, but never use: a library that has started threads would not survive a fork.
+def main(listener: socket.socket, lifeline: socket.socket) -> dict[str, Any] | None:
+    """Fork a server for each worker of pytest that connects, until pytest ends; return a request in a child of it."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the servers
+    loaded = False
+    while lifeline not in multiprocessing.connection.wait([listener, lifeline]):
+        connection = listener.accept()[0]
+        if not loaded:
+            load()
+            loaded = True
+        if not os.fork():
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            listener.close()
+            lifeline.close()
+            return serve(connection)
+        connection.close()
+    return None
 
-    prepare: Python code that does more.
-    """
+
+def load() -> None:
+    """Import, but never use: a library that has started threads would not survive a fork."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # eventlet advises against using it
         for name in LIBRARIES:
             importlib.import_module(name)
-    exec(prepare, {})
     gc.freeze()  # the children then share more of their memory
 
 
@@ -60,7 +78,11 @@ def serve(pytest: socket.socket) -> dict[str, Any] | None:
         if not data:
             return None
         request = json.loads(data)
-        if "wait" in request:
+        answer = 0
+        if "prepare" in request:
+            exec(request["prepare"], {})
+            gc.freeze()
+        elif "wait" in request:
             answer = os.waitstatus_to_exitcode(os.waitpid(request["wait"], 0)[1])
         elif not (answer := os.fork()):
             for number, file in enumerate(files):
@@ -107,23 +129,36 @@ def run_command(words: list[str]) -> None:
 # In the test
 
 
+def start() -> None:
+    """Start the warm process of this run of pytest, which ends with it; only this user reaches its socket."""
+    folder = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, folder)
+    os.environ[ADDRESS] = os.path.join(folder, "warm")
+    ours, theirs = socket.socketpair()
+    atexit.register(ours.close)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener, theirs:
+        listener.bind(os.environ[ADDRESS])
+        listener.listen()
+        files = [listener.fileno(), theirs.fileno()]
+        subprocess.Popen(
+            [sys.executable, __file__, *map(str, files)],
+            env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            pass_fds=files,
+        )
+
+
 class WarmProcess:
-    """The warm process, as the tests see it; it ends with pytest."""
+    """A server of the warm process, as the tests see it; it ends with the worker of pytest."""
 
     def __init__(self, prepare: str) -> None:
-        """prepare: see `load`."""
-        self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        with theirs:
-            subprocess.Popen(
-                [sys.executable, __file__, str(theirs.fileno()), prepare],
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
-            )
+        """prepare: Python code that it runs first."""
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.socket.connect(os.environ[ADDRESS])
         self.lock = threading.Lock()
         atexit.register(self.socket.close)
+        self.ask({"prepare": prepare})
 
     def ask(self, request: dict[str, Any], files: Sequence[int] = ()) -> int:
         """Send a request with files; return the answer: a process's id or exit status."""
@@ -152,7 +187,7 @@ class Child:
         creationflags: int = 0,  # Windows's
         prepare: str = "",
     ):
-        """prepare: each code, see `load`, has a warm process of its own."""
+        """prepare: each code has a server of its own, see `WarmProcess`."""
         self.args = command
         self.returncode: int | None = None
         python, *words = (os.fspath(word) for word in command)
@@ -251,6 +286,9 @@ def run(
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for pytest
-    load(prepare=sys.argv[2])
-    if request := serve(socket.socket(fileno=int(sys.argv[1]))):
+    if request := main(*(socket.socket(fileno=int(number)) for number in sys.argv[1:])):
         run_request(request)
+        if threading.active_count() == 1:  # to take the interpreter apart takes 0.3 s
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            os._exit(0)
