@@ -220,6 +220,14 @@ def test_half_of_a_number_with_a_decimal_comma_is_left_out(log):
     assert findings(found) == [(5, Finding.COLUMNS)] and len(found) == 4
 
 
+def test_decimal_commas_of_four_numbers_may_be_three_that_all_have_one(log):
+    """0,3 | 0,0 | 30,19 without the steering, as Python writes numbers; a row of five parts shows that it is not so."""
+    with pytest.raises(RecordingError, match="or in each row three, all with one"):
+        log(*usual(numbers=["0,3,0,0,30,1875", "0,3,0,0,30,19"]))
+    found = log(*usual(numbers=["0,3,0,0,30,1875", "0,1,0,30,19"]))
+    np.testing.assert_array_equal(numbers(found), np.array([(0.3, 0, 0, 30.1875), (0, 1, 0, 30.19)], np.float32))
+
+
 def test_decimal_commas_that_can_be_read_in_two_ways_are_left_out(log):
     found = log(*usual(numbers=["-0,004694836,1,0,30,19023", "0,1,0,30,19", "0,0,1,0,5"]))
     np.testing.assert_array_equal(

@@ -238,6 +238,8 @@ class RowReader:
             doubt = f", but not those in line {others[0]}"
         elif not any(len(token) > 3 or token[0] == "0" < token[1:] for token in later):
             doubt = ", or more columns"
+        elif all(len(tokens) == 2 * (len(NUMBERS) - 1) for *_, tokens in self._with_commas):
+            doubt = ", or in each row three, all with one"
         for (line, names, tokens), found in zip(self._with_commas, readings, strict=True):
             if len(found) == 1 and not doubt:
                 self._repair("decimal commas", line)
