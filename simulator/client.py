@@ -4,6 +4,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from typing import Literal
 
 from tqdm import tqdm
 
@@ -32,6 +33,10 @@ RECONNECT_INTERVAL = 1.0  # s between two attempts of the window to connect
 WINDOW_SEND_TIMEOUT = 0.1  # s that the window waits for a server that does not read
 
 
+# Why a drive ended: its laps were driven; the server answers, but the car stays where it is; another error, or Ctrl-C.
+DriveEnd = Literal["laps", "stood_still", "failed"]
+
+
 def current_telemetry(run: Run, cameras: Cameras, steering: float, throttle: float) -> str:
     """Return the telemetry packet for the present state; steering and throttle: as last commanded, -1..1."""
     frame = cameras.frames(run.car.node.get_transform())[0]
@@ -47,7 +52,7 @@ class Client(Driven, ClientSession):
         self.run, self.cameras, self.realtime = run, cameras, realtime
         self.watch: Callable[[], None] | None = None  # called after each physics step
         self.frames = 0  # number of frames sent
-        self.ended = "failed"  # until it has ended in another way: "laps", or "stood_still" though the server answers
+        self.ended: DriveEnd = "failed"  # until it has ended in another way
         self.own_time = 0.0  # s of wall time that the simulator itself used, in lock-step
         self._moved_at, self._moved_to = 0.0, 0.0  # s and m travelled when the car had last moved by a metre
 

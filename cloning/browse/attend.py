@@ -50,7 +50,10 @@ def main() -> None:
 
 
 def picture(jpeg: bytes, model: str) -> bytes:
-    """Return a PNG of a frame's size, MAGENTA, as opaque as `opacity` says. Raises ModelError, OSError, ValueError."""
+    """Return a PNG of a frame's size, MAGENTA, as opaque as `opacity` says.
+
+    Raises ModelError, OSError, and ValueError if the JPEG is unusable.
+    """
     frame = decode(jpeg)
     try:
         _, mask = visual_backprop(network(model, Path(model).stat().st_mtime_ns), frame)

@@ -29,7 +29,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     `columns/NAME`, little-endian float32 (n,), and POST tries its analysis again, which failed; `rows/N`, JSON,
     `rows/N/PICTURE.jpg`, and what a model looks at on it, `rows/N/PICTURE/MODEL.png`; `cuts` and `tags`, to which POST
     adds and DELETE deletes some, [{"first", "last", "reason"}, …]; they answer with the details, and with the changed
-    ones as "changed", or with 410 if one to be deleted is not there any more.
+    ones as "changed", or with 410 if none to be deleted is there any more.
     `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are.
     `matches?condition=` has the stretches that meet a condition, `compared?limit=` the models' figures, and POST begins
     what they need. `export` writes a recording, {"rows", "name", "others"}, with all of these other recordings, "ID,…";

@@ -4,8 +4,8 @@
     python -m cloning.network.export model.pt model.onnx
 
 The file takes `frames`, uint8 (n, 160, 320, 3), RGB, as the simulator sends them, and returns `steering`, float32 (n,),
--1..1, positive to the right; values outside must be clipped, as drive.py does. Cropping, brightening and scaling
-are part of it.
+-1..1, positive to the right; values outside must be clipped, as drive.py does. Cropping, brightening and scaling are
+part of it.
 """
 
 from cloning.base import program

@@ -86,9 +86,10 @@ class Network(nn.Module):
 
 
 def exposed(images: torch.Tensor, exposure: Exposure) -> torch.Tensor:
-    """Return images of which the dark ones are brightened, and then those with little contrast get more.
+    """Brighten dark images, and then raise the contrast of those with little; others stay as they are, to the bit.
 
-    images: float32 (N, 3, rows, columns), 0..255. At most MOST_LIGHT and MOST_CONTRAST times; others stay as they are.
+    images: float32 (N, 3, rows, columns), 0..255. They get the exposure's mean, by MOST_LIGHT times at most, and its
+    standard deviation, by MOST_CONTRAST times at most.
     """
     some, dimensions, (mean, deviation) = images[..., ::4, ::4], (1, 2, 3), exposure  # enough to measure
     light = (mean / some.mean(dimensions, keepdim=True).clamp(min=1.0)).clamp(1.0, MOST_LIGHT)

@@ -22,7 +22,7 @@ from cloning.replay.replay import (
     load_recording,
     reference_lines,
 )
-from cloning.replay.score import Metrics, ReplayFilm, plot, replay_report, report_text
+from cloning.replay.score import ReplayFilm, ReplayReport, plot, replay_report, report_text
 from cloning.road.disturbances import Disturbance
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     driver = _driver(options)
     limits = list(dict.fromkeys(options.limits))  # each once
     film = ReplayFilm(options.film) if options.film else None
-    reports: list[Metrics] = []
+    reports: list[ReplayReport] = []
 
     def replay_all() -> None:
         for folder in folders:

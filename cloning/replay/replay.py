@@ -98,7 +98,10 @@ class Drive:
 
 
 def load_recording(folder: str | Path) -> CheckedRecording:
-    """Read a recording without unusable rows, which are printed, and repetitions. Raises RecordingError."""
+    """Read a recording without unusable rows, which are printed, and without repetitions of the row before.
+
+    Raises RecordingError if the recording cannot be read, or no row is left.
+    """
     recording = check_images(read_recording(folder))
     print_findings(recording)
     if not len(recording):
@@ -174,7 +177,10 @@ class ReplayedCar:
         return float(self.line.offset[at] + self.offset_from_human())
 
     def set_back(self, at: int) -> None:
-        """Put the car onto the reference line and along it, with the human driver's curvature."""
+        """Put the car onto the reference line and along it, with the human driver's curvature.
+
+        If the line is the human driver's path, the pose is then exactly the human driver's.
+        """
         self.curvature = self.human_curvature
         self.yaw = float(-self.line.yaw[at])
         self.right = float(-self.line.offset[at] - REAR_AXLE * np.sin(self.yaw))
@@ -221,7 +227,10 @@ class ReplayFrame:
         return encode(self.view, VIEW_JPEG_QUALITY)
 
     def received(self, rows: slice) -> np.ndarray:
-        """Return rows of `decode(self.jpeg())`, and make no others: uint8 (k, 320, 3), RGB."""
+        """Return rows of `decode(self.jpeg())`, which a server receives: uint8 (k, 320, 3), RGB; only these are made.
+
+        rows: of the frame.
+        """
         if self.disturber:
             return compress(self.view, VIEW_JPEG_QUALITY)[rows]
         if not any(self.pose):

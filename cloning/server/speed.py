@@ -6,10 +6,8 @@ STILL, ALMOST_STILL = 0.5, 2.0  # mph: the stand-in simulator tells 0.44 of a ca
 BRAKING = 5.0  # mph: below it the simulator's brake is its weak reverse gear
 UPHILL, STEADY = 0.4, 0.1  # throttle, mph a frame: a car that needs more, and gains no more speed, would roll backwards
 PUSH = 0.7  # throttle that stops it on the steepest grade, and does not throw it forwards
-LOST_FRAMES = {
-    -1.0: 4,
-    PUSH: 12,
-}  # in which the car becomes faster until the other throttle is tried: torque comes late
+# Frames in which a car becomes faster at a throttle until the other one is tried; a push takes longer to tell.
+LOST_FRAMES = {-1.0: 4, PUSH: 12}
 
 
 class SpeedController:

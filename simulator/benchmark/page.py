@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from cloning.server.template import whole_page
 from simulator import driving
 from simulator.benchmark import scores
-from simulator.benchmark.scores import Figures
+from simulator.benchmark.scores import Driven
 from simulator.benchmark.tasks import GROUPS, Task
 from simulator.cameras import Cameras
 from simulator.film import ChaseFilm
@@ -26,9 +26,9 @@ class Clip(NamedTuple):
     again: bool
 
 
-def failures(tasks: Sequence[Task], drives: Sequence[Figures]) -> list[tuple[Task, float]]:
+def failures(tasks: Sequence[Task], drives: Sequence[Driven]) -> list[tuple[Task, float]]:
     """Return the worst drive of each group in which the car left the road, and after how many s it first did."""
-    worst: dict[str, tuple[Task, Figures]] = {}
+    worst: dict[str, tuple[Task, Driven]] = {}
     for task, drive in zip(tasks, drives, strict=True):
         if drive["departures"] and (task.group not in worst or drive["score"] < worst[task.group][1]["score"]):
             worst[task.group] = task, drive

@@ -11,7 +11,7 @@ from cloning.recordings.format import DRIVING_LOG
 from cloning.replay.replay import Driver, ReplayFrame, drive, load_recording, reference_lines
 from cloning.replay.server_driver import ServerDriver
 from cloning.road.autonomy import LIMITS
-from simulator.benchmark.scores import Figures, percent
+from simulator.benchmark.scores import Driven, percent
 from simulator.benchmark.tasks import RECORDINGS
 from simulator.driving import WAIT, load_driver, server_address
 
@@ -25,7 +25,7 @@ def folders(parent: Path) -> list[Path]:
     return found
 
 
-def replay(driver: str, folder: Path) -> Figures:
+def replay(driver: str, folder: Path) -> Driven:
     """Let a driver, as in `Conditions`, drive a recording at the limit that is near the road's edge. Raises UserError.
 
     In any process, it gives the same.

@@ -3,14 +3,35 @@
 from collections.abc import Sequence
 from itertools import pairwise
 from statistics import fmean
-from typing import Any
+from typing import Any, TypedDict
 
 from cloning.lane.foretell import EARLIEST, LATEST, WINDOW
 from simulator.benchmark.tasks import GROUPS, Task
 from simulator.driving import Drive
 
 DIGITS = 2  # of a score, in percent
-Figures = dict[str, Any]  # of a drive, or of a group of drives; score: 0..100
+
+
+class Driven(TypedDict):
+    """What is told of a drive; score: 0..100."""
+
+    group: str
+    name: str
+    score: float
+    departures: list[float]  # s after the start
+    ended: str
+    mean_m: float
+    farthest_m: float
+    alarms: tuple[int, int] | None  # in so many of so many windows, see `alarmed`; None: the entry foretells nothing
+
+
+class Figures(TypedDict):
+    """What is told of a group of drives; score: 0..100."""
+
+    drives: int
+    score: float
+    departures: int
+    mean_m: float
 
 
 def percent(autonomy: float) -> float:
@@ -35,7 +56,7 @@ def alarmed(departures: Sequence[float], alarms: Sequence[float], seconds: float
     return sum(any(begin <= alarm < end for alarm in alarms) for begin, end in found), len(found)
 
 
-def foretelling(drives: Sequence[Figures]) -> str | None:
+def foretelling(drives: Sequence[Driven]) -> str | None:
     """Return how well departures were foretold, in words; None if they were not."""
     sums = [[0, 0], [0, 0]]
     for drive in drives:
@@ -50,8 +71,8 @@ def foretelling(drives: Sequence[Figures]) -> str | None:
     )
 
 
-def driven(task: Task, drive: Drive) -> Figures:
-    """Return what is told of a drive; departures: s after the start; alarms: of `alarmed`, or None."""
+def driven(task: Task, drive: Drive) -> Driven:
+    """Return what is told of a drive."""
     departures = [round(departure.time, 2) for departure in drive.departures]
     return {
         "group": task.group,
@@ -65,7 +86,7 @@ def driven(task: Task, drive: Drive) -> Figures:
     }
 
 
-def by_group(drives: Sequence[Figures]) -> dict[str, Figures]:
+def by_group(drives: Sequence[Driven]) -> dict[str, Figures]:
     """Return the figures of each group that was driven."""
     found: dict[str, Figures] = {}
     for group in dict.fromkeys(each["group"] for each in drives):
