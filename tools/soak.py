@@ -4,12 +4,15 @@
     python -m tools.soak --frames 20000         # about two minutes
 
 Beside a car in lock-step, which leaves and comes again, a second one comes at times, pages are opened and closed, and
-the frames that drive.py saves are deleted. The table has a line for each tenth of the frames. The exit status is 1 if
-an answer was lost or wrong, if memory grew by more than 20 MB after the first twentieth, or if a file or connection was
-left open. Needs Linux, because memory is read from /proc.
+the frames that drive.py saves are deleted. The table has a line for each tenth of the frames. At the end a car drives
+in turns with this drive.py and with one just started, so that what else the machine does counts for both. The exit
+status is 1 if an answer was lost or wrong, if memory grew by more than 20 MB after the first twentieth, if a file or
+connection was left open, or if the 99th percentile of the round trips is 1.2 times the new drive.py's or more. Needs
+Linux, because memory is read from /proc.
 """
 
 import http.client
+import itertools
 import random
 import tempfile
 import threading
@@ -35,6 +38,8 @@ STAY = 3000  # frames, mean: after these the car leaves, and comes again
 KEPT = 2.0  # s: how long saved frames are left on the disk
 SETTLE = 1.0  # s at the start, until what was closed is gone
 PAGES = ("/", "/live")
+TURNS = 10  # with each server, at the end
+MAX_RATIO = 1.2  # of their 99th percentiles
 
 
 @dataclass(frozen=True)
@@ -155,6 +160,20 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
     return lines, [what for what, is_so in found.items() if is_so]
 
 
+def in_turns(servers: tuple[Target, ...], count: int) -> np.ndarray:
+    """Drive this many frames a turn with each server; return their 99th percentiles in ms, the medians of the turns."""
+    jpegs, p99 = frames(), np.empty((TURNS, len(servers)))
+    for turn, server in itertools.product(range(TURNS), range(len(servers))):
+        car, times = Car(servers[server].port, jpegs), []
+        for n in range(count):
+            began = time.perf_counter()
+            car.ask(car.messages[n % len(jpegs)])
+            times.append(1000 * (time.perf_counter() - began))
+        car.simulator.socket.close()
+        p99[turn, server] = np.quantile(times, 0.99)
+    return np.median(p99, 0)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Drive, and print the table; return the exit status. Raises UserError, OSError."""
     parser = command_line("soak", __doc__)
@@ -163,7 +182,12 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder, Target(options.model, Path(folder) / "frames") as server:
         lines, found = soak(server, Path(folder), options.frames)
+        with Target(options.model, Path(folder) / "new") as new:
+            aged, fresh = in_turns((server, new), max(10, options.frames // (50 * TURNS)))
+    if aged >= MAX_RATIO * fresh:
+        found.append(f"{aged / fresh:.1f} times as slow as a drive.py just started")
     print("\n".join(lines))
+    print(f"\np99, in turns with a drive.py just started: {aged:.1f} ms, and {fresh:.1f} ms")
     print(f"\n{'; '.join(found) or 'as at the start'}")
     return program.INCOMPLETE if found else program.DONE
 
