@@ -18,7 +18,7 @@ from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import parts, reader
 from cloning.lane.ahead import centre_ahead
-from cloning.lane.localise import estimate_lane_position
+from cloning.lane.localise import estimate_lane_position, localise_recording
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
@@ -202,8 +202,28 @@ def test_cameras_and_rows_are_fused(drive):
     found = fuse_detections(recording, seen.astype(np.float32))
     assert found.trusted.all()
     assert found.lateral_offset == pytest.approx(0.7, abs=1e-6) and found.heading_error == pytest.approx(0, abs=1e-6)
-    swapped = fuse_detections(recording, seen[:, [0, 2, 1]].astype(np.float32))
-    assert not swapped.trusted.any()
+    narrow = fuse_detections(recording, (0.6 * seen).astype(np.float32))  # as of a road that is wider than it seems
+    assert narrow.trusted.all() and narrow.lateral_offset == pytest.approx(0.7 * 0.6**0.5, abs=0.005)
+    for wrong in (seen[:, [0, 2, 1]], 0.2 * seen):
+        assert not fuse_detections(recording, wrong.astype(np.float32)).trusted.any()
+
+
+@pytest.mark.parametrize(("difference", "which"), [(0.5, 1), (0.05, 0)])
+def test_an_unknown_road_is_read_by_the_network_for_any_road(drive, difference, which):
+    """Though the one for the tracks is trusted in more rows; where both agree, that one counts."""
+    recording = copy.deepcopy(drive[0])
+    recording.steering[:], recording.speed[:] = 0, 30
+    of_tracks = np.broadcast_to(-0.7 - MOUNT_OFFSETS[:, None], (len(recording), 3, 5)).astype(np.float32)
+    of_any_road = of_tracks + difference
+    of_any_road[:40, 1] += 1
+    strips = np.zeros((len(recording), 3, *STRIP_SHAPE), np.uint8)
+    found, networks = (of_tracks, of_any_road), (LaneNetwork(), LaneNetwork())
+    detections = iter(found)
+    position, localised = localise_recording(
+        recording, stretches(recording), lambda _: next(detections), strips.__getitem__, networks
+    )
+    assert not localised and position.trusted.all() == (which == 0)
+    assert np.array_equal(position.lateral_offset, fuse_detections(recording, found[which]).lateral_offset)
 
 
 def test_noise_is_an_unknown_road(copied):

@@ -31,6 +31,7 @@ from cloning.road.motion import REAR_AXLE, Stretch
 from cloning.road.track import ROADS
 
 LONGEST_MISHAP = 300  # rows: more are another road
+MAX_DIFFERENCE = 0.15  # m, mean: positions by two networks that differ less agree
 LINE_ROUNDS = 3  # in each, the painted line is expected where the one before found it
 
 Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
@@ -90,8 +91,9 @@ def localise_recording(
 
     Where a part is on a known road, the position is from its localisation; elsewhere `reader.fuse_detections` gives it.
     Beside a part, fewer than LONGEST_MISHAP rows of its stretch that fit nowhere are a mishap. If no part is on one by
-    a network's detections, the next network is tried; after the last one, those detections count that are trusted in
-    most rows.
+    a network's detections, the next network is tried. On an unknown road the last one's detections count, made for any
+    road: those of the first often agree with each other there, but are wrong. They count only where they agree with the
+    last one's, too, as in a drive on a known track that is too short to be found on it.
 
     stretches: of the recording; detect: returns what `reader.detect_centres` does with a network.
     """
@@ -113,7 +115,9 @@ def localise_recording(
                         piece[start:end] = MISHAP
             return position, localised
         positions.append(position)
-    return max(positions, key=lambda position: position.trusted.sum()), []
+    first, last = positions[0], positions[-1]
+    agree = np.abs(first.lateral_offset - last.lateral_offset).mean() < MAX_DIFFERENCE
+    return (first if agree and first.trusted.sum() >= last.trusted.sum() else last), []
 
 
 def shipped_networks() -> Iterator[LaneNetwork]:

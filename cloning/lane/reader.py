@@ -44,6 +44,9 @@ OUTLIER, ROUNDS = 0.3, 3
 FIT_LENGTH = 4.0  # m before and behind the car's middle: detections within this distance decide the fit
 SMOOTHING_ROWS = 15  # one second, over which cameras are compared and residuals averaged
 MAX_CAMERA_ERROR = 0.3  # m, smoothed: difference between the centres that the side cameras and the centre one detect
+# On roads of another width or kind the network sees too small distances across the road: the side cameras, whose
+# distance is known, seem to be so many times too close together. The offset is seen at about the square root of that.
+SCALE_ROWS, MIN_SCALE = 225, 0.4  # 15 s, over which this scale is averaged; cameras that seem closer don't agree
 # m, smoothed: between the detections and the centre line fitted to them. With 0.4, a real drive in the jungle loses a
 # tenth of its rows; with 0.6, roads drawn without regard to the camera are trusted.
 MAX_RESIDUAL = 0.5
@@ -193,7 +196,6 @@ def fuse_detections(recording: Recording, centres: np.ndarray) -> LanePosition:
 
     Detections before a break in time are not used after it. centres: float32 (n, 3, 5), of `detect_centres`.
     """
-    centres = centres + MOUNT_OFFSETS[:, None]
     pause = np.diff(recording.time)
     breaks = np.flatnonzero((pause <= 0) | (pause > MAX_GAP)) + 1
     parts = [slice(*edges) for edges in itertools.pairwise([0, *breaks.tolist(), len(recording)])]
@@ -203,10 +205,13 @@ def fuse_detections(recording: Recording, centres: np.ndarray) -> LanePosition:
 def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
     """Fit a centre line next to the car in each row without a break; return the car's position relative to it.
 
-    centres: float32 (n, 3, 5), m to the right of the car's middle line.
+    centres: float32 (n, 3, 5), m to the right of the cameras.
     """
-    # Only at the two nearest distances: further ahead a metre is few pixels.
-    camera_error = _smooth(centres[:, 1:] - centres[:, :1])[..., :2]
+    near = centres[..., :2]  # further ahead a metre is few pixels
+    scale = _smooth((near[:, 1] - near[:, 2]).mean(1), SCALE_ROWS) / (MOUNT_OFFSETS[2] - MOUNT_OFFSETS[1])
+    scale = np.clip(scale, MIN_SCALE, 1)
+    near = near / scale[:, None, None] + MOUNT_OFFSETS[:, None]
+    camera_error = _smooth(near[:, 1:] - near[:, :1])
     heading = stretch.heading
     # The path of the rear axle, which slides outwards in bends.
     path, step = heading[:-1] + np.diff(heading) / 2 + stretch.slip, np.diff(stretch.driven)
@@ -215,7 +220,7 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
     distances = DISTANCES_AHEAD[:FITTED]
     ahead = distances + AXLE_TO_CAMERA
     s, c = np.sin(heading)[:, None], np.cos(heading)[:, None]
-    centre = centres[..., :FITTED].mean(1)
+    centre = (centres[..., :FITTED] + MOUNT_OFFSETS[:, None]).mean(1)
     points = np.stack([right[:, None] + ahead * s + centre * c, forward[:, None] + ahead * c - centre * s], axis=-1)
     firsts = np.maximum(np.searchsorted(driven, driven - PAST_METRES), np.arange(len(driven)) - PAST_ROWS)
     offset, yaw, residual = np.empty((3, len(centres)), np.float32)
@@ -238,13 +243,13 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
         yaw[row] = -np.arctan(b)
         offset[row] = -a * np.cos(yaw[row])
     trusted = (np.abs(camera_error) < MAX_CAMERA_ERROR).all((1, 2)) & (_smooth(residual) < MAX_RESIDUAL)
-    return LanePosition.read(offset, yaw, trusted)
+    return LanePosition.read(offset / np.sqrt(scale), yaw, trusted)
 
 
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """Average values (n, …) over SMOOTHING_ROWS with a Hann window, at the ends over the rows that there are."""
-    weights = np.hanning(SMOOTHING_ROWS + 2)[1:-1].astype(np.float32)
-    half, others = SMOOTHING_ROWS // 2, values.ndim - 1
+def _smooth(values: np.ndarray, rows: int = SMOOTHING_ROWS) -> np.ndarray:
+    """Average values (n, …) over an odd number of rows with a Hann window, at the ends over the rows that there are."""
+    weights = np.hanning(rows + 2)[1:-1].astype(np.float32)
+    half, others = rows // 2, values.ndim - 1
     padded = np.pad(values, [(half, half)] + [(0, 0)] * others)
     present = np.pad(np.ones(len(values), np.float32), half)
     total, share = np.zeros_like(values), np.zeros(len(values), np.float32)
