@@ -1,4 +1,4 @@
-"""drive.py without a network socket: speed controller, answers, status line, saved frames, attention."""
+"""drive.py without a network socket: answers, status line, saved frames, attention."""
 
 import base64
 import io
@@ -55,52 +55,7 @@ def steering_always(output: float) -> Network:
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Speed
-
-
-class Car:
-    """A car of mass 1 whose speed follows throttle, drag and slope, in the simulator's figures roughly."""
-
-    def __init__(self):
-        self.speed = 0.0
-
-    def step(self, throttle: float, slope: float = 0.0):
-        self.speed = max(0.0, self.speed + 0.067 * (13 * throttle - 0.1 * self.speed - 22 * slope))
-
-
-def test_controller_begins_as_the_original():
-    """0.1 e + 0.002 Σe by hand, at set speed 9."""
-    controller = drive.SpeedController(9)
-    assert controller.throttle(4) == pytest.approx(0.1 * 5 + 0.002 * 5)
-    assert controller.throttle(8) == pytest.approx(0.1 * 1 + 0.002 * 6)
-    assert controller.throttle(10) == pytest.approx(-0.1 + 0.002 * 5)
-
-
-@pytest.mark.parametrize("set_speeds", [(9, 25, 12), (30,)])
-def test_controller_settles_at_each_set_speed_and_is_not_wound_up_by_a_wait_or_a_hill(set_speeds):
-    controller, car = drive.SpeedController(set_speeds[0]), Car()
-    for _ in range(2000):
-        assert -1 <= controller.throttle(0) <= 1  # held by a wall for two minutes
-    for set_speed in set_speeds:
-        before, controller.set_speed, speeds = car.speed, set_speed, []
-        for frame in range(2000):
-            car.step(controller.throttle(car.speed), slope=0.3 if 600 < frame < 1200 else 0)
-            speeds.append(car.speed)
-        beyond = max(speeds[:600]) - set_speed if set_speed > before else set_speed - min(speeds[:600])
-        assert beyond < 2, "mph over the set speed, or under a lower one"
-        assert abs(car.speed - set_speed) < 0.5, "settled again after the hill"
-
-
-def test_a_set_speed_of_0_brakes_until_the_car_is_at_rest_and_never_drives_it_backwards():
-    controller = drive.SpeedController(9)
-    controller.throttle(9)
-    controller.set_speed = 0
-    assert [controller.throttle(speed) for speed in (9, 6, 4, 4, 4.4, 2, 1, 0.4)] == [-1] * 7 + [0]
-    assert controller.throttle(0.1) == controller.throttle(3) == 0, "nothing brakes a car that rolls so slowly"
-    controller.set_speed = 9
-    assert controller.throttle(1) == pytest.approx(0.8, abs=0.02)
-    controller.set_speed = 0
-    assert [controller.throttle(speed) for speed in (1.2, 1.1, 1.2)] == [-1, -1, 0], "where it stops on a slope"
+# Answers
 
 
 def test_a_change_of_the_set_speed_leaves_the_integral_as_it_is(network, jpeg):
@@ -113,10 +68,6 @@ def test_a_change_of_the_set_speed_leaves_the_integral_as_it_is(network, jpeg):
     answer = session.answer(telemetry(jpeg, speed="8.0000"))
     assert float(answer["throttle"]) == pytest.approx(0.1 * 4 + 0.002 * (50 + 4))
     assert drive.Session(server).controller.set_speed == 12, "the next simulator is driven at it, too"
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Answers
 
 
 def test_frames_are_seen_in_rgb_and_alike_on_disk_and_in_telemetry(session, network, tmp_path):

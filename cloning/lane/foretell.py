@@ -21,6 +21,7 @@ from cloning.lane.reader import (
     ANY_ROAD_WEIGHTS,
     DISTANCES_AHEAD,
     extract_strip,
+    fold_norms,
     load_network,
     normalize,
 )
@@ -60,7 +61,7 @@ class Observer:
 
     def __init__(self, network: Network):
         """Watch a network's activations from now on."""
-        self.network, self.lane = network, load_network(ANY_ROAD_WEIGHTS)
+        self.network, self.lane = network, fold_norms(load_network(ANY_ROAD_WEIGHTS))
         self.activations = torch.empty(0)
         dense = [layer for layer in network.dense if isinstance(layer, nn.Linear)]
         watched = next(layer for layer in dense if layer.in_features <= MOST_UNITS)
