@@ -33,7 +33,7 @@ from cloning.lane.reader import (
     read_strips,
 )
 from cloning.lane.recovery import LanePosition
-from cloning.lane.search import MIN_LOG_LIKELIHOOD, localise
+from cloning.lane.search import MIN_LOG_LIKELIHOOD, Localisation, localise
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
@@ -208,22 +208,33 @@ def test_cameras_and_rows_are_fused(drive):
         assert not fuse_detections(recording, wrong.astype(np.float32)).trusted.any()
 
 
+@pytest.mark.parametrize("known", [0, 60])
 @pytest.mark.parametrize(("difference", "which"), [(0.5, 1), (0.05, 0)])
-def test_an_unknown_road_is_read_by_the_network_for_any_road(drive, difference, which):
-    """Though the one for the tracks is trusted in more rows; where both agree, that one counts."""
+def test_an_unknown_road_is_read_by_the_network_for_any_road(drive, difference, which, known, monkeypatch):
+    """Though the one for the tracks is trusted in more rows; where both agree, that one counts.
+
+    It is all of the recording, or what follows a drive on a known track.
+    """
     recording = copy.deepcopy(drive[0])
     recording.steering[:], recording.speed[:] = 0, 30
+    recording.time[known:] += 100 * (known > 0)
     of_tracks = np.broadcast_to(-0.7 - MOUNT_OFFSETS[:, None], (len(recording), 3, 5)).astype(np.float32)
     of_any_road = of_tracks + difference
-    of_any_road[:40, 1] += 1
-    strips = np.zeros((len(recording), 3, *STRIP_SHAPE), np.uint8)
+    of_any_road[known : known + 20, 1] += 1
     found, networks = (of_tracks, of_any_road), (LaneNetwork(), LaneNetwork())
     detections = iter(found)
+    states = np.tile([0, -0.2, 0.0], (known, 1))
+    parts = [(slice(0, known), Localisation(Track("lake"), states, 0, 0))] if known else []
+    monkeypatch.setattr("cloning.lane.localise.localise_all", lambda *_: iter(parts))
+    strips = np.zeros((len(recording), 3, *STRIP_SHAPE), np.uint8)
     position, localised = localise_recording(
         recording, stretches(recording), lambda _: next(detections), strips.__getitem__, networks
     )
-    assert not localised and position.trusted.all() == (which == 0)
-    assert np.array_equal(position.lateral_offset, fuse_detections(recording, found[which]).lateral_offset)
+    assert localised == parts and position.trusted.all() == (which == 0)
+    wanted = fuse_detections(recording, found[which]).lateral_offset
+    wanted[:known] = -0.2
+    assert np.array_equal(position.lateral_offset, wanted)
+    assert position.placed[:known].all() and not position.placed[known:].any()
 
 
 def test_noise_is_an_unknown_road(copied):

@@ -57,14 +57,17 @@ def test_a_set_speed_of_0_brakes_until_the_car_is_at_rest_and_never_drives_it_ba
 
 @pytest.mark.parametrize("grade, fastest", [(0.0, 3), (0.22, 4), (-0.09, 5.5)])
 def test_a_stopped_car_hardly_rolls_on_a_slope(grade, fastest):
-    """In the jungle; it had 12 mph backwards on the first slope. The last one is where the road begins to fall."""
+    """In the jungle, where it had 12 mph backwards on the second slope, and later left the road there, rolling slowly.
+
+    The last one is where the road begins to fall.
+    """
     track = Track("jungle", "ccw")
     grades = np.array([track.at(s).grade for s in range(int(track.length))])
     run, controller = Run(track, "autonomous"), SpeedController(15)
     run.s = int(np.abs(grades[60:-60] - grade).argmin()) + 60 - 25.0
     run.set_back()
     expert, clock, speeds = Expert(track, top_speed=7, wander=0), SampleClock(1 / 15), []
-    while run.time < 20:
+    while run.time < 50:
         controller.set_speed = 15 if run.time < 5 else 0
         steering, throttle, due = expert.drive(run)[0], controller.throttle(run.speed_mph), False
         while not due:

@@ -33,6 +33,7 @@ ENDING = ".limits.pt"  # of the file beside a network's
 MOST_UNITS = 100  # of the driving network's layer whose activations are compared
 MEAN_TIMES = np.array([0.3, 1.5], np.float32)  # s, of the signs' exponential means
 MAX_STEP = 1.0  # s: a longer pause counts as this
+BLIND_STEP = 0.2  # s, likewise in `Blindness`: at 30 mph, one frame that is like the last before a pause is no alarm
 LEAST = 0.01  # added to a sign before its logarithm is taken
 ALARM = 0.5  # the risk from which it is an alarm: the file's figures are shifted so
 EARLIEST, LATEST = 6.0, 1.0  # s before a departure: an alarm in between foretells it
@@ -163,7 +164,7 @@ class Blindness:
 
     def __call__(self, frame: np.ndarray, time: float, speed: float) -> float:
         """Return it in m, after the next frame; time: s, speed: m/s."""
-        passed, self.time = min(max(time - self.time, 0.0), MAX_STEP), time
+        passed, self.time = min(max(time - self.time, 0.0), BLIND_STEP), time
         self.metres = self.metres + speed * passed if np.array_equal(frame, self.frame) else 0.0
         self.frame = frame
         return self.metres

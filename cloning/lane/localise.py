@@ -91,33 +91,40 @@ def localise_recording(
 
     Where a part is on a known road, the position is from its localisation; elsewhere `reader.fuse_detections` gives it.
     Beside a part, fewer than LONGEST_MISHAP rows of its stretch that fit nowhere are a mishap. If no part is on one by
-    a network's detections, the next network is tried. On an unknown road the last one's detections count, made for any
-    road: those of the first often agree with each other there, but are wrong. They count only where they agree with the
-    last one's, too, as in a drive on a known track that is too short to be found on it.
+    a network's detections, the next network is tried. Rows that are left are on an unknown road. There the last one's
+    detections count, made for any road: those of the first often agree with each other there, but are wrong. They count
+    only where they agree with the last one's, too, as in a drive on a known track that is too short to be found on it.
 
     stretches: of the recording; detect: returns what `reader.detect_centres` does with a network.
     """
-    positions = []
+    positions, localised = list[LanePosition](), list[tuple[slice, Localisation]]()
+    placed, piece = np.zeros(len(recording), bool), np.zeros(len(recording), np.int32)
+    unknown = ~placed
     for network in networks:
         centres = detect(network)
-        position = fuse_detections(recording, centres)
-        if localised := list(localise_all(recording, stretches, centres, strips)):
-            for number, (rows, localisation) in enumerate(localised, 1):
-                _, offset, heading_error = localisation.states.T
-                position.lateral_offset[rows] = offset + REAR_AXLE * np.sin(heading_error)
-                position.heading_error[rows], position.trusted[rows] = heading_error, True
-                position.placed[rows], position.piece[rows] = True, number
-            for stretch in stretches:
-                placed, piece = position.placed[stretch.rows], position.piece[stretch.rows]
-                changes = np.flatnonzero(np.diff(np.r_[False, ~placed, False])).reshape(-1, 2) if placed.any() else ()
-                for start, end in changes:
-                    if end - start < LONGEST_MISHAP:
-                        piece[start:end] = MISHAP
-            return position, localised
-        positions.append(position)
+        positions.append(fuse_detections(recording, centres))
+        localised = localised or list(localise_all(recording, stretches, centres, strips))
+        for number, (rows, _) in enumerate(localised, 1):
+            placed[rows], piece[rows] = True, number
+        for stretch in stretches:
+            here = placed[stretch.rows]
+            changes = np.flatnonzero(np.diff(np.r_[False, ~here, False])).reshape(-1, 2) if here.any() else ()
+            for start, end in changes:
+                if end - start < LONGEST_MISHAP:
+                    piece[stretch.rows][start:end] = MISHAP
+        unknown = ~placed & (piece != MISHAP)
+        if localised and not any(unknown[stretch.rows].any() for stretch in stretches):
+            break
     first, last = positions[0], positions[-1]
-    agree = np.abs(first.lateral_offset - last.lateral_offset).mean() < MAX_DIFFERENCE
-    return (first if agree and first.trusted.sum() >= last.trusted.sum() else last), []
+    difference = np.abs(first.lateral_offset - last.lateral_offset)[unknown]
+    agree = difference.sum() < MAX_DIFFERENCE * len(difference)
+    is_first = agree and first.trusted[unknown].sum() >= last.trusted[unknown].sum()
+    position = replace(first if is_first else last, placed=placed, piece=piece)
+    for rows, localisation in localised:
+        _, offset, heading_error = localisation.states.T
+        position.lateral_offset[rows] = offset + REAR_AXLE * np.sin(heading_error)
+        position.heading_error[rows], position.trusted[rows] = heading_error, True
+    return position, localised
 
 
 def shipped_networks() -> Iterator[LaneNetwork]:

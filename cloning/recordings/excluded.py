@@ -118,9 +118,9 @@ def delete_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> list[Cut]:
     found: list[Cut] = []
 
     def delete(lines: list[str], there: list[Cut]) -> list[str]:
-        at = {each.row(): each.line for each in there}
-        found[:] = (cut for cut in cuts if cut.row() in at)
-        deleted = {at[cut.row()] for cut in found}
+        present, gone = {each.row() for each in there}, {cut.row() for cut in cuts}
+        found[:] = (cut for cut in cuts if cut.row() in present)
+        deleted = {each.line for each in there if each.row() in gone}  # also if the same one was written twice
         return [line for number, line in enumerate(lines, 1) if number not in deleted]
 
     _change(folder / file, delete)
