@@ -125,7 +125,7 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
     time.sleep(SETTLE)
     early = before = Reading.of(server)
     alone = before.files
-    bar = progress_bar(count, "frames")
+    bar = progress_bar(count, "frame")
     with Company(server.port, new_car, folder) as company, bar:
         for tenth in range(TENTHS):
             times, others = [], company.answered
