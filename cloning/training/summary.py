@@ -99,7 +99,7 @@ def run_header(network: Network, device: torch.device, precision: torch.dtype, r
     name = str(precision).removeprefix("torch.")
     size = sum(parameter.numel() for parameter in network.parameters())
     table = f"{layer_table(network)}\n" if layers else ""
-    return f"{table}\na network of {size:,} parameters on {device}, {name}, {threads()} threads{processes}"
+    return f"{table}\na network of {size:,} parameters on {device}, {name}, {plural(threads(), 'thread')}{processes}"
 
 
 def epoch_line(row: EpochMetrics) -> str:
