@@ -297,7 +297,7 @@ def choose_model(argument: Path | None, folder: Path | None) -> Path:
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; arguments: those of this process if None."""
-    status = "Exit status: 0 after Ctrl-C, 1 if frames could not be saved, 2 if the server could not start."
+    status = "Exit status: 130 after Ctrl-C, 1 if frames could not be saved, 2 if the server could not start."
     parser = command_line(None, __doc__, status)
     add = parser.add_argument
     add("model", nargs="?", type=Path, help="model file (default: model.pt if it exists, else the project's own)")

@@ -36,14 +36,14 @@ LAPS: Options = {
     "--laps": {"type": number(float, 1e-6, 1e5), "default": 1, "help": "laps to drive, such as 0.5 (default 1)"}
 }
 SERVER: Options = {
-    "--host": {"type": address, "default": "127.0.0.1", "help": "address of drive.py (default %(default)s)"},
-    "--port": {"type": number(int, 1, MAX_PORT), "default": PORT, "help": "port of drive.py (default %(default)s)"},
+    "--host": {"type": address, "default": "127.0.0.1", "help": "address of the server (default %(default)s)"},
+    "--port": {"type": number(int, 1, MAX_PORT), "default": PORT, "help": "port of the server (default %(default)s)"},
 }
 WAIT: Options = {
     "--wait": {
         "type": number(float, 0.01, 1e6),
         "default": 60.0,
-        "help": "seconds to wait for drive.py, or for an answer that the car can use (default 60)",
+        "help": "seconds to wait for the server, or for an answer that the car can use (default 60)",
     }
 }
 ROAD: Options = {
@@ -160,7 +160,8 @@ def _add_replay(commands: "Subparsers") -> None:
     text = "measure offsets from the lane centre, estimated from the frames (default), or from the human driver's path"
     add("--reference", choices=("lane", "human"), default="lane", help=text)
     add("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
-    add("--picture", metavar="FILE.png", help="plot lateral offset and steering over time")
+    text = "plot lateral offset and steering over time; of several recordings, FILE-RECORDING.png each"
+    add("--picture", metavar="FILE.png", help=text)
     add("--film", metavar="FILE.mp4", help="film what the model sees in the drives at the last limit")
 
 

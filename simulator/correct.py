@@ -6,6 +6,7 @@ So the network learns, where it gets to by its own faults, how to come back. Thi
 
 import math
 
+from cloning.base.outputs import plural
 from cloning.recordings.writer import RecordingWriter
 from cloning.road.disturbances import Disturbance
 from cloning.road.motion import MPH
@@ -87,5 +88,6 @@ class CorrectedClient(Client):
     def summary(self) -> str:
         """Return a line about the corrections."""
         share = 100 * self.expert_time / self.run.time if self.run.time else 0.0
-        recorded = f"{self.recording.rows} rows in {self.recording.folder}"
+        recorded = f"{plural(self.recording.rows, 'row')} in {self.recording.folder}"
+        recorded = recorded if self.recording.rows else "nothing was recorded"
         return f"corrections: {self.corrections}, the expert drove {share:.1f} % of the time; {recorded}"

@@ -140,6 +140,8 @@ def load_driver(driver: str) -> Steering:
         import onnxruntime  # an optional library
     except ImportError as error:
         raise UserError(f"{error}; pip install onnxruntime") from None
+    if not Path(driver).is_file():
+        raise UserError(f"{driver}: no such file; `python -m cloning.network.export model.pt {driver}` writes one")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     try:

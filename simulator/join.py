@@ -26,6 +26,7 @@ STILL = 1 / 15  # s of real time between two telemetries while simulated time st
 # How long a driver in another thread than the program's answers is waited for, s: until one is known to be there, and
 # then. Commands may be constant, and drivers in the same thread, so after so many vain attempts it is not waited for.
 BRIEFLY, PATIENTLY, ATTEMPTS = 0.15, 2.0, 3
+LAUNCHER = "#!/bin/sh\nPYTHONPATH="  # how one begins; another file of its name may be the real simulator
 MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 200,000
 
 
@@ -222,11 +223,15 @@ def write_launcher(arguments: argparse.Namespace) -> None:
         if value is not None:
             options += [f"--{name}", os.path.abspath(value) if name == "road" else str(value)]
     command = shlex.join([sys.executable, "-m", "simulator", *options])
-    here = f'PYTHONPATH={shlex.quote(str(Path(__file__).parents[1]))}"${{PYTHONPATH:+:$PYTHONPATH}}"'
+    here = f'{LAUNCHER}{shlex.quote(str(Path(__file__).parents[1]))}"${{PYTHONPATH:+:$PYTHONPATH}}"'
     path = Path(arguments.launcher)
     try:
+        if path.is_file():
+            with open(path, "rb") as file:
+                if file.read(len(LAUNCHER)) != LAUNCHER.encode():
+                    raise SimulatorError(f"{path}: exists already, and is no launcher; name another file")
         with written_whole(path) as temporary:
-            temporary.write_text(f'#!/bin/sh\n{here} exec {command} "$@"\n', encoding="utf-8")
+            temporary.write_text(f'{here} exec {command} "$@"\n', encoding="utf-8")
             temporary.chmod(0o755)
     except OSError as error:
         raise SimulatorError(f"{path}: {error.strerror}; name a file in a folder that can be written") from error

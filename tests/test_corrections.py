@@ -105,7 +105,7 @@ def test_without_a_correction_or_a_server_there_is_no_recording(tmp_path, capsys
     folder = tmp_path / "x-corrections"
     with Server(ahead) as server:
         assert corrected(folder, server, 0.005) == 0
-    assert "corrections: 0, the expert drove 0.0 % of the time; 0 rows" in capsys.readouterr().out
+    assert "corrections: 0, the expert drove 0.0 % of the time; nothing was recorded" in capsys.readouterr().out
     assert not folder.exists()
     assert main(["correct", str(folder), "--wait", "0.1", "--port", str(unused_port())]) == 2
     assert not folder.exists()

@@ -359,6 +359,16 @@ def test_a_launcher_is_taken_for_the_simulator_and_writes_its_log(tmp_path):
     assert "1 episode, " in (tmp_path / "unitylog.txt").read_text()
 
 
+def test_a_launcher_replaces_none_but_an_earlier_one(tmp_path, capsys):
+    launcher = tmp_path / "udacity.x86_64"
+    launcher.write_bytes(b"\x7fELF the real simulator")
+    command = ["join", "--dialect", "roads", "--launcher", str(launcher)]
+    assert main(command) == 2 and "name another file" in capsys.readouterr().err
+    assert launcher.read_bytes() == b"\x7fELF the real simulator"
+    launcher.unlink()
+    assert main(command) == main([*command, "--fps", "10"]) == 0 and "--fps 10" in launcher.read_text()
+
+
 def test_a_program_may_end_the_simulator_by_a_signal(tmp_path):
     launcher = tmp_path / "sim.x86_64"
     assert main(["join", "--dialect", "measures", "--launcher", str(launcher)]) == 0

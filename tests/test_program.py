@@ -159,7 +159,7 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
             time.sleep(0.003)
     lines = capsys.readouterr().err.splitlines()
     assert 3 <= len(lines) <= 20, "not every update"
-    assert re.fullmatch(r"training +\d+ %, \d+/100 image, 00:00 since the start, 00:\d\d left, loss \d+", lines[0])
+    assert re.fullmatch(r"training +\d+ %, \d+/100 images, 00:00 since the start, 00:\d\d left, loss \d+", lines[0])
 
 
 @pytest.mark.parametrize(

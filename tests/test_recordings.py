@@ -403,3 +403,7 @@ def test_folders_are_found_below_links_and_each_once(tmp_path):
     assert [folder.relative_to(data).as_posix() for folder in found] == ["disk/lake", "disk/more/jungle", "own"]
     with pytest.raises(RecordingError, match="no such folder"):
         find_folders([str(tmp_path / "nowhere")])
+    with pytest.raises(RecordingError, match="no such file; name the folder of a recording"):
+        read_recording(tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match=r"driving_log\.csv: a file; name the folder"):
+        find_folders([str(data / "own" / "driving_log.csv")])

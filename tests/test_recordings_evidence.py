@@ -39,7 +39,7 @@ UNCLEAR_IMAGES += ["{stamp}-{camera}.jpg", "{camera}/{at}.jpg"]
 GERMAN = {"center": "mitte", "left": "links", "right": "rechts"}
 FOLDERS = ["", "IMG/", "/Users/driver/data/IMG/", "C:\\Users\\left turn\\IMG\\", "a b/", "Jos\xe9/", "/Doe, J/IMG/"]
 Line = tuple[str, tuple[list[str], list[float]] | None]  # its text; its row's images and numbers
-EXAMPLES = int(os.environ.get("LOG_EXAMPLES", 200))  # 10,000 take about 6 minutes
+EXAMPLES = int(os.environ.get("LOG_EXAMPLES", 200))  # CONTRIBUTING.md says when to try 10,000
 
 
 @st.composite

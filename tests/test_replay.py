@@ -140,7 +140,7 @@ def test_a_report_tells_known_rows_from_others(recording, lane):
     text = report_text(report)
     assert text.index("from the lane's centre: autonomy") < text.index("recorded driver's path: autonomy")
     assert text.index("recorded driver's path: autonomy") < text.index("from both: autonomy")
-    assert f"40 rows from {mishap['first']} to {mishap['last']}: not driven" in text and "33.3% of the rows" in text
+    assert f"40 rows from {mishap['first']} to {mishap['last']}: not driven" in text and "33.3 % of the rows" in text
     lines = replay.reference_lines(recording, by_lane=False)
     asked = replay_report(recording, lines, [replay.drive(recording, lines, 1.0, lambda _: 0.0)], "human")
     assert asked["rows_placed"] is None and "placed" not in report_text(asked)
@@ -255,7 +255,7 @@ def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model_fil
     done = run(folder, "--model", model_file, "--limit", *"212", *outputs)
     assert done.returncode == 0, done.stderr
     assert "lane's centre unknown in 60 rows from center_" in done.stdout
-    assert "2 m, from the recorded driver's path: autonomy" in done.stdout and "0.0% of the rows" in done.stdout
+    assert "2 m, from the recorded driver's path: autonomy" in done.stdout and "0.0 % of the rows" in done.stdout
     limits = list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"])
     assert limits == ["2", "1"], "one given twice counts once"
     assert film_frames(tmp_path / "x.mp4") == 60, "one drive writes the film"

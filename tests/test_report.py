@@ -20,6 +20,7 @@ from cloning.base.errors import UserError
 from cloning.base.files import csv_bytes
 from cloning.base.film import FilmWriter
 from cloning.replay.score import YARDSTICKS
+from cloning.report.content import bend
 from cloning.report.pictures import film_uri
 
 
@@ -53,6 +54,15 @@ def written(finished, sample_recording, tmp_path_factory):
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"{folder / 'report.html'}: open {(folder / 'report.html').as_uri()} in a browser\n"
     return folder
+
+
+def test_examples_are_named_by_their_own_steering():
+    """In a recording of left bends alone, the least of them was called one to the right."""
+    assert [bend(steering) for steering in (-0.52, -0.03, 0.4)] == [
+        "a bend to the left",
+        "hardly a bend",
+        "a bend to the right",
+    ]
 
 
 def test_the_report_contains_the_run(written, finished):

@@ -196,6 +196,12 @@ def test_a_run_is_resumed_only_by_its_own_recipe(begun, sample_recording, capsys
     assert model.train(more, [sample_recording], begun / "model.pt", device="cpu", resume=True) == 0
 
 
+def test_a_finished_run_that_is_resumed_says_how_to_train_on(begun):
+    done = run_here("--output", begun / "model.pt", "--resume")
+    assert done.returncode == 0 and "resumed in epoch" not in done.stdout
+    assert "the run has finished its 1 epoch; for more, raise --epochs" in done.stdout
+
+
 @pytest.mark.parametrize("missing", [False, True])
 def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording, missing):
     """All files of a run get the same ending, also if one of them was missing."""

@@ -185,7 +185,7 @@ def _attack(attack: Attack | None, port: int, until: float) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the attacks and print a table; return the exit status. Raises UserError."""
     attacks = all_attacks()
-    parser = command_line("attack", __doc__)
+    parser = command_line("python -m tools.attack", __doc__)
     add = parser.add_argument
     add("--model", default=SHIPPED_MODEL, help="a model file (default: the project's own)")
     add("--seconds", type=number(float, 0.1, 3600), default=5, help="for each attack (default %(default)s)")

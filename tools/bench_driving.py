@@ -135,7 +135,7 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
 
 def main(argv: list[str] | None = None) -> int:
     """Run the benchmark and print its table; return the exit status. Raises UserError."""
-    parser = command_line("bench_driving", __doc__)
+    parser = command_line("python -m tools.bench_driving", __doc__)
     add = parser.add_argument
     add("model", help="a model file of model.py")
     add("recording", type=Path, help="folder of a recording, whose first 500 centre images are sent")

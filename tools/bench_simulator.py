@@ -106,7 +106,7 @@ def measure(laps: float, repeat: int, frames: int) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Parse the command line, measure and return the exit status. Raises SimulatorError."""
-    parser = command_line("bench_simulator", __doc__)
+    parser = command_line("python -m tools.bench_simulator", __doc__)
     add = parser.add_argument
     add("--laps", type=number(float, 0.001, 1e5), default=1, help="to record on each track (default %(default)s)")
     add("--repeat", type=number(int, 1), default=3, help="recordings of each track (default %(default)s)")

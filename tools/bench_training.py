@@ -230,7 +230,7 @@ def spread(values: list[float], digits: int) -> list[str]:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the benchmark, or with --part one part of it, in a process that it started; return the exit status."""
-    parser = command_line("bench_training", __doc__)
+    parser = command_line("python -m tools.bench_training", __doc__)
     add = parser.add_argument
     add("recordings", nargs="*", help="folders of recordings; without any, a third of a lap is rendered")
     add("--rounds", type=number(int, 1), default=3, help="measurements of each part (default %(default)s)")

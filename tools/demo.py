@@ -137,7 +137,7 @@ def report(folder: Path, laps: list[Drive]) -> None:
 
 def parse_arguments(argv: list[str] | None) -> Namespace:
     """Parse the command line; argv: that of this process if None."""
-    parser = command_line("demo", __doc__)
+    parser = command_line("python -m tools.demo", __doc__)
     own = "recordings to train on, or folders of recordings (default: two laps that are recorded first)"
     parser.add_argument("recordings", nargs="*", metavar="FOLDER", help=own)
     track = "what is then driven, with recordings of your own (default %(default)s)"

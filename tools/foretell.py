@@ -294,7 +294,7 @@ def table(limits: Limits, driven: Sequence[tuple[Course, Drive]]) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Drive, fit, measure; return the exit status. Raises UserError, OSError."""
-    parser = command_line("foretell", __doc__)
+    parser = command_line("python -m tools.foretell", __doc__)
     add = parser.add_argument
     add("model", nargs="?", type=Path, default=SHIPPED_MODEL, help="model file (default: the project's own)")
     add("--recordings", nargs="*", default=[], help="recordings of ordinary driving, or folders of recordings")

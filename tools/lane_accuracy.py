@@ -176,7 +176,7 @@ def measure_line(recording: Recording, strips: np.ndarray, centres: np.ndarray) 
 
 def main(argv: list[str] | None = None) -> int:
     """Print the measurements; return the exit status. Raises UserError, OSError."""
-    parser = command_line("lane_accuracy", __doc__)
+    parser = command_line("python -m tools.lane_accuracy", __doc__)
     add = parser.add_argument
     add("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
     add("--network", metavar="lane.pt", help="file with the weights (default: those that come with the project)")

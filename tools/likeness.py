@@ -107,7 +107,7 @@ def write_picture(path: str, real: np.ndarray, rendered: np.ndarray) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Parse the command line, compare and return the exit status. Raises UserError."""
-    parser = command_line("likeness", __doc__)
+    parser = command_line("python -m tools.likeness", __doc__)
     add = parser.add_argument
     add("recording", type=Path, help="folder of a real recording of the lake or the jungle")
     add("--frames", type=number(int, 1), default=120, help="poses to compare (default %(default)s)")

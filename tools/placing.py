@@ -301,7 +301,7 @@ def rendered(folder: str, course: tuple[str, str, int, int], laps: float) -> Sou
 
 def main(argv: list[str] | None = None) -> int:
     """Print the table; return the exit status. Raises UserError, OSError."""
-    parser = command_line("placing", __doc__)
+    parser = command_line("python -m tools.placing", __doc__)
     add = parser.add_argument
     add("recordings", nargs="*", help="folders of recordings of a known track, each with a driving_log.csv")
     laps = "length of each rendered drive; 0: none (default %(default)s)"

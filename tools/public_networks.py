@@ -267,7 +267,7 @@ def save(network: nn.Sequential, how: Published, file: Path) -> None:
 
 def main() -> int:
     """Rebuild the networks; return the exit status."""
-    parser = command_line("public_networks", __doc__)
+    parser = command_line("python -m tools.public_networks", __doc__)
     add = parser.add_argument
     add("recordings", nargs="+", help="folders of recordings")
     add("--networks", nargs="+", choices=PUBLISHED, default=list(PUBLISHED), help="which (default: all)")

@@ -67,7 +67,7 @@ def clip(network: Network, track: str, look: int) -> list[np.ndarray]:
 
 def main(argv: list[str] | None = None) -> int:
     """Drive the clips and write the film; return the exit status. Raises UserError."""
-    parser = command_line("readme_film", __doc__)
+    parser = command_line("python -m tools.readme_film", __doc__)
     add = parser.add_argument
     add("model", nargs="?", default=SHIPPED_MODEL, help="model file (default: the shipped network)")
     add("film", nargs="?", default=str(FILM), help="WebP to write (default: the one in README.md)")

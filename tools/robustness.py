@@ -207,7 +207,7 @@ def gallery() -> bytes:
 
 def main(argv: list[str] | None = None) -> int:
     """Measure, and write table and picture. Raises UserError, OSError."""
-    parser = command_line("robustness", __doc__)
+    parser = command_line("python -m tools.robustness", __doc__)
     add = parser.add_argument
     add("models", nargs="*", default=[str(SHIPPED_MODEL)], help="model or .onnx files (default: the project's own)")
     add("--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND", help="default: all")

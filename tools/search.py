@@ -182,7 +182,7 @@ def picture(failures: Sequence[Driven], title: str) -> bytes:
 
 def main(argv: list[str] | None = None) -> int:
     """Search, print a table; return 1 if a failure was not the same when driven again. Raises UserError, OSError."""
-    parser = command_line("search", __doc__)
+    parser = command_line("python -m tools.search", __doc__)
     add = parser.add_argument
     add("folder", type=Path, help="new folder for the failures")
     add("--driver", default=str(SHIPPED_MODEL), help="model file, .onnx file, or HOST:PORT of a server; default: ours")

@@ -155,7 +155,7 @@ def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
 
 def main(argv: list[str] | None = None) -> int:
     """Render, train and measure; return the exit status. Raises UserError, OSError."""
-    parser = command_line("shipped", __doc__)
+    parser = command_line("python -m tools.shipped", __doc__)
     add = parser.add_argument
     add("recordings", nargs="+", help="real recordings, or folders of recordings")
     add("--looks", type=number(int, 1, 101), default=15, help="looks of each track (default %(default)s)")

@@ -125,7 +125,7 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
     time.sleep(SETTLE)
     early = before = Reading.of(server)
     alone = before.files
-    bar = progress_bar(count, "frames")
+    bar = progress_bar(count, "frame")
     with Company(server.port, new_car, folder) as company, bar:
         for tenth in range(TENTHS):
             times, others = [], company.answered
@@ -176,7 +176,7 @@ def in_turns(servers: tuple[Target, ...], count: int) -> np.ndarray:
 
 def main(argv: list[str] | None = None) -> int:
     """Drive, and print the table; return the exit status. Raises UserError, OSError."""
-    parser = command_line("soak", __doc__)
+    parser = command_line("python -m tools.soak", __doc__)
     parser.add_argument("--model", default=SHIPPED_MODEL, help="a model file (default: the project's own)")
     parser.add_argument("--frames", type=number(int, 100, 10**9), default=10**6, help="default %(default)s")
     options = parser.parse_args(argv)

@@ -66,7 +66,7 @@ def speed_run(train: Sequence[Path], courses: Sequence[Course], options: argpars
 
 def main(argv: list[str] | None = None) -> int:
     """Train and drive, print a table; return 1 if a model drives worse than it should. Raises UserError, OSError."""
-    parser = command_line("speedrun", __doc__)
+    parser = command_line("python -m tools.speedrun", __doc__)
     add = parser.add_argument
     add("recordings", nargs="+", help="real recordings, or folders of recordings")
     add("--in-sample", action="store_true", help="train on all recordings, and drive these")

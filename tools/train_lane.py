@@ -295,7 +295,7 @@ def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
 
 def main(argv: list[str] | None = None) -> int:
     """Train the network and write its weights; return the exit status. Raises UserError, OSError."""
-    parser = command_line("train_lane", __doc__)
+    parser = command_line("python -m tools.train_lane", __doc__)
     add = parser.add_argument
     add("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
     looks = "looks of each track, each also with shadows (default %(default)s)"

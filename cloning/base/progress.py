@@ -27,9 +27,10 @@ class Lines(Bar):
 
 
 def progress_bar(total: int, unit: str, hidden: bool = False, **options: Any) -> tqdm:
-    """Return a progress bar of tqdm on stderr; options: more of tqdm's."""
+    """Return a progress bar of tqdm on stderr; unit: one of what is counted; options: more of tqdm's."""
     options["miniters"] = 1  # each update looks at the time
     if sys.stderr.isatty() or hidden:
         return Bar(total=total, unit=unit, disable=hidden, **options)
     every: dict[str, Any] = {"delay": LINE_SECONDS, "mininterval": LINE_SECONDS, "maxinterval": LINE_SECONDS}
-    return Lines(total=total, unit=unit, bar_format=LINE, **{**options, **every, "leave": False})
+    several = unit if unit == "m" else f"{unit}s"
+    return Lines(total=total, unit=several, bar_format=LINE, **{**options, **every, "leave": False})

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from cloning.base.arguments import MAX_PORT, command_line, number
 from cloning.base.errors import UserError
+from cloning.base.outputs import plural
 from cloning.browse.library import Library
 from cloning.browse.page import create_app
 from cloning.browse.runs import Runs
@@ -28,7 +29,7 @@ from cloning.server.site import BROWSE_HOST, BROWSE_PORT
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; arguments: those of this process if None."""
-    status = "Exit status: 0 after Ctrl-C, 2 if the server could not start."
+    status = "Exit status: 130 after Ctrl-C, 2 if the server could not start."
     parser = command_line("python -m cloning.browse", __doc__, status)
     add = parser.add_argument
     add("recordings", nargs="*", metavar="FOLDER", help="recordings, or folders of recordings (default: data)")
@@ -60,11 +61,8 @@ def main() -> int:
     stopped = connections.noted_signals()
     stderr = terminal.log_to_stderr(program.name)
     library, runs = Library(folders, arguments.model), Runs(arguments.run or [])
-    print(
-        f"{len(folders)} recording{'s' * (len(folders) != 1)}. "
-        f"Open http://{BROWSE_HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.",
-        flush=True,
-    )
+    shown = plural(len(folders), "recording") if folders else plural(len(arguments.run), "training run")
+    print(f"{shown}. Open http://{BROWSE_HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.", flush=True)
     try:
         connections.serve(listener, create_app(library, runs), stopped)
     finally:

@@ -98,13 +98,15 @@ class CheckedRecording(Recording):
 def find_folders(given: list[str]) -> list[Path]:
     """Return the recordings (folders with a driving_log.csv) among and below the given folders, without duplicates.
 
-    Raises RecordingError if a folder does not exist, or if neither it nor a folder below it is a recording.
+    Raises RecordingError if a name is of no folder, or if neither the folder nor one below it is a recording.
     """
     folders: dict[Path, Path] = {}
     for name in given:
         path = Path(name)
         if not path.exists():
             raise RecordingError(f"{path}: no such folder. {WHERE_TO_GET_RECORDINGS}")
+        if path.is_file():
+            raise RecordingError(f"{path}: a file; name the folder of a recording, with {DRIVING_LOG} and IMG/")
         logs = [path / DRIVING_LOG] if (path / DRIVING_LOG).is_file() else sorted(logs_below(path))
         if not logs:
             raise RecordingError(f"{path}: no {DRIVING_LOG} in or below it. {WHERE_TO_GET_RECORDINGS}")

@@ -54,6 +54,8 @@ def read_lines(path: Path) -> Iterator[str]:
                 if len(line) == LONGEST_LINE:
                     raise RecordingError(f"{path}: line {at}: longer than any row: not a csv; copy it again")
                 yield line
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such file; name the folder of a recording") from None
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}; make it readable") from None
 

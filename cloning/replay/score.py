@@ -248,7 +248,7 @@ def report_text(report: ReplayReport) -> str:
     ]
     if report["rows_placed"] is not None:
         placed = report["rows_placed"] / rows
-        lines[0] += f"; {placed:.1%} of the rows are placed, on a known track or by the recording itself"
+        lines[0] += f"; {100 * placed:.1f} % of the rows are placed, on a known track or by the recording itself"
     if report["disturbance"]:
         lines.append(f"  disturbance: {report['disturbance']}")
     if report["reference_asked"] == "lane":

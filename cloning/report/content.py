@@ -31,11 +31,19 @@ from cloning.training.pictures import panel
 from cloning.training.run_files import RunFiles
 from cloning.training.summary import VERDICTS, duration
 
-EXAMPLES = {"a bend to the left": 0.05, "hardly a bend": 0.5, "a bend to the right": 0.95}  # quantiles of the steering
+EXAMPLES = (0.05, 0.5, 0.95)  # quantiles of the steering: most often a bend to the left, none, and one to the right
+HARDLY = 0.05  # steering
 FILMS = 9_000_000  # bytes of all films in the page, which should have less than 15 MB
 SHOWN = 6  # interventions of each replay that are shown
 DRIVERS = {"network": "the network", **YARDSTICKS, ORACLE: "recovery steering"}  # rows of the table of replays
 PICTURES = ("LRC_", "augmented-")  # of the training: the three cameras' images, and those made from them
+
+
+def bend(steering: float) -> str:
+    """Return in words the bend in which a driver steers so, -1..1."""
+    if abs(steering) < HARDLY:
+        return "hardly a bend"
+    return f"a bend to the {'left' if steering < 0 else 'right'}"
 
 
 class Shots:
@@ -156,7 +164,7 @@ class Report:
             return []
         recording, shown = self.looked_at, []
         order = np.argsort(recording.steering, kind="stable")
-        for name, quantile in EXAMPLES.items():
+        for quantile in EXAMPLES:
             row = int(order[round(quantile * (len(order) - 1))])
             frame, human = read_frame(recording.path(row)), float(recording.steering[row])
             try:
@@ -165,7 +173,7 @@ class Report:
                 raise ModelError(f"{self.model}: {error}; train the model again") from None
             shown.append(
                 {
-                    "name": name,
+                    "name": bend(human),
                     "recorded": picture_uri(panel(frame, recording.name(row), human)),
                     "attention": frame_uri(overlay(frame, steering, mask)),
                     "steering": f"{steering:+.2f}, the driver {human:+.2f}",

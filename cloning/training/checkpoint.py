@@ -25,6 +25,7 @@ import torch
 
 from cloning.base.errors import ModelError
 from cloning.base.files import write
+from cloning.base.outputs import plural
 from cloning.network.network import (
     NETWORKS,
     PREPROCESSING,
@@ -299,7 +300,10 @@ class Checkpoint:
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if self.resumed:
             self._write_progress(progress)  # a killed run may not have come so far
-            print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
+            if len(progress.history) == self.run.recipe.epochs:
+                print(f"the run has finished its {plural(len(progress.history), 'epoch')}; for more, raise --epochs")
+            else:
+                print(f"resumed in epoch {len(progress.history) + 1} at image {progress.images:,}")
         elif self.run.from_model:
             print(f"begins with the weights of {self.run.from_model}, by the recipe {self.run.recipe.name}")
 

@@ -80,12 +80,13 @@ def sizes(rows: int, observations: int, validation: int) -> str:
 def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> None:
     """Write the unusable rows of all recordings, if any, to a csv file; strict: raise RecordingError instead."""
     rejected = [(recording.folder / DRIVING_LOG, *row) for recording in recordings for row in recording.rejected]
+    count = plural(len(rejected), "unusable row")
     if rejected and strict:
         path, line, _, detail = rejected[0]
-        raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {len(rejected)} unusable rows)")
+        raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {count})")
     if rejected:
         write(file, csv_bytes([("file", "line", "finding", "detail"), *rejected]))
-        print(f"{len(rejected)} unusable rows are left out; {file} lists them")
+        print(f"{count} left out; {file} lists them")
 
 
 def history_csv(history: list[EpochMetrics]) -> bytes:
@@ -99,7 +100,7 @@ def run_header(network: Network, device: torch.device, precision: torch.dtype, r
     name = str(precision).removeprefix("torch.")
     size = sum(parameter.numel() for parameter in network.parameters())
     table = f"{layer_table(network)}\n" if layers else ""
-    return f"{table}\na network of {size:,} parameters on {device}, {name}, {threads()} threads{processes}"
+    return f"{table}\na network of {size:,} parameters on {device}, {name}, {plural(threads(), 'thread')}{processes}"
 
 
 def epoch_line(row: EpochMetrics) -> str:

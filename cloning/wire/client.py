@@ -224,7 +224,8 @@ class Connection:
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, RejectConnection):
-            raise ConnectionLost(f"the server refuses the connection (HTTP {event.status_code})")
+            other = ": another program's server has the port" if event.status_code == 404 else ""
+            raise ConnectionLost(f"the server refuses the connection (HTTP {event.status_code}{other})")
         elif isinstance(event, CloseConnection):
             if self.protocol.state is ConnectionState.OPEN:  # not a closing frame, but bytes that are no frame at all
                 raise ConnectionLost(f"the server does not speak WebSocket ({event.reason!s:.100})")

@@ -84,7 +84,7 @@ def result(variant: Variant, options: argparse.Namespace) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> int:
     """Measure all networks and write the study; return the exit status. Raises UserError, OSError."""
-    parser = command_line("study", __doc__)
+    parser = command_line("python -m tools.study", __doc__)
     add = parser.add_argument
     add("recordings", type=Path, help="the folder of the real recordings")
     add("--networks", type=number(int, 1), help="measure only the first ones of the plan")

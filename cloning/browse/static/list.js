@@ -207,7 +207,7 @@ function road({lane, roads, unusable, frames}) {
   if (lane.state == "running") return `road not known yet: ${(100 * lane.progress).toFixed(0)} % analysed`;
   if (lane.state == "failed") return `road not known, the analysis failed: ${lane.message}`;
   if (unusable == frames) return "road not known: no image can be used";
-  if (!roads.length) return "another road";
+  if (!roads.length) return "on no known track";
   return roads.map(([name, direction]) => `${name}, ${DIRECTIONS[direction]}`).join("; ");
 }
 
