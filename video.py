@@ -36,6 +36,8 @@ Overlay = Callable[[np.ndarray], np.ndarray]  # from a frame to the film's pictu
 
 def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
     """Return the folder's frames and their times, sorted by time. Raises UserError if there are none."""
+    if folder.is_file():
+        raise UserError(f"{folder}: a file; name the folder in which drive.py has saved frames")
     remedy = f"`python drive.py model.pt {folder}` saves frames in it"
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; {remedy}")

@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -345,6 +346,14 @@ def test_a_full_disk_costs_the_film_alone(sample_recording, model_file, tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.png", "r.json"]
     assert "autonomy" in printed.out
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]["2"]
+
+
+def test_pictures_of_recordings_with_the_same_name_are_kept_apart(sample_recording, model_file, tmp_path):
+    """As of two people who each have a recording called lake."""
+    folders = [shutil.copytree(sample_recording, tmp_path / person / "lake") for person in ("a", "b")]
+    options = "--model", model_file, "--reference", "human", "--limit", "1", "--picture", tmp_path / "way.png"
+    assert simulator.main(["replay", *map(str, (*folders, *options))]) == 0
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["way-lake-1.png", "way-lake-2.png"]
 
 
 def kill_itself():

@@ -184,6 +184,12 @@ def test_no_film_is_a_clear_error(run, tmp_path, name, words):
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
 
 
+def test_a_file_is_no_folder(run, tmp_path):
+    (tmp_path / "run1.mp4").write_bytes(b"")
+    status, error = run("run1.mp4")
+    assert status == 2 and "a file; name the folder" in error and "drive.py model.pt" not in error
+
+
 @pytest.mark.parametrize(
     "fps", ["0", "-5", "fast", "nan", "inf", "1/0", "0/0", "1/", "1e-9", "1e300", "1e-999999999", "1000.1", "1/1/1", ""]
 )

@@ -13,6 +13,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from cloning.lane.reader import (
     read_strips,
 )
 from cloning.lane.search import localise
-from cloning.recordings.log import Recording, read_recording
+from cloning.recordings.log import Recording, find_folders, read_recording
 from cloning.road.generated import COURSES, generate
 from cloning.road.motion import MPH, stretches
 from cloning.road.track import ROADS, Track
@@ -125,7 +126,7 @@ def spread(values: np.ndarray) -> str:
     return f"{np.abs(values).mean():.2f} m, 95th percentile {np.quantile(np.abs(values), 0.95):.2f}"
 
 
-def measure_recording(folder: str, network: LaneNetwork) -> None:
+def measure_recording(folder: Path, network: LaneNetwork) -> None:
     """Print the estimated positions of a real recording's side cameras, its lateral offsets, and the time needed."""
     recording = read_recording(folder)
     started = time.perf_counter()
@@ -185,13 +186,13 @@ def main(argv: list[str] | None = None) -> int:
     edges = "generated roads of each kind to render by their edges, two drives each (default %(default)s)"
     add("--edges", type=number(int, 0), default=0, metavar="ROADS", help=edges)
     options = parser.parse_args(argv)
-    network = load_network(options.network)
+    network, folders = load_network(options.network), find_folders(options.recordings)
     if options.laps:
         measure_frames(network)
         measure_drives(network, options.laps)
     if options.edges:
         measure_edges(network, options.edges)
-    for folder in options.recordings:
+    for folder in folders:
         measure_recording(folder, network)
     return program.DONE
 

@@ -273,8 +273,8 @@ def main() -> int:
     add("--networks", nargs="+", choices=PUBLISHED, default=list(PUBLISHED), help="which (default: all)")
     add("--folder", type=Path, default=Path("public"), help="for the results (default: public)")
     options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
     recordings = [check_images(read_recording(folder)) for folder in find_folders(options.recordings)]
+    options.folder.mkdir(parents=True, exist_ok=True)
     for recording in recordings:
         print_findings(recording)
     for name in options.networks:

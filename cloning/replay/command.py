@@ -45,7 +45,8 @@ def run(options: argparse.Namespace) -> None:
     reports: list[ReplayReport] = []
 
     def replay_all() -> None:
-        for folder in folders:
+        names = [folder.name for folder in folders]
+        for number, folder in enumerate(folders, 1):
             recording = load_recording(folder)
             lines = reference_lines(recording, options.reference == "lane")
             if film:
@@ -56,7 +57,10 @@ def run(options: argparse.Namespace) -> None:
             print(report_text(reports[-1]), flush=True)
             if options.picture:
                 path = Path(options.picture)
-                path = path if len(folders) == 1 else path.with_stem(f"{path.stem}-{folder.name}")
+                if len(folders) > 1:
+                    path = path.with_stem(f"{path.stem}-{folder.name}")
+                if names.count(folder.name) > 1:  # else one would replace the other
+                    path = path.with_stem(f"{path.stem}-{number}")
                 write_output(path, plot(recording, drives))
 
     steps: list[Callable[[], object]] = [replay_all, driver.close]
