@@ -3,13 +3,13 @@
 import math
 
 STILL, ALMOST_STILL = 0.5, 2.0  # mph: the stand-in simulator tells 0.44 of a car at rest
-BRAKING = 5.0  # mph: below it the simulator's brake is its weak reverse gear
-UPHILL, STEADY = 0.4, 0.1  # throttle, mph a frame: a car that needs more, and gains no more speed, would roll backwards
-PUSH = 0.7  # throttle that stops it on the steepest grade, and does not throw it forwards
-# Throttle with which a pushed car is held then: so much more each time, up to this share of what held its speed before.
-HOLD_STEP, HOLDING = 0.1, 0.8
-# Frames in which a car becomes faster at a throttle until the other one is tried; a push takes longer to tell.
-LOST_FRAMES = {-1.0: 4, PUSH: 12}
+LEVEL = 0.1  # throttle that keeps a car at 9 to 15 mph where the road is level
+# A stopped car's throttle is changed every so many frames while the car does not become slower: by what it needed above
+# LEVEL, but so much at least and at most. If that makes the car faster sooner, or after so many changes in vain, it is
+# changed the other way, by so many times as much.
+CHANGE_FRAMES, FIRST_CHANGE, MOST_CHANGES, GROWTH = 4, (0.1, 0.5), 2, 1.5
+LEAST_CHANGE = 0.03  # once it has come to rest the next change is half as large and the other way, but so much at least
+ROLLING, SLOWER, FASTER = 0.8, 0.02, 0.05  # mph; by the last two, a speed surely changes in CHANGE_FRAMES
 
 
 class SpeedController:
@@ -17,22 +17,24 @@ class SpeedController:
 
     The sum is not changed while the throttle is at its limit, so that it does not wind up on a hill. A set speed of 0
     brakes until the car is at rest, or almost and no longer becomes slower. On a slope no brake holds it there, and
-    what the simulator tells has no sign: a car that rolls downhill is braked again, one that rolls backwards is pushed,
-    and then held by more throttle: rolling to and fro, it would leave the road within a minute.
+    what the simulator tells has no sign: so a throttle that holds it is sought, to one side until the car has come to
+    rest, then to the other in steps half as large.
     """
 
     PROPORTIONAL, INTEGRAL = 0.1, 0.002
 
     def __init__(self, set_speed: float):
         """set_speed: mph."""
-        self.set_speed, self.error_sum, self.driven = set_speed, 0.0, math.inf
-        self._begin(0.0, math.inf)
+        self.set_speed, self.error_sum = set_speed, 0.0
+        self._begin(LEVEL)
 
-    def _begin(self, throttle: float, speed: float) -> None:
-        """Forget what `_stop` did; throttle, speed: of a car that is driven."""
-        self.is_uphill, self.driven = throttle > UPHILL and speed < self.driven + STEADY, speed
-        self.stands, self.stop_throttle, self.hold = False, -1.0, 0.0
-        self.speed, self.faster = math.inf, 0  # in the last frame, mph; frames in which it rose
+    def _begin(self, throttle: float) -> None:
+        """Forget what `_stop` did; throttle: of a car that is driven."""
+        least, most = FIRST_CHANGE
+        self.change = math.copysign(min(max(abs(throttle - LEVEL), least), most), throttle - LEVEL)
+        self.stands, self.hold, self.rests = False, 0.0, True
+        self.speed = self.gain = math.inf  # mph, when a change was last due, and how much faster it had become by then
+        self.frames, self.in_vain = 0, 0  # since then; changes
 
     def throttle(self, speed: float) -> float:
         """Return the throttle, -1..1, at this speed in mph; call it once per frame."""
@@ -42,20 +44,27 @@ class SpeedController:
         throttle = self.PROPORTIONAL * error + self.INTEGRAL * (self.error_sum + error)
         if abs(throttle) <= 1:
             self.error_sum += error
-        self._begin(throttle, speed)
+        self._begin(throttle)
         return min(1.0, max(-1.0, throttle))
 
     def _stop(self, speed: float) -> float:
-        before, self.speed = self.speed, speed
-        if self.stands:
-            self.stands, self.faster = speed < (ALMOST_STILL if self.is_uphill else BRAKING), 0
-            self.stop_throttle = PUSH if self.is_uphill else -1.0
-            if self.is_uphill and not self.stands:
-                self.hold = max(0.0, min(self.hold + HOLD_STEP, HOLDING * self.INTEGRAL * self.error_sum))
-        elif speed < STILL or before < speed < ALMOST_STILL:
-            self.stands = True
-        else:
-            self.faster = self.faster + 1 if speed > max(before, BRAKING) else 0
-            if self.faster == LOST_FRAMES[self.stop_throttle]:
-                self.is_uphill, self.stands, self.hold = not self.is_uphill, True, 0.0
-        return self.hold if self.stands else self.stop_throttle
+        if not self.stands:
+            before, self.speed = self.speed, speed
+            self.stands = speed < STILL or before < speed < ALMOST_STILL
+            return self.hold if self.stands else -1.0
+        if speed < STILL and not self.rests:
+            self.change = math.copysign(max(abs(self.change) / 2, LEAST_CHANGE), -self.change)
+            self.in_vain = 0
+        self.rests = speed < STILL or (self.rests and speed < ROLLING)
+        self.frames += 1
+        if self.frames == CHANGE_FRAMES:
+            if speed > STILL and speed > self.speed + (FASTER if speed <= ROLLING else -SLOWER):
+                self.in_vain += 1
+                if self.in_vain > MOST_CHANGES or speed - self.speed > self.gain + FASTER:
+                    self.change, self.in_vain = -GROWTH * self.change, 0
+                self.hold = min(1.0, max(-1.0, self.hold + self.change))
+            else:
+                self.in_vain = 0
+            self.gain = speed - self.speed if self.in_vain else math.inf
+            self.speed, self.frames = speed, 0
+        return self.hold
