@@ -12,23 +12,13 @@ import torch
 
 from cloning.base.errors import ModelError
 from cloning.network import tensors
-from cloning.network.network import SHIPPED_MODEL, Network, load_model, save_model
+from cloning.network.network import SHIPPED_MODEL, load_model, save_model
 
 
-@pytest.fixture
-def network():
-    torch.manual_seed(0)
-    return Network()
-
-
-@pytest.fixture
-def frames():
-    return torch.from_numpy(np.random.default_rng(0).integers(0, 256, (5, 160, 320, 3), np.uint8))
-
-
-def test_model_file_carries_what_driving_needs(network, frames, tmp_path):
+def test_model_file_carries_what_driving_needs(network, tmp_path):
     path = tmp_path / "model.pt"
-    save_model(path, network.eval(), arguments={"seed": 1})
+    frames = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (5, 160, 320, 3), np.uint8))
+    save_model(path, network, arguments={"seed": 1})
     saved = torch.load(path, weights_only=True)
     assert saved["recipe"] == {
         "frame": (160, 320, 3),

@@ -1,7 +1,7 @@
 """Let cars drive with one drive.py for hours' worth of frames, and tell whether it stays as it was at the start.
 
-    python -m tools.soak                        # a million frames: about an hour and a half on two cores
-    python -m tools.soak --frames 20000         # about two minutes
+    python -m tools.soak                        # a million frames: about two hours on two cores
+    python -m tools.soak --frames 20000         # about three minutes
 
 Beside a car in lock-step, which leaves and comes again, a second one comes at times, pages are opened and closed, and
 the frames that drive.py saves are deleted. The table has a line for each tenth of the frames. At the end a car drives
@@ -111,6 +111,13 @@ class Company:
                 path.unlink()
 
 
+def timed(car: Car, n: int) -> tuple[bool, float]:
+    """Let a car send its n-th frame; return whether the answer is right, and its time in ms. Raises OSError if lost."""
+    began, k = time.perf_counter(), n % len(car.messages)
+    answer = car.ask(car.messages[k])
+    return answer == car.expected[k], 1000 * (time.perf_counter() - began)
+
+
 def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]]:
     """Drive this many frames; return the table's lines and what was found wrong. Raises OSError."""
     jpegs = frames()
@@ -135,9 +142,9 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
                     car, leaves = new_car(), n + 1 + int(random.expovariate(1 / STAY))
                 if n == count // (2 * TENTHS):
                     early = Reading.of(server)
-                began, k = time.perf_counter(), n % len(jpegs)
-                wrong += car.ask(car.messages[k]) != expected[k]  # one that is lost raises OSError
-                times.append(1000 * (time.perf_counter() - began))
+                is_right, passed = timed(car, n)
+                wrong += not is_right
+                times.append(passed)
                 bar.update()
             now, answered = Reading.of(server), len(times) + company.answered - others
             spent = 1000 * (now.seconds - before.seconds) / answered
@@ -164,11 +171,8 @@ def in_turns(servers: tuple[Target, ...], count: int) -> np.ndarray:
     """Drive this many frames a turn with each server; return their 99th percentiles in ms, the medians of the turns."""
     jpegs, p99 = frames(), np.empty((TURNS, len(servers)))
     for turn, server in itertools.product(range(TURNS), range(len(servers))):
-        car, times = Car(servers[server].port, jpegs), []
-        for n in range(count):
-            began = time.perf_counter()
-            car.ask(car.messages[n % len(jpegs)])
-            times.append(1000 * (time.perf_counter() - began))
+        car = Car(servers[server].port, jpegs)
+        times = [timed(car, n)[1] for n in range(count)]
         car.simulator.socket.close()
         p99[turn, server] = np.quantile(times, 0.99)
     return np.median(p99, 0)

@@ -98,33 +98,39 @@ def localise_recording(
     stretches: of the recording; detect: returns what `reader.detect_centres` does with a network.
     """
     positions, localised = list[LanePosition](), list[tuple[slice, Localisation]]()
-    placed, piece = np.zeros(len(recording), bool), np.zeros(len(recording), np.int32)
-    unknown = ~placed
+    piece = np.zeros(len(recording), np.int32)
     for network in networks:
         centres = detect(network)
         positions.append(fuse_detections(recording, centres))
         localised = localised or list(localise_all(recording, stretches, centres, strips))
-        for number, (rows, _) in enumerate(localised, 1):
-            placed[rows], piece[rows] = True, number
-        for stretch in stretches:
-            here = placed[stretch.rows]
-            changes = np.flatnonzero(np.diff(np.r_[False, ~here, False])).reshape(-1, 2) if here.any() else ()
-            for start, end in changes:
-                if end - start < LONGEST_MISHAP:
-                    piece[stretch.rows][start:end] = MISHAP
-        unknown = ~placed & (piece != MISHAP)
-        if localised and not any(unknown[stretch.rows].any() for stretch in stretches):
+        piece = _pieces(len(recording), stretches, [rows for rows, _ in localised])
+        if localised and all(piece[stretch.rows].all() for stretch in stretches):
             break
+    unknown = piece == 0
     first, last = positions[0], positions[-1]
     difference = np.abs(first.lateral_offset - last.lateral_offset)[unknown]
     agree = difference.sum() < MAX_DIFFERENCE * len(difference)
     is_first = agree and first.trusted[unknown].sum() >= last.trusted[unknown].sum()
-    position = replace(first if is_first else last, placed=placed, piece=piece)
+    position = replace(first if is_first else last, placed=piece > 0, piece=piece)
     for rows, localisation in localised:
         _, offset, heading_error = localisation.states.T
         position.lateral_offset[rows] = offset + REAR_AXLE * np.sin(heading_error)
         position.heading_error[rows], position.trusted[rows] = heading_error, True
     return position, localised
+
+
+def _pieces(count: int, stretches: list[Stretch], parts: list[slice]) -> np.ndarray:
+    """Return the number of the part, from 1, that each row is in, MISHAP, or 0 for an unknown road: int32 (count,)."""
+    piece = np.zeros(count, np.int32)
+    for number, rows in enumerate(parts, 1):
+        piece[rows] = number
+    for stretch in stretches:
+        here = piece[stretch.rows]
+        changes = np.flatnonzero(np.diff(np.r_[False, here == 0, False])).reshape(-1, 2) if here.any() else ()
+        for start, end in changes:
+            if end - start < LONGEST_MISHAP:
+                here[start:end] = MISHAP
+    return piece
 
 
 def shipped_networks() -> Iterator[LaneNetwork]:
