@@ -4,9 +4,9 @@ import math
 
 STILL, ALMOST_STILL = 0.5, 2.0  # mph: the stand-in simulator tells 0.44 of a car at rest
 LEVEL = 0.1  # throttle that keeps a car at 9 to 15 mph where the road is level
-# A stopped car's throttle is changed every so many frames while the car does not become slower: by what it needed above
-# LEVEL, but so much at least and at most. If that makes the car faster sooner, or after so many changes in vain, it is
-# changed the other way, by so many times as much.
+# A stopped car's throttle is changed every CHANGE_FRAMES as long as the car does not become slower. The first change is
+# what the car needed above LEVEL, within FIRST_CHANGE. A change was wrong if the car then gains speed faster than
+# before, or if MOST_CHANGES of them were in vain: the next one is GROWTH times as large, the other way.
 CHANGE_FRAMES, FIRST_CHANGE, MOST_CHANGES, GROWTH = 4, (0.1, 0.5), 2, 1.5
 LEAST_CHANGE = 0.03  # once it has come to rest the next change is half as large and the other way, but so much at least
 ROLLING, SLOWER, FASTER = 0.8, 0.02, 0.05  # mph; by the last two, a speed surely changes in CHANGE_FRAMES
