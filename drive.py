@@ -363,7 +363,7 @@ def main() -> int:
             try:
                 server.saver.close()
             except UserError as error:
-                print(f"{program.name}: {error}", file=sys.stderr)
+                stderr.write(f"{program.name}: {error}\n")  # after the sessions' last lines, which wait there, too
                 lost = True
         stderr.finish()
     return program.INCOMPLETE if lost else 128 + stopped[0]
