@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import warnings
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,8 @@ def test_an_error_above_that_of_constant_steering_is_explained():
     assert larger.endswith(f"replay RECORDING --model {Path('runs', 'net.pt')}")
     assert "larger error" not in text(labels) and "hardly follows" not in text(labels)
     assert "net.pt hardly follows the driver" in text(np.zeros_like(labels))
+    with warnings.catch_warnings(action="error"):
+        assert math.isnan(summary.correlation(labels[:1], labels[:1])), "of a single row"
 
 
 def test_the_line_of_a_diagnostic_picture_stays_within_its_image():
@@ -226,6 +229,14 @@ def test_without_recordings_the_user_is_told_where_to_get_some(tmp_path):
     done = run_here("--output", "runs/a/model.pt", cwd=tmp_path)
     assert done.returncode == 2 and "data/README.md" in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_why_too_few_rows_are_left(linked, tmp_path):
+    short = render_recording(tmp_path / "short", rows=3)
+    assert "3 of 3 rows are left, at least 5 are needed: record more\n" in run_here(short, cwd=tmp_path).stderr
+    names = sorted(path.name for path in linked.glob("IMG/center*"))
+    (linked / "excluded.csv").write_text(f"{names[0]},{names[-3]},\n", encoding="utf-8")
+    assert "are left, at least 5 are needed: excluded.csv cuts most of them" in run_here(linked, cwd=tmp_path).stderr
 
 
 def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path):

@@ -200,5 +200,7 @@ def driving(history: list[EpochMetrics], recipe: Recipe, still: np.ndarray, file
 
 def correlation(predicted: np.ndarray, labels: np.ndarray) -> float:
     """Return Pearson's correlation, nan if either is constant; predicted, labels: (n,)."""
+    if len(labels) < 2:
+        return math.nan
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(predicted, labels)[0, 1])
