@@ -20,6 +20,8 @@ def test_a_folder_is_refused_at_once(tmp_path, monkeypatch, name):
     assert caught.value.filename == name
     with pytest.raises(OutputError, match="is a folder"):
         check_folders(name)
+    with pytest.raises(OutputError, match="is a folder"):
+        check_folders("new/")
 
 
 def test_a_file_appears_only_when_it_is_complete(tmp_path):

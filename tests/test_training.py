@@ -209,6 +209,7 @@ def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_pat
         (["--batch-size", str(10**18)], "at most"),
         (["--output", "."], "error: --output .: is a folder"),
         (["--output", "data"], "error: --output data: is a folder"),
+        (["--output", "runs/a/"], "error: --output runs/a/: is a folder"),
         (["--device", "cuda"], "error: --device cuda: "),
         (["--device", "mps"], "error: --device mps: "),
         (["--robust", "--throttle-threshold", "0.1"], "--throttle-threshold has no effect with --robust"),
@@ -248,6 +249,8 @@ def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path
     assert f"line 4: left out: IMG/{damaged.name}: cut short" in lenient.stdout
     header, row = (tmp_path / "rejected_rows.csv").read_text(encoding="utf-8").splitlines()
     assert header == "file,line,finding,detail" and damaged.name in row
+    summary.list_rejected([], tmp_path / "rejected_rows.csv", strict=False)
+    assert not (tmp_path / "rejected_rows.csv").exists(), "an earlier run's list is not this one's"
     strict = run_here(copied, *SHORT, "--strict", "--output", tmp_path / "strict.pt")
     assert strict.returncode == 2
     assert damaged.name in strict.stderr
