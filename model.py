@@ -398,7 +398,7 @@ def prepare(command: Command) -> Prepared:
     """Read the data of the run that a command is about. Raises UserError, OSError."""
     run, begin = resumed(command)
     folders = find_folders(list(run.recordings))
-    run = replace(run, recordings=tuple(str(folder.resolve()) for folder in folders))
+    run = replace(run, recordings=tuple(str(folder.absolute()) for folder in folders))
     rejected_file = RunFiles(command.process.output).rejected
     observations = read_observations(run.recipe, folders, rejected_file, command.process.strict)
     train, validation = split(observations, run.recipe, run.seed)

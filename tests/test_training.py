@@ -167,6 +167,19 @@ def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_rec
     assert run.generator.observations is training and run.validation is validation
 
 
+def test_a_link_may_name_a_recording_a_problem_area(linked, tmp_path):
+    link = tmp_path / "lake-repetitive"
+    try:
+        link.symlink_to(linked)
+    except OSError:
+        pytest.skip("Windows lets only privileged users make symbolic links")
+    once, often = (
+        model.prepare(parse([str(folder), "--output", str(tmp_path / "model.pt")])) for folder in (linked, link)
+    )
+    assert len(often.training) == 4 * len(once.training)
+    assert often.run.recordings == (str(link),), "as --resume will read it"
+
+
 def test_every_recording_under_data_is_the_default(linked, tmp_path):
     render_recording(linked.with_name("turn-repetitive"), rows=20, seed=1)
     done = run_here(*SHORT, "--epochs", 1, "--samples-per-epoch", 16, cwd=tmp_path)

@@ -126,9 +126,13 @@ class Observations(Table):
         return cls.joined(parts, recordings=recordings, recording=index)
 
     def counts(self, repeats: int) -> np.ndarray:
-        """Return how often each observation counts: int (n,), `repeats` in a recording of problem areas, else 1."""
-        names = [recording.folder.resolve().name for recording in self.recordings]
-        return np.array([repeats if name.endswith(PROBLEM_AREAS) else 1 for name in names])[self.recording]
+        """Return how often each observation counts: int (n,), `repeats` in a recording of problem areas, else 1.
+
+        A link to the recording may have that name, or the folder itself.
+        """
+        names = [(each.folder.absolute().name, each.folder.resolve().name) for each in self.recordings]
+        is_repeated = [any(name.endswith(PROBLEM_AREAS) for name in both) for both in names]
+        return np.where(is_repeated, repeats, 1)[self.recording]
 
     def drives(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the drive without a break that each observation is of, and the time since its start.
