@@ -151,17 +151,9 @@ class Observations(Table):
         """Return the file of an observation's image; camera: 0 centre, 1 left, 2 right."""
         return self.recordings[self.recording[at]].path(self.row[at], camera)
 
-    def read(self, at: int, camera: int) -> np.ndarray:
-        """Return an observation's whole frame: uint8 (160, 320, 3), RGB. Raises RecordingError."""
-        return read_checked(self.path(at, camera))
-
     def frames(self, at: int) -> list[np.ndarray]:
-        """Return an observation's frames of the centre, left and right camera, as `read` does."""
-        return [self.read(at, camera) for camera in range(len(CAMERAS))]
-
-    def read_cropped(self, at: int, camera: int) -> np.ndarray:
-        """Return what the network sees of an observation's frame: uint8 (75, 320, 3), RGB, not to be changed."""
-        return self.road(at, self.row[at], camera)[SEEN_ROWS.start - ROAD_ROWS.start :]
+        """Return an observation's whole frames of the centre, left and right camera, as `read_checked` does."""
+        return [read_checked(self.path(at, camera)) for camera in range(len(CAMERAS))]
 
     def road(self, at: int, row: int, camera: int) -> np.ndarray:
         """Return the `ROAD_ROWS` of any frame of an observation's recording: uint8 (90, 320, 3), RGB.
@@ -172,9 +164,11 @@ class Observations(Table):
 
     def cropped(self, rows: np.ndarray, cameras: np.ndarray) -> Any:
         """Return what the network sees of these k frames: uint8 (k, 75, 320, 3), RGB."""
+        first = SEEN_ROWS.start - ROAD_ROWS.start
         if self.gpu:
-            return self.road_on_gpu(rows, self.row[rows], cameras)[:, SEEN_ROWS.start - ROAD_ROWS.start :]
-        return np.stack([self.read_cropped(*one) for one in zip(rows, cameras, strict=True)])
+            return self.road_on_gpu(rows, self.row[rows], cameras)[:, first:]
+        chosen = zip(rows, self.row[rows], cameras, strict=True)
+        return np.stack([self.road(*one)[first:] for one in chosen])
 
     def center(self, rows: np.ndarray) -> Any:
         """Return the centre images of these observations, as `cropped` does."""
