@@ -123,7 +123,8 @@ def logs_below(path: Path) -> Iterator[Path]:
     """
 
     def left_out(error: OSError) -> None:
-        program.warn_once(f"{error.filename}: {error.strerror}; left out with what is in it")
+        if not isinstance(error, FileNotFoundError):  # it has just gone
+            program.warn_once(f"{error.filename}: {error.strerror}; left out with what is in it")
 
     visited = set()
     for folder, below, files in os.walk(path, onerror=left_out, followlinks=True):
