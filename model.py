@@ -404,6 +404,8 @@ def prepare(command: Command) -> Prepared:
     train, validation = split(observations, run.recipe, run.seed)
     training = run.recipe.resample(observations.take(train), run.recipe, run.seed)
     print(summary.sizes(len(train), len(training), len(validation)))
+    if not len(training):
+        raise RecordingError("resampling has left out all rows for training, straight driving; record more")
     return Prepared(run, training, observations.take(validation), begin)
 
 

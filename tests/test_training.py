@@ -245,6 +245,14 @@ def test_without_recordings_the_user_is_told_where_to_get_some(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_straight_rows_that_are_all_left_out_by_resampling(tmp_path):
+    """Each stays with a probability of 0.8: with this seed none of four does."""
+    log = render_recording(tmp_path / "straight", rows=5) / "driving_log.csv"
+    log.write_text(re.sub(r",[^,]+(,1,0,30.19)", r",0\1", log.read_text(encoding="utf-8")), encoding="utf-8")
+    done = run_here(log.parent, "--seed", 198, cwd=tmp_path)
+    assert done.returncode == 2 and "resampling has left out all rows for training" in done.stderr
+
+
 def test_why_too_few_rows_are_left(linked, tmp_path):
     short = render_recording(tmp_path / "short", rows=3)
     assert "3 of 3 rows are left, at least 5 are needed: record more\n" in run_here(short, cwd=tmp_path).stderr
