@@ -82,8 +82,10 @@ def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, 
     summary.list_rejected(observations.recordings, rejected_file, strict)
     print(summary.recordings_table(counts, recipe.words.dropped.format(recipe=recipe)))
     if len(observations) < recipe.folds:
-        why = recipe.words.too_few if rows.dropped > rows.unusable else f"see {rejected_file}"
         left = f"{len(observations)} of {rows.rows_read} rows are left"
+        reasons = {"record more": rows.kept, recipe.words.too_few: rows.dropped, f"see {rejected_file}": rows.unusable}
+        reasons["excluded.csv cuts most of them"] = rows.cut
+        why = max(reasons, key=lambda reason: reasons[reason])
         raise RecordingError(f"{left}, at least {recipe.folds} are needed: {why}")
     return observations
 
@@ -380,9 +382,10 @@ class TrainingRun:
         labels, mean = self.validation.steering, self.training.steering.mean()
         last, best = self.files.last, self.files.best
         guess = functools.partial(self.predict, images=self.validation.center, rows=np.arange(len(labels)))
-        models = {last: guess(self.network)}
-        is_last = last.read_bytes() == best.read_bytes()
-        models[best] = models[last] if is_last else guess(load_model(best, self.device))
+        models = {last: guess(self.network.eval())}
+        if best.exists():  # not if it was moved away before the run was resumed
+            is_last = last.read_bytes() == best.read_bytes()
+            models[best] = models[last] if is_last else guess(load_model(best, self.device))
         table = summary.error_table(labels, mean, models, self.recipe)
         return table + summary.driving(self.progress.history, self.recipe, still_drifts(self.held_out), self.files)
 
@@ -395,12 +398,14 @@ def prepare(command: Command) -> Prepared:
     """Read the data of the run that a command is about. Raises UserError, OSError."""
     run, begin = resumed(command)
     folders = find_folders(list(run.recordings))
-    run = replace(run, recordings=tuple(str(folder.resolve()) for folder in folders))
+    run = replace(run, recordings=tuple(str(folder.absolute()) for folder in folders))
     rejected_file = RunFiles(command.process.output).rejected
     observations = read_observations(run.recipe, folders, rejected_file, command.process.strict)
     train, validation = split(observations, run.recipe, run.seed)
     training = run.recipe.resample(observations.take(train), run.recipe, run.seed)
     print(summary.sizes(len(train), len(training), len(validation)))
+    if not len(training):
+        raise RecordingError("resampling has left out all rows for training, straight driving; record more")
     return Prepared(run, training, observations.take(validation), begin)
 
 

@@ -44,7 +44,7 @@ def temporaries(folder: Path) -> list[Path]:
 def check_whole(folder: Path) -> None:
     """Each file that stands under its own name can be read to its end."""
     for path in folder.rglob("*"):
-        if path.is_dir() or any(is_temporary(each) or each.suffix == ".part" for each in (path, *path.parents)):
+        if path.is_dir() or any(map(is_temporary, (path, *path.parents))):
             continue
         data = path.read_bytes()
         if path.suffix == ".pt":

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from cloning.base.errors import OutputError, UserError
-from cloning.base.files import write, written_whole
+from cloning.base.files import folder_written_whole, write, written_whole
 from cloning.base.outputs import check_folders, run_all
 
 
@@ -20,6 +20,8 @@ def test_a_folder_is_refused_at_once(tmp_path, monkeypatch, name):
     assert caught.value.filename == name
     with pytest.raises(OutputError, match="is a folder"):
         check_folders(name)
+    with pytest.raises(OutputError, match="is a folder"):
+        check_folders("new/")
 
 
 def test_a_file_appears_only_when_it_is_complete(tmp_path):
@@ -91,12 +93,25 @@ def test_several_may_write_a_file_at_the_same_time(tmp_path):
     assert os.listdir(tmp_path) == ["film.mp4"]
 
 
+def test_several_may_write_a_folder_at_the_same_time(tmp_path):
+    """The first one to finish has only its own files in it; the others fail, and leave nothing."""
+    path = tmp_path / "lake"
+    with pytest.raises(OSError) as raised, folder_written_whole(path) as second:
+        (second / "second.csv").write_bytes(b"second")
+        with folder_written_whole(path) as first:
+            (first / "first.csv").write_bytes(b"first")
+    assert raised.value.filename == str(path)
+    assert os.listdir(tmp_path) == ["lake"] and os.listdir(path) == ["first.csv"]
+
+
 def test_what_killed_processes_left_goes_after_a_day(tmp_path):
     """Each use has its own temporary file, which nobody else would ever write or delete."""
     old, new, foreign = (tmp_path / name for name in (".other.npz.0123abcd.part", ".film.mp4.89ef0123.part", ".a.part"))
     for path, age in ((old, 86_500), (new, 86_300), (foreign, 86_500)):
         path.write_bytes(b"half")
         os.utime(path, (time.time() - age,) * 2)
+    (tmp_path / ".lake.0123abcd.part" / "IMG").mkdir(parents=True)
+    os.utime(tmp_path / ".lake.0123abcd.part", (time.time() - 86_500,) * 2)
     write(tmp_path / "film.mp4", b"new")
     left = {new.name, foreign.name, "film.mp4"}
     assert set(os.listdir(tmp_path)) == left, "another process may still write the new one"

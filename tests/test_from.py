@@ -35,10 +35,13 @@ def test_a_run_begins_with_the_weights_of_the_file_and_nothing_else_of_it(sample
 @pytest.mark.parametrize("recipe", [REPORT, ROBUST])
 def test_a_run_keeps_the_recipe_of_the_network_that_it_begins_with(base, recipe):
     saved = torch.load(base, weights_only=True)
+    del saved["digest"]
     saved["arguments"]["recipe"]["name"] = recipe.name
-    tensors.save(base, {name: saved[name] for name in saved if name != "digest"})
-    for option, wanted in ((), recipe), (("--robust",), ROBUST), (("--no-robust",), REPORT):
-        assert parse(["--from", str(base), *option], REPORT, ROBUST).run.recipe.name == wanted.name
+    earlier = {"recordings": ["data"], "seed": 0, "robust": recipe is ROBUST}  # of a version without recipes
+    for arguments in (saved["arguments"], earlier):
+        tensors.save(base, {**saved, "arguments": arguments})
+        for option, wanted in ((), recipe), (("--robust",), ROBUST), (("--no-robust",), REPORT):
+            assert parse(["--from", str(base), *option], REPORT, ROBUST).run.recipe.name == wanted.name
 
 
 def test_it_is_resumed_exactly_without_the_file(sample_recording, base, tmp_path):

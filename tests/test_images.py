@@ -233,6 +233,15 @@ def test_images_are_checked_named_and_left_out(copied, monkeypatch):
     np.testing.assert_array_equal(again.digests, found.digests)
 
 
+def test_ctrl_c_does_not_wait_for_all_images(copied, monkeypatch):
+    read = Mock(side_effect=read_jpeg)
+    monkeypatch.setattr(check, "read_jpeg", read)
+    monkeypatch.setattr("cloning.base.progress.Bar.update", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        check_images(read_recording(copied), threads=1)
+    assert read.call_count <= check.IMAGES_AT_ONCE < 180
+
+
 def lower_case_folder(folder: Path) -> None:
     (folder / "IMG").rename(folder / "moved")
     (folder / "moved").rename(folder / "img")

@@ -236,6 +236,36 @@ def test_a_damaged_tub_is_reported_with_its_line(tub, tmp_path, row):
     assert [path.name for path in tmp_path.iterdir()] == ["tub"]
 
 
+@pytest.mark.parametrize("last", ["3", "[]", '{"paths": 3}', '{"paths": ["catalog_0.catalog"], "deleted_indexes": 3}'])
+def test_a_damaged_manifest_of_a_tub_is_reported(tub, tmp_path, last):
+    lines = (tub / "manifest.json").read_text(encoding="utf-8").splitlines()
+    (tub / "manifest.json").write_text("\n".join([*lines[:4], last]), encoding="utf-8")
+    done = run(tub, "--output", tmp_path / "recording")
+    assert done.returncode == 2 and "manifest.json: line 5 names no catalogs" in done.stderr, done.stderr
+
+
+def test_rows_without_a_time_or_a_number_are_left_out(data_set, tmp_path):
+    path = data_set / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    times, actions = (table[name].to_pylist() for name in ("recorded_at", "action"))
+    times[2:5], actions[6] = [None, 1e22, float("nan")], [None, 1.0, 0.0]
+    for name, values in (("recorded_at", times), ("action", actions)):
+        table = table.set_column(table.column_names.index(name), name, [values])
+    pq.write_table(table, path)
+    done = run(data_set, "--output", tmp_path / "recording")
+    assert done.returncode == 0 and "time or numbers are not finite is left out (4 times)" in done.stdout, done.stderr
+    assert len(checked(tmp_path / "recording")) == 15
+
+
+def test_a_recording_without_images_is_left_out(recordings, tmp_path):
+    (tmp_path / "bare").mkdir()
+    shutil.copy(recordings[0] / "driving_log.csv", tmp_path / "bare")
+    done = run(recordings[1], tmp_path / "bare", "--output", tmp_path / "set")
+    assert done.returncode == 0 and "set: 5 frames of 3 cameras in 1 episode" in done.stdout, done.stderr
+    done = run(tmp_path / "bare", "--output", tmp_path / "other")
+    assert done.returncode == 2 and "bare: no usable row is left\n" in done.stderr
+
+
 def test_what_exists_is_not_replaced(recordings, written, tub):
     for source in (recordings[0], written, tub):
         done = run(source, "--output", tub)

@@ -1,5 +1,6 @@
 """driving_log.csv in the nineteen formats met in the wild, and others: read right, repaired or refused."""
 
+import os
 import random
 import re
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from rendered import render_recording
 
+from cloning.base import program
 from cloning.base.errors import RecordingError
 from cloning.recordings import rows
 from cloning.recordings.check import check_images
@@ -78,6 +80,7 @@ def findings(found: Recording) -> list[tuple[int, Finding]]:
         usual("/IMG/"),
         usual("IMG_Ori\\"),
         usual("D:\\montravail\\IMG\\IMG\\"),
+        usual("PK/IMG/"),  # Excel's workbooks begin with these letters
         usual("/home/driver/Behavioral Cloning/data rev/IMG/"),  # 10
         [usual("C:\\IMG\\")[3], *usual("/home/a b/IMG/")[:2], usual("IMG/", SPACED, ", ")[2]],  # 11, out of order
         usual("C:\\Users\\Doe, John\\IMG\\"),
@@ -407,3 +410,18 @@ def test_folders_are_found_below_links_and_each_once(tmp_path):
         read_recording(tmp_path / "nowhere")
     with pytest.raises(RecordingError, match=r"driving_log\.csv: a file; name the folder"):
         find_folders([str(data / "own" / "driving_log.csv")])
+
+
+def test_a_folder_that_cannot_be_read_is_named(tmp_path, monkeypatch, capsys):
+    for name in ("jungle", "lake"):
+        render_recording(tmp_path / name, rows=1)
+    listed, locked = os.scandir, str(tmp_path / "lake")
+
+    def scandir(folder):
+        if folder == locked:
+            raise PermissionError(13, "Permission denied", folder)
+        return listed(folder)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert find_folders([str(tmp_path)]) == [tmp_path / "jungle"]
+    assert capsys.readouterr().err == f"{program.name}: {locked}: Permission denied; left out with what is in it\n"

@@ -147,6 +147,10 @@ def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
     changed = run_here(render_recording(tmp_path / "other", rows=20, seed=1), "--output", output, "--resume")
     assert changed.returncode == 2
     assert "the run began with other recordings" in changed.stderr
+    with edited(begun / "model-resume.pt") as saved:
+        saved["training"]["images"] = 4
+    fewer = run_here("--output", output, "--resume", "--epochs", 1)
+    assert fewer.returncode == 2 and "the run is in epoch 2; give more --epochs" in fewer.stderr
 
 
 def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path):
@@ -197,9 +201,14 @@ def test_a_run_is_resumed_only_by_its_own_recipe(begun, sample_recording, capsys
 
 
 def test_a_finished_run_that_is_resumed_says_how_to_train_on(begun):
+    """Also if its models were moved away; the last epoch's is written again."""
+    before = weights(begun / "model.pt")
+    for name in MODELS[:2]:
+        (begun / f"{name}.pt").unlink()
     done = run_here("--output", begun / "model.pt", "--resume")
     assert done.returncode == 0 and "resumed in epoch" not in done.stdout
     assert "the run has finished its 1 epoch; for more, raise --epochs" in done.stdout
+    assert same(weights(begun / "model.pt"), before)
 
 
 @pytest.mark.parametrize("missing", [False, True])

@@ -14,7 +14,7 @@ import model
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
-from cloning.network.network import CROP, SEEN_SHAPE, Network
+from cloning.network.network import CROP, SEEN_SHAPE, Network, save_model
 from cloning.recordings.log import CheckedRecording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
@@ -273,6 +273,28 @@ def test_validation_counts_centre_images_and_other_poses_alike(sample_recording,
         assert both == pytest.approx((plain + run.validate()[0]) / 2, rel=1e-6)
     assert not np.allclose(labels, other_labels)
     assert not np.array_equal(center(np.arange(3)), warped(np.arange(3)))
+
+
+def test_the_summary_compares_networks_as_they_drive(sample_recording, tmp_path):
+    """Ordinary frames are dark to this network, which brightens them when it drives."""
+    command = [str(sample_recording), *map(str, OPTIONS), "--output", str(tmp_path / "model.pt")]
+    asked = parse(command, REPORT, ROBUST)
+    run = model.TrainingRun(model.prepare(asked), asked.process, Ranks())
+    run.network.exposure = (200.0, 60.0)
+    run.progress.images = 1
+    run.progress.finish_epoch(0.1, 0.1)
+    run.files.pictures.mkdir()
+    run.save(run.files.last)
+    save_model(run.files.best, run.network)
+    with run.pool:
+        errors = next(line.split() for line in run.summary().splitlines() if line.startswith("steering of 0 to 1 "))
+    assert errors[-1] == errors[-2]
+
+
+def test_a_recording_without_images_is_left_out(linked, tmp_path):
+    shutil.rmtree(linked / "IMG")
+    done = run_here(linked, "--robust", "--output", tmp_path / "model.pt")
+    assert done.returncode == 2 and "0 of 60 rows are left, at least 5 are needed: see" in done.stderr
 
 
 def test_drives_too_short_are_named(tmp_path):

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import warnings
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -90,6 +91,8 @@ def test_an_error_above_that_of_constant_steering_is_explained():
     assert larger.endswith(f"replay RECORDING --model {Path('runs', 'net.pt')}")
     assert "larger error" not in text(labels) and "hardly follows" not in text(labels)
     assert "net.pt hardly follows the driver" in text(np.zeros_like(labels))
+    with warnings.catch_warnings(action="error"):
+        assert math.isnan(summary.correlation(labels[:1], labels[:1])), "of a single row"
 
 
 def test_the_line_of_a_diagnostic_picture_stays_within_its_image():
@@ -164,6 +167,19 @@ def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_rec
     assert run.generator.observations is training and run.validation is validation
 
 
+def test_a_link_may_name_a_recording_a_problem_area(linked, tmp_path):
+    link = tmp_path / "lake-repetitive"
+    try:
+        link.symlink_to(linked)
+    except OSError:
+        pytest.skip("Windows lets only privileged users make symbolic links")
+    once, often = (
+        model.prepare(parse([str(folder), "--output", str(tmp_path / "model.pt")])) for folder in (linked, link)
+    )
+    assert len(often.training) == 4 * len(once.training)
+    assert often.run.recordings == (str(link),), "as --resume will read it"
+
+
 def test_every_recording_under_data_is_the_default(linked, tmp_path):
     render_recording(linked.with_name("turn-repetitive"), rows=20, seed=1)
     done = run_here(*SHORT, "--epochs", 1, "--samples-per-epoch", 16, cwd=tmp_path)
@@ -206,6 +222,7 @@ def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_pat
         (["--batch-size", str(10**18)], "at most"),
         (["--output", "."], "error: --output .: is a folder"),
         (["--output", "data"], "error: --output data: is a folder"),
+        (["--output", "runs/a/"], "error: --output runs/a/: is a folder"),
         (["--device", "cuda"], "error: --device cuda: "),
         (["--device", "mps"], "error: --device mps: "),
         (["--robust", "--throttle-threshold", "0.1"], "--throttle-threshold has no effect with --robust"),
@@ -228,6 +245,22 @@ def test_without_recordings_the_user_is_told_where_to_get_some(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_straight_rows_that_are_all_left_out_by_resampling(tmp_path):
+    """Each stays with a probability of 0.8: with this seed none of four does."""
+    log = render_recording(tmp_path / "straight", rows=5) / "driving_log.csv"
+    log.write_text(re.sub(r",[^,]+(,1,0,30.19)", r",0\1", log.read_text(encoding="utf-8")), encoding="utf-8")
+    done = run_here(log.parent, "--seed", 198, cwd=tmp_path)
+    assert done.returncode == 2 and "resampling has left out all rows for training" in done.stderr
+
+
+def test_why_too_few_rows_are_left(linked, tmp_path):
+    short = render_recording(tmp_path / "short", rows=3)
+    assert "3 of 3 rows are left, at least 5 are needed: record more\n" in run_here(short, cwd=tmp_path).stderr
+    names = sorted(path.name for path in linked.glob("IMG/center*"))
+    (linked / "excluded.csv").write_text(f"{names[0]},{names[-3]},\n", encoding="utf-8")
+    assert "are left, at least 5 are needed: excluded.csv cuts most of them" in run_here(linked, cwd=tmp_path).stderr
+
+
 def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path):
     damaged = sorted((copied / "IMG").glob("left*"))[3]
     damaged.write_bytes(damaged.read_bytes()[:1000])
@@ -237,6 +270,8 @@ def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path
     assert f"line 4: left out: IMG/{damaged.name}: cut short" in lenient.stdout
     header, row = (tmp_path / "rejected_rows.csv").read_text(encoding="utf-8").splitlines()
     assert header == "file,line,finding,detail" and damaged.name in row
+    summary.list_rejected([], tmp_path / "rejected_rows.csv", strict=False)
+    assert not (tmp_path / "rejected_rows.csv").exists(), "an earlier run's list is not this one's"
     strict = run_here(copied, *SHORT, "--strict", "--output", tmp_path / "strict.pt")
     assert strict.returncode == 2
     assert damaged.name in strict.stderr

@@ -39,6 +39,7 @@ from cloning.network.compute import keep_freed_memory, threads
 from cloning.network.network import CROP, SEEN_ROWS, Network
 from cloning.road.track import Track
 from cloning.training.distributed import Ranks
+from cloning.training.observations import read_checked
 from cloning.training.options import Command, Process, Run
 from simulator.record import record
 from tools.command import head, python, row
@@ -107,7 +108,7 @@ def one_by_one(generator: model.Generator, number: int) -> tuple[np.ndarray, np.
     """Make a batch as a typical generator does, one image at a time: uint8 (n, 75, 320, 3), labels float32 (n,)."""
     choices, images, angles = generator.sample(number), [], []
     for i, (at, camera) in enumerate(zip(choices.observation, choices.camera, strict=True)):
-        seen = generator.observations.read(at, camera)[SEEN_ROWS]
+        seen = read_checked(generator.observations.path(at, camera))[SEEN_ROWS]
         for kind, augmentation in enumerate(generator.recipe.augmentations):
             if choices.slots[i, kind] >= 0:
                 chosen = [column[i : i + 1] for column in choices.augmenting[kind]]

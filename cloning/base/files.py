@@ -37,8 +37,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    _clean(path.absolute().parent)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    temporary = _temporary(path)
     try:
         yield temporary
         if temporary.exists():
@@ -52,29 +51,35 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         raise
 
 
+def _temporary(path: Path) -> Path:
+    """Return a name for what will be `path`, beside it; the first time in a folder, clean that."""
+    _clean(path.absolute().parent)
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+
+
 @functools.cache  # once: a folder of saved frames takes long to list
 def _clean(folder: Path) -> None:
     """Delete what killed processes left in a folder, if it can be deleted."""
     with suppress(OSError):
         for entry in os.scandir(folder):
             if TEMPORARY_NAME.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > LEFT_BEHIND:
-                os.unlink(entry)
+                delete = shutil.rmtree if entry.is_dir(follow_symlinks=False) else os.unlink
+                delete(entry)
 
 
 @contextmanager
 def folder_written_whole(path: str | Path) -> Iterator[Path]:
     """Yield an empty folder beside `path`, and rename it to `path` when the block ends without an exception.
 
-    A process killed at any time leaves `path` absent or complete, and perhaps the other folder, `.NAME.part`, which the
-    next one deletes. Raises OSError, with the name `path`, also if that exists.
+    A process killed at any time leaves `path` absent or complete. The temporary folder is as `written_whole`'s file. Of
+    several that write `path` at the same time the first one to finish wins. Raises OSError, with the name `path`, also
+    if that exists.
     """
     path = Path(path).absolute()
     if os.path.lexists(path):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-    temporary = path.with_name(f".{path.name}.part")
+    temporary = _temporary(path)
     try:
-        if temporary.exists():
-            shutil.rmtree(temporary)
         temporary.mkdir()
         yield temporary
         os.rename(temporary, path)

@@ -9,6 +9,8 @@ from pathlib import Path
 from cloning.base.errors import OutputError, UserError
 from cloning.base.files import write
 
+FOLDER_ENDS = "/", os.sep  # of the name of a folder that need not exist
+
 
 def check_folders(*paths: str | None, model: str | Path | None = None) -> None:
     """Raise OutputError, before the work, if an output is a folder, in no folder, or the model file that is read."""
@@ -17,7 +19,7 @@ def check_folders(*paths: str | None, model: str | Path | None = None) -> None:
             raise OutputError(f"{path}: is the model itself, which would be replaced; name another file")
         if path and not Path(path).absolute().parent.is_dir():
             raise OutputError(f"{path}: no such folder to write it in; make the folder first")
-        if path and Path(path).is_dir():
+        if path and (path.endswith(FOLDER_ENDS) or Path(path).is_dir()):
             raise OutputError(f"{path}: is a folder; name a file in it")
 
 

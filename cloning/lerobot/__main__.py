@@ -72,6 +72,9 @@ def main() -> int:
                 print_findings(recording)
                 if (lane := recording.folder / LANE_FILE).exists():
                     print(f"{lane}: left out; of what comes back, --robust will have to estimate the lane")
+            recordings = [recording for recording in recordings if len(recording)]
+            if not recordings:
+                raise RecordingError(f"{source}: no usable row is left")
             print(f"{output}: {write_data_set(recordings, output)}")
             return program.DONE
         samples = read_data_set(source, arguments.camera, arguments.steering)

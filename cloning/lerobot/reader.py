@@ -93,8 +93,9 @@ def _episodes(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _column(table: pa.Table, key: str, at: int) -> Sequence[float]:
-    """Return one number of a feature in each row."""
-    return [value[at] if isinstance(value, list) else value for value in table[key].to_pylist()]
+    """Return one number of a feature in each row; nan for one that is missing."""
+    values = [value[at] if isinstance(value, list) else value for value in table[key].to_pylist()]
+    return np.array(values, float).tolist()
 
 
 def _images(

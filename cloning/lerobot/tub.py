@@ -23,11 +23,14 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
     """
     camera = camera or "cam/image_array"
     lines = _lines(folder / MANIFEST)
-    if len(lines) < 5 or not isinstance(lines[4], dict) or "paths" not in lines[4]:
-        raise RecordingError(f"{folder / MANIFEST}: line 5 names no catalogs: not of a tub of version 2; copy it again")
-    deleted, index = set(lines[4].get("deleted_indexes", [])), -1
-    for path in lines[4]["paths"]:
-        for line, row in enumerate(_lines(folder / path), 1):
+    try:
+        paths, deleted = [folder / name for name in lines[4]["paths"]], set(lines[4].get("deleted_indexes") or ())
+    except (AttributeError, IndexError, KeyError, TypeError):
+        remedy = "line 5 names no catalogs: not of a tub of version 2; copy it again"
+        raise RecordingError(f"{folder / MANIFEST}: {remedy}") from None
+    index = -1
+    for path in paths:
+        for line, row in enumerate(_lines(path), 1):
             index += 1
             try:
                 if index in deleted:
@@ -45,7 +48,7 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
                     yield Sample(time, [image], {"steering": float(row["user/angle"]), **throttle})
             except (AttributeError, KeyError, TypeError, ValueError) as error:
                 problem = f"no {error}" if isinstance(error, KeyError) else str(error)
-                raise RecordingError(f"{folder / path}: line {line}: {problem}; correct or delete the line") from None
+                raise RecordingError(f"{path}: line {line}: {problem}; correct or delete the line") from None
 
 
 def _lines(path: Path) -> list[Any]:

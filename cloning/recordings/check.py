@@ -20,6 +20,7 @@ from cloning.recordings.images import RULES, decode, read_jpeg
 from cloning.recordings.log import CheckedRecording, Recording
 
 COPY_OR_DELETE = "copy it again, or delete the row"
+IMAGES_AT_ONCE = 32  # for each thread: Ctrl-C waits for them, and a future takes memory, of perhaps millions of images
 
 
 def check_images(
@@ -55,7 +56,7 @@ def check_images(
     title, hidden = f"checking images of {recording.folder.name}", not show_progress or not len(todo)
     with ThreadPoolExecutor(threads) as pool, progress_bar(len(todo), "image", hidden, desc=title, leave=False) as bar:
         remaining = iter(todo.tolist())
-        while part := list(islice(remaining, 4096)):  # a future takes memory, and there may be millions of images
+        while part := list(islice(remaining, IMAGES_AT_ONCE * threads)):
             for _ in pool.map(examine, part):
                 bar.update()
     is_usable = np.ones(len(names), bool)

@@ -11,6 +11,7 @@ from typing import Self
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.errors import RecordingError
 from cloning.base.table import Column, Table
 from cloning.recordings.columns import Finding, Rejected, UnclearLogError
@@ -37,8 +38,8 @@ class Recording(Table):
     names      bytes (m,): file names in `IMG/`, sorted, without duplicates
     images     int32 (n, 3): indices into `names` of a row's centre, left and right image
     steering   float32 (n,): -1..1, right positive
-    throttle   float32 (n,): -1..1
-    brake      float32 (n,): -1..1
+    throttle   float32 (n,): 0..1
+    brake      float32 (n,): 0..1
     speed      float32 (n,): mph
     time       float64 (n,): seconds since 1970 by the recording computer's clock; without time stamps, line / 15
     lines      int32 (n,): line in the csv, from 1
@@ -116,9 +117,17 @@ def find_folders(given: list[str]) -> list[Path]:
 
 
 def logs_below(path: Path) -> Iterator[Path]:
-    """Yield each driving_log.csv below a folder, through symbolic links too: recordings are often on another disk."""
+    """Yield each driving_log.csv below a folder, through symbolic links too: recordings are often on another disk.
+
+    A folder that cannot be read is named on stderr.
+    """
+
+    def left_out(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError):  # it has just gone
+            program.warn_once(f"{error.filename}: {error.strerror}; left out with what is in it")
+
     visited = set()
-    for folder, below, files in os.walk(path, followlinks=True):
+    for folder, below, files in os.walk(path, onerror=left_out, followlinks=True):
         if (real := os.path.realpath(folder)) in visited:
             below.clear()  # reached a second time, through a link
             continue

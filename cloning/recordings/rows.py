@@ -64,7 +64,7 @@ def _encoding(path: Path) -> str:
     """Return the csv's encoding, judged by its first bytes. Raises RecordingError if it is not text."""
     with open(path, "rb") as file:
         start = file.read(4)
-    if start[:2] == b"PK":
+    if start == b"PK\x03\x04":
         raise RecordingError(f"{path}: line 1: an Excel workbook under a csv's name; open it and save it as CSV")
     if start == b"\x00\x05\x16\x07":
         raise RecordingError(f"{path}: line 1: a macOS resource file (AppleDouble); copy the real {DRIVING_LOG}")

@@ -3,7 +3,6 @@
 import errno
 import math
 import os
-import re
 from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -29,7 +28,7 @@ DEFAULT_START = datetime(2018, 1, 1, 12)
 
 def csharp_number(value: float) -> str:
     """Return a number as C# writes a float: with seven significant digits, for example 6.9E-05."""
-    return re.sub(r"E([+-]\d)$", r"E\g<1>", f"{value:.7G}").replace("-0", "0") if value == 0 else f"{value:.7G}"
+    return f"{value + 0:.7G}"  # + 0 turns -0 into 0
 
 
 def check_name_of_corrections(folder: str | Path) -> None:

@@ -190,6 +190,9 @@ def resumed(command: Command) -> tuple[Run, SavedRun | FirstWeights | None]:
             other = f"damaged, or of another run than {files.resume.name}, which would replace it"
             raise ModelError(f"{model}: {other}; move it away first")
     epochs = run.recipe.epochs if "epochs" in given else saved.run.recipe.epochs
+    begun = len(saved.progress.history) + (saved.progress.images > 0)
+    if epochs < begun:
+        raise ModelError(f"{files.resume}: the run is in epoch {begun}; give more --epochs, or leave the option out")
     recordings = run.recordings if "recordings" in given else saved.run.recordings
     return replace(saved.run, recordings=recordings, recipe=replace(saved.run.recipe, epochs=epochs)), saved
 
@@ -299,6 +302,8 @@ class Checkpoint:
         settings["training"] = {"labels": counts.tolist()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if self.resumed:
+            if progress.history and not progress.images and not self.files.last.exists():  # it was moved away
+                self.save(progress, self.files.last)
             self._write_progress(progress)  # a killed run may not have come so far
             if len(progress.history) == self.run.recipe.epochs:
                 print(f"the run has finished its {plural(len(progress.history), 'epoch')}; for more, raise --epochs")

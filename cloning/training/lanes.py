@@ -55,9 +55,11 @@ class Lanes(LaneAhead):
     @classmethod
     def of(cls, recording: Recording) -> Self:
         """Return the lane at every row of a recording. Raises OSError, and the errors of `lane_position`."""
+        lanes = cls.unknown(len(recording))
+        if not len(lanes):  # no image is usable
+            return lanes
         whole = stretches(recording)
         position = lane_position(recording, whole)
-        lanes = cls.unknown(len(recording))
         for stretch in itertools.chain.from_iterable(position.pieces(recording, each) for each in whole):
             rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
             ahead = LaneAhead.of_stretch(stretch, position.lateral_offset[rows], position.trusted[rows])

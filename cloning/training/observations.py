@@ -126,9 +126,13 @@ class Observations(Table):
         return cls.joined(parts, recordings=recordings, recording=index)
 
     def counts(self, repeats: int) -> np.ndarray:
-        """Return how often each observation counts: int (n,), `repeats` in a recording of problem areas, else 1."""
-        names = [recording.folder.resolve().name for recording in self.recordings]
-        return np.array([repeats if name.endswith(PROBLEM_AREAS) else 1 for name in names])[self.recording]
+        """Return how often each observation counts: int (n,), `repeats` in a recording of problem areas, else 1.
+
+        A link to the recording may have that name, or the folder itself.
+        """
+        names = [(each.folder.absolute().name, each.folder.resolve().name) for each in self.recordings]
+        is_repeated = [any(name.endswith(PROBLEM_AREAS) for name in both) for both in names]
+        return np.where(is_repeated, repeats, 1)[self.recording]
 
     def drives(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the drive without a break that each observation is of, and the time since its start.
@@ -147,17 +151,9 @@ class Observations(Table):
         """Return the file of an observation's image; camera: 0 centre, 1 left, 2 right."""
         return self.recordings[self.recording[at]].path(self.row[at], camera)
 
-    def read(self, at: int, camera: int) -> np.ndarray:
-        """Return an observation's whole frame: uint8 (160, 320, 3), RGB. Raises RecordingError."""
-        return read_checked(self.path(at, camera))
-
     def frames(self, at: int) -> list[np.ndarray]:
-        """Return an observation's frames of the centre, left and right camera, as `read` does."""
-        return [self.read(at, camera) for camera in range(len(CAMERAS))]
-
-    def read_cropped(self, at: int, camera: int) -> np.ndarray:
-        """Return what the network sees of an observation's frame: uint8 (75, 320, 3), RGB, not to be changed."""
-        return self.road(at, self.row[at], camera)[SEEN_ROWS.start - ROAD_ROWS.start :]
+        """Return an observation's whole frames of the centre, left and right camera, as `read_checked` does."""
+        return [read_checked(self.path(at, camera)) for camera in range(len(CAMERAS))]
 
     def road(self, at: int, row: int, camera: int) -> np.ndarray:
         """Return the `ROAD_ROWS` of any frame of an observation's recording: uint8 (90, 320, 3), RGB.
@@ -168,9 +164,11 @@ class Observations(Table):
 
     def cropped(self, rows: np.ndarray, cameras: np.ndarray) -> Any:
         """Return what the network sees of these k frames: uint8 (k, 75, 320, 3), RGB."""
+        first = SEEN_ROWS.start - ROAD_ROWS.start
         if self.gpu:
-            return self.road_on_gpu(rows, self.row[rows], cameras)[:, SEEN_ROWS.start - ROAD_ROWS.start :]
-        return np.stack([self.read_cropped(*one) for one in zip(rows, cameras, strict=True)])
+            return self.road_on_gpu(rows, self.row[rows], cameras)[:, first:]
+        chosen = zip(rows, self.row[rows], cameras, strict=True)
+        return np.stack([self.road(*one)[first:] for one in chosen])
 
     def center(self, rows: np.ndarray) -> Any:
         """Return the centre images of these observations, as `cropped` does."""

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from cloning.base.arguments import number
 from cloning.base.errors import ModelError
+from cloning.base.outputs import FOLDER_ENDS
 from cloning.network.compute import DEVICES, is_available
 from cloning.network.network import load_checkpoint
 from cloning.recordings.format import DRIVING_LOG, PROBLEM_AREAS
@@ -107,7 +108,7 @@ def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
     process = Process(**{name: values.pop(name) for name in ("output", "device", "strict", "resume") if name in values})
     if "recordings" in values:
         values["recordings"] = tuple(values["recordings"])
-    if Path(process.output).is_dir():
+    if process.output.endswith(FOLDER_ENDS) or Path(process.output).is_dir():
         parser.error(f"--output {process.output}: is a folder; name the model file in it, such as model.pt")
     if not is_available(process.device):
         parser.error(f"--device {process.device}: torch finds no such GPU on this machine; leave the option out")
@@ -118,8 +119,10 @@ def recipe_name(model: str) -> str | None:
     """Return the name of the recipe that trained a model file; None if the file does not tell, or can't be read."""
     with suppress(ModelError):  # `read_first_weights` tells of it later
         arguments = load_checkpoint(model).get("arguments")
-        recipe = arguments.get("recipe") if isinstance(arguments, dict) else None
-        return recipe.get("name") if isinstance(recipe, dict) else None
+        if isinstance(arguments, dict):
+            earlier = "robust" if arguments.get("robust") is True else "report"  # of a version without recipes
+            recipe = arguments.get("recipe", {"name": earlier})
+            return recipe.get("name") if isinstance(recipe, dict) else None
     return None
 
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from cloning.training.recipe import Augmentation
 GPU_PIECE = 512  # images at most that a GPU predicts together
 GPU_SIZES = 16  # of batches on a GPU are multiples of this, because each size is recorded: see Graphed
 PIECE = 28  # images at most: their activations fit a CPU's cache, which is twice as fast as a whole batch at once
-Module = TypeVar("Module", bound=nn.Module)
 
 
 @dataclass
@@ -96,12 +95,6 @@ def start_batch(
     return wait
 
 
-def converted(network: Module, precision: torch.dtype) -> Module:
-    """Return the network if its weights have this precision, else a copy whose weights have it."""
-    same = next(network.parameters()).dtype == precision
-    return network if same else copy.deepcopy(network).to(precision)
-
-
 def squared_errors(
     network: Callable[..., torch.Tensor],
     images: torch.Tensor,
@@ -151,10 +144,10 @@ class SquaredErrors(nn.Module):
         super().__init__()
         self.network, self.precision, self.pool, self.huber = network, precision, pool, huber
         self.device = next(network.parameters()).device
-        on_cpu = self.device.type == "cpu"
+        is_usable = self.device.type != "cpu" or next(network.parameters()).dtype == precision
         self.graphed = Graphed(self.gradients)
         # In a tuple, because the weights of the copy are not this module's parameters.
-        self.converted = (converted(network, precision) if on_cpu else network,)
+        self.converted = (network if is_usable else copy.deepcopy(network).to(precision),)
 
     def forward(self, batch: Batch, meanwhile: Callable[[], None] = lambda: None) -> torch.Tensor:
         """Return the sum over this process's images: a scalar, float32.

@@ -78,7 +78,10 @@ def sizes(rows: int, observations: int, validation: int) -> str:
 
 
 def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> None:
-    """Write the unusable rows of all recordings, if any, to a csv file; strict: raise RecordingError instead."""
+    """Write the unusable rows of all recordings to a csv file, or delete it if there are none.
+
+    strict: raise RecordingError if there are any.
+    """
     rejected = [(recording.folder / DRIVING_LOG, *row) for recording in recordings for row in recording.rejected]
     count = plural(len(rejected), "unusable row")
     if rejected and strict:
@@ -87,6 +90,8 @@ def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> 
     if rejected:
         write(file, csv_bytes([("file", "line", "finding", "detail"), *rejected]))
         print(f"{count} left out; {file} lists them")
+    else:
+        file.unlink(missing_ok=True)  # an earlier run's
 
 
 def history_csv(history: list[EpochMetrics]) -> bytes:
@@ -200,5 +205,7 @@ def driving(history: list[EpochMetrics], recipe: Recipe, still: np.ndarray, file
 
 def correlation(predicted: np.ndarray, labels: np.ndarray) -> float:
     """Return Pearson's correlation, nan if either is constant; predicted, labels: (n,)."""
+    if len(labels) < 2:
+        return math.nan
     with np.errstate(invalid="ignore"):
         return float(np.corrcoef(predicted, labels)[0, 1])
