@@ -100,7 +100,7 @@ def replayed(folder: Path, model: Path, limit: float, offset: np.ndarray, where:
     metrics = {"autonomy_percent": 90.0, "interventions": len(where), "distance_mean_m": 0.25, "distance_p95_m": 0.48}
     unknown = [[int(read_recording(folder).images[7, 0]), 5, "not driven"]]
     known = {"by_reference": {"lane_centre": metrics}, "rows_placed": len(offset), "unknown": unknown}
-    driven = {"mean_speed_mph": 15.0, "steering_roughness_per_s": 0.2, "by_lane": len(offset)}
+    driven = {"mean_speed_mph": 15.0, "steering_roughness_per_s": 0.2, "by_lane": len(offset) - 3}
     about = {**metrics, **known, **driven, "human_mean_m": 0.0, "where": where}
     written(folder, Analysis("replay", str(model), limit), columns, **about)
 
@@ -123,6 +123,14 @@ def written_run(folder, finished: int, images: int, epochs=4, losses=(0.5, 0.4, 
         for name in ("LRC_", "augmented-"):
             (files.pictures / f"training_generator_{name}{observations}.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     return files
+
+
+# The next answer about a recording comes when `late.go` is called.
+LATE = """const own = fetch; late = {asked: 0}; fetch = async (...what) => {
+    const answer = await own(...what);
+    if (what[0].includes("/details") && !late.asked++) await new Promise(go => late.go = go);
+    return answer;
+}; 0"""
 
 
 def at(page, row: int) -> None:

@@ -17,7 +17,7 @@ from cloning.base.errors import RecordingError, UserError, message_of
 from cloning.browse import analyse, analyses, library, summary
 from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
 from cloning.browse.filter import matching
-from cloning.browse.library import UnknownError
+from cloning.browse.library import Library, UnknownError
 from cloning.lane.search import Localisation
 from cloning.network.network import load_model, steer
 from cloning.recordings.check import check_images
@@ -297,6 +297,34 @@ def test_a_recording_without_an_image_has_no_lane(linked):
     assert result.about["unusable"] == 60 and not len(result.images)
     road = summary.road_of(result, read_uncut(linked).images[:, 0], np.zeros(60, bool))
     assert road["roads"] == [] and road["offset"] is None and road["first_unusable"][0][0] == 1
+
+
+def test_a_recording_is_shown_though_its_images_and_a_model_are_gone(linked, tmp_path, monkeypatch):
+    (linked / "IMG").rename(linked / "elsewhere")
+    with opened(linked, tmp_path / "gone.pt") as recording:
+        assert recording.overview()["frames"] == 60
+        details = recording.details("1")
+        for each in (details["lane"], *details["models"], *details["replays"]):
+            assert each["state"] == "failed" and "IMG: No such file" in each["message"]
+        (linked / "elsewhere").rename(linked / "IMG")
+        assert recording.details()["lane"]["state"] in ("waiting", "running")
+        [model] = recording.compared("1", begin=True)["models"]
+        for state in (model["steering"], model["replay"]):
+            assert state["state"] == "failed" and "gone.pt: No such file or directory; put it back" in state["message"]
+        monkeypatch.setattr(recording, "overview", lambda: {"message": "spoilt"})
+        with pytest.raises(RecordingError, match="spoilt"):
+            recording.details()
+
+
+def test_what_has_the_same_name_is_told_apart(linked, tmp_path):
+    copies = [shutil.copytree(linked, tmp_path / person / "lake") for person in ("b", "c/b")]
+    shown = Library([linked, *copies], [tmp_path / name for name in ("a/m.pt", "a/../b/m.pt", "a/x.pt")])
+    try:
+        assert list(shown.models) == ["a/m.pt", "b/m.pt", "x.pt"]
+        names = ["data/lake", f"{tmp_path.name}/b/lake", "c/b/lake"]
+        assert list(shown.names.values()) == names == [shown[each].overview()["name"] for each in shown.recordings]
+    finally:
+        shown.close()
 
 
 def test_without_file_handles_no_file_is_blamed():

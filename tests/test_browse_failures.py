@@ -4,10 +4,11 @@ import os
 import shutil
 
 import numpy as np
-from browse_process import at, browsing, placed, replayed, steered, written_run
+from browse_process import LATE, at, browsing, placed, replayed, steered, written, written_run
 from browser import needs_chromium
 from test_excluded import center
 
+from cloning.browse.analyses import Analysis
 from cloning.recordings.log import read_recording
 
 pytestmark = needs_chromium
@@ -68,6 +69,9 @@ def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked,
         page.shows("article .bad", "excluded.csv: line 1")
         cuts.unlink()
         page.wait("document.querySelector('article .road')")
+        page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
+        page.shows("#notice", "does not answer")
+        page.wait("document.querySelector('#notice').hidden && document.querySelector('article .road')")
         cuts.write_text("spoilt\n", encoding="utf-8")
         page.run(f"location.hash = '{server.hash('lake')}/7'")
         page.shows("#notice", "excluded.csv: line 1")
@@ -120,14 +124,6 @@ def test_an_undo_that_fails_can_be_tried_again(linked, page):
         assert file.read_text(encoding="utf-8") == header and page.run("document.querySelector('#notice').hidden")
 
 
-# The next answer about the recording comes when `go` is called.
-HELD = """const own = fetch; fetch = async (...what) => {
-    const answer = await own(...what);
-    if (what[0].includes("/details") && !window.go) await new Promise(held => go = held);
-    return answer;
-}; 0"""
-
-
 def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, page, tmp_path, model_file):
     model = shutil.copy(model_file, tmp_path / "one.pt")
     (tmp_path / "torch.py").write_text("import time\ntime.sleep(600)", encoding="utf-8")
@@ -136,13 +132,22 @@ def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, p
     with browsing(linked, "--model", model, modules=tmp_path) as server:
         page.open(server.base)
         page.wait("document.querySelector('article .road')")
-        page.run(HELD)
-        page.run(f"location.hash = '{server.hash('lake')}/7'")
-        page.wait("window.go")
+        page.run(LATE)
+        page.run(f"location.hash = '{server.hash('lake')}/7?find=model1 < 0'")
+        page.wait("late.go")
         os.utime(model, (0, 0))
-        page.run("go()")
+        page.run("late.go()")
         at(page, 7)
         page.shows("#findings", "one.pt: 0 % analysed")
+        page.shows("#matches", "still being analysed")
+        written(linked, Analysis("steering", str(model)), {"steering": np.full(60, -0.3)})
+        page.shows("#plots", "one.pt -0.300")
+        page.shows("#matches", "60 frames in 1 stretch")
+        os.utime(model, (1, 1))
+        page.shows("#plots", "one.pt not known")
+        written(linked, Analysis("steering", str(model)), {"steering": np.full(60, 0.2)})
+        page.shows("#plots", "one.pt 0.200")
+        page.shows("#matches", "no frame")
 
 
 def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, model_file):
@@ -155,6 +160,11 @@ def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, 
         page.open(f"{server.base}{here}/7?limit=7&look=3&mark=x-9")
         at(page, 7)
         page.wait(f"location.hash == '{here}/7'")
+        page.run(f"location.hash = '{here}/1.4?mark=9-5&zoom=30-50'")
+        page.wait(f"location.hash == '{here}/1?zoom=30-50&mark=5-9'")
+        page.run(f"location.hash = '{here}/-1?zoom=x-5'")
+        page.wait(f"location.hash == '{here}/0'")
+        assert page.complaints() == []
         page.run("location.hash = '#/run/0?with=0,3'")
         page.wait("document.querySelectorAll('#losses .uplot').length")
         page.run(f"location.hash = '#/compare?limit=7&ids=gone,{here[2:]}'")

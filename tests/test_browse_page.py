@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from browse_process import at, browsing, placed, replayed, steered, written_run
+from browse_process import LATE, at, browsing, placed, replayed, steered, written_run
 from browser import LOOKS, decoded, needs_chromium
 from test_excluded import center
 
@@ -34,14 +34,6 @@ def served(sample_recording, models, tmp_path_factory):
     written_run(run, finished=1, images=500)
     with browsing(sample_recording, "--model", *models, "--run", run) as server:
         yield server
-
-
-# The next answer about the recording comes when `late.go` is called.
-LATE = """const own = fetch; late = {asked: 0}; fetch = async (...what) => {
-    const answer = await own(...what);
-    if (what[0].includes("/details") && !late.asked++) await new Promise(go => late.go = go);
-    return answer;
-}; 0"""
 
 
 def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
@@ -124,6 +116,7 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     page.press("l")
     page.wait("document.querySelectorAll('#replay-list .interventions').length == 2")
     assert page.run("plots.getBoundingClientRect().top") == top, "the curves stay where they are"
+    assert "the lane's centre or driver's path" in page.text("#plots")
     for words in ("one.pt at 1 m", "two.pt at 1 m", "90.0 %", "mean 0.25 m", "1.20 m to the right"):
         assert words in page.text()
     for key, row in (("n", 29), ("n", 39), ("n", 49), ("N", 39)):
@@ -153,6 +146,7 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     page.shows("#replay-list", "at 2.5 m")
     page.press("l")
     page.wait("document.querySelector('#replays').hidden && !document.querySelector('.replayed')")
+    assert "driver's path" not in page.text("#plots")
     assert page.complaints() == []
 
 
@@ -213,9 +207,10 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         at(page, 41)
         page.press("/")
         page.run("document.execCommand('selectAll')")
-        page.send("Input.insertText", text="abs(steering) > ")
+        page.send("Input.insertText", text="(steering > 0.2) or (steering < ")
+        assert page.run("document.querySelector('#cut-matches').disabled"), "those of the condition before"
         page.shows("#matches", "not complete")
-        page.send("Input.insertText", text="0.2")
+        page.send("Input.insertText", text="-0.2)")
         wanted = int((np.abs(recording.steering) > 0.2).sum())
         page.shows("#matches", f"{wanted} frames in ")
         page.run("document.activeElement.blur()")
@@ -314,6 +309,7 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
         page.shows("#total", "4 recordings, 121 frames")
         page.shows("#runs", "no training run in this folder yet")
         page.wait("document.querySelector('article img').naturalWidth == 320")
+        assert any("center.jpg?version=" in each for each in page.addresses()), "of this log, not of one before it"
         page.until(lambda: "60 rows refused" in page.text("#cards") and "IndexError" not in page.text(), 90)
         assert page.fits() and page.barriers() == [], "an error with a long word"
         shown = "[...document.querySelectorAll('#cards article:not([hidden]) h2')].map(each => each.textContent).join()"
@@ -326,7 +322,13 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
             page.run(f"document.querySelector('#query').value = '{query}'; document.querySelector('#query').oninput()")
             assert page.run(shown) == names
         assert page.run("location.hash") == "#?find=refused%3E0"
+        page.click("#cards article:not([hidden]) h2 a")
+        page.shows("#where", "frame 1 of 60")
+        page.press("Escape")
+        page.wait(f"location.hash == '#?find=refused%3E0' && {shown} == 'gone'")
         page.run("document.querySelector('#query').value = ''; document.querySelector('#query').oninput()")
+        page.open(f"{server.base}#?select={server.hash('spoilt')[2:]}")  # which cannot be exported
+        page.shows("#total", "4 recordings, 121 frames")
         for name in ("lake", "one"):
             page.click(f"[aria-label='Select {name}']")
         page.wait("location.hash.includes('select=')")
@@ -338,11 +340,14 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
         page.shows("#merged", "both. The list has it. one is put 1 day later")
         page.shows("#total", "5 recordings, 182 frames")
         assert len(read_recording(linked.with_name("both"))) == 61
-        page.run(f"location.hash = '{server.hash('one')}'")
+        page.run(f"location.hash = '{server.hash('one')}/0?mark=0-0'")
         page.shows("#where", "frame 1 of 1")
+        page.wait("document.querySelector('#stretches .mark')")
         assert now(page, "plots.plots[3].axes[0]._splits.length") == 1, "no axis of a hundred NaN:NaN"
         (tmp_path / "data/one/driving_log.csv").write_text((log.splitlines()[0] + "\n") * 2, encoding="utf-8")
         page.shows("#notice", "press R to read it again")
+        page.wait("!location.hash.includes('mark')")
+        assert not page.run("document.querySelector('#stretches .mark')"), "it was of other rows"
         page.press("r")
         page.shows("#where", "frame 1 of 2")
         assert page.run("document.querySelector('#notice').hidden")

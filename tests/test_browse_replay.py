@@ -192,6 +192,9 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
     found = runs.overview(files)
     assert found["state"] == "stopped" and [row["loss"] for row in found["history"]] == [0.5, None, 0.3]
     assert found["pictures"] == [0, 1200, 6400]
+    files = written_run(tmp_path / "diverged", finished=2, images=0, losses=(float("nan"), float("inf")))
+    json.dumps(runs.Runs([files.last.parent]).found(), allow_nan=False)  # which no browser reads
+    assert runs.overview(files)["best"] is None
 
 
 @pytest.mark.parametrize(
@@ -253,7 +256,14 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         assert page.run("document.querySelectorAll('#losses .u-series.smoothed').length") == 6, "beside the raw ones"
         average = page.run("import('/static/run.js').then(({average}) => average([1, 0, null, 0], 0.5))")
         assert average == [1, pytest.approx(1 / 3), None, pytest.approx(1 / 7)], "sums of 1, 1/2, 1/4, 1/8"
-        page.run("dispatchEvent(new HashChangeEvent('hashchange'))")
+        page.run("smooth.focus()")
+        page.press("ArrowLeft")  # which elsewhere shows earlier pictures
+        page.press("ArrowRight")
+        page.press("ArrowRight")
+        page.wait("location.hash == '#/run/0?with=1&smooth=0.51'")
+        page.press("ArrowLeft")
+        page.wait("location.hash == '#/run/0?with=1&smooth=0.5'")
+        page.run("smooth.blur(); dispatchEvent(new HashChangeEvent('hashchange'))")
         page.wait(
             "smoothed.textContent == '0.50' && document.querySelectorAll('#losses .u-series.smoothed').length == 6"
         )

@@ -1,6 +1,7 @@
 """The server of recordings over a real socket: what it tells, what it refuses, and cuts."""
 
 import json
+import shutil
 import socket
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -70,7 +71,7 @@ def test_replays_and_runs_over_the_socket(served, sample_recording):
     assert np.abs(decode(data).astype(int) - recorded).mean() > 1, "moved half a metre to the right"
     assert served.get(f"{here}/details?limit=2.5")["replays"][0]["state"] == "none"
     status, data, _ = served.ask(f"{here}/columns/offset", "POST")
-    assert status == 200 and json.loads(data)["lane"] == {"state": "ready"}, "what is there stays"
+    assert status == 200 and json.loads(data)["lane"]["state"] == "ready", "what is there stays"
     empty, found = served.get("/runs")
     assert "no training run in this folder yet" in empty["message"]
     assert found["id"] == 1 and found["state"] == "finished" and "pictures" not in found
@@ -237,6 +238,16 @@ def test_cuts_over_the_socket(linked):
         refused(gone, "columns/offset", "POST")
         assert gone in server.get(f"{here}/overview")["message"]
         assert (linked.with_name("elsewhere") / "excluded.csv").read_text(encoding="utf-8") == text
+
+
+def test_a_recording_that_is_new_is_in_the_list(linked, tmp_path):
+    with browsing(linked.parent) as server:
+        assert list(server.recordings()) == ["lake"]
+        new = shutil.copytree(linked, linked.with_name("new"))
+        assert list(server.recordings()) == ["lake", "new"]
+        linked.rename(tmp_path / "lake")
+        new.rename(tmp_path / "new")
+        assert list(server.recordings()) == ["lake", "new"], "what is gone is told in its card"
 
 
 def test_others_are_answered_while_a_long_log_is_read(linked):

@@ -21,6 +21,7 @@ import torch
 import warm
 from commands import ROOT
 from drive_process import serving
+from matplotlib.axes import Axes
 from rendered import render_recording
 
 from cloning.base.errors import SimulatorError
@@ -32,7 +33,7 @@ from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.processes import CAN_FORK
-from cloning.replay.score import ReplayFilm, driving_metrics, replay_report, report_text, steering_metrics
+from cloning.replay.score import ReplayFilm, driving_metrics, plot, replay_report, report_text, steering_metrics
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature
 from simulator import __main__ as simulator
@@ -353,7 +354,7 @@ def test_pictures_of_recordings_with_the_same_name_are_kept_apart(sample_recordi
     folders = [shutil.copytree(sample_recording, tmp_path / person / "lake") for person in ("a", "b")]
     options = "--model", model_file, "--reference", "human", "--limit", "1", "--picture", tmp_path / "way.png"
     assert simulator.main(["replay", *map(str, (*folders, *options))]) == 0
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["way-lake-1.png", "way-lake-2.png"]
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["way-a-lake.png", "way-b-lake.png"]
 
 
 def kill_itself():
@@ -417,8 +418,17 @@ def test_ctrl_c_ends_a_drive_that_waits_for_a_server(recording):
     assert time.monotonic() - begin < 15
 
 
-def test_stretches_are_joined_in_one_report(folder):
-    recording = read_recording(folder)
+def test_stretches_are_joined_in_one_report_and_no_line_of_its_plot_goes_from_one_to_the_other(folder, monkeypatch):
+    recording, plotted = read_recording(folder), []
     recording.time[150:] += 60
     done = replay.drive(recording, human(recording), 1.0, echo)
     assert len(human(recording)) == 2 and sum(done.seconds) == pytest.approx(298 * 0.067, abs=0.01)
+    draw = Axes.plot
+
+    def watched(axes, seconds, values, **look):
+        plotted.append(values)
+        return draw(axes, seconds, values, **look)
+
+    monkeypatch.setattr(Axes, "plot", watched)
+    plot(recording, [done])
+    assert all(np.isnan(offset[150]) and not np.isnan(offset[151:]).any() for offset in plotted[:2])

@@ -15,13 +15,15 @@ import pytest
 import warm
 from browser import LOOKS, needs_chromium
 from commands import ROOT, log
+from matplotlib.figure import Figure
 
 from cloning.base.errors import UserError
 from cloning.base.files import csv_bytes
 from cloning.base.film import FilmWriter
+from cloning.recordings.format import BINS
 from cloning.replay.score import YARDSTICKS
 from cloning.report.content import bend
-from cloning.report.pictures import film_uri
+from cloning.report.pictures import film_uri, steering_chart
 
 
 def report(*arguments) -> subprocess.CompletedProcess:
@@ -95,6 +97,19 @@ def test_the_report_contains_the_run(written, finished):
     assert len(page) < 15e6
 
 
+def test_the_titles_of_the_histograms_stay_in_their_places(monkeypatch):
+    figures, save = list[Figure](), Figure.savefig
+
+    def kept(figure, *arguments, **options):
+        figures.append(figure)
+        save(figure, *arguments, **options)
+
+    monkeypatch.setattr(Figure, "savefig", kept)
+    steering_chart(dict.fromkeys(("of {:,} rows, as driven", "of {:,} for training, resampled"), np.full(BINS, 2500)))
+    left, right = (axes.title.get_window_extent() for axes in figures[0].axes)
+    assert left.x0 > 0 and left.x1 < right.x0 and right.x1 < figures[0].bbox.x1
+
+
 def test_a_long_film_is_made_small(tmp_path):
     film, noise = tmp_path / "lap.mp4", np.random.default_rng(0).integers(0, 256, (41, 180, 320, 3), np.uint8)
     writer = FilmWriter(film, 10)
@@ -157,14 +172,26 @@ def test_a_run_of_another_version_is_told_in_a_sentence(written, tmp_path):
     assert not (copy / "report.html").exists()
 
 
-def test_recordings_that_are_gone_are_named_in_the_report(written, tmp_path):
-    copy = shutil.copytree(written, tmp_path / "copy")
+def test_what_cannot_be_shown_of_the_recordings_is_named_and_those_with_the_same_name_are_told_apart(
+    written, sample_recording, tmp_path
+):
+    """One is gone, one spoilt, and one has lost most of its images."""
+    copy, lossy = shutil.copytree(written, tmp_path / "copy"), tmp_path / "other" / sample_recording.name
+    shutil.copytree(sample_recording, lossy)
+    for image in sorted((lossy / "IMG").glob("center*"))[10:]:
+        image.unlink()
+    (lossy.with_name("a spoilt one")).mkdir()
+    (lossy.with_name("a spoilt one") / "driving_log.csv").write_text("x", encoding="utf-8")
     arguments = (copy / "training_arguments.json").read_text(encoding="utf-8")
-    moved = re.sub(r'"recordings": \[[^]]*\]', '"recordings": ["gone/<lake>"]', arguments)
+    recordings = json.dumps(["gone/<lake>", str(lossy.parent), str(sample_recording)])
+    moved = re.sub(r'"recordings": \[[^]]*\]', f'"recordings": {recordings}', arguments)
     (copy / "training_arguments.json").write_text(moved, encoding="utf-8")
-    assert report(copy).returncode == 0
+    assert not (done := report(copy)).returncode, done.stderr
     page = (copy / "report.html").read_text(encoding="utf-8")
     assert "Not shown: gone/&lt;lake&gt;: no such folder" in page and "No recording was held out" in page
+    assert "a spoilt one/driving_log.csv: line 1: neither a row nor a header" in page
+    assert ">other/lake sample</th><td>10</td><td>0</td><td>50</td>" in page, "rows, cut, unusable"
+    assert f">{sample_recording.parent.name}/lake sample</th><td>60</td>" in page
 
 
 @needs_chromium

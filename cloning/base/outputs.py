@@ -3,7 +3,7 @@
 import contextlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from cloning.base.errors import OutputError, UserError
@@ -39,6 +39,19 @@ def write_json(path: str | Path, value: Mapping | Sequence) -> None:
 def plural(count: int, noun: str, several: str = "") -> str:
     """Return a count with its noun, as `1 lap` or `2 laps`; several: the plural, if it is not the noun with an s."""
     return f"{count} {noun if count == 1 else several or noun + 's'}"
+
+
+def short_names(paths: Iterable[Path]) -> list[str]:
+    """Return the paths' names, with the folders around them where others have the same: `lake`, or `a/lake`."""
+    every = [Path(os.path.abspath(path)).parts for path in paths]
+
+    def short(own: tuple[str, ...]) -> str:
+        for length in range(1, len(own)):
+            if sum(other[-length:] == own[-length:] for other in every) == 1:
+                return "/".join(own[-length:])
+        return str(Path(*own))
+
+    return [short(parts) for parts in every]
 
 
 def run_all(*steps: Callable[[], object]) -> None:

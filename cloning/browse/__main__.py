@@ -22,7 +22,6 @@ from cloning.base.outputs import plural
 from cloning.browse.library import Library
 from cloning.browse.page import create_app
 from cloning.browse.runs import Runs
-from cloning.recordings.log import find_folders
 from cloning.server import terminal
 from cloning.server.site import BROWSE_HOST, BROWSE_PORT
 
@@ -48,20 +47,21 @@ def main() -> int:
     try:
         from cloning.server import connections  # here, because it needs the socket libraries
 
-        folders = find_folders(arguments.recordings or ["data"]) if arguments.recordings or not arguments.run else []
         for model in arguments.model:
             if not model.is_file():
                 raise UserError(f"{model}: no such model file; `python model.py` trains one")
         for folder in arguments.run or []:
             if not folder.is_dir():
                 raise UserError(f"{folder}: no such folder; name one that `python model.py` writes to")
+        given = [] if arguments.run and not arguments.recordings else arguments.recordings or ["data"]
+        library, runs = Library(given, arguments.model), Runs(arguments.run or [])
         listener = connections.claim_port(BROWSE_HOST, arguments.port)
     except (UserError, OSError) as error:
         return program.failed(error)
     stopped = connections.noted_signals()
     stderr = terminal.log_to_stderr(program.name)
-    library, runs = Library(folders, arguments.model), Runs(arguments.run or [])
-    shown = plural(len(folders), "recording") if folders else plural(len(arguments.run), "training run")
+    count = len(library.recordings)
+    shown = plural(count, "recording") if count else plural(len(arguments.run), "training run")
     print(f"{shown}. Open http://{BROWSE_HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.", flush=True)
     try:
         connections.serve(listener, create_app(library, runs), stopped)

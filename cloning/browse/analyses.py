@@ -87,7 +87,7 @@ def file_stamp(path: Path) -> tuple[int, int]:
     try:
         status = path.stat()
     except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}; put it back, or leave the recording out") from None
+        raise RecordingError(f"{path}: {error.strerror}; put it back, or leave it out") from None
     return status.st_size, status.st_mtime_ns
 
 
@@ -140,7 +140,7 @@ class Analyses:
         self.thread.start()
 
     def state(self, folder: Path, analysis: Analysis, begin: bool = True) -> dict[str, Any]:
-        """Return how far an analysis is, for the page: {"state", "progress" or "message"}.
+        """Return how far an analysis is, for the page: {"state", and "progress", "message" or the result's "stamp"}.
 
         The states are ready, running, waiting, paused, failed and, if it is not to begin now and nobody asked for it,
         none.
@@ -153,7 +153,7 @@ class Analyses:
                 return {"state": "failed", "message": self.failed[now]}
             if (now in self.ready and result_file(*job).exists()) or read_result(*job):
                 self.ready.add(now)
-                return {"state": "ready"}
+                return {"state": "ready", "stamp": now[1]}
             if self.running == job:
                 return {"state": "running", "progress": self.progress}
             if job not in self.waiting:

@@ -1,11 +1,12 @@
 """The recordings that the page shows, read again whenever their files change."""
 
+import contextlib
 import functools
 import hashlib
 import os
 import tempfile
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from cloning.base.errors import OutputError, RecordingError, UserError, message_of
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.base.frame import FRAME
+from cloning.base.outputs import short_names
 from cloning.browse import replays, summary
 from cloning.browse.analyses import LANE, Analyses, Analysis, Result, file_stamp, read_result, stamp
 from cloning.browse.attention import Attention
@@ -21,7 +23,7 @@ from cloning.browse.filter import matching, stretches_of
 from cloning.recordings.excluded import EXCLUDED, TAGS, Cut, add_cuts, cut_rows, delete_cuts, one_line, read_cuts
 from cloning.recordings.format import CAMERAS, DRIVING_LOG, SAMPLE_RATE
 from cloning.recordings.images import jpeg_size, read_frame, read_jpeg
-from cloning.recordings.log import Recording, read_uncut
+from cloning.recordings.log import Recording, find_folders, read_uncut
 from cloning.recordings.part import write_part
 from cloning.road.autonomy import LIMITS
 from cloning.road.overlay import overlay
@@ -41,19 +43,28 @@ class UnknownError(UserError):
 class Library:
     """The recordings, by an identifier that stays the same when the server is started again."""
 
-    def __init__(self, folders: list[Path], models: list[Path]):
-        """folders: recordings; models: whose steering is shown."""
-        self.models = [str(model) for model in models]
-        self.analyses, self.attention = Analyses(), Attention()
+    def __init__(self, given: Sequence[str | Path], models: list[Path]):
+        """given: recordings, or folders of recordings; models: whose steering is shown. Raises RecordingError."""
         self.recordings: dict[str, Path] = {}
-        for folder in folders:
-            self.add(folder)
+        self.names: dict[str, str] = {}  # of the recordings, by the same identifiers
+        self.given = given
+        self.add(*find_folders(given))
+        self.models = dict(zip(short_names(models), map(str, models), strict=True))
+        self.analyses, self.attention = Analyses(), Attention()
 
-    def add(self, folder: Path) -> str:
-        """Add a recording, and return its identifier."""
-        identifier = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=6).hexdigest()
-        self.recordings[identifier] = folder
-        return identifier
+    def look(self) -> None:
+        """Add the recordings that are new in the given folders."""
+        for each in self.given:
+            with contextlib.suppress(RecordingError):  # what is gone is told where it is shown
+                self.add(*find_folders([each]))
+
+    def add(self, *folders: Path) -> list[str]:
+        """Add recordings, and return their identifiers."""
+        added = {hashlib.blake2b(os.fsencode(each.resolve()), digest_size=6).hexdigest(): each for each in folders}
+        recordings = self.recordings | added
+        self.names = dict(zip(recordings, short_names(recordings.values()), strict=True))
+        self.recordings = recordings
+        return list(added)
 
     def close(self) -> None:
         """End the processes that were started for the page."""
@@ -64,13 +75,14 @@ class Library:
         """Return a recording. Raises UnknownError."""
         if identifier not in self.recordings:
             raise UnknownError(f"no recording {identifier} here; go back to the list")
-        return ShownRecording(identifier, self.recordings[identifier], self.models, self.analyses)
+        name, folder = self.names[identifier], self.recordings[identifier]
+        return ShownRecording(identifier, name, folder, self.models, self.analyses)
 
     def model(self, index: int) -> str:
         """Return a model's file. Raises UnknownError."""
         if index >= len(self.models):
             raise UnknownError(f"no model {index}")
-        return self.models[index]
+        return list(self.models.values())[index]
 
 
 class ShownRecording:
@@ -81,11 +93,12 @@ class ShownRecording:
     with model 0 as the driver, at a limit of 2.5 m; driver-0-2.5 and so on, its steering then.
     """
 
-    def __init__(self, identifier: str, folder: Path, models: list[str], analyses: Analyses):
-        """models: their files, in the order of the page."""
-        self.identifier, self.folder, self.models, self.analyses = identifier, folder, models, analyses
+    def __init__(self, identifier: str, name: str, folder: Path, models: dict[str, str], analyses: Analyses):
+        """models: name -> file, in the order of the page."""
+        self.identifier, self.name, self.folder = identifier, name, folder
+        self.models, self.analyses = models, analyses
         self.analysed = {"offset": (LANE, "offset"), "label": (LANE, "label")}  # column -> analysis, its name there
-        for index, model in enumerate(models):
+        for index, model in enumerate(models.values()):
             self.analysed[f"model-{index}"] = Analysis("steering", model), "steering"
             for limit in LIMITS:
                 replay = Analysis("replay", model, limit)
@@ -109,14 +122,14 @@ class ShownRecording:
 
     def overview(self) -> dict[str, Any]:
         """Return what the list shows of a recording; {"message"} instead of figures if it can't be read."""
-        shown: dict[str, Any] = {"id": self.identifier, "name": self.folder.resolve().name, "folder": str(self.folder)}
+        shown: dict[str, Any] = {"id": self.identifier, "name": self.name, "folder": str(self.folder)}
         try:
             cuts, version = tuple(read_cuts(self.folder)), self.version()
             shown |= {"version": version, **_figures(self.folder, version, cuts)}
             shown["tags"] = sorted({tag.reason for tag in read_cuts(self.folder, TAGS)})
             shown["lane"] = self._state("offset")
             if shown["lane"]["state"] == "ready":
-                shown |= _road(self.folder, version, cuts, stamp(self.folder, LANE))
+                shown |= _road(self.folder, version, cuts, shown["lane"]["stamp"])
         except (UserError, OSError) as error:
             shown["message"] = message_of(error)
         return shown
@@ -132,8 +145,10 @@ class ShownRecording:
         """
         recording, cuts = self.read(), read_cuts(self.folder)
         self.analyses.urgent = self.folder
-        models = [{"name": Path(model).name, **self._state(f"model-{at}")} for at, model in enumerate(self.models)]
+        models = [{"name": name, **self._state(f"model-{at}")} for at, name in enumerate(self.models)]
         shown = self._without_map()
+        if "message" in shown:  # a file has changed since
+            raise RecordingError(shown["message"])
         for kind, some in (("cuts", cuts), ("tags", read_cuts(self.folder, TAGS))):
             covered = _rows_cut(self.folder, tuple(some), recording)
             shown[kind] = [
@@ -156,8 +171,7 @@ class ShownRecording:
     def _replay(self, recording: Recording, column: str, begin: bool = False) -> dict[str, Any]:
         shown = self._state(column, begin)
         if shown["state"] == "ready":
-            result, now = self._result(column)
-            shown |= {**replays.figures(result, recording.images[:, 0]), "stamp": now}
+            shown |= replays.figures(self._result(column)[0], recording.images[:, 0])
         return shown
 
     def replay(self, limit: str, begin: bool) -> None:
@@ -177,7 +191,11 @@ class ShownRecording:
         return self.analysed[column][0]
 
     def _state(self, column: str, begin: bool = True) -> dict[str, Any]:
-        return self.analyses.state(self.folder, self._analysis(column), begin)
+        analysis = self._analysis(column)
+        try:
+            return self.analyses.state(self.folder, analysis, begin)
+        except RecordingError as error:  # the images or the model are gone; all else can be shown
+            return {"state": "failed", "message": str(error)}
 
     def _result(self, column: str) -> tuple[Result, str]:
         """Return the result of the analysis that has a column, and its stamp."""
@@ -225,7 +243,7 @@ class ShownRecording:
         kept = self._kept(recording)
         if begin:
             self.analyses.resume()
-        for at, column in enumerate(self._replays(limit)):
+        for at, (name, column) in enumerate(zip(self.models, self._replays(limit), strict=True)):
             steering = self._state(f"model-{at}", begin)
             error = None
             if steering["state"] == "ready":
@@ -233,7 +251,7 @@ class ShownRecording:
                 known = difference[~np.isnan(difference)]
                 error = float(np.sqrt(np.mean(known**2))) if len(known) else None
             replay = self._replay(recording, column, begin)
-            models.append({"name": Path(self.models[at]).name, "steering": steering, "error": error, "replay": replay})
+            models.append({"name": name, "steering": steering, "error": error, "replay": replay})
         return shown | {"models": models}
 
     def row(self, row: int, version: str | None = None) -> dict[str, Any]:

@@ -75,6 +75,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/recordings")
     def recordings() -> list[dict[str, str]]:
+        eventlet.tpool.execute(library.look)
         return [{"id": identifier, "folder": str(folder)} for identifier, folder in library.recordings.items()]
 
     @app.get("/recordings/<identifier>/overview")
@@ -111,8 +112,9 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/<int:model>.png")
     def attention(identifier: str, row: int, picture: str, model: int) -> flask.Response:
         jpeg = shown(identifier).jpeg(row, picture, version())
-        # In a thread, so that others are answered meanwhile.
-        return kept(eventlet.tpool.execute(library.attention.png, jpeg, library.model(model)), "image/png")
+        # In a thread, so that others are answered meanwhile; not kept, since the model may be trained anew.
+        png = eventlet.tpool.execute(library.attention.png, jpeg, library.model(model))
+        return flask.Response(png, mimetype="image/png")
 
     @app.route("/recordings/<identifier>/<any(cuts, tags):kind>", methods=["POST", "DELETE"])
     def cut(identifier: str, kind: str) -> dict[str, Any]:
@@ -135,7 +137,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
         name, rows, others = (str(body.get(key, "")) for key in ("name", "rows", "others"))
         together = [library[other] for other in others.split(",") if other]
         folder, notes = shown(identifier).export(stretches(rows), version() or "", name, together)
-        return {"id": library.add(folder), "folder": str(folder), "notes": notes}
+        return {"id": library.add(folder)[0], "folder": str(folder), "notes": notes}
 
     @app.get("/recordings/<identifier>/film.mp4")
     def film(identifier: str) -> flask.Response:

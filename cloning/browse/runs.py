@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cloning.base.errors import UserError, message_of
+from cloning.base.outputs import short_names
 from cloning.browse.library import UnknownError
 from cloning.training.run_files import RunFiles, best_epoch, judged_by
 
@@ -27,6 +28,7 @@ class Runs:
         self.asked = bool(folders)
         folders = folders or [Path()]
         self.files = [RunFiles(str(folder / "model.pt")) for folder in folders]
+        self.names = short_names(folders)
 
     def found(self) -> list[dict[str, Any]]:
         """Return what the list shows of each run; {"message"} instead of figures if it can't be read or has not begun.
@@ -36,18 +38,18 @@ class Runs:
         shown = []
         for index, files in enumerate(self.files):
             if files.arguments.exists() or self.asked:
-                name: dict[str, Any] = {"id": index, "folder": str(files.last.parent.resolve())}
                 try:
                     known = overview(files)
-                    shown.append(name | {key: known[key] for key in known.keys() - {"pictures", "trail", "options"}})
+                    known = {key: known[key] for key in known.keys() - {"pictures", "trail", "options"}}
                 except (UserError, OSError) as error:
-                    shown.append(name | {"message": message_of(error)})
+                    known = {"message": message_of(error)}
+                shown.append(self._place(index) | known)
         return shown
 
     def run(self, index: int) -> dict[str, Any]:
         """Return what the page shows of a run. Raises UserError, OSError."""
         files = self._files(index)
-        return {"id": index, "folder": str(files.last.parent.resolve()), **overview(files)}
+        return self._place(index) | overview(files)
 
     def picture(self, index: int, name: str) -> bytes:
         """Return a diagnostic picture, a PNG. Raises UserError, OSError."""
@@ -66,6 +68,10 @@ class Runs:
         if not path.is_file():
             raise UnknownError(f"{path}: not written yet; `python -m cloning.report {path.parent}` writes it")
         return path.read_bytes()
+
+    def _place(self, index: int) -> dict[str, Any]:
+        folder = self.files[index].last.parent
+        return {"id": index, "name": self.names[index], "folder": str(folder.resolve())}
 
     def _files(self, index: int) -> RunFiles:
         if index >= len(self.files):
@@ -139,7 +145,7 @@ def _best(history: list[dict[str, float]], by: Any) -> dict[str, Any] | None:
         return None
     by = judged_by(history, by if by in ("val_loss", "val_drift") else "val_loss")
     best = best_epoch(history, by)
-    return None if math.isnan(best[by]) else {"epoch": best["epoch"], "by": by, "value": best[by]}
+    return {"epoch": best["epoch"], "by": by, "value": best[by]} if math.isfinite(best[by]) else None
 
 
 def _flat(options: dict[str, Any]) -> dict[str, str]:

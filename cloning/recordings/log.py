@@ -4,7 +4,7 @@ A number that cannot be read for certain is never guessed: its row is left out a
 """
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
@@ -96,7 +96,7 @@ class CheckedRecording(Recording):
     digests: np.ndarray
 
 
-def find_folders(given: list[str]) -> list[Path]:
+def find_folders(given: Iterable[str | Path]) -> list[Path]:
     """Return the recordings (folders with a driving_log.csv) among and below the given folders, without duplicates.
 
     Raises RecordingError if a name is of no folder, or if neither the folder nor one below it is a recording.

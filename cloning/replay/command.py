@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 
-from cloning.base.outputs import check_folders, run_all, write_json, write_output
+from cloning.base.outputs import check_folders, run_all, short_names, write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.processes import CAN_FORK, ForkedDrives
@@ -45,8 +45,7 @@ def run(options: argparse.Namespace) -> None:
     reports: list[ReplayReport] = []
 
     def replay_all() -> None:
-        names = [folder.name for folder in folders]
-        for number, folder in enumerate(folders, 1):
+        for folder, name in zip(folders, short_names(folders), strict=True):
             recording = load_recording(folder)
             lines = reference_lines(recording, options.reference == "lane")
             if film:
@@ -58,9 +57,7 @@ def run(options: argparse.Namespace) -> None:
             if options.picture:
                 path = Path(options.picture)
                 if len(folders) > 1:
-                    path = path.with_stem(f"{path.stem}-{folder.name}")
-                if names.count(folder.name) > 1:  # else one would replace the other
-                    path = path.with_stem(f"{path.stem}-{number}")
+                    path = path.with_stem(f"{path.stem}-{name.replace('/', '-')}")
                 write_output(path, plot(recording, drives))
 
     steps: list[Callable[[], object]] = [replay_all, driver.close]

@@ -127,7 +127,7 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
     else:
         lines = [ReferenceLine.human_path(stretch) for stretch in driven]
     if not lines:
-        raise RecordingError(f"{recording.folder}: no two seconds of driving without a break to replay")
+        raise RecordingError(f"{recording.folder}: no two seconds of driving without a break to replay; leave it out")
     return lines
 
 

@@ -302,12 +302,11 @@ def plot(recording: Recording, drives: list[Drive]) -> bytes:
     figure = Figure(figsize=(12, 2.6 * (len(drives) + 1)), layout="constrained")
     axes = figure.subplots(len(drives) + 1, 1, sharex=True)
     for ax, done in zip(axes, drives, strict=False):
-        seconds, offset = np.cumsum(done.seconds), np.array(done.offset)
-        human_offset = offset - done.offset_from_human
-        offset[np.flatnonzero(np.diff(done.row) > 1) + 1] = np.nan  # no line is plotted across a break
+        seconds, begins = np.cumsum(done.seconds), np.equal(done.seconds, 0)
+        offset = np.where(begins, np.nan, done.offset)  # no line is plotted across a break
         ax.axhspan(-done.limit, done.limit, color="0.93")
         ax.plot(seconds, offset, linewidth=0.9, label="model")
-        ax.plot(seconds, human_offset, linewidth=0.7, color="0.5", label="recorded driver")
+        ax.plot(seconds, offset - done.offset_from_human, linewidth=0.7, color="0.5", label="recorded driver")
         for at in done.interventions:
             ax.axvline(seconds[at], color="tab:red", linewidth=0.8)
         count = plural(len(done.interventions), "intervention")

@@ -1,8 +1,9 @@
 """What a report contains: figures, tables and pictures of a run, and the page made of them."""
 
+import contextlib
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,13 +11,15 @@ import jinja2
 import numpy as np
 
 from cloning.base import program
-from cloning.base.errors import ModelError, UserError, message_of
+from cloning.base.errors import ModelError, RecordingError, UserError, message_of
+from cloning.base.outputs import short_names
 from cloning.browse import summary
 from cloning.browse.runs import overview
 from cloning.network.attention import visual_backprop
 from cloning.network.compute import one_thread
 from cloning.network.layer_table import layer_table
 from cloning.network.network import load_model
+from cloning.recordings.check import check_images
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, find_folders, read_recording
 from cloning.replay.command import drive_at_limits
@@ -93,7 +96,8 @@ class Report:
         self.run, self.name = overview(files), folder.resolve().name
         self.model = files.best if files.best.exists() else files.last
         if not self.run["best"] or not self.model.exists():
-            raise UserError(f"{folder}: no epoch is finished, so there is nothing to report; let model.py go on")
+            why = "no epoch is finished with a loss that is a number"
+            raise UserError(f"{folder}: {why}, so there is nothing to report; let model.py go on, or train again")
         one_thread()  # as drive.py does; replays run at the same time
         self.network = load_model(self.model)
         self.arguments = files.arguments
@@ -109,20 +113,30 @@ class Report:
         self.missing: list[str] = []  # why recordings are not shown
         self.looked_at: Recording | None = None  # the recording whose frames are shown
         for name in self.run["recordings"]:
-            self._read(name)
+            with self._noting_what_is_missing():
+                for found in find_folders([name]):
+                    with self._noting_what_is_missing():
+                        self._read(found)
+        for each, short in zip(self.recordings, short_names(each["folder"] for each in self.recordings), strict=True):
+            each["name"] = short
         self.replays: list[dict[str, Any]] = []
 
-    def _read(self, name: str) -> None:
-        """Read the recordings in one of the folders that the run was given."""
+    @contextlib.contextmanager
+    def _noting_what_is_missing(self) -> Iterator[None]:
         try:
-            for folder in find_folders([name]):
-                recording = read_recording(folder)
-                figures = summary.figures(recording, np.zeros(len(recording), bool))
-                cut = sum(rows for _, rows in recording.cuts)
-                self.recordings.append({**figures, "folder": str(folder), "name": folder.name, "cut_frames": cut})
-                self.looked_at = self.looked_at or recording
+            yield
         except (UserError, OSError) as error:
             self.missing.append(message_of(error))
+
+    def _read(self, folder: Path) -> None:
+        """Read a recording that the run was given. Raises RecordingError, OSError."""
+        recording = check_images(read_recording(folder), show_progress=False)
+        if not len(recording):
+            raise RecordingError(f"{folder}: no usable row is left")
+        figures = summary.figures(recording, np.zeros(len(recording), bool))
+        cut = sum(rows for _, rows in recording.cuts)
+        self.recordings.append({**figures, "folder": folder, "cut_frames": cut})
+        self.looked_at = self.looked_at or recording
 
     def replay(self, folders: list[Path]) -> None:
         """Let the network drive recordings, at both limits. Raises UserError."""
@@ -149,7 +163,7 @@ class Report:
             self.replays.append(
                 {
                     **report,
-                    "trained_on": folder.resolve() in [Path(each["folder"]).resolve() for each in self.recordings],
+                    "trained_on": folder.resolve() in [each["folder"].resolve() for each in self.recordings],
                     "table": rows,
                     "plot": uri(plot(recording, drives), "image/png"),
                     "interventions": len(where),

@@ -110,8 +110,9 @@ def steering_chart(counts: dict[str, np.ndarray]) -> Chart:
         axes.stairs(counts[title], np.linspace(-1, 1, BINS + 1), fill=True)
         scale = {"yscale": "log", "xlim": (-1, 1), "ylim": (0.7, most)}
         rows, straight = sum(counts[title]), counts[title][BINS // 2]
-        finding = f"{100 * straight / max(1, rows):.0f} % {title.format(rows)}, steer straight on"
-        axes.set(title=finding, xlabel="steering, -1 left to 1 right", ylabel="rows", **scale)
+        finding = f"{100 * straight / max(1, rows):.0f} % {title.format(rows)},\nsteer straight on"
+        axes.set_title(finding, fontsize="medium")  # short enough for two beside each other
+        axes.set(xlabel="steering, -1 left to 1 right", ylabel="rows", **scale)
 
     return chart(*(partial(draw, title) for title in counts))
 

@@ -23,7 +23,7 @@ async function route(isAgain) {
   document.title = "Recordings";
   try {
     await (id == "run" ? showRun(row, shown) : id == "compare" ? showComparison(shown)
-      : id ? showRecording(id, Number(row) || 0, shown) : showList(shown));
+      : id ? showRecording(id, row, shown) : showList(shown));
     if (isAgain && number == routed) notice();
   } catch (error) {
     if (number != routed) return;
@@ -49,13 +49,13 @@ addEventListener("change", ({target}) => byMouse && target.matches("select") && 
 addEventListener("hashchange", () => route());
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || document.querySelector("dialog[open]")) return;
-  if (event.target.matches("input:not([type=range]), select")) {
+  if (event.target.matches("input:not(#scrub), select")) {
     if (event.key == "Escape") event.target.blur();
     return;
   }
   if (event.key == "?") help();
   else if (event.key == "Escape" && !element("notice").hidden) notice();
-  else if (event.key == "Escape") location.hash = "";
+  else if (event.key == "Escape") location.hash = element("home").hash;
   else if (!element("run").hidden) {
     if (!pressedInRun(event.key)) return;
   } else if (element("recording").hidden || (event.key == " " && event.target.closest("button, a, summary"))) return;

@@ -24,6 +24,10 @@ export function notice(message = "") {
   element("notice").hidden = !message;
 }
 
+// What sends a value to the server, as the options of a request.
+export const sending = (method, value) =>
+  ({method, headers: {"Content-Type": "application/json"}, body: JSON.stringify(value)});
+
 export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;
 export const many = (count, word, several = `${word}s`) =>
   `${count.toLocaleString("en")} ${count == 1 ? word : several}`;
@@ -38,6 +42,23 @@ export function onClick(button, action) {
 
 // The attributes of a button that needs more words than it shows: for a screen reader, and as a tooltip.
 export const told = words => ({"aria-label": words, title: words});
+
+// A histogram of counts in equal bins from low to high, drawn by uPlot; axis, more: options of its axis and the plot.
+export function histogram(holder, name, counts, [low, high], axis, more) {
+  const colours = getComputedStyle(document.body), wide = (high - low) / counts.length;
+  holder.setAttribute("role", "img");
+  holder.setAttribute("aria-label", `Histogram of ${name}, on a square-root scale`);
+  return new uPlot({
+    legend: {show: false},
+    scales: {x: {time: false, range: [low, high]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
+      range: (_, least, most) => [0, Math.max(1, most)]}},
+    axes: [{stroke: colours.getPropertyValue("--quiet"), grid: {show: false}, ticks: {show: false},
+      font: "12px system-ui, sans-serif", ...axis}, {show: false}],
+    series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, points: {show: false},
+      paths: uPlot.paths.bars({size: [0.9, 100]})}],
+    ...more,
+  }, [counts.map((_, bin) => low + (bin + 0.5) * wide), counts], holder);
+}
 
 // Give an element new children, unless they would show the same as before; build: makes them. A focus in them stays:
 // on the button with the same index.

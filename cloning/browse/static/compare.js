@@ -5,7 +5,7 @@ import {LIMITS} from "./replays.js";
 const COLUMNS = { // of each model, and what they mean
   "steering error": "Root mean square of the difference from the driver's steering, in all frames",
   autonomy: "Share of the time without an intervention, each of which counts as 6 s",
-  "mean distance": "From the lane's centre, while the model drives",
+  "mean distance": "While the model drives, from the lane's centre, or from the driver's path where that is not known",
 };
 const AGAIN = 2000; // ms until recordings whose analyses are not done are asked for again
 let open; // {limit, ids, found, timer}

@@ -1,5 +1,5 @@
 // Marking stretches, cutting them from a recording or tagging them, and undoing it; what can be undone survives leaving the page.
-import {ask, clock, element, make, many, notice, renew, told} from "./common.js";
+import {ask, clock, element, make, many, notice, renew, sending, told} from "./common.js";
 import {find} from "./filter.js";
 import {seek, stop} from "./moving.js";
 import {page, remember, say} from "./state.js";
@@ -107,9 +107,7 @@ function change(...what) {
 // there if that fails, unless what it would delete has been deleted elsewhere.
 async function act(now, kind, method, cuts, what, from = "") {
   try {
-    const details = await ask(`/${now.id}/${kind}${now.query()}`, {
-      method, headers: {"Content-Type": "application/json"}, body: JSON.stringify(cuts),
-    });
+    const details = await ask(`/${now.id}/${kind}${now.query()}`, sending(method, cuts));
     now.orders += 1;
     const changed = details.changed.map(({first, last, reason}) => ({first, last, reason}));
     if (from) now[from].pop();

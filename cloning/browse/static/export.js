@@ -1,5 +1,5 @@
 // Saving frames as a recording of their own, whole recordings as one, or frames as a film.
-import {ask, element, make, notice, request} from "./common.js";
+import {ask, element, make, notice, request, sending} from "./common.js";
 
 let asked; // what `askForName` was called with
 
@@ -8,7 +8,7 @@ let asked; // what `askForName` was called with
 export function askForName(selection) {
   asked = selection;
   element("selection").textContent = asked.what;
-  element("export-name").value = asked.name;
+  element("export-name").value = asked.name.split("/").at(-1);
   element("film").hidden = Boolean(asked.others);
   element("export").returnValue = "";
   element("export").showModal();
@@ -29,10 +29,8 @@ element("export").onclose = async () => {
       setTimeout(() => URL.revokeObjectURL(address), 60000);
       return tell(`The film is saved: ${name}.mp4.`);
     }
-    const {folder, notes} = await ask(`/${id}/export?version=${version}`, {
-      method: "POST", headers: {"Content-Type": "application/json"},
-      body: JSON.stringify({rows, name, others: others.join()}),
-    });
+    const what = {rows, name, others: others.join()};
+    const {folder, notes} = await ask(`/${id}/export?version=${version}`, sending("POST", what));
     tell([`Written: ${folder}. The list has it.`, ...notes.map(note => `${note}.`)].join(" "));
     written?.();
   } catch (error) {

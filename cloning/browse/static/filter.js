@@ -1,5 +1,5 @@
 // Finding frames by a condition, written or brushed on a histogram, and what can be done with them: cut, export.
-import {ask, element, make, many} from "./common.js";
+import {ask, element, histogram, make, many} from "./common.js";
 import {askForReason, marked, showStretches} from "./cuts.js";
 import {askForName} from "./export.js";
 import {page, remember, say} from "./state.js";
@@ -10,7 +10,6 @@ let typing, plot;
 // Show the frames that meet the condition in the page's state.
 export async function find() {
   const now = page.open, {condition} = now, shown = element("matches");
-  if (element("condition").value.trim() != condition) element("condition").value = condition;
   shown.className = "";
   if (condition) {
     try {
@@ -36,14 +35,16 @@ export async function find() {
   remember();
 }
 
-function set(condition) {
+export function setCondition(condition) {
   page.open.condition = condition;
+  if (element("condition").value.trim() != condition) element("condition").value = condition;
   return find();
 }
 
 element("condition").oninput = () => {
   clearTimeout(typing);
-  typing = setTimeout(() => page.open && set(element("condition").value.trim()), SOON);
+  element("cut-matches").disabled = true; // till those of this condition are found
+  typing = setTimeout(() => page.open && setCondition(element("condition").value.trim()), SOON);
 };
 element("filter").onsubmit = event => event.preventDefault();
 element("cut-matches").onclick = () =>
@@ -70,24 +71,16 @@ export function showHistogram() {
     [there[0] ?? 0, there[0] ?? 0]);
   const [from, to] = low < high ? [low, high] : [low - 0.5, low + 0.5], wide = (to - from) / BINS;
   for (const value of there) counts[Math.min(BINS - 1, Math.floor((value - from) / wide))] += 1;
-  const colours = getComputedStyle(document.body), holder = element("histogram");
   plot?.destroy();
-  holder.setAttribute("aria-label", `Histogram of ${name}, on a square-root scale`);
-  plot = new uPlot({
-    width: Math.min(300, innerWidth - 24), height: HEIGHT, legend: {show: false}, padding: [2, 10, 0, 10],
+  plot = histogram(element("histogram"), name, counts, [from, to], {size: 16, gap: 1, space: 40}, {
+    width: Math.min(300, innerWidth - 24), height: HEIGHT, padding: [2, 10, 0, 10],
     cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
-    scales: {x: {time: false, range: [from, to]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
-      range: (_, low, high) => [0, Math.max(1, high)]}},
-    axes: [{stroke: colours.getPropertyValue("--quiet"), size: 16, gap: 1, space: 40, grid: {show: false},
-      ticks: {show: false}, font: "11px system-ui, sans-serif"}, {show: false}],
-    series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, points: {show: false},
-      paths: uPlot.paths.bars({size: [0.9, 100]})}],
     hooks: {setSelect: [plot => {
       const {left, width} = plot.select, value = px => Number(plot.posToVal(px, "x").toPrecision(3));
       if (width > 3) brush(name, value(left), value(left + width));
       plot.setSelect({left: 0, width: 0, top: 0, height: 0}, false);
     }]},
-  }, [counts.map((_, bin) => from + (bin + 0.5) * wide), counts], holder);
+  });
 }
 
 // uPlot knows the mouse alone: a finger that drags over the histogram is one.
@@ -99,9 +92,14 @@ for (const [pointer, mouse] of Object.entries(MOUSE)) {
 
 // The condition for a range of values, in place of an earlier one of the same column.
 function brush(name, low, high) {
-  const others = page.open.condition.split(" and ").filter(part => part && !part.includes(` <= ${name} <= `));
-  const kept = others.map(part => part.includes(" or ") && !part.startsWith("(") ? `(${part})` : part);
-  set([...kept, `${low} <= ${name} <= ${high}`].join(" and "));
+  const {condition} = page.open, earlier = new RegExp(`^[-+.\\de]+ <= ${name} <= [-+.\\de]+$`);
+  let flat = condition, before; // without what is in parentheses
+  do {
+    before = flat;
+    flat = flat.replace(/\([^()]*\)/g, "");
+  } while (flat != before);
+  const others = /\bor\b/.test(flat) ? [`(${condition})`] : condition.split(" and ");
+  setCondition([...others.filter(part => part && !earlier.test(part)), `${low} <= ${name} <= ${high}`].join(" and "));
 }
 
 element("of").onchange = () => {

@@ -109,8 +109,8 @@ export class Frames {
 
   async layer(row, path) {
     try {
-      const cache = path.endsWith(".jpg") ? "no-store" : "default"; // what a browser caches stays in its memory, too
-      const answer = await fetch(`/recordings/${this.id}/rows/${row}/${path}?version=${this.version}`, {cache});
+      const options = {cache: "no-store"}; // what a browser caches stays in its memory, too
+      const answer = await fetch(`/recordings/${this.id}/rows/${row}/${path}?version=${this.version}`, options);
       if (!answer.ok) return {message: (await answer.json()).message};
       return {layer: await createImageBitmap(await answer.blob())};
     } catch (error) {

@@ -1,5 +1,5 @@
 // All recordings at a glance.
-import {ask, element, make, many, notice, onClick, renew, request} from "./common.js";
+import {ask, element, histogram, make, many, notice, onClick, renew, request} from "./common.js";
 import {askForName} from "./export.js";
 import {stateOf} from "./run.js";
 
@@ -11,6 +11,7 @@ let shown = 0; // counted up when the list is left, so that answers that come la
 const known = new Map(); // card -> its recording's overview
 const histograms = new Map(); // card -> its histogram
 let selected = new Set(); // ids of recordings
+let lost = false; // whether the server has not answered
 
 export function leaveList() {
   shown += 1;
@@ -19,9 +20,15 @@ export function leaveList() {
   known.clear();
 }
 
+// Show the list anew.
+function again() {
+  dispatchEvent(new HashChangeEvent("hashchange"));
+}
+
 export async function showList(state) {
   const now = shown, recordings = await ask("");
   if (now != shown) return;
+  lost = false;
   element("list").hidden = false;
   element("query").value = state.get("find") ?? "";
   selected = new Set(state.get("select")?.split(","));
@@ -81,7 +88,8 @@ function arrange() {
   element("merge").disabled = together().length < 2;
   const state = new URLSearchParams({
     ...query && {find: query}, ...by != "name" && {sort: by}, ...selected.size && {select: [...selected]}});
-  history.replaceState(null, "", state.size ? `#?${state}` : "#");
+  element("home").href = state.size ? `#?${state}` : "#"; // from a recording back to the same
+  history.replaceState(null, "", element("home").href);
   const states = [...known.values()].map(({lane}) => lane?.state), isPaused = states.includes("paused");
   const left = states.filter(state => PENDING.includes(state)).length;
   renew(element("analysing"), [left, isPaused], () => {
@@ -99,7 +107,7 @@ new ResizeObserver(() => histograms.forEach(plot =>
 element("query").oninput = element("sort").onchange = arrange;
 // The selected recordings that are shown, in their order.
 const together = () => [...element("cards").children].filter(card => !card.hidden).map(card => known.get(card))
-  .filter(each => selected.has(each?.id));
+  .filter(each => selected.has(each?.id) && !each.message);
 element("merge").onclick = () => {
   const all = together(), [{id, version, frames, name}, ...others] = all;
   const sum = all.reduce((total, each) => total + each.frames - each.cut_frames, 0);
@@ -107,7 +115,7 @@ element("merge").onclick = () => {
     what: `${many(all.length, "recording")} as one: ${many(sum, "frame")}`, name: `${name}-and-more`,
     id, version, rows: `0-${frames}`, others: others.map(({id}) => id),
     tell: words => element("merged").textContent = words,
-    written: () => element("list").hidden || dispatchEvent(new HashChangeEvent("hashchange")), // which shows it
+    written: () => element("list").hidden || again(), // which shows it
   });
 };
 element("compare").onclick = () => {
@@ -122,6 +130,7 @@ async function showRuns(now) {
   try {
     const runs = await request("/runs");
     if (now != shown) return;
+    if (lost) return again(); // what did not come meanwhile, too
     const card = ({id, folder}) => make("article", "", {},
       make("h2", "", {}, make("a", `Training run in ${folder}`, {href: `#/run/${id}`})), make("p"));
     renew(element("runs"), runs.map(({id, folder}) => [id, folder]), () => runs.map(card));
@@ -131,7 +140,9 @@ async function showRuns(now) {
       state.className = run.message ? "bad" : "";
     });
   } catch (error) {
-    if (now == shown) notice(error.message);
+    if (now != shown) return;
+    lost = true;
+    notice(error.message);
   }
   if (now == shown) setTimeout(() => now == shown && showRuns(now), AGAIN);
 }
@@ -174,7 +185,7 @@ function draw(overview, card) {
     card.replaceChildren(heading, make("p", message, {class: "bad"}));
     return;
   }
-  const src = `/recordings/${id}/rows/${overview.picture}/center.jpg`;
+  const src = `/recordings/${id}/rows/${overview.picture}/center.jpg?version=${overview.version}`;
   const picture = make("img", "", {src, alt: "", width: 320, height: 160, loading: "lazy"});
   picture.onerror = () => picture.replaceWith(make("div", "", {class: "none"}));
   const histogram = make("div", "", {class: "histogram"}), [, mean, most] = overview.speed ?? [];
@@ -233,18 +244,7 @@ function map({outline, path}) {
 const widthOf = holder => Math.max(120, holder.clientWidth);
 
 function bars(counts, holder) {
-  const colours = getComputedStyle(document.body);
-  const steering = counts.map((_, bin) => (bin + 0.5) / counts.length * 2 - 1);
-  holder.setAttribute("role", "img");
-  holder.setAttribute("aria-label", "Histogram of steering, on a square-root scale");
   holder.title = "How many frames have which steering, on a square-root scale";
-  return new uPlot({
-    width: widthOf(holder), height: HEIGHT, legend: {show: false}, cursor: {show: false}, padding: [4, 8, 0, 8],
-    scales: {x: {time: false, range: [-1, 1]}, y: {distr: 100, fwd: Math.sqrt, bwd: value => value * value,
-      range: (plot, low, high) => [0, Math.max(1, high)]}},
-    axes: [{stroke: colours.getPropertyValue("--quiet"), size: 18, gap: 2, grid: {show: false}, ticks: {show: false},
-      splits: () => [-1, -0.5, 0, 0.5, 1], font: "12px system-ui, sans-serif"}, {show: false}],
-    series: [{}, {fill: colours.getPropertyValue("--line"), width: 0, paths: uPlot.paths.bars({size: [0.9, 100]}),
-      points: {show: false}}],
-  }, [steering, counts], holder);
+  return histogram(holder, "steering", counts, [-1, 1], {size: 18, gap: 2, splits: () => [-1, -0.5, 0, 0.5, 1]},
+    {width: widthOf(holder), height: HEIGHT, cursor: {show: false}, padding: [4, 8, 0, 8]});
 }

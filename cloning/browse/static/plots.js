@@ -70,6 +70,7 @@ export class Plots {
       marks: replay.where.map(([row]) => row)})).filter(Boolean);
     const drivers = this.replays.map((replay, index) => replay &&
       ({...models[index], name: `${models[index].name} driving`, values: replay.driver})).filter(Boolean);
+    const isAlwaysKnown = this.replays.every(replay => !replay || replay.by_lane == replay.driven);
     const human = {name: "driver", values: steering, colour: colours.getPropertyValue("--line")};
     const taught = label ? [{name: "label", values: label, colour: colours.getPropertyValue("--label"),
       title: "The recovery steering, which model.py --robust learns"}] : [];
@@ -82,14 +83,14 @@ export class Plots {
         curves: [{name: "", values: throttle}]},
       {title: "Speed", unit: " mph", digits: 1, tall: 60, range: [0, Math.max(31, most(speed))],
         curves: [{name: "", values: speed}]},
-      {title: "Metres right of the lane's centre", unit: " m", digits: 2, tall: 120, lines: LIMITS,
+      {title: `Metres right of the lane's centre${isAlwaysKnown ? "" : " or driver's path"}`, unit: " m", digits: 2, tall: 120, lines: LIMITS,
         range: (_, low, high) => balanced(Math.max(2.75, -low * 1.05, high * 1.05), OFF),
         curves: [{name: replays.length ? "driver" : "", values: offset}, ...replays]},
     ];
     this.shown = [];
     this.plots = graphs.map((graph, at) => this.plot({...graph, isLast: at == graphs.length - 1}));
     if (this.zoom) this.setZoom(...this.zoom);
-    this.goTo(this.row);
+    this.showRow();
   }
 
   plot({title, unit, digits, range, curves, lines = [], tall, isLast}) {
@@ -232,8 +233,12 @@ export class Plots {
     if (row < low || row > high) { // turn the page
       this.setZoom(row - (high - low) / 10, row + (high - low) * 0.9);
     }
+    this.showRow();
+  }
+
+  showRow() {
     for (const {value, unit, digits, values} of this.shown) {
-      const here = values?.[row];
+      const here = values?.[this.row];
       value.textContent = !values ? "not known" : Number.isNaN(here) ? "not known here" : rounded(here, digits) + unit;
     }
     this.plots.forEach(plot => this.move(plot, plot.here));

@@ -1,7 +1,7 @@
 // One recording: its frames and curves, news of it from the server, and the keys.
 import {ask, element, make, many, notice, onClick, renew, request} from "./common.js";
-import {changes, cutMarked, mark, redo, showCuts, undo} from "./cuts.js";
-import {askToExport, find, showHistogram} from "./filter.js";
+import {changes, cutMarked, mark, redo, showCuts, showStretches, undo} from "./cuts.js";
+import {askToExport, find, setCondition, showHistogram} from "./filter.js";
 import {Frames} from "./frames.js";
 import {changeSpeed, goTo, jump, JUMPS, play, seek, setLoop, setSpeed} from "./moving.js";
 import {Plots} from "./plots.js";
@@ -50,12 +50,12 @@ export function leaveRecording() {
   page.open = undefined;
 }
 
-// shown: the rest of the state, as `remember` writes it.
+// row, shown: the state, as `note` writes it, or as somebody has changed it.
 export async function showRecording(id, row, shown) {
   const mine = ++latest, limits = LIMITS.find(each => each == shown.get("limit")), columns = {};
   const details = await ask(`/${id}/details${limits ? `?limit=${limits}` : ""}`);
-  const load = async name => columns[name] = await column(id, details.version, name);
-  const analyses = Promise.allSettled(analysed(details, {}).map(load));
+  const load = async name => columns[name] = await column(id, details.version, name), stamps = stampsOf(details);
+  const analyses = Promise.allSettled(Object.keys(stamps).filter(name => stamps[name]).map(load));
   await Promise.all(["steering", "throttle", "speed", "seconds"].map(load));
   const isStale = (await analyses).some(({status}) => status == "rejected"); // a file has changed since the details
   if (mine != latest) return;
@@ -63,11 +63,16 @@ export async function showRecording(id, row, shown) {
   element("recording").hidden = false;
   offerModels(details);
   for (const reason of ["difference", "intervention"]) element(`jump-${reason}`).hidden = !details.models.length;
-  const count = columns.seconds.length, marks = (shown.get("mark") ?? "").match(/^(\d*)-(\d*)$/) ?? [];
-  const [first, last] = marks.slice(1).map(at => at ? Math.min(Number(at), count - 1) : undefined);
+  const count = columns.seconds.length, rowOf = text => Math.min(Math.max(0, Math.round(text) || 0), count - 1);
+  const rowsOf = name => {
+    const [, ...both] = (shown.get(name) ?? "").match(/^(\d*)-(\d*)$/) ?? [];
+    return both.map(at => at ? rowOf(at) : undefined);
+  };
+  const [first, last] = rowsOf("mark"), [low = 0, high = count - 1] = rowsOf("zoom");
   const looked = shown.get("look"), attention = details.models[looked] ? Number(looked) : null;
   const now = page.open = {
-    id, details, columns, count, marks: {first, last}, ...changes(id), row: Math.min(row, count - 1), playing: 0, orders: 0,
+    id, details, columns, count, marks: first > last ? {first: last, last: first} : {first, last}, ...changes(id),
+    stamps: isStale ? {} : stamps, row: rowOf(row), playing: 0, orders: 0,
     jumps: {...details.jumps}, limit: limits, attention, replays: [], update,
     condition: shown.get("find") ?? "", of: shown.get("of") ?? "steering", paths: shown.get("paths") != "0",
     query: () => now.limit ? `?limit=${now.limit}` : "",
@@ -79,20 +84,19 @@ export async function showRecording(id, row, shown) {
   document.title = details.name;
   element("scrub").max = count - 1;
   say("");
-  now.plots.setZoom(...(shown.get("zoom") ?? `0-${count - 1}`).split("-").map(Number));
   setSpeed(shown.get("speed") ?? 1);
   setLoop(shown.get("loop") == "1");
   setPaths(now.paths);
   goTo(now.row);
+  now.plots.setZoom(low, high); // which may be elsewhere
   await refresh(now, isStale ? undefined : details);
-  await find();
+  if (page.open == now) await setCondition(now.condition);
 }
 
-// The columns of finished analyses that are not here yet.
-function analysed({lane, models}, columns) {
-  const names = lane.state == "ready" ? ["offset", "label"] : [];
-  models.forEach(({state}, index) => state == "ready" && names.push(`model-${index}`));
-  return names.filter(name => !columns[name]);
+// The columns of analyses, with the stamps of what they were made of, undefined for those that are not finished.
+function stampsOf({lane: {stamp}, models}) {
+  const ofModels = models.map(({stamp}, index) => [`model-${index}`, stamp]);
+  return {offset: stamp, label: stamp, ...Object.fromEntries(ofModels)};
 }
 
 async function column(id, version, name) {
@@ -105,23 +109,26 @@ async function column(id, version, name) {
 async function update(details) {
   const now = page.open;
   clearTimeout(now.timer);
-  if (details.message) notice(details.message);
   if (details.version != now.details.version) {
     now.marks = {}; // of other rows
+    showStretches();
+    remember();
     return notice(CHANGED);
   }
   now.details = details;
-  const ready = analysed(details, now.columns);
-  for (const name of ready) now.columns[name] = await now.column(name);
+  const stamps = stampsOf(details), changed = Object.keys(stamps).filter(name => stamps[name] != now.stamps[name]);
+  for (const name of changed) now.columns[name] = stamps[name] && await now.column(name);
   if (page.open != now) return;
-  if (ready.length) {
+  now.stamps = stamps;
+  if (changed.length) {
     now.plots.build();
     now.frames.setPictures(cameras());
   }
-  if (ready.length || !now.hasHistogram) showHistogram();
+  if (changed.length || !now.hasHistogram) showHistogram();
   now.hasHistogram = true;
-  await showReplays();
+  const areReplaysNew = await showReplays();
   if (page.open != now) return;
+  if (changed.length || areReplaysNew) find();
   showCuts();
   showFindings();
   buttons();

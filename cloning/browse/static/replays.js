@@ -46,14 +46,16 @@ export function offerModels({models}) {
   }));
 }
 
-// Show the replays at the chosen limit as far as they are: curves, pictures, figures, interventions.
+// Show the replays at the chosen limit as far as they are: curves, pictures, figures, interventions. Return whether they
+// are others than before.
 export async function showReplays() {
   const now = page.open, {details} = now;
+  let changed = false;
   if (details.limit == now.limit) {
     const replays = await Promise.all(details.replays.map((replay, index) => load(now, replay, index)));
     if (page.open != now || details.limit != now.limit) return;
     const stamps = all => JSON.stringify(all.map(replay => replay && [replay.limit, replay.stamp]));
-    const changed = stamps(replays) != stamps(now.replays);
+    changed = stamps(replays) != stamps(now.replays);
     now.replays = replays;
     if (changed) {
       now.plots.setReplays(replays);
@@ -70,6 +72,7 @@ export async function showReplays() {
     const content = [now.id, details.version, details.limit, details.replays];
     renew(element("replay-list"), content, () => details.replays.map(section));
   }
+  return changed;
 }
 
 // A replay with its column, if it is there; the one that is shown already, if it is still the same.
@@ -145,11 +148,8 @@ async function choose(limit) {
   now.limit = limit;
   remember();
   say(limit ? `Replays at a limit of ${limit} m.` : "No replays.");
-  if (limit) return order("POST", `replays/${limit}`);
-  now.replays = [];
-  now.plots.setReplays([]);
-  now.frames.setPictures(cameras());
-  await now.update({...now.details, limit: null, replays: []});
+  if (limit) await order("POST", `replays/${limit}`);
+  else await now.update({...now.details, limit: null, replays: []});
 }
 
 export function nextLimit() {

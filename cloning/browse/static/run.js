@@ -48,7 +48,6 @@ async function load(now) {
   return {all, runs: await Promise.all([now.id, ...now.others].map(each => request(`/runs/${each}`)))};
 }
 
-const nameOf = ({folder}) => folder.split(/[\\/]/).at(-1);
 const UNITS = {val_loss: "validation loss", val_drift: "drift"};
 // Which epoch is the best, why, and whether its drift says the same.
 function best({best, history}) {
@@ -95,9 +94,8 @@ async function refresh(now) {
 function update({all, runs}) {
   const now = open, before = now.runs, [run] = runs, {history} = run, last = history.at(-1);
   Object.assign(now, {run, runs});
-  const name = nameOf(run);
-  element("title").textContent = `/ training run in ${name}`;
-  document.title = `${run.state}: ${name}`;
+  element("title").textContent = `/ training run in ${run.name}`;
+  document.title = `${run.state}: ${run.name}`;
   const done = history.length + Math.min(1, run.images / run.samples_per_epoch);
   element("run-bar").value = run.state == "finished" ? 1 : Math.min(1, done / run.epochs);
   element("run-bar").setAttribute("aria-valuetext", stateOf(run));
@@ -118,7 +116,7 @@ function update({all, runs}) {
   const others = all.filter(each => each.id != now.id && !each.message);
   const overlay = each => {
     const isShown = now.others.includes(String(each.id));
-    const button = make("button", nameOf(each), {"aria-pressed": isShown, title: each.folder});
+    const button = make("button", each.name, {"aria-pressed": isShown, title: each.folder});
     const chosen = isShown ? now.others.filter(id => id != each.id) : [...now.others, each.id];
     onClick(button, () => location.hash = addressOf(now, chosen));
     return button;
@@ -139,7 +137,7 @@ function showOptions(runs) {
   element("run-options").firstElementChild.textContent =
     runs.length == 1 ? "Its options" : `Options in which they differ (${shown.length})`;
   renew(element("run-table"), runs.map(({options, folder}) => [folder, options]), () => [
-    make("tr", "", {}, ...["option", ...runs.map(nameOf)].map(text => make("th", text, {scope: "col"}))),
+    make("tr", "", {}, ...["option", ...runs.map(({name}) => name)].map(text => make("th", text, {scope: "col"}))),
     ...shown.map(name => make("tr", "", {},
       make("th", name, {scope: "row"}), ...runs.map(({options}) => make("td", options[name] ?? "–")))),
   ]);
@@ -176,7 +174,7 @@ function draw() {
   const [drift, losses] = [[], []]; // [epochs, values], and the curve's looks
   runs.forEach((run, at) => {
     const {history, trail, best} = run, stroke = at ? MODEL_COLOURS[(at - 1) % MODEL_COLOURS.length] : colour("--line");
-    const of = runs.length > 1 ? `${nameOf(run)} ` : "", points = {show: true, size: 7, fill: stroke};
+    const of = runs.length > 1 ? `${run.name} ` : "", points = {show: true, size: 7, fill: stroke};
     const values = key => [history.map(({epoch}) => epoch), history.map(row => row[key])];
     drift.push([values("val_drift"), {label: `${of}drift`, stroke, width: 2, points}]);
     const curves = [
