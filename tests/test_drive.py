@@ -109,6 +109,14 @@ def test_unusable_telemetry_gets_the_last_steering_and_no_throttle_and_its_reaso
     assert session.answer(good)["steering_angle"] == before["steering_angle"]
 
 
+def test_a_car_that_is_to_stop_brakes_even_if_no_image_can_be_used(session, jpeg):
+    blind: dict[str, Any] = {**telemetry(jpeg, speed="12.0000"), "image": ""}
+    assert session.answer(blind)["throttle"] == "0"
+    session.drive_at(0.0)
+    slower = [session.answer({**blind, "speed": speed})["throttle"] for speed in ("12", "6", "0", "fast")]
+    assert slower == ["-1", "-1", "0", "0"] and session.unusable == 5
+
+
 @pytest.mark.parametrize("failure", ["raises", "nan"])
 def test_a_failing_network_is_answered(session, jpeg, failure):
     before = session.answer(telemetry(jpeg))

@@ -57,17 +57,10 @@ def parse_telemetry(message: object) -> Telemetry:
 
     message: the decoded JSON, or UNREADABLE. Other fields are ignored. Raises UnusableTelemetry.
     """
-    if message is UNREADABLE:
-        raise UnusableTelemetry(f"its JSON is incomplete, or it is longer than {MAX_MESSAGE} bytes")
-    if not isinstance(message, dict):
-        raise UnusableTelemetry("it is not a JSON object")
-    for key in ("speed", "image"):
-        if key not in message:
-            raise UnusableTelemetry(f"{key} is missing")
-    try:
-        speed, _ = parse_number(message["speed"])
-    except ValueError as error:
-        raise UnusableTelemetry("speed is not a number") from error
+    speed = parse_speed(message)
+    assert isinstance(message, dict), "a message with a speed is one"
+    if "image" not in message:
+        raise UnusableTelemetry("image is missing")
     try:
         cte, _ = parse_number(message.get("cte"))
     except ValueError:
@@ -80,6 +73,20 @@ def parse_telemetry(message: object) -> Telemetry:
         return Telemetry(jpeg, decode(jpeg), speed, cte, parse_place(message.get(STAND_IN)))
     except ValueError as error:
         raise UnusableTelemetry(f"the image is unusable: {error}") from error
+
+
+def parse_speed(message: object) -> float:
+    """Return the speed in a telemetry message, mph, whatever its image is. Raises UnusableTelemetry."""
+    if message is UNREADABLE:
+        raise UnusableTelemetry(f"its JSON is incomplete, or it is longer than {MAX_MESSAGE} bytes")
+    if not isinstance(message, dict):
+        raise UnusableTelemetry("it is not a JSON object")
+    if "speed" not in message:
+        raise UnusableTelemetry("speed is missing")
+    try:
+        return parse_number(message["speed"])[0]
+    except ValueError as error:
+        raise UnusableTelemetry("speed is not a number") from error
 
 
 def parse_place(told: object) -> Place | None:
