@@ -156,6 +156,7 @@ def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape,
         '{"crop": [0, 0, 320, 0]}',
         '{"crop": [1, 2, 3]}',
         '{"colour": "CMYK"}',
+        '{"crop": [1.5, 0]}',
         '{"scale": 2}',
         "[]",
         "{",
@@ -163,6 +164,21 @@ def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape,
         (tmp_path / "keras.json").write_text(wrong, encoding="utf-8")
         with pytest.raises(UserError, match=r"keras\.json: does not tell"):
             driving.load_driver(file)
+
+
+@pytest.mark.parametrize(
+    ("shape", "axes", "kind", "reason"),
+    [
+        ((1, 160, 320, 3), [1, 2], 11, "expected: (tensor(double))"),
+        ((2, 160, 320, 3), [1, 2], 1, "invalid dimensions"),
+        ((), None, 1, "does not tell how frames become"),
+    ],
+)
+def test_an_onnx_network_of_other_inputs_is_refused_before_it_drives(tmp_path, shape, axes, kind, reason):
+    file = onnx_file(tmp_path / "other.onnx", shape, axes, kind)
+    with pytest.raises(UserError, match=r"other\.") as caught:
+        driving.load_driver(file)
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_without_that_file_frames_are_as_the_simulator_sends_them(tmp_path):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from cloning.recordings.images import decode
-from cloning.wire.protocol import STAND_IN, Place
+from cloning.wire.protocol import MAX_NAME, STAND_IN, Place
 
 MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
 UNREADABLE = object()  # what the server gives for a telemetry that is too long or not JSON
@@ -26,7 +26,7 @@ NUMBER = re.compile(
     r" ?(?P<after>[-)\u2212]?)"
 )
 SIGNS = {"": 1, "+": 1, "-": -1, "()": -1}  # by the characters before and after a number
-MAX_LENGTH = 40  # characters of a number, or of a road's name
+MAX_LENGTH = 40  # characters of a number
 LARGEST = 1e6  # m or s in a place: no road and no drive is longer
 
 
@@ -97,7 +97,7 @@ def parse_place(told: object) -> Place | None:
     numbers = (place.x, place.y, place.offset, place.departures, place.time)
     # A comparison with nan is false.
     usable = all(type(number) in (int, float) and abs(number) <= LARGEST for number in numbers)
-    return place if usable and type(place.track) is str and len(place.track) <= MAX_LENGTH else None
+    return place if usable and type(place.track) is str and len(place.track) <= MAX_NAME else None
 
 
 def parse_number(written: object) -> tuple[float, str]:
