@@ -18,6 +18,7 @@ import warm
 from drive_process import awaited, serving
 
 import drive
+from cloning.base.errors import UserError
 from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
@@ -304,6 +305,13 @@ def test_a_new_page_gets_the_last_minute_in_as_many_rows_as_it_can_show(jpegs, m
     times = [row[0] for row in json.loads(next(pages.events())[6:])["rows"]]
     assert len(times) <= page.SHOWN_FRAMES and times == sorted(times)
     assert times[-1] == session.history[-1].time and times[-1] - times[0] > 49
+
+
+def test_other_systems_are_told_before_a_server_starts(monkeypatch):
+    monkeypatch.setattr(attack, "Path", lambda _: SimpleNamespace(exists=bool))
+    for tool in (attack, soak):
+        with pytest.raises(UserError, match="needs Linux"):
+            tool.main([])
 
 
 def test_a_soak_finds_what_does_not_stay_as_it_was(server, tmp_path, monkeypatch):
