@@ -46,6 +46,12 @@ def expected(server, jpegs) -> list[str]:
     return car.expected
 
 
+def test_a_server_leaves_the_sessions_of_others_in_its_process_as_they_are():
+    own, other = Server().eio, engineio.Server(async_mode="threading")
+    assert type(engineio.socket.Socket(own, "sid")) is Client
+    assert type(engineio.socket.Socket(other, "sid")) is Client.__base__
+
+
 @pytest.mark.parametrize("name", all_attacks())
 def test_a_car_is_answered_beside_an_attack(server, jpegs, expected, name):
     report = attack.run(all_attacks()[name], server, jpegs, expected, SECONDS)
@@ -161,9 +167,8 @@ def test_a_failed_handshake_takes_no_place(server, jpegs):
     attack.Car(server.port, jpegs[:1]).simulator.socket.close()
 
 
-def test_the_client_that_was_served_longest_ago_goes_first(monkeypatch):
+def test_the_client_that_was_served_longest_ago_goes_first():
     """So a car that waits for its answer waits for one other at most, however many never wait."""
-    monkeypatch.setattr(engineio.socket, "Socket", engineio.socket.Socket)  # a Server replaces it, here until the end
     engine, served = Server().eio, list[str]()
 
     def serve(client):
