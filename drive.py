@@ -19,6 +19,7 @@ import statistics
 import sys
 import time
 from collections import Counter
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from cloning.recordings import saved_frames
 from cloning.road.motion import MPH, SET_SPEED_MPH, TOP_SPEED_MPH
 from cloning.server import page, terminal
 from cloning.server.speed import SpeedController
-from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_telemetry
+from cloning.server.telemetry import UnusableTelemetry, decimal_separator, format_number, parse_speed, parse_telemetry
 from cloning.wire.protocol import PORT
 
 KERAS = (".h5", ".hdf5", ".keras")  # endings of files that other projects' drive.py takes
@@ -88,6 +89,9 @@ class Session(page.Session):
                 f"a frame can't be used: {self.reason}; the answer repeats the last steering with throttle 0",
                 extra={"warned": self.warned},
             )
+            if self.controller.set_speed == 0:  # a car that is to stop needs no picture for that
+                with suppress(UnusableTelemetry):
+                    throttle = self.controller.throttle(parse_speed(message))
         else:
             self.frame = telemetry.image
             self.driven += 1
@@ -338,16 +342,19 @@ def main() -> int:
         saved_frames.check_folder(arguments.folder)
     origin = "the model that comes with the project" if model == SHIPPED_MODEL else ""
     server = DriveServer(network, arguments.speed, origin or str(model), limits, arguments.stop_when_lost)
-    listener = connections.claim_port(arguments.host, arguments.port)
+    where_taken = f"for the stand-in alone choose another --port: Udacity's simulator connects to {PORT} only"
+    listener = connections.claim_port(arguments.host, arguments.port, where_taken)
     if arguments.folder:
         server.saver, server.recording = saved_frames.FrameSaver(arguments.folder), True  # last: it empties it
     stopped, port = connections.noted_signals(), listener.getsockname()[1]
     watched = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(arguments.host, arguments.host)
-    stand_in = program.in_commands("python -m simulator drive")
+    stand_in = f"in a second terminal its stand-in: `{page.stand_in('drive', watched, str(port))}`"
+    simulator = "Now start the simulator, choose a track and AUTONOMOUS MODE,\nor"
+    if port != PORT:
+        simulator = f"The simulator connects to port {PORT} only.\nNow start"
     print(
         f"Driving with {model}{origin and f' ({origin})'}.\n"
-        f"Listening on {arguments.host}:{port}. Now start the simulator, choose a track and AUTONOMOUS MODE,\n"
-        f"or in a second terminal its stand-in: `{stand_in}{f' --port {port}' * (port != PORT)}`.\n"
+        f"Listening on {arguments.host}:{port}. {simulator} {stand_in}.\n"
         f"Watch at http://{f'[{watched}]' if ':' in watched else watched}:{port}/ . Ctrl-C ends.",
         file=sys.stderr,
         flush=True,

@@ -1,4 +1,4 @@
-"""The simulator's commands: `python -m simulator record`, `drive`, `correct`, `replay`, `window`, `join`."""
+"""The simulator's commands: `python -m simulator record`, `drive`, `correct`, `replay`, `window`, `join` and so on."""
 
 from cloning.base import program
 
@@ -351,8 +351,11 @@ def run_join(arguments: argparse.Namespace) -> int:
     """Let another program's server drive, or write the program that does this."""
     from simulator.join import join, write_launcher
 
+    track = chosen_track(arguments, needs_file=arguments.dialect != "roads")
+    if arguments.dialect == "episodes" and (arguments.track or arguments.road):
+        raise UserError("in the dialect episodes the program names the tracks; leave out --track and --road")
     if not arguments.launcher:
-        return join(arguments, chosen_track(arguments, needs_file=False), given_for_road(arguments))
+        return join(arguments, track, given_for_road(arguments))
     write_launcher(arguments)
     return program.DONE
 

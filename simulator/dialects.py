@@ -267,8 +267,9 @@ class Episodes(Dialect):
         self.weather, self.day = weather, daytime == "day"
         self.disturbance = self.stage.disturbance or FALLING.get(weather)
         if changed:
-            self.open(source)
-        self.restart()
+            self.open(source, self.stage.direction)
+        else:
+            self.restart()
         self.ready, self.still, self.told = True, False, 0
 
     def advance(self) -> None:

@@ -13,8 +13,10 @@ import math
 import re
 import threading
 from collections.abc import Callable
-from contextlib import closing
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, replace
+from operator import index
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,6 +44,7 @@ from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Expert
 from simulator.run import Departure, Run
+from simulator.workers import started_workers
 from simulator.world import Scene
 
 PATIENCE = 30.0  # s that a drive may take beyond twice the time at its set speed
@@ -146,18 +149,21 @@ def load_driver(driver: str) -> Steering:
     options.intra_op_num_threads = 1
     try:
         session = onnxruntime.InferenceSession(driver, options)
+        taken = session.get_inputs()[0]
+        prepare = preprocessing(Path(driver).with_suffix(".json"), taken.shape, taken.type == "tensor(uint8)")
+
+        def steering(frame: np.ndarray) -> float:
+            found = session.run(None, {taken.name: prepare(frame)})[0].flat[0]
+            if not np.isfinite(found):
+                raise ArithmeticError("the network's steering is not finite")
+            return float(np.clip(found, -1, 1))
+
+        steering(np.zeros(FRAME, np.uint8))
+    except UserError:
+        raise
     except Exception as error:  # onnxruntime has its own, without a common class
-        raise UserError(f"{driver}: {str(error)[:200]}") from None
-    taken = session.get_inputs()[0]
-    prepare = preprocessing(Path(driver).with_suffix(".json"), taken.shape, taken.type == "tensor(uint8)")
-
-    def steering(frame: np.ndarray) -> float:
-        found = session.run(None, {taken.name: prepare(frame)})[0].flat[0]
-        if not np.isfinite(found):
-            raise ArithmeticError("the network's steering is not finite")
-        return float(np.clip(found, -1, 1))
-
-    steering(np.zeros(FRAME, np.uint8))
+        reason = " ".join(str(error)[:200].split())
+        raise UserError(f"{driver}: does not steer by a frame as LEADERBOARD.md says: {reason}") from None
     return steering
 
 
@@ -178,9 +184,9 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
     it takes uint8, else float32. Raises UserError.
     """
     try:
-        said = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        said = json.loads(file.read_text(encoding="utf-8-sig")) if file.exists() else {}
         crop, colour, (low, high) = ({**PREPROCESSING, **said}[name] for name in PREPROCESSING)
-        top, bottom, left, right = crop if len(crop) == 4 else (*crop, 0, 0)  # rows alone are enough
+        top, bottom, left, right = map(index, crop if len(crop) == 4 else (*crop, 0, 0))  # rows alone are enough
         conversion, scale = COLOURS[colour], (high - low) / 255
         last = shape[-1] == 3
         rows, columns = shape[1:3] if last else shape[2:]
@@ -189,7 +195,7 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
         whole_cut = not (0 <= top < FRAME[0] - bottom <= FRAME[0] and 0 <= left < FRAME[1] - right <= FRAME[1])
         if unknown or whole_cut or len(shape) != 4 or 3 not in (shape[1], shape[3]):
             raise ValueError(f"shape {shape}, {said}")
-    except (ValueError, TypeError, KeyError, OSError) as error:
+    except (ValueError, TypeError, LookupError, OSError) as error:
         wanted = f"it may have {json.dumps(PREPROCESSING)} with other values, and colours {', '.join(COLOURS)}"
         raise UserError(f"{file}: does not tell how frames become the network's input ({error!r}); {wanted}") from None
 
@@ -216,6 +222,19 @@ def check_driver(driver: str) -> None:
             session.connect()
     elif driver not in BUILT_IN:
         load_driver(driver)
+
+
+def workers_for(driver: str, processes: int, scheduler: str | None) -> AbstractContextManager[Executor]:
+    """Return `started_workers` for drives of a driver, one for a server. Raises UserError, also if there is no such.
+
+    A server may take the cars that it drives for one and the same.
+    """
+    check_driver(driver)
+    if not server_address(driver):
+        return started_workers(processes, scheduler)
+    if scheduler:
+        raise UserError(f"{driver}: a server drives one car at a time; leave out --scheduler")
+    return started_workers(1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ step's time goes into rendering the frame in software, on one core.
 """
 
 import math
+import operator
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -52,7 +53,7 @@ def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> 
     """Raise SimulatorError if a value is not valid, or of a type that cannot be compared; allowed: what is valid."""
     try:
         accepted = valid(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, ArithmeticError):
         accepted = False
     if not accepted:
         raise SimulatorError(f"{name} {value!r}: it must be {allowed}")
@@ -60,7 +61,7 @@ def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> 
 
 def check_look(look: Any) -> None:
     """Raise SimulatorError if a look is not a number of one."""
-    check("look", look, lambda number: number >= 0 and number % 1 == 0, "a whole number from 0")
+    check("look", look, lambda number: operator.index(number) >= 0, "a whole number from 0, as an int")
 
 
 def parse_disturbance(text: Any) -> Disturbance | None:
@@ -190,15 +191,13 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         s, offset = options.get("s", self.run.s), options.get("offset", 0.0)
         length = self.track.length
         check("s", s, lambda metres: 0 <= metres < length, f"at least 0 and less than {length:.1f} (m)")
-        check("offset", offset, math.isfinite, "a number (m)")
+        left, right = self.track.edges[self.track.index(s)]
+        edges = f"at {s:.1f} m the edges are at {-left:.2f} and {right:.2f} m"
+        check("offset", offset, lambda metres: -left <= metres <= right, f"a number on the road (m); {edges}")
         self.run.s = float(s)
         self.run.set_back(float(offset), turn=float(turn))
         if side := self.run.off_road():
-            left, right = self.track.edges[self.track.index(self.run.s)]
-            raise SimulatorError(
-                f"offset {offset!r}: a wheel would be beyond the road's {side} edge; "
-                f"at {self.run.s:.1f} m the edges are at {-left:.2f} and {right:.2f} m"
-            )
+            raise SimulatorError(f"offset {offset!r}: a wheel would be beyond the road's {side} edge; {edges}")
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Drive until the next frame is due, or the car leaves the road; return what the class describes.

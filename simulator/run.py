@@ -7,7 +7,7 @@ import numpy as np
 from cloning.road.autonomy import autonomy
 from cloning.road.motion import MPH, wrap_angle
 from cloning.road.track import Track
-from cloning.wire.protocol import Place
+from cloning.wire.protocol import MAX_NAME, Place
 from simulator.car import STEP, WHEELS, Car
 from simulator.world import build_physics
 
@@ -100,8 +100,9 @@ class Run:
     @property
     def place(self) -> Place:
         """Where the car is, for the page of drive.py."""
-        position = self.car.node.get_pos()
-        return Place(self.track.name, position.x, position.y, self.offset, len(self.departures), self.time)
+        position, source = self.car.node.get_pos(), self.track.source
+        name = source if isinstance(source, str) else f"--road {self.track.name}"[:MAX_NAME]
+        return Place(name, position.x, position.y, self.offset, len(self.departures), self.time)
 
     @property
     def laps(self) -> int:

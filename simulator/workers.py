@@ -22,6 +22,7 @@ from cloning.base.errors import SimulatorError, UserError
 from cloning.base.processes import interrupt_deferred
 from cloning.base.progress import progress_bar
 
+WAIT = 30.0  # s for a worker of Dask's to come; its scheduler is waited for as long
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -41,7 +42,7 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
 def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Executor]:
     """A context with an executor; call it in the main thread. At its end, nothing runs there any more.
 
-    Raises SimulatorError if a process was killed, UserError if there is no such scheduler.
+    Raises SimulatorError if a process was killed, UserError if there is no such scheduler, or it has no worker.
     """
     with ExitStack() as stack:
         if scheduler:
@@ -107,8 +108,10 @@ def _dask(address: str, stack: ExitStack) -> Executor:
         raise UserError(f"{error}; pip install distributed") from None
     try:
         client = stack.enter_context(Client(address))
+        client.wait_for_workers(1, timeout=WAIT)  # without: a scheduler alone is waited for for ever
     except (OSError, ValueError) as error:
-        raise UserError(f"{address}: {error}; start one with `dask scheduler`") from None
+        remedy = "start `dask scheduler`, and on each machine `dask worker` with its address"
+        raise UserError(f"{address}: {error}; {remedy}") from None
     executor = client.get_executor(pure=False)
     stack.callback(executor.shutdown, wait=False)
     return executor

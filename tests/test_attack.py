@@ -18,6 +18,7 @@ import warm
 from drive_process import awaited, serving
 
 import drive
+from cloning.base.errors import UserError
 from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
@@ -43,6 +44,12 @@ def expected(server, jpegs) -> list[str]:
     car = attack.Car(server.port, jpegs)
     car.simulator.socket.close()
     return car.expected
+
+
+def test_a_server_leaves_the_sessions_of_others_in_its_process_as_they_are():
+    own, other = Server().eio, engineio.Server(async_mode="threading")
+    assert type(engineio.socket.Socket(own, "sid")) is Client
+    assert type(engineio.socket.Socket(other, "sid")) is Client.__base__
 
 
 @pytest.mark.parametrize("name", all_attacks())
@@ -160,9 +167,8 @@ def test_a_failed_handshake_takes_no_place(server, jpegs):
     attack.Car(server.port, jpegs[:1]).simulator.socket.close()
 
 
-def test_the_client_that_was_served_longest_ago_goes_first(monkeypatch):
+def test_the_client_that_was_served_longest_ago_goes_first():
     """So a car that waits for its answer waits for one other at most, however many never wait."""
-    monkeypatch.setattr(engineio.socket, "Socket", engineio.socket.Socket)  # a Server replaces it, here until the end
     engine, served = Server().eio, list[str]()
 
     def serve(client):
@@ -304,6 +310,13 @@ def test_a_new_page_gets_the_last_minute_in_as_many_rows_as_it_can_show(jpegs, m
     times = [row[0] for row in json.loads(next(pages.events())[6:])["rows"]]
     assert len(times) <= page.SHOWN_FRAMES and times == sorted(times)
     assert times[-1] == session.history[-1].time and times[-1] - times[0] > 49
+
+
+def test_other_systems_are_told_before_a_server_starts(monkeypatch):
+    monkeypatch.setattr(attack, "Path", lambda _: SimpleNamespace(exists=bool))
+    for tool in (attack, soak):
+        with pytest.raises(UserError, match="needs Linux"):
+            tool.main([])
 
 
 def test_a_soak_finds_what_does_not_stay_as_it_was(server, tmp_path, monkeypatch):

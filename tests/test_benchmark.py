@@ -20,7 +20,7 @@ from cloning.road.disturbances import KINDS, Disturbance
 from cloning.road.motion import MPH
 from cloning.road.track import Track
 from cloning.wire.client import parse_event
-from simulator import __main__, driving
+from simulator import __main__, driving, workers
 from simulator.benchmark import page as report
 from simulator.benchmark import scores, tasks
 from simulator.benchmark.command import drive, run
@@ -156,6 +156,7 @@ def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape,
         '{"crop": [0, 0, 320, 0]}',
         '{"crop": [1, 2, 3]}',
         '{"colour": "CMYK"}',
+        '{"crop": [1.5, 0]}',
         '{"scale": 2}',
         "[]",
         "{",
@@ -163,6 +164,21 @@ def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape,
         (tmp_path / "keras.json").write_text(wrong, encoding="utf-8")
         with pytest.raises(UserError, match=r"keras\.json: does not tell"):
             driving.load_driver(file)
+
+
+@pytest.mark.parametrize(
+    ("shape", "axes", "kind", "reason"),
+    [
+        ((1, 160, 320, 3), [1, 2], 11, "expected: (tensor(double))"),
+        ((2, 160, 320, 3), [1, 2], 1, "invalid dimensions"),
+        ((), None, 1, "does not tell how frames become"),
+    ],
+)
+def test_an_onnx_network_of_other_inputs_is_refused_before_it_drives(tmp_path, shape, axes, kind, reason):
+    file = onnx_file(tmp_path / "other.onnx", shape, axes, kind)
+    with pytest.raises(UserError, match=r"other\.") as caught:
+        driving.load_driver(file)
+    assert reason in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_without_that_file_frames_are_as_the_simulator_sends_them(tmp_path):
@@ -193,7 +209,7 @@ def test_real_recordings_that_are_missing_are_told_before_anything_is_driven(tmp
         run(__main__.parse_arguments(["benchmark", "straight", "--recordings", str(tmp_path)]))
 
 
-def test_drives_give_the_same_on_dasks_workers_of_which_one_is_killed(tmp_path):
+def test_drives_give_the_same_on_dasks_workers_of_which_one_is_killed(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     file, processes = tmp_path / "scheduler.json", []
 
@@ -203,11 +219,15 @@ def test_drives_give_the_same_on_dasks_workers_of_which_one_is_killed(tmp_path):
 
     try:
         start("scheduler", "--port", 0, "--no-dashboard")
-        for _ in range(2):
-            start("worker", "--nthreads", 1, "--no-nanny", "--no-dashboard")
         while not file.exists():
             time.sleep(0.1)
         address = json.loads(file.read_text(encoding="utf-8"))["address"]
+        with monkeypatch.context() as impatient, pytest.raises(UserError, match="on each machine `dask worker`"):
+            impatient.setattr(workers, "WAIT", 0.1)
+            with started_workers(1, address):
+                pass
+        for _ in range(2):
+            start("worker", "--nthreads", 1, "--no-nanny", "--no-dashboard")
         every = [task._replace(look=look) for look in (1, 2, 3) for task in TINY]
         with started_workers(1, address) as pool:
             results = pool.map(partial(drive, "straight"), every)

@@ -25,9 +25,13 @@ from cloning.network.network import Network
 from cloning.recordings import saved_frames as frames
 from cloning.recordings.images import decode
 from cloning.road.overlay import overlay
+from cloning.road.points import make_road
+from cloning.road.track import Track
+from cloning.server.telemetry import parse_place
 from cloning.server.terminal import MAX_PER_MINUTE, Few, Unblocked
 from cloning.wire.client import telemetry_packet
 from cloning.wire.protocol import Place
+from simulator.run import Run
 from tools.simulator_client import telemetry
 
 
@@ -109,6 +113,14 @@ def test_unusable_telemetry_gets_the_last_steering_and_no_throttle_and_its_reaso
     assert session.answer(good)["steering_angle"] == before["steering_angle"]
 
 
+def test_a_car_that_is_to_stop_brakes_even_if_no_image_can_be_used(session, jpeg):
+    blind: dict[str, Any] = {**telemetry(jpeg, speed="12.0000"), "image": ""}
+    assert session.answer(blind)["throttle"] == "0"
+    session.drive_at(0.0)
+    slower = [session.answer({**blind, "speed": speed})["throttle"] for speed in ("12", "6", "0", "fast")]
+    assert slower == ["-1", "-1", "0", "0"] and session.unusable == 5
+
+
 @pytest.mark.parametrize("failure", ["raises", "nan"])
 def test_a_failing_network_is_answered(session, jpeg, failure):
     before = session.answer(telemetry(jpeg))
@@ -163,6 +175,8 @@ def test_the_place_that_the_stand_in_tells_is_shown_and_any_other_ignored(sessio
     for told in (*({**place, **one} for one in wrong), {**place, "z": 0}, {**place, "track": "x" * 99}, {}, [], "here"):
         assert session.answer({**telemetry(jpeg), "stand_in": told})["steering_angle"] == plain["steering_angle"]
         assert session.place is None and session.history[-1].cte is None and session.unusable == 0
+    run = Run(Track(make_road([(0, 0), (60, 0)], name="a road whose name is much longer than others")))
+    assert parse_place(vars(run.place)) and run.place.track.startswith("--road a road"), "no name of a known track"
     session.answer({**telemetry(jpeg), "stand_in": place})
     assert session.place == Place(**place) and session.history[-1][-4:] == (0.25, 1, -2.5, None)
 

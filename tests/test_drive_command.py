@@ -32,7 +32,8 @@ def test_mistakes_are_reported(model_file, tmp_path, monkeypatch):
             ((tmp_path / "foreign.pt",), "not a model of this project"),
             ((model_file, tmp_path / "mine"), "thesis.txt"),
             ((model_file, "--stop-when-lost"), "nothing tells when it is lost"),
-            ((model_file, tmp_path / "run1", "--port", other.port), f"can't listen on 127.0.0.1:{other.port}"),
+            ((model_file, tmp_path / "run1", "--port", other.port), "Udacity's simulator connects to 4567 only"),
+            ((model_file, "--host", "192.0.2.1"), "--host must be an address of this machine"),
         ):
             monkeypatch.setattr(sys, "argv", ["drive.py", *map(str, arguments)])
             with pytest.raises(UserError) as caught:

@@ -5,6 +5,7 @@ import json
 import threading
 import time
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ from browser import LOOKS, decoded, needs_chromium
 from drive_process import ask, serving
 
 import drive
+from cloning.base import program
 from cloning.server import page as drive_page
 from tools import bench_driving
 from tools.simulator_client import Simulator, telemetry
@@ -156,7 +158,7 @@ def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monk
 
     monkeypatch.setattr(drive_page, "UPDATE_INTERVAL", 2**-10)
     events = drive_page.Pages(server, with_attention=False, pause=pause).events()
-    quiet = {"state": "waiting", "set_speed": 9.0, "recording": False, "saving": "", "folder": ""}
+    quiet = {"state": "waiting", "set_speed": 9.0, "recording": False}
     assert json.loads(next(events)[6:]) == quiet
     next(events)
     assert len(naps) == 1 + drive_page.QUIET_INTERVALS
@@ -164,6 +166,16 @@ def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monk
     session.heard, session.manual = time.monotonic(), True
     assert json.loads(next(events)[6:])["state"] == "manual"
     assert len(naps) <= drive_page.QUIET_INTERVALS + 3
+
+
+def test_commands_are_the_installed_projects_and_lead_to_the_server(network, monkeypatch):
+    monkeypatch.setattr(program, "installed", {"python video.py": "bc video", "python -m simulator": "bc simulator"})
+    server = drive.DriveServer(network)
+    session: Any = drive.Session(server)
+    session.folder = SimpleNamespace(path=Path("run1"), progress=str)
+    assert drive_page.figures(server, session, 0.0)["film"] == "bc video run1"
+    assert drive_page.stand_in("drive", "127.0.0.1", "4567") == "bc simulator drive"
+    assert drive_page.stand_in("drive", "::1", "4568") == "bc simulator drive --host ::1 --port 4568"
 
 
 def test_frames_per_second_are_those_of_the_last_two(network):
@@ -213,7 +225,7 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
     def shows_the_sky() -> bool:
         return cv2.matchTemplate(page.screenshot(), sky, cv2.TM_SQDIFF_NORMED).min() < 0.01
 
-    with serving(model_file, "run1", cwd=tmp_path) as server:
+    with serving(model_file, "run 1", cwd=tmp_path) as server:
         own = f"http://127.0.0.1:{server.port}/"
         page.look(687, 800)  # where the image is as wide as its pixels
         page.open(own)
@@ -222,11 +234,12 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
         assert page.run("document.querySelector('#camera').hidden && document.querySelector('#plots').hidden")
         commands = page.run("[...document.querySelectorAll('#start code')].map(each => each.innerText)")
         assert [f"python -m simulator {words} --port {server.port}" for words in STARTS] == commands[1:]
+        assert "connects to port 4567 only" in page.text("#start")
         assert str(model_file) in page.text() and "begins with the first frame" in page.text()
         usual = telemetry(jpegs[0], speed="9.0000")
         with feeding(server.port, usual) as feeder:
             page.shows("#state", "Driving")
-            page.shows("#saving", "frames saved in run1")
+            page.shows("#saving", "frames saved in run 1")
             page.wait("document.querySelector('#rate').textContent > 0")
             page.until(shows_the_sky)
             assert page.run(PLOTS) == 4, "no distance from the centre"
@@ -245,11 +258,9 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             page.shows("#plots", "set speed 9.5 mph")
             page.shows("#record", "Record")
             page.press(" ")
-            page.shows("#saving", "frames saved in run1-2")
-            page.shows("#film", "python video.py run1-2")
-            page.shows(
-                "#browse", "cloning.lerobot run1-2 --output run1-2-recording && python -m cloning.browse run1-2-"
-            )
+            page.shows("#saving", "frames saved in run 1-2")
+            page.shows("#film", "python video.py 'run 1-2'")
+            page.shows("#browse", "python -m cloning.lerobot 'run 1-2' --output 'run 1-2-recording' && python -m ")
             for key in ("Tab", " "):
                 page.press(key)
             page.wait("document.querySelector('#attention').checked")

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -329,7 +330,7 @@ def test_episodes_have_weather_pauses_metrics_and_segments():
 
 
 def test_unknown_names_are_refused_and_known_ones_all_start():
-    dialect = Episodes(LAKE)
+    dialect = Episodes(replace(LAKE, direction="ccw"))
     for names, reason in (
         (("moon", "sunny", "day"), "no such track"),
         (("lake", "hail", "day"), "no such weather; there are sunny, rainy, snowy, foggy"),
@@ -341,6 +342,7 @@ def test_unknown_names_are_refused_and_known_ones_all_start():
     for names in (("mountain", "rainy", "day"), ("jungle", "snowy", "daynight")):
         dialect.start(*names)
         images.append(json.loads(dialect.telemetry()[2:])[1]["image"])
+        assert dialect.track.direction == "ccw", "also in the jungle, whose own is cw"
     assert dialect.ready
     assert images[0] != images[1]
 
@@ -367,6 +369,20 @@ def test_a_launcher_replaces_none_but_an_earlier_one(tmp_path, capsys):
     assert launcher.read_bytes() == b"\x7fELF the real simulator"
     launcher.unlink()
     assert main(command) == main([*command, "--fps", "10"]) == 0 and "--fps 10" in launcher.read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["roads", "--road", "none.csv"], "none.csv: No such file"),
+        (["measures", "--width", "6"], "--width is of a road of your own"),
+        (["episodes", "--track", "jungle"], "the program names the tracks; leave out --track and --road"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused_before_a_launcher_is_written(words, reason, tmp_path, capsys):
+    launcher = tmp_path / "sim.x86_64"
+    assert main(["join", "--launcher", str(launcher), "--dialect", *words]) == 2
+    assert reason in capsys.readouterr().err and not launcher.exists()
 
 
 def test_a_program_may_end_the_simulator_by_a_signal(tmp_path):

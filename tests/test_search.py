@@ -29,7 +29,7 @@ def straight(tmp_path_factory):
 
 
 def test_a_search_finds_failures_that_repeat_and_writes_roads_for_others(straight, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(search, "started_workers", Here)
+    monkeypatch.setattr(driving, "started_workers", Here)
     folder = tmp_path / "found"
     words = [str(folder), "--driver", straight, "--roads", "2", "--searches", "random"]
     assert search.main(words) == DONE
@@ -88,7 +88,7 @@ def test_diversity_is_the_angle_between_straight_and_turned_roads():
     assert search.diversity([arc]) is None
 
 
-def test_wrong_drivers_and_folders_are_refused(tmp_path):
+def test_wrong_drivers_and_folders_are_refused_and_a_server_drives_one_car(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     with pytest.raises(search.UserError, match="is not empty; name a new folder"):
         search.main([str(tmp_path)])
@@ -96,4 +96,10 @@ def test_wrong_drivers_and_folders_are_refused(tmp_path):
         search.main([str(tmp_path / "new"), "--driver", "none.pt"])
     with pytest.raises(search.UserError, match=r"none\.onnx: no such file; "):
         search.main([str(tmp_path / "new"), "--driver", "none.onnx"])
+    with Server(lambda packet, n: [], sessions=2) as server:
+        address = f"127.0.0.1:{server.port}"
+        with pytest.raises(search.UserError, match="drives one car at a time; leave out --scheduler"):
+            search.main([str(tmp_path / "new"), "--driver", address, "--scheduler", "none"])
+        monkeypatch.setattr(driving, "started_workers", lambda *how: how)
+        assert driving.workers_for(address, 8, None) == (1,)
     assert not (tmp_path / "new").exists()

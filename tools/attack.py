@@ -19,6 +19,7 @@ import numpy as np
 
 from cloning.base import program
 from cloning.base.arguments import command_line, number
+from cloning.base.errors import UserError
 from cloning.base.processes import interrupt_deferred
 from cloning.network.network import SHIPPED_MODEL
 from tools.attacks import Attack, all_attacks, frames
@@ -102,8 +103,10 @@ class Target(ServerProcess):
     """A drive.py process under attack."""
 
     def __init__(self, model: str | Path, *folder: Path):
-        """Start it; folder: for its frames."""
-        import resource  # missing on Windows, where main refuses to run
+        """Start it; folder: for its frames. Raises UserError where the system is not Linux."""
+        if not Path("/proc/self/status").exists():
+            raise UserError("needs Linux, because memory is read from /proc")
+        import resource  # missing on Windows
 
         super().__init__(ROOT / "drive.py", model, *folder, "--port", "0")
         resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (OPEN_FILES, OPEN_FILES))
@@ -191,8 +194,6 @@ def main(argv: list[str] | None = None) -> int:
     add("--seconds", type=number(float, 0.1, 3600), default=5, help="for each attack (default %(default)s)")
     add("--only", nargs="+", choices=attacks, metavar="ATTACK", help=f"of {', '.join(attacks)} (default: all)")
     options = parser.parse_args(argv)
-    if not Path("/proc/self/status").exists():
-        parser.error("needs Linux, because memory is read from /proc")
     jpegs, broken = frames(), 0
     print(f"{'':22} asked   got wrong  fps  p50 ms p99 ms max ms  peak MB  new car s  left open")
     for name in ("nobody", *(options.only or attacks)):

@@ -2,7 +2,7 @@
 
     python -m tools.search found                                  # the network that comes with the project
     python -m tools.search found --max-angle 60 --hills 0.2       # on roads that are harder than those of other teams
-    python -m tools.search found --driver 127.0.0.1:4567 --processes 1     # a server that drives one car at a time
+    python -m tools.search found --driver 127.0.0.1:4567          # a server, which drives one car at a time
     python -m simulator drive --road found/evolution-1-17.json    # drives a failure again, with drive.py --speed 20
 
 A road has 7 or 8 nodes, 10 to 25 m apart, with a turn at each, through which a Catmull-Rom spline goes. A driver
@@ -34,8 +34,8 @@ from cloning.road.generated import LANDS, MARKINGS, PointRoad
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.points import LAND, MARKING, MAX_GRADE, spline_road
 from cloning.road.track import LEFT, RIGHT, Track
-from simulator.driving import Conditions, Drive, check_driver, drive
-from simulator.workers import add_workers, results, started_workers
+from simulator.driving import Conditions, Drive, drive, workers_for
+from simulator.workers import add_workers, results
 from tools.command import head, row
 
 SEARCHES = ("random", "evolution")
@@ -198,7 +198,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--land", choices=LANDS, default=LAND, help="default: %(default)s")
     add_workers(parser)
     options = parser.parse_args(argv)
-    check_driver(options.driver)  # before processes start
+    workers = workers_for(options.driver, options.processes, options.scheduler)
     folder: Path = options.folder
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder}: is not empty; name a new folder")
@@ -206,7 +206,7 @@ def main(argv: list[str] | None = None) -> int:
     kind = Kind(options.max_angle, options.hills, options.marking, options.land)
     work = functools.partial(drive, Conditions(options.driver, options.speed, options.look))
     searches, failures = [], []
-    with started_workers(options.processes, options.scheduler) as pool:
+    with workers as pool:
         for seed, search in itertools.product(options.seeds, options.searches):
             figures, failed = run_search(
                 folder, search, seed, options.roads, kind, lambda roads: list(results(pool, work, roads))

@@ -51,9 +51,7 @@ DIRECTIONS = ("ccw", "cw")
 FIRST_LOOK = 1001  # the first look, besides look 0, that is trained on
 LAPS = 0.5  # of a generated road: of so many images, more roads teach more than whole laps
 RATE = 7.5  # rows a second, half of the simulator's: of so many images, more roads teach more than denser ones
-FAST = (
-    8.5  # m/s² sideways in the jungle's fast laps, where the simulator's drivers reach 8: frames don't show the speed
-)
+FAST = 8.5  # m/s² sideways in the jungle's fast laps; the simulator's drivers reach 8, and frames don't show the speed
 
 
 class Lap(NamedTuple):

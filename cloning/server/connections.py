@@ -156,16 +156,21 @@ def _is_address(host: str) -> bool:
         return False
 
 
-def claim_port(host: str, port: int) -> socket.socket:
-    """Return a listening socket; port 0 chooses a free one. Raises UserError, with the remedy, if the port is taken."""
+def claim_port(host: str, port: int, where_taken: str = "choose another --port") -> socket.socket:
+    """Return a listening socket; port 0 chooses a free one. Raises UserError, with the remedy.
+
+    where_taken: the remedy for a port that another server has, besides to stop that.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return eventlet.listen((host, port), family, reuse_port=False)  # else it would share a taken port
     except OSError as error:
-        raise UserError(
-            f"can't listen on {host}:{port} ({error.strerror or error}); is another server running? Stop it, or "
-            "choose another --port"
-        ) from None
+        remedies = {
+            errno.EADDRINUSE: f"stop the other server that uses it, or {where_taken}",
+            errno.EACCES: "choose another --port",
+        }
+        remedy = remedies.get(error.errno or 0, "--host must be an address of this machine, such as 127.0.0.1")
+        raise UserError(f"can't listen on {host}:{port} ({error.strerror or error}): {remedy}") from None
 
 
 def noted_signals() -> list[int]:

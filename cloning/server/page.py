@@ -6,6 +6,7 @@ import functools
 import itertools
 import json
 import math
+import shlex
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import flask
 import numpy as np
 
+from cloning.base import program
 from cloning.base.arguments import number
 from cloning.base.errors import TrackError, UserError
 from cloning.network.attention import visual_backprop
@@ -107,9 +109,11 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     @app.get("/")
     def index() -> str:
         constants = {"seconds": SHOWN_SECONDS, "top_speed": TOP_SPEED_MPH, "limits": LIMITS}
-        port = flask.request.host.rpartition(":")[2]
-        option = "" if port == str(PORT) or not port.isdecimal() else f" --port {port}"
-        return flask.render_template("drive.html", model=server.model, option=option, **constants)
+        host, _, port = flask.request.host.rpartition(":")
+        where = (host.strip("[]"), port) if port.isdecimal() else ("127.0.0.1", str(PORT))
+        commands = [stand_in(words, *where) for words in ("drive --realtime --track jungle", "window --autonomous")]
+        shown = {"model": server.model, "commands": commands, "usual_port": PORT, "is_usual": where[1] == str(PORT)}
+        return flask.render_template("drive.html", **shown, **constants)
 
     @app.get("/live")
     def live() -> flask.Response:
@@ -153,6 +157,12 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
         return {"recording": server.recording}, 200
 
     return app
+
+
+def stand_in(words: str, host: str, port: str) -> str:
+    """Return a command of the stand-in simulator, with the options by which it connects to a server."""
+    where = f" --host {host}" * (host not in ("127.0.0.1", "localhost")) + f" --port {port}" * (port != str(PORT))
+    return program.in_commands(f"python -m simulator {words}{where}")
 
 
 def posted(name: str, kind: type) -> Any:
@@ -257,9 +267,12 @@ def state_of(session: Session | None, now: float) -> str:
 
 def figures(server: Server, session: Session | None, now: float) -> dict[str, Any]:
     """Return what the page tells besides the state and the graphs, for JSON; now: time.monotonic()."""
-    folder = session.folder if session else None
     shown: dict[str, Any] = {"set_speed": server.set_speed, "recording": server.recording}
-    shown |= {"saving": folder.progress() if folder else "", "folder": str(folder.path) if folder else ""}
+    if session and session.folder:
+        saved, copy = (shlex.quote(f"{session.folder.path}{ending}") for ending in ("", "-recording"))
+        browse = f"python -m cloning.lerobot {saved} --output {copy} && python -m cloning.browse {copy}"
+        shown |= {"saving": session.folder.progress(), "film": program.in_commands(f"python video.py {saved}")}
+        shown |= {"browse": program.in_commands(browse)}
     if session:
         recent = frames_since(session.history, now - RATE_SECONDS)
         rate = (len(recent) - 1) / max(now - recent[0].time, 1e-3) if recent else 0.0

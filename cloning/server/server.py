@@ -124,7 +124,7 @@ class Engine(engineio.Server):
 
     def __init__(self, *args: Any, **options: Any):
         super().__init__(*args, **options)
-        engineio.socket.Socket = Client  # of which python-engineio makes one for each session
+        engineio.socket.Socket = make_session  # which python-engineio calls for each session of any server
         self.opening = eventlet.semaphore.Semaphore()
 
     def handle_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
@@ -162,6 +162,11 @@ class Engine(engineio.Server):
             return False
         quietest.hang_up()
         return True
+
+
+def make_session(server: engineio.Server, sid: str, usual: type = engineio.socket.Socket) -> Any:
+    """Return a new session of a server: a Client of an Engine, the usual one of any other in this process."""
+    return (Client if isinstance(server, Engine) else usual)(server, sid)
 
 
 class Server(socketio.Server):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from cloning.recordings.images import decode
-from cloning.wire.protocol import STAND_IN, Place
+from cloning.wire.protocol import MAX_NAME, STAND_IN, Place
 
 MAX_MESSAGE = 1 << 17  # bytes; a telemetry message has about 16,000
 UNREADABLE = object()  # what the server gives for a telemetry that is too long or not JSON
@@ -26,7 +26,7 @@ NUMBER = re.compile(
     r" ?(?P<after>[-)\u2212]?)"
 )
 SIGNS = {"": 1, "+": 1, "-": -1, "()": -1}  # by the characters before and after a number
-MAX_LENGTH = 40  # characters of a number, or of a road's name
+MAX_LENGTH = 40  # characters of a number
 LARGEST = 1e6  # m or s in a place: no road and no drive is longer
 
 
@@ -57,17 +57,10 @@ def parse_telemetry(message: object) -> Telemetry:
 
     message: the decoded JSON, or UNREADABLE. Other fields are ignored. Raises UnusableTelemetry.
     """
-    if message is UNREADABLE:
-        raise UnusableTelemetry(f"its JSON is incomplete, or it is longer than {MAX_MESSAGE} bytes")
-    if not isinstance(message, dict):
-        raise UnusableTelemetry("it is not a JSON object")
-    for key in ("speed", "image"):
-        if key not in message:
-            raise UnusableTelemetry(f"{key} is missing")
-    try:
-        speed, _ = parse_number(message["speed"])
-    except ValueError as error:
-        raise UnusableTelemetry("speed is not a number") from error
+    speed = parse_speed(message)
+    assert isinstance(message, dict), "a message with a speed is one"
+    if "image" not in message:
+        raise UnusableTelemetry("image is missing")
     try:
         cte, _ = parse_number(message.get("cte"))
     except ValueError:
@@ -82,6 +75,20 @@ def parse_telemetry(message: object) -> Telemetry:
         raise UnusableTelemetry(f"the image is unusable: {error}") from error
 
 
+def parse_speed(message: object) -> float:
+    """Return the speed in a telemetry message, mph, whatever its image is. Raises UnusableTelemetry."""
+    if message is UNREADABLE:
+        raise UnusableTelemetry(f"its JSON is incomplete, or it is longer than {MAX_MESSAGE} bytes")
+    if not isinstance(message, dict):
+        raise UnusableTelemetry("it is not a JSON object")
+    if "speed" not in message:
+        raise UnusableTelemetry("speed is missing")
+    try:
+        return parse_number(message["speed"])[0]
+    except ValueError as error:
+        raise UnusableTelemetry("speed is not a number") from error
+
+
 def parse_place(told: object) -> Place | None:
     """Return what the stand-in simulator tells of its car's place; None if it is not exactly that."""
     if not isinstance(told, dict) or set(told) != {each.name for each in fields(Place)}:
@@ -90,7 +97,7 @@ def parse_place(told: object) -> Place | None:
     numbers = (place.x, place.y, place.offset, place.departures, place.time)
     # A comparison with nan is false.
     usable = all(type(number) in (int, float) and abs(number) <= LARGEST for number in numbers)
-    return place if usable and type(place.track) is str and len(place.track) <= MAX_LENGTH else None
+    return place if usable and type(place.track) is str and len(place.track) <= MAX_NAME else None
 
 
 def parse_number(written: object) -> tuple[float, str]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 PORT = 4567  # on which the simulator expects the server
 FRAGMENT = 1016  # bytes: the client splits longer messages
 PING_INTERVAL, PONG_TIMEOUT = 25, 60  # s: the client pings this often, and gives up without an answer in this time
+MAX_NAME = 40  # characters of a road's name
 STAND_IN = "stand_in"  # the field with a `Place` that the stand-in simulator adds to each telemetry
 
 
@@ -12,7 +13,7 @@ STAND_IN = "stand_in"  # the field with a `Place` that the stand-in simulator ad
 class Place:
     """Where the stand-in simulator's car is, and how it got there.
 
-    track       name of the road
+    track       name of the road, of at most MAX_NAME characters; of one of points, no name of another
     x, y        m to the east and to the north
     offset      m to the right of the road's centre line
     departures  how often it has left the road

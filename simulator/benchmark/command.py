@@ -6,13 +6,12 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from cloning.base.errors import UserError
 from cloning.base.outputs import write_json, write_output
 from simulator import driving
 from simulator.benchmark import page, replays, scores, tasks
 from simulator.benchmark.tasks import Task
 from simulator.driving import Drive
-from simulator.workers import results, started_workers
+from simulator.workers import results
 
 
 def drive(driver: str, task: Task) -> Drive:
@@ -23,14 +22,11 @@ def drive(driver: str, task: Task) -> Drive:
 def run(options: argparse.Namespace) -> None:
     """Drive everything, write the page and the JSON, and print the figures. Raises UserError, OSError."""
     entry, folder = options.entry, options.folder
-    driving.check_driver(entry)  # before processes start
-    server = driving.server_address(entry)
-    if server and options.scheduler:
-        raise UserError(f"{entry}: a server drives one car at a time; leave out --scheduler")
+    workers = driving.workers_for(entry, options.processes, options.scheduler)
     recordings = replays.folders(options.recordings) if options.recordings else []
     folder.mkdir(parents=True, exist_ok=True)
     chosen = tasks.quick_tasks() if options.quick else tasks.all_tasks()
-    with started_workers(1 if server else options.processes, options.scheduler) as pool:
+    with workers as pool:
         done = results(pool, functools.partial(drive, entry), chosen, "drive")
         drives = [scores.driven(*pair) for pair in zip(chosen, done, strict=True)]
         clips = list(results(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film"))

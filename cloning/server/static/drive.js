@@ -19,7 +19,7 @@ const WORDS = {
   doubtful: ["Stopped: the network is lost", "It would probably leave the road. Go drives on, at your own risk."],
   manual: ["A person drives", "drive.py drives again when W and S are released in the simulator."],
   silent: ["The simulator is silent", "It is connected but sends nothing. Is it paused?"],
-  unusable: ["No frame can be used", "The car is told to steer as before, without throttle."],
+  unusable: ["No frame can be used", "The car is told to steer as before, without throttle. Stop brakes it, if its speed can be read."],
   gone: ["The simulator has gone", "What it sent last is shown. drive.py waits for the next one: see below."],
   lost: ["drive.py does not answer", "It has ended, or too many pages are open. This page tries again by itself."],
 };
@@ -69,16 +69,16 @@ function showNow() {
 // Whether drive.py holds the car, so that Go lets it drive.
 const isStopped = () => live.set_speed == 0 || live.state == "doubtful";
 
-function showFigures({rate, frames, unusable, reason, saving, recording, folder, set_speed, state}) {
+function showFigures({rate, frames, unusable, reason, saving, film, browse, recording, set_speed, state}) {
   write("rate", ["driving", "doubtful"].includes(state) ? rate.toFixed(1) : "–");
   write("frames", frames ?? "–");
   write("unusable", unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–", unusable ? "bad" : "");
   write("saving", saving || (recording ? "begins with the first frame" : "no"));
   element("record").setAttribute("aria-pressed", recording);
   write("record", recording ? "Stop recording" : "Record");
-  for (const each of document.querySelectorAll(".saved")) each.hidden = !folder;
-  const commands = {film: `python video.py ${folder}`, browse: `python -m cloning.lerobot ${folder} --output ${folder}-recording && python -m cloning.browse ${folder}-recording`};
-  for (const [id, command] of Object.entries(commands)) write(id, command);
+  for (const each of document.querySelectorAll(".saved")) each.hidden = !film;
+  write("film", film ?? "");
+  write("browse", browse ?? "");
   element("plots").hidden = !rows.length;
   element("start").hidden = !["waiting", "gone"].includes(state);
   const stopped = isStopped();
