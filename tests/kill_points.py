@@ -123,12 +123,15 @@ def main() -> None:
 PREPARE = f"""
 import functools, multiprocessing, sys
 sys.path.append({str(ROOT)!r})
+from cloning.base import figure
+figure.png = lambda figure, dpi: {PICTURE!r}
+import pandas  # or else pyarrow does for its first table, in every child
 import av, matplotlib.figure, model, video, drive, simulator.client, simulator.film, simulator.record, simulator.report
 import cloning.network.attention, cloning.replay.command
 from cloning.report import pictures as charts
 from cloning.training import pictures
 from simulator import record, scenery, workers
-pictures.SCALE, pictures.png, record.MAX_RENDERERS = 1, lambda figure, dpi: {PICTURE!r}, 1
+pictures.SCALE, record.MAX_RENDERERS = 1, 1
 charts.chart = lambda *draws: charts.Chart("", "")
 workers._context = lambda: multiprocessing.get_context("fork")
 scenery.build = functools.cache(scenery.build)

@@ -141,6 +141,7 @@ class Placing:
         self.recording = recording
         self.followers = [Followers(stretch, centres[stretch.rows]) for stretch in stretches]
         self.parts: list[Part] = []
+        self.grown: dict[tuple, Part | None] = {}  # what `best_of` has found: the same is sought again later
         self.cuts_ends = False  # whether a part that is not certain may be so without rows at its ends
 
     def anchors(self) -> None:
@@ -333,8 +334,10 @@ class Placing:
         expected = EXPECTED, reach - slack, reach + slack
         for limits, least, most in [(ALONE, *anywhere_near)] if paused else [expected, (MISHAP, *anywhere_near)]:
             least, most = (least, most) if forward else (-most, -least)
-            positions = s + np.arange(least, most + PROBE_STEP / 2, PROBE_STEP)
-            found = self.best_of(positions, part.track, index, rows)
+            sought = tuple(s + np.arange(least, most + PROBE_STEP / 2, PROBE_STEP)), part.track, index, rows
+            if sought not in self.grown:
+                self.grown[sought] = self.best_of(*sought)
+            found = self.grown[sought]
             # It may have grown from rows that were followed along the track, or back.
             if not found or not least - SLACK <= found.position(start) - s <= most + SLACK:
                 continue
@@ -347,7 +350,7 @@ class Placing:
                 return found
         return None
 
-    def best_of(self, positions: np.ndarray, track: int, index: int, rows: tuple[int, int, int]) -> Part | None:
+    def best_of(self, positions: tuple[float, ...], track: int, index: int, rows: tuple[int, int, int]) -> Part | None:
         """Return the part that grows best from one of these positions, if it is `unrivalled`; rows: as for `near`."""
         (start, first, end), followers = rows, self.followers[index]
         candidates = [Candidate(followers.ahead[track], np.array([s, 0.0, 0.0]), start) for s in positions]
