@@ -63,6 +63,7 @@ class Client(engineio.socket.Socket):
         finally:  # without: a handshake that fails takes a place for ever
             self.close(wait=False, abort=True)
             self.server.sockets.pop(self.sid, None)
+            self.websocket = None  # without: 40 MB of what was read last beside upgrades, till the collector comes
 
     def _serve(self, opened: Any) -> None:
         self.websocket = WebSocket(opened.socket)
