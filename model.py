@@ -82,11 +82,7 @@ def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, 
     summary.list_rejected(observations.recordings, rejected_file, strict)
     print(summary.recordings_table(counts, recipe.words.dropped.format(recipe=recipe)))
     if len(observations) < recipe.folds:
-        left = f"{len(observations)} of {rows.rows_read} rows are left"
-        reasons = {"record more": rows.kept, recipe.words.too_few: rows.dropped, f"see {rejected_file}": rows.unusable}
-        reasons["excluded.csv cuts most of them"] = rows.cut
-        why = max(reasons, key=lambda reason: reasons[reason])
-        raise RecordingError(f"{left}, at least {recipe.folds} are needed: {why}")
+        raise RecordingError(rows.too_few(recipe.folds, recipe.words.too_few, rejected_file))
     return observations
 
 

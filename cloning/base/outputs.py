@@ -3,13 +3,17 @@
 import contextlib
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from cloning.base.errors import OutputError, UserError
 from cloning.base.files import write
 
-FOLDER_ENDS = "/", os.sep  # of the name of a folder that need not exist
+
+def names_folder(path: str) -> bool:
+    """Return whether a name is of a folder, which need not exist if it ends as one."""
+    return path.endswith(("/", os.sep)) or Path(path).is_dir()
 
 
 def check_folders(*paths: str | None, model: str | Path | None = None) -> None:
@@ -19,7 +23,7 @@ def check_folders(*paths: str | None, model: str | Path | None = None) -> None:
             raise OutputError(f"{path}: is the model itself, which would be replaced; name another file")
         if path and not Path(path).absolute().parent.is_dir():
             raise OutputError(f"{path}: no such folder to write it in; make the folder first")
-        if path and (path.endswith(FOLDER_ENDS) or Path(path).is_dir()):
+        if path and names_folder(path):
             raise OutputError(f"{path}: is a folder; name a file in it")
 
 
@@ -44,10 +48,11 @@ def plural(count: int, noun: str, several: str = "") -> str:
 def short_names(paths: Iterable[Path]) -> list[str]:
     """Return the paths' names, with the folders around them where others have the same: `lake`, or `a/lake`."""
     every = [Path(os.path.abspath(path)).parts for path in paths]
+    ends = Counter(parts[-length:] for parts in every for length in range(1, len(parts)))
 
     def short(own: tuple[str, ...]) -> str:
         for length in range(1, len(own)):
-            if sum(other[-length:] == own[-length:] for other in every) == 1:
+            if ends[own[-length:]] == 1:
                 return "/".join(own[-length:])
         return str(Path(*own))
 

@@ -54,9 +54,11 @@ class Library:
 
     def look(self) -> None:
         """Add the recordings that are new in the given folders."""
+        found: list[Path] = []
         for each in self.given:
             with contextlib.suppress(RecordingError):  # what is gone is told where it is shown
-                self.add(*find_folders([each]))
+                found += find_folders([each])
+        self.add(*found)
 
     def add(self, *folders: Path) -> list[str]:
         """Add recordings, and return their identifiers."""

@@ -4,12 +4,11 @@ import argparse
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from cloning.base.arguments import number
 from cloning.base.errors import ModelError
-from cloning.base.outputs import FOLDER_ENDS
+from cloning.base.outputs import names_folder
 from cloning.network.compute import DEVICES, is_available
 from cloning.network.network import load_checkpoint
 from cloning.recordings.format import DRIVING_LOG, PROBLEM_AREAS
@@ -108,7 +107,7 @@ def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
     process = Process(**{name: values.pop(name) for name in ("output", "device", "strict", "resume") if name in values})
     if "recordings" in values:
         values["recordings"] = tuple(values["recordings"])
-    if process.output.endswith(FOLDER_ENDS) or Path(process.output).is_dir():
+    if names_folder(process.output):
         parser.error(f"--output {process.output}: is a folder; name the model file in it, such as model.pt")
     if not is_available(process.device):
         parser.error(f"--device {process.device}: torch finds no such GPU on this machine; leave the option out")

@@ -51,6 +51,13 @@ class Counts(NamedTuple):
         unusable = recording.rows_read - cut - usable
         return cls(str(recording.folder), recording.rows_read, cut, unusable, usable - kept, kept)
 
+    def too_few(self, needed: int, dropped: str, rejected: Path) -> str:
+        """Return that too few rows are kept, and the main reason; dropped: why `Recipe.select` drops rows."""
+        reasons = {"record more": self.kept, dropped: self.dropped, f"see {rejected}": self.unusable}
+        reasons["excluded.csv cuts most of them"] = self.cut
+        why = max(reasons, key=reasons.__getitem__)
+        return f"{self.kept} of {self.rows_read} rows are left, at least {needed} are needed: {why}"
+
 
 def total(counts: list[Counts]) -> Counts:
     """Return the sums over all recordings."""
