@@ -85,13 +85,14 @@ class Session(page.Session):
         except Exception as error:  # whatever it is: without an answer the car would stand still
             self.unusable += 1
             self.reason = str(error) if isinstance(error, UnusableTelemetry) else f"{type(error).__name__}: {error}"
-            log.warning(
-                f"a frame can't be used: {self.reason}; the answer repeats the last steering with throttle 0",
-                extra={"warned": self.warned},
-            )
             if self.controller.set_speed == 0:  # a car that is to stop needs no picture for that
                 with suppress(UnusableTelemetry):
                     throttle = self.controller.throttle(parse_speed(message))
+            log.warning(
+                f"a frame can't be used: {self.reason}; the answer repeats the last steering with throttle "
+                f"{throttle:g}",
+                extra={"warned": self.warned},
+            )
         else:
             self.frame = telemetry.image
             self.driven += 1

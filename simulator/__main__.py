@@ -1,4 +1,4 @@
-"""The simulator's commands: `python -m simulator record`, `drive`, `correct`, `replay`, `window`, `join` and so on."""
+"""Commands: `python -m simulator record`, `drive`, `correct`, `replay`, `window`, `join`, `benchmark`."""
 
 from cloning.base import program
 

@@ -33,7 +33,7 @@ SHOWN_SECONDS = 60  # of driving in the graphs
 HISTORY_FRAMES = SHOWN_SECONDS * 120  # that a session remembers: enough for 120 frames/s
 SHOWN_FRAMES = 1200  # at most, in one event: as many as a graph has pixels; a new page gets the whole minute
 UPDATE_INTERVAL = 0.05  # s between two pictures
-PHASES = 8  # of an interval, at which events are sent to an eighth of the pages each; all at once: 16 ms instead of 13
+PHASES = 8  # moments of an interval, at each of which an eighth of the pages get their event; without: 16 ms, not 13
 QUIET_INTERVALS = 20  # without driving, after which a page gets an event nevertheless
 RATE_SECONDS = 2  # over which frames/s are counted
 SILENCE = 2.0  # s without a telemetry, or without a usable one, after which the page says so
@@ -212,7 +212,7 @@ class Pages:
         frames also {"rows": [each a DrivenFrame], "image": JPEG in base64}.
         """
         self.open += 1
-        phase = self.open % PHASES / PHASES / 2 * UPDATE_INTERVAL
+        phase = self.open % PHASES / PHASES / 2 * UPDATE_INTERVAL  # in the first half: a late event is still in time
         try:
             shown, state, last, quiet = None, "", 0.0, 0
             self.pause(0)

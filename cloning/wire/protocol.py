@@ -13,7 +13,7 @@ STAND_IN = "stand_in"  # the field with a `Place` that the stand-in simulator ad
 class Place:
     """Where the stand-in simulator's car is, and how it got there.
 
-    track       name of the road, of at most MAX_NAME characters; of one of points, no name of another
+    track       name of the road, of at most MAX_NAME characters; of a --road, one that no known road has
     x, y        m to the east and to the north
     offset      m to the right of the road's centre line
     departures  how often it has left the road
