@@ -6,14 +6,19 @@ The network learns absolute positions from rendered frames: both tracks and gene
 poses. The pose of a real frame is unknown, but differences between poses are known: between the cameras of the car,
 between two rows of a drive, and between two warps of a frame. The network learns these from real recordings. Half of
 all frames are mirrored, so that no side is preferred. The weights are written to lane.pt in the current folder, which
-git ignores. To ship them, measure them with `python -m tools.lane_accuracy --network lane.pt`, then copy the file to
-cloning/lane/any_road.pt, which was made like this, but without mountain roads, and then trained on for 4,000 batches
-from a learning rate of 1.5e-3, with frames of 306 laps that `tools.shipped` had rendered: those of walls four times,
-those of mountain roads one and a half times as often. cloning/lane/lane.pt was made by an earlier version of this file,
-from the two tracks without shadows. For both, the jungle was first rendered with 4.1 m between its centre and its edge
-lines.
+git ignores. To ship them, measure them with `python -m tools.lane_accuracy --network lane.pt --edges 7`, then copy the
+file to cloning/lane/any_road.pt. That was made like this in four steps: without mountain roads; 4,000 batches from a
+rate of 1.5e-3 with frames of 306 laps that `tools.shipped` had rendered; then, each with --start,
+
+    python -m tools.train_lane RECORDING … --looks 0 --roads 210 --mountains 300 --steps 12000 --rate 2e-3
+    python -m tools.train_lane RECORDING … --looks 0 --roads 210 --mountains 300 --steps 9000 --rate 1.5e-3
+
+with four real recordings, and with frames of walls two and a half times as often, those of rails and of mountain roads
+one and a half times. cloning/lane/lane.pt was made by an earlier version of this file, from the two tracks without
+shadows. For both, the jungle was first rendered with 4.1 m between its centre and its edge lines.
 """
 
+import copy
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -32,6 +37,7 @@ from cloning.lane.reader import (
     STRIP_SHAPE,
     STRIP_TO_LEVEL,
     LaneNetwork,
+    load_network,
     normalize,
     read_strips,
     save_network,
@@ -255,13 +261,12 @@ def masked_loss(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
     return (losses * DISTANCE_WEIGHTS).sum() / (known * DISTANCE_WEIGHTS).sum()
 
 
-def train(batches: BatchSampler, steps: int, rate: float = 4e-3) -> LaneNetwork:
-    """Train a network with AdamW and a one-cycle learning rate; print a line every 250 steps."""
-    torch.manual_seed(batches.seed)
+def train(batches: BatchSampler, steps: int, rate: float, network: LaneNetwork) -> LaneNetwork:
+    """Train a network with AdamW and a one-cycle learning rate of this maximum; print a line every 250 steps."""
     one_thread()  # because another thread prepares the next batch at the same time
     device = torch.device("cpu")
     precision = choose_precision(device)
-    network = LaneNetwork().train()
+    network.train()
     optimizer = torch.optim.AdamW(network.parameters(), rate, weight_decay=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps, pct_start=0.15)
     started, sums = time.monotonic(), np.zeros(2)
@@ -299,20 +304,25 @@ def main(argv: list[str] | None = None) -> int:
     add = parser.add_argument
     add("recordings", nargs="*", help="folders of real recordings, each with a driving_log.csv")
     looks = "looks of each track, each also with shadows (default %(default)s)"
-    add("--looks", type=number(int, 1), default=24, help=looks)
+    add("--looks", type=number(int, 0), default=24, help=looks)
     frames = "frames of the lake in a look, and of each road; twice as many of the jungle (default %(default)s)"
     add("--frames", type=number(int, 1), default=150, help=frames)
     add("--roads", type=number(int, 0), default=100, help="generated roads (default %(default)s)")
     add("--mountains", type=number(int, 0), default=100, help="generated mountain roads (default %(default)s)")
     add("--steps", type=number(int, 1), default=3600, help="batches to train on (default %(default)s)")
+    add("--rate", type=number(float, 0, 1), default=4e-3, help="greatest learning rate (default %(default)s)")
+    add("--start", metavar="lane.pt", help="file of weights to train on (default: random ones)")
     add("--seed", type=number(int, 0), default=0, help="of all random choices (default %(default)s)")
     add("--output", type=Path, default=Path("lane.pt"), help="file of weights (default %(default)s)")
     options = parser.parse_args(argv)
+    torch.manual_seed(options.seed)
+    network = copy.deepcopy(load_network(options.start)) if options.start else LaneNetwork()
     recordings = [RealRecording(folder) for folder in find_folders(options.recordings)]
     chosen = scenes(options.looks, {"road": options.roads, "mountain": options.mountains}, options.frames)
     print(f"rendering {sum(scene.frames for scene in chosen)} frames of {len(chosen)} scenes", flush=True)
     strips, centres = render_all(chosen, options.seed)
-    save_network(options.output, train(BatchSampler(strips, centres, recordings, options.seed), options.steps))
+    batches = BatchSampler(strips, centres, recordings, options.seed)
+    save_network(options.output, train(batches, options.steps, options.rate, network))
     return program.DONE
 
 
