@@ -183,7 +183,8 @@ def _add_join(commands: "Subparsers") -> None:
         run_join,
         "let another team's test program drive, in place of the modified simulator that it expects",
         *(SERVER, WAIT, ROAD, DISTURB),
-        epilog="It ends when the program's server has gone for --wait seconds. Unity's own options, with which such "
+        epilog="It ends when the program's server has gone for --wait seconds, and in the dialect measures also after "
+        "the laps that the program asks for. Unity's own options, with which such "
         "programs start their simulator, are accepted: -logFile FILE takes the messages, and -batchmode is always so.",
     )
     add = parser.add_argument

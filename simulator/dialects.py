@@ -11,6 +11,7 @@ All three programs are servers; the simulator connects to them. Lateral offsets 
 
 import base64
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -33,12 +34,14 @@ from simulator.scenery.weather import FALLING, in_weather
 from simulator.world import Scene
 
 SECTOR = 10.0  # m of road that waypoints and sectors count
-AHEAD = 5.0  # m ahead of the car: where `next_cte` is measured, if it goes straight on
+AHEAD = 0.3  # s ahead of the car, if it goes straight on: where `next_cte` is measured, as in the real simulator
+CRASHED = 1.0  # s after a departure in which `crash` is 1
 LOST = 7.0  # m from the centre line at which a car that nobody sets back is set back
 DAY = 120.0  # simulated s of a day and its night
 DARKEST = 0.35  # brightness at midnight, of that at noon
 ROAD_END = "end of the road"  # `hit` there
 TRACKS = {"mountain": "road-40"}  # by the program's name; the others are called as here
+ROAD_WEATHERS = {"Rain": "rainy", "Snow": "snowy", "Fog": "foggy"}  # by perturbation-drive's name; its skies are sunny
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class Dialect(Driven):
     run    the present drive
     still  whether simulated time stands still until the program says something else
     ready  whether the program is to get telemetry
+    over   whether the program wants no more
     more   s after an answer in which more may come that belongs to it
     apart  whether the program's driver may be in another thread than its answers
     same   whether the last answer is the same as the one before
@@ -71,8 +75,8 @@ class Dialect(Driven):
     more, apart, same = 0.0, False, False
 
     def __init__(self, stage: Stage):
-        self.stage, self.still, self.ready, self.episodes = stage, False, True, 0
-        self.disturbance = stage.disturbance
+        self.stage, self.still, self.ready, self.over, self.episodes = stage, False, True, False, 0
+        self.set_weather("sunny")
         self.views: list[Cameras] = []
         self.replies: list[str] = []  # packets to send besides telemetry
         self.open(stage.source, stage.direction)
@@ -87,9 +91,13 @@ class Dialect(Driven):
                 self.views.append(Cameras(Scene(built), ("center",)))
         self.restart()
 
+    def set_weather(self, weather: str) -> None:
+        """Choose the weather, as `in_weather` names it, of the tracks that are built from now on."""
+        self.weather, self.disturbance = weather, self.stage.disturbance or FALLING.get(weather)
+
     def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
-        """Return what the telemetry's images show."""
-        return [scenery.build(source, self.stage.look)]
+        """Return what the telemetry's images show. Raises TrackError for an unknown weather."""
+        return [in_weather(scenery.build(source, self.stage.look), self.weather)]
 
     def restart(self) -> None:
         """Set the car at the start of its road, at rest."""
@@ -105,6 +113,11 @@ class Dialect(Driven):
     def advance(self) -> None:
         """Drive for one physics step, after which a car that has left the road is set back."""
         self.run.step(self.steering, self.throttle)
+
+    @property
+    def sector(self) -> str:
+        """The number of the sector in which the car is; each lap begins in sector 0."""
+        return str(int(max(0.0, self.run.travelled) % self.track.length // SECTOR))
 
     def obey(self, data: Any) -> bool:
         """Drive as an event's data say; return whether they can be used."""
@@ -141,11 +154,26 @@ class Dialect(Driven):
 
 
 class Measures(Dialect):
-    """Telemetry with lap, waypoint, out-of-bound episodes and so on; steering as usual. Nothing can be crashed into."""
+    """Telemetry with lap, waypoint, out-of-bound episodes and so on; steering as usual.
+
+    `crash` marks a departure, as in the real simulator: programs find failures by it. Nothing can be crashed into.
+    """
+
+    max_laps = math.inf
 
     def handle(self, event: str, data: Any) -> bool:
-        """Steer, or drive on as before."""
-        return event == "manual" or (event == "steer" and self.obey(data))
+        """Steer, or drive on as before; remember after how many laps it is over."""
+        if event != "steer" or not self.obey(data):
+            return event == "manual"
+        if str(data.get("max_laps")).isdecimal():
+            self.max_laps = int(data["max_laps"])
+        return True
+
+    def advance(self) -> None:
+        """Drive for one physics step, and finish with the last lap."""
+        laps = self.run.laps
+        super().advance()
+        self.over = self.over or laps < self.run.laps >= self.max_laps
 
     def telemetry(self) -> str:
         """Return the usual telemetry, speed in mph, and the measures."""
@@ -153,13 +181,13 @@ class Measures(Dialect):
         more = {
             "brake": f"{max(0.0, -self.throttle):.4f}",
             "lapNumber": str(run.laps + 1),
-            "currentWayPoint": str(int(run.s // SECTOR)),
-            "crash": "0",
+            "currentWayPoint": self.sector,
+            "crash": str(int(any(run.time - left.time < CRASHED for left in run.departures[-1:]))),
             "tot_obes": str(len(run.departures)),
             "tot_crashes": "0",
             "distance": f"{run.distance:.4f}",
-            "sim_time": f"{run.time:.4f}",
-            "ang_diff": f"{math.degrees(run.lane[1]):.4f}",
+            "sim_time": str(int(run.time + 1e-6)),  # whole seconds: ThirdEye reads an int
+            "ang_diff": f"{abs(math.degrees(run.lane[1])):.4f}",
         }
         return event_packet("telemetry", self.state(MPH) | more)
 
@@ -167,6 +195,7 @@ class Measures(Dialect):
 class Roads(Dialect):
     """Roads sent as text; the car stays where it leaves them until the program sets it back. Speed is in m/s.
 
+    A weather is that of the roads sent after it. Its intensity is not used.
     These programs answer at once, with what their driver, in another thread, has commanded last.
     """
 
@@ -180,6 +209,8 @@ class Roads(Dialect):
 
     def handle(self, event: str, data: Any) -> bool:
         """Steer, lay a road, or set the car back at its start. Raises TrackError for a text that is no road."""
+        if event == "weather" and isinstance(data, dict):
+            self.set_weather(ROAD_WEATHERS.get(str(data.get("type")), "sunny"))
         self.same, self._last = event == "steer" and data == self._last, data
         if event == "steer":
             self.still = self.run.at_end
@@ -211,7 +242,7 @@ class Roads(Dialect):
             "cte_pid": f"{self.run.offset:.4f}",
             "hit": ROAD_END if self.run.at_end else "none",
             "track": self.text,
-            "angl": f"{math.degrees(self.run.lane[1]):.4f}",
+            "angl": f"{-math.degrees(self.run.lane[1]):.4f}",  # right positive, from the car's heading to the road's
             # The car's attitude, of which only the heading is told: a quaternion x, y, z, w and Euler angles in degrees
             **{f"angle{i}": f"{value:.6f}" for i, value in enumerate(turn, 1)},
         }
@@ -227,16 +258,16 @@ class Episodes(Dialect):
     more = 0.003  # after its action, the program sends whether to go on, and perhaps another episode
 
     def __init__(self, stage: Stage):
-        self.weather, self.day = "sunny", True
+        self.day = True
         self.tone: np.ndarray | None = None  # of the camera by day
         super().__init__(stage)
         self.ready = False
-        self.told = 0  # departures of which the program knows
+        self.events: list[dict[str, str]] = []  # of this episode, as the program knows them
 
     def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
         """Return the scenery in its weather, and the same in the colours of its segments."""
-        built = scenery.build(source, self.stage.look)
-        return [in_weather(built, self.weather), segments(built)]
+        built = super().build(source)
+        return [*built, segments(built[0])]
 
     def open(self, source: str | PointRoad, direction: str | None = None) -> None:
         """Build a track in its weather, and set the car at its start. Raises TrackError."""
@@ -249,14 +280,20 @@ class Episodes(Dialect):
             return self.obey(data)
         if event in ("pause_sim", "resume_sim"):
             self.still = event == "pause_sim"
-            self.replies.append(event_packet("sim_paused" if self.still else "sim_resumed", {}))
-        elif event == "end_episode" and self.ready:
-            self.ready = False
-            self.replies.append(event_packet("episode_metrics", self.metrics()))
-            self.replies.append(event_packet("episode_events", [self.departure(i) for i in range(self.told)]))
+            self.tell("sim_paused" if self.still else "sim_resumed", {})
+        elif event == "end_episode":
+            self.still = True
+            self.tell("episode_metrics", self.metrics())
+            self.tell("episode_events", {"events": self.events})
+            self.tell("episode_ended", {})
         elif event == "start_episode" and isinstance(data, dict):
             self.start(*(str(data.get(key)) for key in ("track_name", "weather_name", "daytime_name")))
+            self.tell("episode_started", {})
         return False
+
+    def tell(self, event: str, data: Any) -> None:
+        """Send the program an event."""
+        self.replies.append(event_packet(event, data))
 
     def start(self, track: str, weather: str, daytime: str) -> None:
         """Begin an episode; daytime: "day" or "daynight". Raises UserError."""
@@ -264,37 +301,43 @@ class Episodes(Dialect):
             raise TrackError(f"{daytime[:40]}: there is no such daytime; there are day and daynight")
         source: str | PointRoad = TRACKS.get(track, track)
         changed = (source, weather) != (self.track.source, self.weather)
-        self.weather, self.day = weather, daytime == "day"
-        self.disturbance = self.stage.disturbance or FALLING.get(weather)
+        self.set_weather(weather)
+        self.day = daytime == "day"
         if changed:
             self.open(source, self.stage.direction)
         else:
             self.restart()
-        self.ready, self.still, self.told = True, False, 0
+        self.ready, self.still, self.events = True, False, []
 
     def advance(self) -> None:
         """Drive for one physics step, and tell the program if the car has left the road."""
         super().advance()
-        for i in range(self.told, len(self.run.departures)):
-            self.replies.append(event_packet("episode_event", self.departure(i)))
-            self.told += 1
+        for left in self.run.departures[len(self.events) :]:
+            self.events.append(
+                {
+                    "timestamp": str(int(1000 * time.time())),  # ms of real time, as programs stamp what they receive
+                    "key": "out_of_track",
+                    "value": left.side,
+                    "sector": self.sector,
+                    "pos_x": f"{left.x:.4f}",
+                    "pos_z": f"{left.y:.4f}",
+                    "time": f"{left.time:.2f}",
+                    "speed": f"{left.speed:.4f}",
+                }
+            )
+            self.tell("episode_event", self.events[-1])
 
-    def departure(self, i: int) -> dict[str, str]:
-        """Return what the program is told about the i-th departure."""
-        left = self.run.departures[i]
-        place = {"pos_x": f"{left.x:.4f}", "pos_z": f"{left.y:.4f}", "sector": str(int(left.s // SECTOR))}
-        return {"event": "out_of_bounds", "time": f"{left.time:.2f}", "speed": f"{left.speed:.4f}", **place}
-
-    def metrics(self) -> dict[str, str]:
-        """Return the measures of the episode that ends; m, s and m/s."""
+    def metrics(self) -> dict[str, str | int]:
+        """Return the measures of the episode that ends; m, s and m/s. The real simulator has only the counts."""
         run = self.run
         offset = np.abs(run.trajectory.offset or [0.0])
         return {
+            "collisionCount": 0,
+            "outOfTrackCount": len(run.departures),
             "track": run.track.name,
             "time": f"{run.time:.2f}",
             "distance": f"{run.distance:.2f}",
             "laps": str(run.laps),
-            "out_of_bounds": str(len(run.departures)),
             "mean_cte": f"{offset.mean():.4f}",
             "max_cte": f"{offset.max():.4f}",
             "mean_speed": f"{run.distance / run.time if run.time else 0.0:.4f}",
@@ -311,15 +354,16 @@ class Episodes(Dialect):
     def telemetry(self) -> str:
         """Return the telemetry with lap, sector and the image of the segments, a PNG."""
         run = self.run
-        pose, (x, y, _) = run.car.heading, run.car.node.get_pos()
-        ahead = self.track.locate(x + AHEAD * math.cos(pose), y + AHEAD * math.sin(pose), run.s)[1]
+        pose, (x, y, _), far = run.car.heading, run.car.node.get_pos(), AHEAD * run.car.speed
+        ahead = self.track.locate(x + far * math.cos(pose), y + far * math.sin(pose), run.s)[1]
         colours = self.views[1].segments(run.car.node.get_transform())
         encoded, png = cv2.imencode(".png", cv2.cvtColor(colours, cv2.COLOR_RGB2BGR))
         assert encoded
         more = {
             "next_cte": f"{ahead:.4f}",
+            "angular_difference": f"{math.degrees(run.lane[1]):.4f}",
             "lap": str(run.laps + 1),
-            "sector": str(int(run.s // SECTOR)),
+            "sector": self.sector,
             "semantic_segmentation": base64.b64encode(png.tobytes()).decode(),
         }
         return event_packet("car_telemetry", self.state() | more)

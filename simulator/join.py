@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import math
 import os
 import shlex
 import sys
@@ -39,6 +40,7 @@ class Joined(ClientSession):
     """
 
     remedy = ""  # the server is another team's program
+    connect_timeout = math.inf  # it may open a session only when its test begins
 
     def __init__(self, dialect: Dialect, host: str, port: int, wait: float, pace: float, rate: float):
         """wait: s to wait for a server; pace: simulated s a second, 0 for lock-step.
@@ -55,7 +57,7 @@ class Joined(ClientSession):
 
     def run(self) -> None:
         """Join a server, again and again. Raises SimulatorError if there is none, UserError for an impossible wish."""
-        while True:
+        while not self.dialect.over:
             try:
                 self.connect()
                 try:
@@ -75,10 +77,10 @@ class Joined(ClientSession):
         return SimulatorError(f"{self._lost or 'no answer'}; no server at {host}:{port} for {self.wait:g} s")
 
     def _exchange(self) -> None:
-        """Send and receive until the connection is lost. Raises ConnectionLost."""
+        """Send and receive until the program wants no more, or the connection is lost. Raises ConnectionLost."""
         self._listen(SETTLE)
         self._origin = self.time - self.pace * time.perf_counter()
-        while True:
+        while not self.dialect.over:
             while not self.dialect.ready:
                 self._listen(ASK_AGAIN)
             telemetry = self.dialect.telemetry()

@@ -62,8 +62,8 @@ def number(data, key):
 @pytest.mark.parametrize("more", [[], ["--pace", "2"]])
 def test_measures_are_sent_with_the_telemetry(more, capsys):
     def answer(data, n):
-        time = number(data, "sim_time")
-        return [steer(0.1 if time > 1.5 else 0, 1)] if time < 3 else None
+        time = int(data["sim_time"])  # as ThirdEye reads it
+        return [steer(0.1 if time > 1 else 0, 1)] if time < 3 else None
 
     with Program(answer) as program:
         assert join("measures", program, *more, "--look", "1") == 0
@@ -76,19 +76,36 @@ def test_measures_are_sent_with_the_telemetry(more, capsys):
     assert number(last, "ang_diff") > 2
     assert number(last, "distance") > 5
     assert number(last, "speed") > 8  # mph
-    times = [number(data, "sim_time") for data in program.data]
+    times = [int(data["sim_time"]) for data in program.data]
     if not more:  # in lock-step the frames are those of any other run
-        assert times == pytest.approx(np.ceil(np.arange(len(times)) / 15 / 0.02 - 1e-6) * 0.02)
+        assert times == (np.ceil(np.arange(len(times)) / 15 / 0.02 - 1e-6) * 0.02 + 1e-6).astype(int).tolist()
 
 
 def test_a_departure_is_an_out_of_bound_episode_and_the_car_is_set_back():
+    after = 0  # telemetries after it
+
     def answer(data, n):
-        return [steer(1 if n > 25 else 0, 1)] if data["tot_obes"] == "0" else None
+        nonlocal after
+        after += data["tot_obes"] == "1"
+        return None if after > 20 else [steer(1 if n > 25 and not after else 0, 0.1 if after else 1)]
 
     with Program(answer) as program:
         assert join("measures", program) == 0
     assert program.data[-1]["tot_obes"] == "1"
     assert abs(number(program.data[-1], "cte")) < 0.5
+    crash = "".join(data["crash"] for data in program.data)
+    assert crash.strip("0") == 15 * "1", "for a second, by which programs find the failure"
+    assert {data["tot_crashes"] for data in program.data} == {"0"}
+    assert min(number(data, "ang_diff") for data in program.data) >= 0
+
+
+def test_the_last_lap_that_a_program_wants_ends_the_drive(tmp_path):
+    (tmp_path / "road.csv").write_text("0,0\n25,0\n")
+    wanted = {"max_laps": "2", "confidence": "1", "loss": "0.01"}
+    with Program(lambda data, n: [["steer", steer(0, 1)[1] | wanted]] if n < 200 else None) as program:
+        assert join("measures", program, "--road", str(tmp_path / "road.csv"), "--wait", "60") == 0
+    places = {(data["lapNumber"], data["currentWayPoint"]) for data in program.data}
+    assert places == {(lap, place) for lap in "12" for place in "012"}, "each lap begins in the first sector"
 
 
 class RoadTests:
@@ -116,7 +133,7 @@ class RoadTests:
             self.done = True
             self.results.append((data["hit"], round(number(data, "pos_x"), 1), round(number(data, "pos_z"), 1)))
             return [["reset", {}]]
-        return [steer(self.steering - 0.6 * number(data, "cte_pid") - number(data, "angl") / 25, 0.8)]
+        return [steer(self.steering - 0.6 * number(data, "cte_pid") + number(data, "angl") / 25, 0.8)]
 
 
 def test_roads_are_laid_driven_to_their_end_and_set_back():
@@ -135,6 +152,18 @@ def test_roads_are_laid_driven_to_their_end_and_set_back():
     assert number(begun, "angle6") == pytest.approx(357.9, abs=0.1)  # degrees from north to the right
     speeds = [number(data, "speed") for data in program.data]
     assert 5 < max(speeds) <= 13.5  # m/s: 30 mph
+
+
+def test_each_road_has_the_weather_sent_before_it():
+    """perturbation-drive sends the weather and then the road once more."""
+    dialect, images = Roads(LAKE), []
+    for weather in ("Sun", "Fog", "Rain", "MoonShine Skybox"):
+        assert not dialect.handle("weather", {"type": weather, "rate": "30"}), "the road is the answer"
+        assert dialect.handle("track", {"track_string": ROADS[0]})
+        images.append(decode(base64.b64decode(json.loads(dialect.telemetry()[2:])[1]["image"])).astype(int))
+    sun, fog, rain, moon = images
+    assert min(np.abs(sun - fog).mean(), np.abs(sun - rain).mean(), np.abs(fog - rain).mean()) > 5
+    assert (sun == moon).all()
 
 
 def test_the_same_program_gets_the_same_drive_again():
@@ -160,7 +189,7 @@ def test_a_driver_in_another_thread_is_waited_for_however_slow_it_is():
                         continue
                     data = latest.pop("data")
                 time.sleep(pause)
-                steering = -0.6 * number(data, "cte") - number(data, "angl") / 25
+                steering = -0.6 * number(data, "cte") + number(data, "angl") / 25
                 latest["command"] = steer(steering, 1 - (number(data, "speed") / 10) ** 2)
 
         def answer(data, n, tests=tests, lock=lock, latest=latest):
@@ -198,12 +227,26 @@ def test_a_road_that_crosses_itself_is_laid_all_the_same():
     assert json.loads(dialect.telemetry()[2:])[1]["track"] == eight
 
 
+def test_a_server_may_open_the_session_late(monkeypatch):
+    """Flask-SocketIO 4 opens it when its connect handler returns: udacity-gym's waits there for the first track."""
+    monkeypatch.setattr("cloning.wire.session.ClientSession.connect_timeout", 0.3)
+
+    class Late(Program):
+        def send(self, client, text):
+            time.sleep(1.0 if text.startswith("0") else 0.0)
+            super().send(client, text)
+
+    with Late(lambda data, n: [steer(0, 1)] if n < 3 else None) as program:
+        assert join("measures", program, "--wait", "5") == 0
+    assert len(program.data) == 4
+
+
 def test_a_lost_answer_stops_nothing(monkeypatch):
     monkeypatch.setattr("simulator.join.ASK_AGAIN", 0.2)
     with Program(lambda data, n: [] if n % 7 == 3 else [steer(0, 1)] if n < 30 else None) as program:
         assert join("measures", program) == 0
-    times = [data["sim_time"] for data in program.data]
-    assert times[4] == times[3] != times[5]
+    distances = [data["distance"] for data in program.data]
+    assert distances[4] == distances[3] != distances[5]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -217,7 +260,8 @@ class EpisodeProgram:
         self.sio = socketio.Server(async_mode="threading", transports=["websocket"])
         self.heard: list[tuple[str, Any]] = []
         self.plan = plan(self)
-        for event in ("episode_metrics", "episode_events", "episode_event", "sim_paused", "sim_resumed"):
+        events = "episode_metrics", "episode_events", "episode_event", "episode_started", "episode_ended"
+        for event in (*events, "sim_paused", "sim_resumed"):
             self.sio.on(event, lambda sid, data, event=event: self.heard.append((event, data)))
         self.sio.on("connect", self.connect)
         self.sio.on("car_telemetry", self.telemetry)
@@ -324,9 +368,29 @@ def test_episodes_have_weather_pauses_metrics_and_segments():
     heard = [event for event, _ in program.heard]
     assert "sim_paused" in heard
     assert "sim_resumed" in heard
-    metrics = dict(program.heard)["episode_metrics"]
-    assert (metrics["track"], metrics["out_of_bounds"]) == ("lake", "1")
-    assert dict(program.heard)["episode_events"][0]["event"] == "out_of_bounds"
+    before, metrics = (data for event, data in program.heard if event == "episode_metrics")
+    assert (before["outOfTrackCount"], metrics["outOfTrackCount"], metrics["collisionCount"]) == (0, 1, 0)
+    assert metrics["track"] == "lake"
+    event = next(data for event, data in program.heard if event == "episode_event")
+    assert event["key"] == "out_of_track"
+    assert abs(time.time() - int(event["timestamp"]) / 1000) < 600
+    assert dict(program.heard)["episode_events"]["events"] == [event]
+    assert heard.index("episode_started") < heard.index("sim_resumed")
+    assert heard.count("episode_started") == heard.count("episode_ended") == 2
+
+
+def test_an_episode_can_be_ended_at_any_time_and_then_telemetry_goes_on():
+    dialect = Episodes(LAKE)
+    for begin in (lambda: None, lambda: dialect.start("lake", "sunny", "day")):
+        begin()
+        dialect.handle("end_episode", None)
+        names = [json.loads(packet[2:])[0] for packet in dialect.replies]
+        assert names == ["episode_metrics", "episode_events", "episode_ended"]
+        dialect.replies.clear()
+    assert dialect.ready and dialect.still
+    data = json.loads(dialect.telemetry()[2:])[1]
+    assert (data["lap"], data["sector"], data["next_cte"]) == ("1", "0", data["cte"])
+    assert abs(number(data, "angular_difference")) < 0.1
 
 
 def test_unknown_names_are_refused_and_known_ones_all_start():

@@ -33,6 +33,7 @@ class ClientSession:
     """
 
     remedy = "; start `python drive.py` in another terminal"  # where there is no server
+    connect_timeout = CONNECT_TIMEOUT
 
     def __init__(self, host: str, port: int, wait: float, real_timing: bool = False, max_packet: int = MAX_PACKET):
         """wait: seconds to wait for a server to appear, or for a usable answer; the others: see Connection."""
@@ -65,7 +66,7 @@ class ClientSession:
                 self._connection = Connection(
                     *self.address,
                     self.real_timing,
-                    min(CONNECT_TIMEOUT, left),
+                    min(self.connect_timeout, left),
                     min(SEND_TIMEOUT, self.wait),
                     self.max_packet,
                 )
