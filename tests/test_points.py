@@ -57,7 +57,8 @@ def test_an_open_road_begins_and_ends_at_its_ends_and_goes_on_straight_beyond(di
 def test_forms_of_a_file_give_the_same_road(tmp_path):
     files = {
         "a.csv": "x,y\n0,0\n30,0\n55,8\n80,30\n",
-        "b.txt": "0,0,0\n30,0,0\n55,8,0\n80,30,0",
+        "b.txt": "0,0,0\n30,0,0\n55,8,0\n80,30,0\n  \n",
+        "names.csv": "Y, Z, X\n0,0,0\n0,0,30\n8,0,55\n30,0,80\n",
         "c.json": json.dumps(BEND),
         "d": json.dumps({"road_points": BEND, "risk": "anything"}),
         "e.road": "@".join(f"{x},0.0,{y}" for x, y in BEND),  # y is up
@@ -97,6 +98,7 @@ REFUSED = [
     ({"points": [(0, 0), (5e6, 0)]}, "point 2 is"),
     ({"points": [(0, 0), ("a", 0)]}, "point 2 is"),
     ({"points": [(0, 0), 7]}, "point 2 is 7"),
+    ({"points": [(0, 0, 1), (30, 0)]}, "point 2 has 2 numbers, the first one 3: all must have z, or none"),
     ({"points": BEND, "width": 30}, "width 30: it must be 5 to 12"),
     ({"points": BEND, "width": "8"}, "width '8'"),
     ({"points": BEND, "marking": "blue"}, "marking 'blue': it must be one of yellow double"),
@@ -120,7 +122,9 @@ def test_what_is_no_road_is_refused_with_reason_and_place(arguments, reason):
         ('{"points": [[0, 0], [30, 0]]}', 'under the key "road_points"'),
         ('{"road_points": [[0, 0], [30, 0]], "closed": 1}', "closed 1: it must be true or false"),
         ("", "0 different points"),
-        ("\x00\x01", "0 different points"),
+        ("\x00\x01", "line 1: .* is not a point x,y or x,y,z, nor a line of these names"),
+        ("s,x,y\n0,0,0\n30,30,0\n", "line 1: s,x,y is not a point x,y or x,y,z, nor a line of these names"),
+        ("x,y\n0,0,0\n30,30,0\n", "line 2: 0,0,0 is not a point"),
     ],
 )
 def test_what_is_no_file_of_points_is_refused(text, reason, tmp_path):

@@ -6,7 +6,7 @@
 
 A file has one of three forms, whatever its name:
 
-* CSV: a line x,y or x,y,z for each point, below one line of names or none
+* CSV: a line x,y or x,y,z for each point, below a line with these names, in any order, or none
 * JSON: a list of such points, or an object that has it as "road_points", and may have "width", "marking", "land" and
   "closed" beside it; other keys are ignored
 * the text x,y,z@x,y,z@… that programs of road tests send to the simulator, in which y is the height
@@ -118,8 +118,15 @@ def _numbers(points: Iterable[Sequence[float]]) -> np.ndarray:
             raise TrackError(
                 f"point {i} is {str(point)[:60]}: it must be (x, y) or (x, y, z), in m within {FARTHEST:g} m of (0, 0)"
             )
-        rows.append([*row, 0.0][:3])
-    return np.array(rows).reshape(-1, 3)
+        if rows and len(row) != len(rows[0]):
+            raise TrackError(
+                f"point {i} has {len(row)} numbers, the first one {len(rows[0])}: all must have z, or none"
+            )
+        rows.append(row)
+    numbers = np.zeros((len(rows), 3))
+    if rows:
+        numbers[:, : len(rows[0])] = rows
+    return numbers
 
 
 def _fault(road: PointRoad) -> str:
@@ -199,14 +206,21 @@ def parse_road(text: str) -> tuple[list[list[float]], dict[str, Any]]:
         return points, {key: own[key] for key in ("closed", "width", "marking", "land") if key in own}
     if "@" in text:
         return parse_track_string(text), {}
+    rows = [(number, row) for number, row in enumerate(csv.reader(text.splitlines()), 1) if any(map(str.strip, row))]
+    names = [name.strip().lower() for name in rows[0][1]] if rows else []
+    if sorted(names) in (["x", "y"], ["x", "y", "z"]):
+        rows = rows[1:]
+    else:
+        names = []
     points = []
-    for number, fields in enumerate(csv.reader(text.splitlines()), 1):
+    for number, row in rows:
         try:
-            points.append([float(field) for field in fields])
+            point = [float(field) for field in row]
+            points.append([value for _, value in sorted(zip(names, point, strict=True))] if names else point)
         except ValueError:
-            if points or number > 1:
-                raise TrackError(f"line {number}: {','.join(fields)[:60]} is not a point x,y or x,y,z") from None
-    return [point for point in points if point], {}
+            what = f"line {number}: {','.join(row)[:60]} is not a point x,y or x,y,z"
+            raise TrackError(what if points else f"{what}, nor a line of these names") from None
+    return points, {}
 
 
 def parse_track_string(text: str) -> list[list[float]]:
