@@ -186,7 +186,10 @@ def tub(tmp_path) -> Path:
     return folder
 
 
-def test_a_donkeycar_tub_becomes_a_recording(tub, tmp_path):
+@pytest.mark.parametrize("end", [b"\n", b"\r\r\n"], ids=["linux", "windows"])
+def test_a_donkeycar_tub_becomes_a_recording(tub, tmp_path, end):
+    for file in (tub / "manifest.json", *tub.glob("*.catalog")):
+        file.write_bytes(file.read_bytes().replace(b"\n", end))
     done = run(tub, "--output", tmp_path / "recording")
     assert done.returncode == 0, done.stderr
     for told in ("marked as deleted is left out (1 time)", "local drove is left out (1 time)", "is missing or damaged"):

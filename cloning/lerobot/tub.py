@@ -56,9 +56,12 @@ def _lines(path: Path) -> list[Any]:
     found: list[Any] = []
     try:
         for text in path.read_text(encoding="utf-8").splitlines():
-            found.append(json.loads(text))
+            if text:  # donkeycar 4.0 ends its lines with \r\r\n on Windows
+                found.append(json.loads(text))
         return found
     except ValueError as error:
-        raise RecordingError(f"{path}: line {len(found) + 1}: {error}; copy the file again") from None
+        raise RecordingError(
+            f"{path}: line {len(found) + 1}: {error}; copy the file again, or delete the line"
+        ) from None
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}; copy it again") from None

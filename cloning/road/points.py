@@ -108,7 +108,7 @@ def spline_road(steps: np.ndarray, **options: Any) -> PointRoad:
 
 def _numbers(points: Iterable[Sequence[float]]) -> np.ndarray:
     """Return points as float64 (n, 3), m. Raises TrackError."""
-    rows = []
+    rows: list[list[float]] = []
     for i, point in enumerate(points, 1):
         try:
             row = [float(value) for value in point]
