@@ -210,6 +210,14 @@ def test_a_donkeycar_tub_becomes_a_recording(tub, tmp_path, end):
     assert gone.returncode == 2 and "gone: no such folder; name a recording, data set" in gone.stderr
 
 
+def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
+    for catalog in tub.glob("*.catalog"):
+        catalog.write_text(catalog.read_text(encoding="utf-8").replace('"user"}', '"local"}'), encoding="utf-8")
+    done = run(tub, "--output", tmp_path / "recording")
+    assert done.returncode == 2 and "no usable row" in done.stderr
+    assert "a row that the local drove is left out (11 times)" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [

@@ -82,8 +82,9 @@ def main() -> int:
         rows = write_recording(samples, output, arguments.full_lock, notes)
     except RecordingError as error:
         raise RecordingError(f"{source}: {error}") from None
-    for note, times in notes.items():
-        print(f"{source}: {note} ({plural(times, 'time')})")
+    finally:  # also why there is no usable row
+        for note, times in notes.items():
+            print(f"{source}: {note} ({plural(times, 'time')})")
     print(f"{output}: {plural(rows, 'row')}; look at them with `python -m cloning.browse {output}`")
     return program.DONE
 
