@@ -361,6 +361,8 @@ def test_episodes_have_weather_pauses_metrics_and_segments():
     segments = cv2.cvtColor(np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
     assert segments.shape == frame.shape
     assert tuple(segments[110, 160]) == ROAD
+    road = segments[:, :, 2] == 255  # as udacity-gym's programs find it
+    assert road[100:130, 150:170].all() and not road[:50].any() and 0.1 < road.mean() < 0.5
     assert tuple(segments[5, 5]) in (SKY, GROUND)
     assert tuple(segments[158, 160]) == CAR
     assert len(set(map(tuple, segments.reshape(-1, 3)))) <= 6

@@ -8,8 +8,8 @@ from simulator.scenery.parts import Scenery
 from simulator.scenery.shapes import Mesh
 from simulator.scenery.textures import plain
 
-# The colours of Cityscapes (arXiv 1604.01685), RGB.
-ROAD, VERGE, GROUND = (128, 64, 128), (244, 35, 232), (152, 251, 152)
+# RGB. udacity-gym's programs take a blue of 255 for the road; the other colours are those of Cityscapes (1604.01685).
+ROAD, VERGE, GROUND = (0, 0, 255), (244, 35, 232), (152, 251, 152)
 PLANT, SKY, CAR = (107, 142, 35), (70, 130, 180), (0, 0, 142)
 
 
