@@ -1,0 +1,181 @@
+"""udacity-gym and its like, played by a Socket.IO server of today: episodes on named tracks, with pauses and events."""
+
+import base64
+import json
+import threading
+import time
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import socketio
+from socketio.exceptions import ConnectionRefusedError
+from test_join import LAKE, join, number
+from werkzeug.serving import make_server
+
+from cloning.base.errors import TrackError
+from cloning.recordings.images import decode
+from simulator.dialects import Episodes
+from simulator.scenery.segments import CAR, GROUND, ROAD, SKY
+
+
+class EpisodeProgram:
+    """A test program of the dialect of episodes: `plan` yields what to send in answer to a telemetry."""
+
+    def __init__(self, plan):
+        self.sio = socketio.Server(async_mode="threading", transports=["websocket"])
+        self.heard: list[tuple[str, Any]] = []
+        self.plan = plan(self)
+        events = "episode_metrics", "episode_events", "episode_event", "episode_started", "episode_ended"
+        for event in (*events, "sim_paused", "sim_resumed"):
+            self.sio.on(event, lambda sid, data, event=event: self.heard.append((event, data)))
+        self.sio.on("connect", self.connect)
+        self.sio.on("car_telemetry", self.telemetry)
+        self.data = None
+        self.server = make_server("127.0.0.1", 0, socketio.WSGIApp(self.sio), threaded=True)
+        self.port = self.server.server_port
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+
+    def start(self, track, weather="sunny", daytime="day"):
+        self.sio.emit("end_episode")
+        self.sio.emit("start_episode", {"track_name": track, "weather_name": weather, "daytime_name": daytime})
+
+    def connect(self, sid, environ, auth=None):
+        time.sleep(0.3)  # the program is not ready yet
+        if next(self.plan, "over"):
+            raise ConnectionRefusedError("the program is over")
+
+    def telemetry(self, sid, data):
+        self.data = data
+        try:
+            next(self.plan)
+        except StopIteration:
+            self.sio.disconnect(sid)
+
+    def act(self, steering=0.0, throttle=1.0):
+        self.sio.emit("action", {"steering_angle": str(steering), "throttle": str(throttle)})
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.server.shutdown()
+        self.server.server_close()
+
+
+def test_an_episode_may_begin_instead_of_an_answer(monkeypatch):
+    monkeypatch.setattr("simulator.join.ASK_AGAIN", 30.0)
+    began = []
+
+    def plan(program):
+        program.start("lake")
+        yield
+        program.act()
+        yield
+        for _ in range(2):
+            began.append(time.monotonic())
+            program.start("lake")
+            yield
+        began.append(time.monotonic())
+
+    with EpisodeProgram(plan) as program:
+        assert join("episodes", program, "--wait", "3") == 0  # on a busy machine it takes long to be ready
+    assert began[2] - began[0] < 15
+
+
+def test_episodes_have_weather_pauses_metrics_and_segments():
+    seen = {}
+
+    def plan(program):
+        program.start("lake")
+        yield
+        for _ in range(20):
+            program.act()
+            program.sio.emit("resume_sim")
+            yield
+        seen["sunny"] = program.data
+        program.act()
+        program.sio.emit("pause_sim")
+        yield
+        for _ in range(3):
+            seen.setdefault("paused", []).append(program.data["pos_x"])
+            program.act()
+            program.sio.emit("pause_sim")
+            yield
+        while not any(event == "episode_event" for event, _ in program.heard):
+            program.act(1.0)
+            program.sio.emit("resume_sim")
+            yield
+        program.act()
+        program.start("lake", "foggy", "daynight")
+        yield
+        while number(program.data, "speed") > 0.01:  # of the episode before
+            program.act()
+            yield
+        seen["foggy"] = program.data
+
+    with EpisodeProgram(plan) as program:
+        assert join("episodes", program, "--wait", "3") == 0  # other land is built meanwhile
+    data = seen["sunny"]
+    assert {"lap", "sector", "next_cte", "cte", "pos_x", "pos_y", "pos_z", "speed", "steering_angle"} <= set(data)
+    assert number(data, "speed") > 3
+    frame = decode(base64.b64decode(data["image"]))
+    fog = decode(base64.b64decode(seen["foggy"]["image"]))
+    assert np.ptp(frame[2].astype(int), axis=-1).mean() > 40, "a blue sky"
+    assert np.ptp(fog[2].astype(int), axis=-1).mean() < 15, "a grey one"
+    png = np.frombuffer(base64.b64decode(data["semantic_segmentation"]), np.uint8)
+    segments = cv2.cvtColor(np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2RGB)
+    assert segments.shape == frame.shape
+    assert tuple(segments[110, 160]) == ROAD
+    road = segments[:, :, 2] == 255  # as udacity-gym's programs find it
+    assert road[100:130, 150:170].all() and not road[:50].any() and 0.1 < road.mean() < 0.5
+    assert tuple(segments[5, 5]) in (SKY, GROUND)
+    assert tuple(segments[158, 160]) == CAR
+    assert len(set(map(tuple, segments.reshape(-1, 3)))) <= 6
+    assert len(set(seen["paused"][1:])) == 1
+    heard = [event for event, _ in program.heard]
+    assert "sim_paused" in heard
+    assert "sim_resumed" in heard
+    before, metrics = (data for event, data in program.heard if event == "episode_metrics")
+    assert (before["outOfTrackCount"], metrics["outOfTrackCount"], metrics["collisionCount"]) == (0, 1, 0)
+    assert metrics["track"] == "lake"
+    event = next(data for event, data in program.heard if event == "episode_event")
+    assert event["key"] == "out_of_track"
+    assert abs(time.time() - int(event["timestamp"]) / 1000) < 600
+    assert dict(program.heard)["episode_events"]["events"] == [event]
+    assert heard.index("episode_started") < heard.index("sim_resumed")
+    assert heard.count("episode_started") == heard.count("episode_ended") == 2
+
+
+def test_an_episode_can_be_ended_at_any_time_and_then_telemetry_goes_on():
+    dialect = Episodes(LAKE)
+    for begin in (lambda: None, lambda: dialect.start("lake", "sunny", "day")):
+        begin()
+        dialect.handle("end_episode", None)
+        names = [json.loads(packet[2:])[0] for packet in dialect.replies]
+        assert names == ["episode_metrics", "episode_events", "episode_ended"]
+        dialect.replies.clear()
+    assert dialect.ready and dialect.still
+    data = json.loads(dialect.telemetry()[2:])[1]
+    assert (data["lap"], data["sector"], data["next_cte"]) == ("1", "0", data["cte"])
+    assert abs(number(data, "angular_difference")) < 0.1
+
+
+def test_unknown_names_are_refused_and_known_ones_all_start():
+    dialect = Episodes(replace(LAKE, direction="ccw"))
+    for names, reason in (
+        (("moon", "sunny", "day"), "no such track"),
+        (("lake", "hail", "day"), "no such weather; there are sunny, rainy, snowy, foggy"),
+        (("lake", "sunny", "night"), "no such daytime"),
+    ):
+        with pytest.raises(TrackError, match=reason):
+            dialect.start(*names)
+    images = []
+    for names in (("mountain", "rainy", "day"), ("jungle", "snowy", "daynight")):
+        dialect.start(*names)
+        images.append(json.loads(dialect.telemetry()[2:])[1]["image"])
+        assert dialect.track.direction == "ccw", "also in the jungle, whose own is cw"
+    assert dialect.ready
+    assert images[0] != images[1]
