@@ -184,8 +184,8 @@ def _add_join(commands: "Subparsers") -> None:
         "let another team's test program drive, in place of the modified simulator that it expects",
         *(SERVER, WAIT, ROAD, DISTURB),
         epilog="It ends when the program's server has gone for --wait seconds, and in the dialect measures also after "
-        "the laps that the program asks for. Unity's own options, with which such "
-        "programs start their simulator, are accepted: -logFile FILE takes the messages, and -batchmode is always so.",
+        "the laps that the program asks for. Unity's own options, with which such programs start their simulator, are "
+        "accepted: -logFile FILE takes the messages, and -batchmode and -nographics are always so.",
     )
     add = parser.add_argument
     text = (
@@ -206,7 +206,7 @@ def _add_join(commands: "Subparsers") -> None:
     )
     add("--launcher", metavar="NAME.x86_64", help=text)
     add("-logFile", dest="log", metavar="FILE", help=argparse.SUPPRESS)
-    add("-batchmode", action="store_true", help=argparse.SUPPRESS)
+    add("-batchmode", "-nographics", action="store_true", help=argparse.SUPPRESS)
 
 
 def _add_benchmark(commands: "Subparsers") -> None:

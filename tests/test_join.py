@@ -250,7 +250,7 @@ def test_a_launcher_is_taken_for_the_simulator_and_writes_its_log(tmp_path):
     launcher = tmp_path / "sim.x86_64"
     assert main(["join", "--dialect", "roads", "--launcher", str(launcher), "--wait", "0.3", "--marking", "kerb"]) == 0
     with Program(RoadTests([0.0])) as program:
-        options = ["-batchmode", "--port", str(program.port), "-logFile", "unitylog.txt"]
+        options = ["-batchmode", "-nographics", "--port", str(program.port), "-logFile", "unitylog.txt"]
         process = subprocess.run([launcher, *options], cwd=tmp_path, capture_output=True, timeout=60)
     assert (process.returncode, process.stdout, process.stderr) == (0, b"", b"")
     assert "1 episode, " in (tmp_path / "unitylog.txt").read_text()
