@@ -314,6 +314,7 @@ class TrainingRun:
     def epoch(self) -> None:
         """Train on whole batches until the epoch has at least `samples_per_epoch` images, as Keras 1 counts."""
         recipe, progress, ranks = self.recipe, self.progress, self.ranks
+        self.network.train()
         started = time.monotonic() - progress.seconds
         if ranks.first:
             print(f"Epoch {len(progress.history) + 1}/{recipe.epochs}", flush=True)
@@ -341,7 +342,11 @@ class TrainingRun:
                     self.save()
 
     def validate(self) -> tuple[float, float]:
-        """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m."""
+        """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m.
+
+        The network sees images as it does when it drives: brightened where they are dark, if its recipe says so.
+        """
+        self.network.eval()
         n, share = len(self.validation), self.ranks.share
         chosen = default_rng([self.seed, 4]).permutation(n)[: max(self.recipe.samples_per_epoch // 5, 1)]
         mine, sets = chosen[share], self.validation_sets

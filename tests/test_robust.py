@@ -14,7 +14,7 @@ import model
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
-from cloning.network.network import CROP, SEEN_SHAPE, Network, save_model
+from cloning.network.network import CROP, SEEN_SHAPE, Network, load_model
 from cloning.recordings.log import CheckedRecording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
@@ -275,19 +275,24 @@ def test_validation_counts_centre_images_and_other_poses_alike(sample_recording,
     assert not np.array_equal(center(np.arange(3)), warped(np.arange(3)))
 
 
-def test_the_summary_compares_networks_as_they_drive(sample_recording, tmp_path):
-    """Ordinary frames are dark to this network, which brightens them when it drives."""
+def test_networks_are_measured_as_they_drive(sample_recording, tmp_path):
+    """Ordinary frames are dark to this network, which brightens them when it drives, and not when it learns."""
     command = [str(sample_recording), *map(str, OPTIONS), "--output", str(tmp_path / "model.pt")]
     asked = parse(command, REPORT, ROBUST)
     run = model.TrainingRun(model.prepare(asked), asked.process, Ranks())
     run.network.exposure = (200.0, 60.0)
-    run.progress.images = 1
-    run.progress.finish_epoch(0.1, 0.1)
     run.files.pictures.mkdir()
-    run.save(run.files.last)
-    save_model(run.files.best, run.network)
     with run.pool:
+        run.network.eval()
+        run.epoch()
+        assert run.network.training
+        run.progress.finish_epoch(0.1, 0.1)
+        run.save(run.files.last, run.files.best)
+        measured, _ = run.validate()
+        run.network.train()
         errors = next(line.split() for line in run.summary().splitlines() if line.startswith("steering of 0 to 1 "))
+        run.network = load_model(run.files.best)
+        assert run.validate()[0] == measured
     assert errors[-1] == errors[-2]
 
 
