@@ -22,7 +22,16 @@ def base(finished, tmp_path):
     return shutil.copy(finished[1] / "model.pt", tmp_path / "base.pt")
 
 
+def set_preprocessing(path, **preprocessing):
+    """Change some of the preprocessing in a model file."""
+    saved = torch.load(path, weights_only=True)
+    saved["recipe"] |= preprocessing
+    del saved["digest"]
+    torch.save(saved, path)
+
+
 def test_a_run_begins_with_the_weights_of_the_file_and_nothing_else_of_it(sample_recording, base, tmp_path):
+    set_preprocessing(base, exposure=(80.0, 20.0))
     command = [str(sample_recording), "--from", str(base), "--output", str(tmp_path / "run" / "model.pt")]
     asked = parse(command, REPORT, ROBUST)
     run = model.TrainingRun(model.prepare(asked), asked.process, Ranks())
@@ -30,6 +39,7 @@ def test_a_run_begins_with_the_weights_of_the_file_and_nothing_else_of_it(sample
     assert same(run.network.state_dict(), weights(base))
     assert run.progress.number == 0 and not run.progress.history and not run.optimizer.state
     assert not run.checkpoint.resumed
+    assert run.network.exposure == run.recipe.exposure == (0.0, 0.0), "as training_arguments.json says"
 
 
 @pytest.mark.parametrize("recipe", [REPORT, ROBUST])
@@ -77,19 +87,12 @@ def test_resume_refuses_another_file_to_begin_with(finished, sample_recording, b
     assert refused.returncode == 2 and "the run began with --from ''" in refused.stderr
 
 
-def other_preprocessing(path):
-    saved = torch.load(path, weights_only=True)
-    saved["recipe"]["crop"] = (50, 35)
-    del saved["digest"]
-    torch.save(saved, path)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda path: path.unlink(), "no such file"),
         (lambda path: path.write_bytes(b"steering,throttle"), "damaged"),
-        (other_preprocessing, "its preprocessing is not that of this program's network"),
+        (lambda path: set_preprocessing(path, crop=(50, 35)), "its preprocessing is not that of this program"),
     ],
 )
 def test_an_unusable_file_is_named_before_anything_is_written(sample_recording, base, tmp_path, change, words):

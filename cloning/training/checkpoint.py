@@ -239,7 +239,7 @@ def _restore_network(network: Network, saved: dict[str, Any]) -> None:
     """Give the network the weights of a checkpoint. Raises ValueError if they, or their preprocessing, do not fit."""
     if read_network(saved) is not type(network):
         raise ValueError(f"its layers are {shown(saved.get('layers'))}")
-    *preprocessing, network.exposure = read_preprocessing(saved)
+    *preprocessing, _ = read_preprocessing(saved)  # not the exposure, which the recipe tells
     if preprocessing != [network.crop, network.scale, network.offset]:
         raise ValueError("its preprocessing is not that of this program's network")
     restore_weights(network, saved)
