@@ -317,15 +317,28 @@ def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, p
         (["FOLDER", "--model", "nothing.pt"], "no such file"),
         (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
         (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
-        (["SHORT", "--model", "MODEL"], "two seconds"),
     ],
 )
-def test_unusable_arguments_are_reported(folder, model_file, tmp_path, arguments, message, capsys):
+def test_unusable_arguments_are_reported(folder, model_file, arguments, message, capsys):
     known = {"FOLDER": folder, "MODEL": model_file}
-    if "SHORT" in arguments:
-        known["SHORT"] = render_recording(tmp_path / "short", rows=20)
     assert simulator.main(["replay", *[str(known.get(argument, argument)) for argument in arguments]]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_recordings_of_which_nothing_can_be_replayed_are_left_out(sample_recording, model_file, tmp_path, capsys):
+    short, unusable = render_recording(tmp_path / "short", rows=20), render_recording(tmp_path / "unusable", rows=20)
+    for image in (unusable / "IMG").iterdir():
+        image.write_bytes(b"")
+    options = ["--model", str(model_file), "--reference", "human", "--report", str(tmp_path / "r.json")]
+    assert simulator.main(["replay", str(short), str(unusable), *options]) == 2
+    printed = capsys.readouterr()
+    assert f"left out: {short}: no two seconds" in printed.out
+    assert f"{unusable / 'driving_log.csv'}: no usable row" in printed.err
+    assert simulator.main(["replay", str(short), str(sample_recording), str(unusable), *options]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.count("left out: ") == 2 + 5, "recordings, and the first of the images"
+    [report] = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    assert report["recording"] == str(sample_recording)
 
 
 def film_frames(path) -> int:

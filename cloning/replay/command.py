@@ -15,6 +15,7 @@ from cloning.replay.processes import CAN_FORK, ForkedDrives
 from cloning.replay.replay import (
     Drive,
     Driver,
+    NothingToReplay,
     ReferenceLine,
     ReplayFrame,
     Watcher,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 def run(options: argparse.Namespace) -> None:
     """Replay the recordings at each limit, print their reports and write the files. Raises UserError.
 
+    Those of which nothing can be replayed are named and left out, unless that is true of all.
     options: those of the command, under their names. After an error or Ctrl-C, the files are still written, with the
     recordings replayed until then.
     """
@@ -46,8 +48,14 @@ def run(options: argparse.Namespace) -> None:
 
     def replay_all() -> None:
         for folder, name in zip(folders, short_names(folders), strict=True):
-            recording = load_recording(folder)
-            lines = reference_lines(recording, options.reference == "lane")
+            try:
+                recording = load_recording(folder)
+                lines = reference_lines(recording, options.reference == "lane")
+            except NothingToReplay as error:
+                if folder == folders[-1] and not reports:
+                    raise
+                print(f"left out: {error}", flush=True)
+                continue
             if film:
                 film.begin(recording)
             watch = film.watch if film else None

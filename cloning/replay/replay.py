@@ -37,6 +37,10 @@ from cloning.road.motion import (
 MAX_YAW_FROM_HUMAN = 1.2  # radians: views further to the side cannot be warped from the frames
 
 
+class NothingToReplay(RecordingError):
+    """A recording of which nothing can be replayed."""
+
+
 @dataclass(frozen=True)
 class ReferenceLine:
     """The line from which lateral offsets are measured, over one stretch of a recording.
@@ -100,12 +104,12 @@ class Drive:
 def load_recording(folder: str | Path) -> CheckedRecording:
     """Read a recording without unusable rows, which are printed, and without repetitions of the row before.
 
-    Raises RecordingError if the recording cannot be read, or no row is left.
+    Raises RecordingError if the recording cannot be read, NothingToReplay if no row is left.
     """
     recording = check_images(read_recording(folder))
     print_findings(recording)
     if not len(recording):
-        raise RecordingError(f"{recording.folder / DRIVING_LOG}: no usable row is left to replay")
+        raise NothingToReplay(f"{recording.folder / DRIVING_LOG}: no usable row is left to replay")
     return recording.without_copies()
 
 
@@ -115,7 +119,7 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
     by_lane: use the lane centre in pieces in which it is known or its estimate is trusted, and leave out mishaps and
     the parts in which the human driver is off the road; in other pieces, and if not by_lane, use the human driver's
     path.
-    Raises RecordingError if there is no stretch to replay.
+    Raises NothingToReplay if there is no stretch to replay.
     """
     driven, lines = stretches(recording), list[ReferenceLine]()
     if by_lane:
@@ -127,7 +131,7 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
     else:
         lines = [ReferenceLine.human_path(stretch) for stretch in driven]
     if not lines:
-        raise RecordingError(f"{recording.folder}: no two seconds of driving without a break to replay; leave it out")
+        raise NothingToReplay(f"{recording.folder}: no two seconds of driving without a break to replay; record more")
     return lines
 
 
