@@ -22,7 +22,7 @@ from cloning.base.files import csv_bytes
 from cloning.base.film import FilmWriter
 from cloning.recordings.format import BINS
 from cloning.replay.score import YARDSTICKS
-from cloning.report.content import bend
+from cloning.report.content import Report, bend
 from cloning.report.pictures import film_uri, steering_chart
 
 
@@ -192,6 +192,19 @@ def test_what_cannot_be_shown_of_the_recordings_is_named_and_those_with_the_same
     assert "a spoilt one/driving_log.csv: line 1: neither a row nor a header" in page
     assert ">other/lake sample</th><td>10</td><td>0</td><td>50</td>" in page, "rows, cut, unusable"
     assert f">{sample_recording.parent.name}/lake sample</th><td>60</td>" in page
+
+
+def test_a_recording_is_said_to_be_held_out_only_if_all_that_the_network_learned_from_is_known(
+    written, sample_recording, tmp_path
+):
+    copy, other = (shutil.copytree(each, tmp_path / each.name) for each in (written, sample_recording))
+    arguments = json.loads((copy / "training_arguments.json").read_bytes())
+    unsure = "it may have been trained on"
+    for run, words in ({}, "was held out"), ({"from_model": "a.pt"}, unsure), ({"recordings": ["moved"]}, unsure):
+        (copy / "training_arguments.json").write_text(json.dumps(arguments | run), encoding="utf-8")
+        found = Report(copy)
+        found.replay([other])
+        assert [each["which"] for each in found.replays] == [words]
 
 
 @needs_chromium

@@ -119,6 +119,7 @@ class Report:
                         self._read(found)
         for each, short in zip(self.recordings, short_names(each["folder"] for each in self.recordings), strict=True):
             each["name"] = short
+        self.knows_all = not (self.missing or arguments.get("from_model"))  # that the network was trained on
         self.replays: list[dict[str, Any]] = []
 
     @contextlib.contextmanager
@@ -160,10 +161,12 @@ class Report:
                 (caption, frame_uri(captioned(frame.view, steering, caption)))
                 for caption, (frame, steering) in zip(captions, shots.taken, strict=False)
             ]
+            is_given = folder.resolve() in [each["folder"].resolve() for each in self.recordings]
+            other = "was held out" if self.knows_all else "it may have been trained on"
             self.replays.append(
                 {
                     **report,
-                    "trained_on": folder.resolve() in [each["folder"].resolve() for each in self.recordings],
+                    "which": "it was trained on" if is_given else other,
                     "table": rows,
                     "plot": uri(plot(recording, drives), "image/png"),
                     "interventions": len(where),
