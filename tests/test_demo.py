@@ -59,7 +59,8 @@ def test_a_whole_demo_and_then_nothing_is_done_again(commands, capsys):
     }
     printed = capsys.readouterr()
     assert printed.err == ""
-    assert all(text in printed.out for text in (demo.ACTIVATE, *(command.format("demo") for command, _ in demo.NEXT)))
+    named = [program.ACTIVATE, *(command.format("demo") for command, _ in demo.NEXT)]
+    assert all(command in printed.out for command in named)
     assert (
         "1138 m at 30 mph, never left the road; 0.07 m from the centre line on average, 0.28 m at most" in printed.out
     )

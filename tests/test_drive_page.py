@@ -169,13 +169,17 @@ def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monk
 
 
 def test_commands_are_the_installed_projects_and_lead_to_the_server(network, monkeypatch):
-    monkeypatch.setattr(program, "installed", {"python video.py": "bc video", "python -m simulator": "bc simulator"})
     server = drive.DriveServer(network)
+    browser = drive_page.create_app(server, time.sleep).test_client()
+    assert f"<code>{program.ACTIVATE}</code>" in browser.get("/").text
+    monkeypatch.setattr(program, "installed", {"python video.py": "bc video", "python -m simulator": "bc simulator"})
     session: Any = drive.Session(server)
     session.folder = SimpleNamespace(path=Path("run1"), progress=str)
     assert drive_page.figures(server, session, 0.0)["film"] == "bc video run1"
     assert drive_page.stand_in("drive", "127.0.0.1", "4567") == "bc simulator drive"
     assert drive_page.stand_in("drive", "::1", "4568") == "bc simulator drive --host ::1 --port 4568"
+    page = browser.get("/").text
+    assert "<code>bc simulator drive --realtime" in page and "activate" not in page
 
 
 def test_frames_per_second_are_those_of_the_last_two(network):

@@ -37,7 +37,6 @@ IMAGES = 20_000  # to train on: such a network drove both laps at 30 mph at most
 RECORDED = [Lap("lake", "ccw", look=0), Lap("lake", "cw", look=0)]
 SPEEDS = {"lake": 30, "jungle": 15}  # mph
 # Printed at the end: what to type, and what it does.
-ACTIVATE = "source .venv/bin/activate"  # of the environment that make installs; README.md has other systems'
 NEXT = (
     ("python -m simulator window", "drive yourself: the arrow keys steer, R records to data/, F1 shows all keys"),
     ("python drive.py {}/model.pt", "drive the real simulator: then start it in AUTONOMOUS MODE"),
@@ -173,7 +172,7 @@ def main(argv: list[str] | None = None) -> int:
     following = [(command.format(folder.as_posix()), text) for command, text in NEXT]
     width = max(len(command) for command, _ in following)
     print(f"\nLook at it in a browser: {(folder / 'report.html').resolve().as_uri()}")
-    print(f"\nThree things to do next, after `{ACTIVATE}` in every new terminal:")
+    print(f"\nThree things to do next, after `{program.ACTIVATE}` in every new terminal:")
     print("\n".join(f"  {command:{width}}  # {text}" for command, text in following))
     return program.INCOMPLETE if any(lap.report()["departures"] for lap in laps) else program.DONE
 

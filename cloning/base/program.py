@@ -40,6 +40,7 @@ DONE = 0
 INCOMPLETE = 1  # done, with a loss that was reported: frames left out of a film, a car that left the road
 FAILED = 2  # not done: argparse's status for wrong arguments, and that of every other error the user can correct
 NO_MEMORY = ("allocate", "out of memory", "start new thread")  # in a RuntimeError of torch or Python
+ACTIVATE = r".venv\Scripts\activate" if sys.platform == "win32" else "source .venv/bin/activate"  # a clone's
 PATIENCE = 0.5  # s that Ctrl-C waits for a library that is being loaded
 name = "python"  # of the command, which begins its messages; this one if another program calls its `main`
 installed: dict[str, str] = {}  # a clone's commands, such as python drive.py -> as the installed project calls them
@@ -94,9 +95,8 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
 def missing_library(error: ModuleNotFoundError) -> str:
     """Return in a sentence which library is missing, and what to do."""
     library = str(error.name).partition(".")[0]
-    activate = r".venv\Scripts\activate" if sys.platform == "win32" else "source .venv/bin/activate"
     return (
-        f"the library {library} is missing: activate the environment, in the project's folder (`{activate}`); "
+        f"the library {library} is missing: activate the environment, in the project's folder (`{ACTIVATE}`); "
         f"where that does not help, `pip install {PACKAGES.get(library, library)}`"
     )
 

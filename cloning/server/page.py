@@ -114,6 +114,7 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
         where = (host.strip("[]"), port) if port.isdecimal() else ("127.0.0.1", str(PORT))
         commands = [stand_in(words, *where) for words in ("drive --realtime --track jungle", "window --autonomous")]
         shown = {"model": server.model, "commands": commands, "usual_port": PORT, "is_usual": where[1] == str(PORT)}
+        shown["activate"] = "" if program.installed else program.ACTIVATE
         return flask.render_template("drive.html", **shown, **constants)
 
     @app.get("/live")
