@@ -69,8 +69,8 @@ PICTURE_EVERY = 6400  # observations between two diagnostic pictures
 def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, strict: bool) -> Observations:
     """Read and filter the recordings (steps 2 to 4 of the report), and print the numbers of rows.
 
-    Unusable rows are listed in `rejected_file`. Raises RecordingError if too few rows are left, and if `strict` if a
-    row is unusable.
+    Raises RecordingError if too few rows are left; the unusable ones are then listed in `rejected_file`, or `strict`
+    stops at one.
     """
     parts, counts, frames = list[Observations](), [], FrameCache(KEPT_FRAMES)
     for folder in folders:
@@ -79,9 +79,10 @@ def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, 
         counts.append(summary.Counts.of(recording, len(parts[-1])))
         print_findings(recording)
     observations, rows = Observations.of_recordings(parts), summary.total(counts)
-    summary.list_rejected(observations.recordings, rejected_file, strict)
     print(summary.recordings_table(counts, recipe.words.dropped.format(recipe=recipe)))
     if len(observations) < recipe.folds:
+        if rows.unusable:
+            summary.list_rejected(observations.recordings, rejected_file, strict)
         raise RecordingError(rows.too_few(recipe.folds, recipe.words.too_few, rejected_file))
     return observations
 
@@ -413,6 +414,9 @@ def prepare(command: Command) -> Prepared:
 def run(command: Command, ranks: Ranks) -> None:
     """Read the data, train, and print the summary. Raises UserError, OSError, Interrupted, KeyboardInterrupt."""
     training_run = TrainingRun(ranks.from_first(lambda: prepare(command)), command.process, ranks)
+    recordings, file = training_run.training.recordings, training_run.files.rejected
+    # Not before: a --resume that is refused leaves the run's list as it is.
+    ranks.from_first(lambda: summary.list_rejected(recordings, file, command.process.strict))
     if ranks.first:
         layers = training_run.recipe.name != ROBUST.name  # the report shows them, and so does each run's own
         print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks, layers))

@@ -140,13 +140,17 @@ def test_a_training_outlives_its_terminal_after_nohup():
 
 
 def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
-    output = begun / "model.pt"
+    output, rejected = begun / "model.pt", begun / "rejected_rows.csv"
+    rejected.write_text("the run's", encoding="utf-8")
     other = run_here("--output", output, "--resume", "--learning-rate", 0.1)
     assert other.returncode == 2
     assert "--learning-rate 0.0001, not 0.1" in other.stderr
     changed = run_here(render_recording(tmp_path / "other", rows=20, seed=1), "--output", output, "--resume")
     assert changed.returncode == 2
     assert "the run began with other recordings" in changed.stderr
+    few = run_here(render_recording(tmp_path / "few", rows=3), "--output", output, "--resume")
+    assert few.returncode == 2 and "record more" in few.stderr
+    assert rejected.read_text(encoding="utf-8") == "the run's"
     with edited(begun / "model-resume.pt") as saved:
         saved["training"]["images"] = 4
     fewer = run_here("--output", output, "--resume", "--epochs", 1)
