@@ -14,6 +14,7 @@ from test_excluded import center
 
 from cloning.base.errors import RecordingError
 from cloning.browse import __main__ as browse
+from cloning.lane.reader import SHIPPED_WEIGHTS
 from cloning.recordings.excluded import Cut, add_cuts
 from cloning.recordings.images import decode, read_frame
 from cloning.recordings.log import read_recording, read_uncut
@@ -270,6 +271,7 @@ def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, mon
     for arguments, words in (
         ([tmp_path], f"{tmp_path}: no driving_log.csv in or below it. Record some: in the simulator (training mode"),
         ([sample_recording, "--model", tmp_path / "m.pt"], f"{tmp_path / 'm.pt'}: no such model file"),
+        ([sample_recording, "--model", SHIPPED_WEIGHTS], f"{SHIPPED_WEIGHTS}: not a model of this project that steers"),
     ):
         monkeypatch.setattr(sys, "argv", ["browse", *map(str, arguments), "--port", "0"])
         assert browse.main() == 2 and (said := capsys.readouterr().err).startswith(f"python: {words}")

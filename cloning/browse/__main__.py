@@ -22,6 +22,7 @@ from cloning.base.outputs import plural
 from cloning.browse.library import Library
 from cloning.browse.page import create_app
 from cloning.browse.runs import Runs
+from cloning.network import FORMAT
 from cloning.server import terminal
 from cloning.server.site import BROWSE_HOST, BROWSE_PORT
 
@@ -50,6 +51,8 @@ def main() -> int:
         for model in arguments.model:
             if not model.is_file():
                 raise UserError(f"{model}: no such model file; `python model.py` trains one")
+            if FORMAT.encode() not in model.read_bytes():
+                raise UserError(f"{model}: not a model of this project that steers; `python model.py` trains one")
         for folder in arguments.run or []:
             if not folder.is_dir():
                 raise UserError(f"{folder}: no such folder; name one that `python model.py` writes to")

@@ -12,10 +12,10 @@ from torch import nn
 from cloning.base import program
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME
-from cloning.network import tensors
+from cloning.network import FORMAT, tensors
 from cloning.network.fast_layers import BlockConv2d, elu
 
-FORMAT, VERSION = "behavioral-cloning", 1  # of the model file
+VERSION = 1  # of the model file
 SHIPPED_MODEL = Path(__file__).with_name("shipped.pt")  # comes with the project
 PREPROCESSING = "recipe"  # the key of frame, colour, crop, scale, offset and exposure in the file
 COLOUR = "RGB"  # order of a frame's colours
