@@ -216,6 +216,7 @@ def _add_benchmark(commands: "Subparsers") -> None:
     add("--quick", action="store_true", help="fewer and shorter drives: two minutes on 2 cores, else up to an hour")
     text = "for report.html and benchmark.json (default: %(default)s)"
     add("--folder", type=Path, default=Path("benchmark"), help=text)
+    add("--resume", action="store_true", help="go on there after the drives of a benchmark that was interrupted")
     add("--recordings", type=Path, metavar="FOLDER", help="also replay the real recordings of data/README.md in it")
     add_workers(parser)
 

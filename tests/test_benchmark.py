@@ -13,7 +13,7 @@ from commands import HERE, ROOT
 from steer_server import STEER, Server
 
 from cloning.base.errors import UserError
-from cloning.base.program import DONE
+from cloning.base.program import DONE, FAILED
 from cloning.network.network import SHIPPED_MODEL
 from cloning.road.autonomy import INTERVENTION_TIME
 from cloning.road.disturbances import KINDS, Disturbance
@@ -139,6 +139,27 @@ def onnx_file(path, shape, axes, kind):
     graph = helper.make_graph(nodes, "mean", [taken], [given])
     save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8), path)
     return str(path)
+
+
+def test_a_benchmark_goes_on_after_the_drives_before_its_server_ended(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tasks, "quick_tasks", lambda: TINY)
+    monkeypatch.setattr(report, "failures", lambda *drives: [])
+    ends = 1 + 3  # the connection in the third drive, after one that only asks whether a server is there
+    sessions = ends + 1 + 3
+
+    def answer(packet, n):
+        return None if len(server.requests) == ends and n == 5 else [STEER % ("0", "0")]
+
+    with Server(answer, sessions=sessions) as server:
+        words = ["benchmark", f"127.0.0.1:{server.port}", "--quick", "--folder", str(tmp_path)]
+        assert __main__.main(words) == FAILED and "with --resume, the benchmark goes on" in capsys.readouterr().err
+        assert __main__.main([words[0], "straight", *words[2:], "--resume"]) == FAILED
+        assert "'entry': 'straight'" in capsys.readouterr().err
+        assert __main__.main([*words, "--resume"]) == DONE
+        assert len(server.requests) == sessions
+    found = json.loads((tmp_path / "benchmark.json").read_text(encoding="utf-8"))
+    assert [each["name"] for each in found["drives"]] == [task.name for task in TINY]
+    assert {path.name for path in tmp_path.iterdir()} == {"benchmark.json", "report.html"}
 
 
 @pytest.mark.parametrize(("shape", "axes"), [((1, 66, 200, 3), [1, 2]), ((None, 3, 66, 200), [2, 3])])

@@ -3,9 +3,13 @@
 import argparse
 import functools
 import hashlib
+import json
+from collections.abc import Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
+from cloning.base.errors import SimulatorError, UserError
 from cloning.base.outputs import write_json, write_output
 from simulator import driving
 from simulator.benchmark import page, replays, scores, tasks
@@ -19,25 +23,49 @@ def drive(driver: str, task: Task) -> Drive:
     return driving.drive(task.conditions(driver), task.source)
 
 
+def drive_all(
+    pool: Executor, driver: str, chosen: Sequence[Task], file: Path, about: dict[str, Any], resume: bool
+) -> list[scores.Driven]:
+    """Return what is told of the drives; the file gets each as it comes, and to resume, those in it are not repeated.
+
+    about: what the entry is, as in the file. Raises UserError, OSError.
+    """
+    kept: dict[str, scores.Driven] = {}
+    if resume and file.exists():
+        found = json.loads(file.read_text(encoding="utf-8"))
+        if found["about"] != about:
+            raise UserError(f"{file}: has drives of {found['about']}, not of {about}; leave out --resume")
+        kept = found["drives"]
+    missing = [task for task in chosen if task.name not in kept]
+    for task, done in zip(missing, results(pool, functools.partial(drive, driver), missing, "drive"), strict=True):
+        kept[task.name] = scores.driven(task, done)
+        write_json(file, {"about": about, "drives": kept})
+    return [kept[task.name] for task in chosen]
+
+
 def run(options: argparse.Namespace) -> None:
     """Drive everything, write the page and the JSON, and print the figures. Raises UserError, OSError."""
     entry, folder = options.entry, options.folder
+    file, unfinished = Path(entry), folder / "unfinished.json"
+    about = {
+        "version": tasks.VERSION,
+        "entry": file.stem if file.is_file() else entry,
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None,
+    }
     workers = driving.workers_for(entry, options.processes, options.scheduler)
     recordings = replays.folders(options.recordings) if options.recordings else []
     folder.mkdir(parents=True, exist_ok=True)
     chosen = tasks.quick_tasks() if options.quick else tasks.all_tasks()
-    with workers as pool:
-        done = results(pool, functools.partial(drive, entry), chosen, "drive")
-        drives = [scores.driven(*pair) for pair in zip(chosen, done, strict=True)]
-        clips = list(results(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film"))
-        drives += results(pool, functools.partial(replays.replay, entry), recordings, "recording")
+    try:
+        with workers as pool:
+            drives = drive_all(pool, entry, chosen, unfinished, about, options.resume)
+            clips = list(results(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film"))
+            drives += results(pool, functools.partial(replays.replay, entry), recordings, "recording")
+    except SimulatorError as error:
+        raise SimulatorError(f"{error}; with --resume, the benchmark goes on after the drives that are done") from None
     groups = scores.by_group(drives)
-    file = Path(entry)
-    found: dict[str, Any] = {
-        "version": tasks.VERSION,
+    found: dict[str, Any] = about | {
         "quick": options.quick,
-        "entry": file.stem if file.is_file() else entry,
-        "sha256": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None,
         "score": scores.score(groups),
         "groups": groups,
         "foretelling": scores.foretelling(drives),
@@ -45,6 +73,7 @@ def run(options: argparse.Namespace) -> None:
     }
     write_json(folder / "benchmark.json", found)
     write_output(folder / "report.html", page.page(found, clips).encode())
+    unfinished.unlink()
     for group, figures in groups.items():
         print(group, *(f"{name} {value}" for name, value in figures.items()), sep=", ")
     if found["foretelling"]:
