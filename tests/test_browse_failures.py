@@ -1,5 +1,6 @@
 """What the page of recordings says, in a real Chromium, where something fails, takes long, or is gone."""
 
+import json
 import os
 import shutil
 
@@ -86,6 +87,25 @@ def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked,
         page.wait("document.querySelector('#notice').hidden")
         page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
         at(page, 59)
+
+
+def test_what_another_tab_cuts_is_shown_and_undone(linked, page):
+    """A browser tells a tab when another one has changed what it keeps."""
+    placed(linked, np.zeros(60))
+    cut = {"first": center(linked, 0), "last": center(linked, 1), "reason": "off"}
+    with browsing(linked) as server:
+        page.open(f"{server.base}{server.hash('lake')}")
+        at(page, 0)
+        (linked / "excluded.csv").write_text(f"{','.join(cut.values())}\n", encoding="utf-8")
+        key, done = (
+            f"cuts-{server.hash('lake').removeprefix('#/')}",
+            {"kind": "cuts", "method": "DELETE", "cuts": [cut]},
+        )
+        page.run(f"localStorage.setItem('{key}', JSON.stringify({{done: [{json.dumps(done)}], undone: []}}))")
+        page.run(f"dispatchEvent(new StorageEvent('storage', {{key: '{key}'}}))")
+        page.shows("#cuts", "2 frames: off")
+        page.press("z")
+        page.shows("#cuts", "None")
 
 
 def test_an_undo_that_fails_can_be_tried_again(linked, page):

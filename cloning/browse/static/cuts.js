@@ -137,6 +137,19 @@ export function changes(id) {
   return JSON.parse(localStorage.getItem(`cuts-${id}`)) ?? {done: [], undone: []};
 }
 
+// Another tab has changed the recording that is open here, too: both tabs show its cuts, and undo the same changes.
+addEventListener("storage", async ({key}) => {
+  const now = page.open;
+  if (key != `cuts-${now?.id}`) return;
+  Object.assign(now, changes(now.id));
+  try {
+    const details = await ask(`/${now.id}/details${now.query()}`);
+    if (page.open == now) await now.update(details);
+  } catch (error) {
+    notice(error.message);
+  }
+});
+
 export function undo() {
   const now = page.open, {first, last} = now.marks;
   if (first != undefined || last != undefined) {
