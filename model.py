@@ -66,11 +66,10 @@ PICTURE_EVERY = 6400  # observations between two diagnostic pictures
 # Data preprocessing: recordings -> observations
 
 
-def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, strict: bool) -> Observations:
+def read_observations(recipe: Recipe, folders: list[Path], strict: bool) -> Observations:
     """Read and filter the recordings (steps 2 to 4 of the report), and print the numbers of rows.
 
-    Raises RecordingError if too few rows are left; the unusable ones are then listed in `rejected_file`, or `strict`
-    stops at one.
+    Raises RecordingError if too few rows are left, and if `strict` if a row is unusable.
     """
     parts, counts, frames = list[Observations](), [], FrameCache(KEPT_FRAMES)
     for folder in folders:
@@ -80,10 +79,10 @@ def read_observations(recipe: Recipe, folders: list[Path], rejected_file: Path, 
         print_findings(recording)
     observations, rows = Observations.of_recordings(parts), summary.total(counts)
     print(summary.recordings_table(counts, recipe.words.dropped.format(recipe=recipe)))
+    if strict:
+        summary.refuse_rejected(observations.recordings)
     if len(observations) < recipe.folds:
-        if rows.unusable:
-            summary.list_rejected(observations.recordings, rejected_file, strict)
-        raise RecordingError(rows.too_few(recipe.folds, recipe.words.too_few, rejected_file))
+        raise RecordingError(rows.too_few(recipe.folds, recipe.words.too_few))
     return observations
 
 
@@ -343,11 +342,8 @@ class TrainingRun:
                     self.save()
 
     def validate(self) -> tuple[float, float]:
-        """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m.
-
-        The network sees images as it does when it drives: brightened where they are dark, if its recipe says so.
-        """
-        self.network.eval()
+        """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m."""
+        self.network.eval()  # as it drives: dark images are brightened, if the recipe says so
         n, share = len(self.validation), self.ranks.share
         chosen = default_rng([self.seed, 4]).permutation(n)[: max(self.recipe.samples_per_epoch // 5, 1)]
         mine, sets = chosen[share], self.validation_sets
@@ -361,9 +357,8 @@ class TrainingRun:
         """Raise UserError on rank 0, FirstRankFailed on the others, unless a loss is finite."""
         if not math.isfinite(loss):
             epoch, rate = len(self.progress.history) + 1, self.recipe.learning_rate
-            remedy = f"start again with a smaller --learning-rate than {rate:g}"
-            error = UserError(f"epoch {epoch}: the loss is not finite any more; {remedy}")
-            raise error if self.ranks.first else FirstRankFailed
+            error = f"epoch {epoch}: the loss is not finite; start again with a smaller --learning-rate than {rate:g}"
+            raise UserError(error) if self.ranks.first else FirstRankFailed
 
     def save(self, *models: Path) -> None:
         """Write the network to these files, and the state that --resume needs. Raises UserError, OSError."""
@@ -401,8 +396,7 @@ def prepare(command: Command) -> Prepared:
     run, begin = resumed(command)
     folders = find_folders(list(run.recordings))
     run = replace(run, recordings=tuple(str(folder.absolute()) for folder in folders))
-    rejected_file = RunFiles(command.process.output).rejected
-    observations = read_observations(run.recipe, folders, rejected_file, command.process.strict)
+    observations = read_observations(run.recipe, folders, command.process.strict)
     train, validation = split(observations, run.recipe, run.seed)
     training = run.recipe.resample(observations.take(train), run.recipe, run.seed)
     print(summary.sizes(len(train), len(training), len(validation)))
@@ -414,14 +408,11 @@ def prepare(command: Command) -> Prepared:
 def run(command: Command, ranks: Ranks) -> None:
     """Read the data, train, and print the summary. Raises UserError, OSError, Interrupted, KeyboardInterrupt."""
     training_run = TrainingRun(ranks.from_first(lambda: prepare(command)), command.process, ranks)
-    recordings, file = training_run.training.recordings, training_run.files.rejected
-    # Not before: a --resume that is refused leaves the run's list as it is.
-    ranks.from_first(lambda: summary.list_rejected(recordings, file, command.process.strict))
     if ranks.first:
+        summary.list_rejected(training_run.training.recordings, training_run.files.rejected)  # not of a refused run
         layers = training_run.recipe.name != ROBUST.name  # the report shows them, and so does each run's own
         print(summary.run_header(training_run.network, training_run.device, training_run.precision, ranks, layers))
-        labels = training_run.training.steering
-        training_run.checkpoint.begin(training_run.progress, training_run.precision, labels)
+        training_run.checkpoint.begin(training_run.progress, training_run.precision, training_run.training.steering)
     try:
         with training_run.stop:
             training_run.train()

@@ -286,7 +286,7 @@ def test_a_run_that_diverges_stops_and_saves_nothing_of_it(begun, sample_recordi
     recipe = replace(REPORT, epochs=2, samples_per_epoch=samples, batch_size=8, learning_rate=np.inf)
     process = {"device": "cpu", "save_seconds": save_seconds}
     assert model.train(recipe, [sample_recording], begun / "model.pt", seed=1, **process) == 2
-    message = "python: epoch 1: the loss is not finite any more; start again with a smaller --learning-rate than inf\n"
+    message = "python: epoch 1: the loss is not finite; start again with a smaller --learning-rate than inf\n"
     assert capsys.readouterr().err == message
     assert seeds(begun) == {"model.pt": 0, "model-best.pt": 0, "model-resume.pt": 1, "model-resume-previous.pt": 0}
     assert torch.load(begun / "model-resume.pt", weights_only=True)["training"]["images"] == 0

@@ -270,7 +270,7 @@ def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path
     assert f"line 4: left out: IMG/{damaged.name}: cut short" in lenient.stdout
     header, row = (tmp_path / "rejected_rows.csv").read_text(encoding="utf-8").splitlines()
     assert header == "file,line,finding,detail" and damaged.name in row
-    summary.list_rejected([], tmp_path / "rejected_rows.csv", strict=False)
+    summary.list_rejected([], tmp_path / "rejected_rows.csv")
     assert not (tmp_path / "rejected_rows.csv").exists(), "an earlier run's list is not this one's"
     strict = run_here(copied, *SHORT, "--strict", "--output", tmp_path / "strict.pt")
     assert strict.returncode == 2

@@ -51,9 +51,9 @@ class Counts(NamedTuple):
         unusable = recording.rows_read - cut - usable
         return cls(str(recording.folder), recording.rows_read, cut, unusable, usable - kept, kept)
 
-    def too_few(self, needed: int, dropped: str, rejected: Path) -> str:
+    def too_few(self, needed: int, dropped: str) -> str:
         """Return that too few rows are kept, and the main reason; dropped: why `Recipe.select` drops rows."""
-        reasons = {"record more": self.kept, dropped: self.dropped, f"see {rejected}": self.unusable}
+        reasons = {"record more": self.kept, dropped: self.dropped, "most can't be used, see above": self.unusable}
         reasons["excluded.csv cuts most of them"] = self.cut
         why = max(reasons, key=reasons.__getitem__)
         return f"{self.kept} of {self.rows_read} rows are left, at least {needed} are needed: {why}"
@@ -84,19 +84,20 @@ def sizes(rows: int, observations: int, validation: int) -> str:
     return f"\n{resampled}; validation: {validation:,} rows\n"
 
 
-def list_rejected(recordings: Iterable[Recording], file: Path, strict: bool) -> None:
-    """Write the unusable rows of all recordings to a csv file, or delete it if there are none.
+def refuse_rejected(recordings: Iterable[Recording]) -> None:
+    """Raise RecordingError if a recording has unusable rows."""
+    rejected = [(recording.folder / DRIVING_LOG, row) for recording in recordings for row in recording.rejected]
+    for path, row in rejected:
+        count = plural(len(rejected), "unusable row")
+        raise RecordingError(f"{path}: line {row.line}: {row.detail} (--strict stops at {count})")
 
-    strict: raise RecordingError if there are any.
-    """
+
+def list_rejected(recordings: Iterable[Recording], file: Path) -> None:
+    """Write the unusable rows of all recordings to a csv file, or delete it if there are none."""
     rejected = [(recording.folder / DRIVING_LOG, *row) for recording in recordings for row in recording.rejected]
-    count = plural(len(rejected), "unusable row")
-    if rejected and strict:
-        path, line, _, detail = rejected[0]
-        raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {count})")
     if rejected:
         write(file, csv_bytes([("file", "line", "finding", "detail"), *rejected]))
-        print(f"{count} left out; {file} lists them")
+        print(f"{plural(len(rejected), 'unusable row')} left out; {file} lists them")
     else:
         file.unlink(missing_ok=True)  # an earlier run's
 
