@@ -25,7 +25,7 @@ def render_frame(bend: float, offset: float, rng: np.random.Generator) -> np.nda
     frame[60:][(left <= columns) & (columns < right)] = (110, 110, 105)
     for edge in (left, right):
         frame[60:][(edge - 3 <= columns) & (columns < edge + 3)] = (210, 180, 60)
-    return np.clip(frame + rng.normal(0, 6, frame.shape), 0, 255).astype(np.uint8)
+    return np.clip(frame + rng.integers(-10, 11, frame.shape, np.int8), 0, 255).astype(np.uint8)
 
 
 def render_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/Users/driver/data/IMG/") -> Path:
