@@ -85,22 +85,17 @@ def test_the_exit_status_tells_whether_the_car_left_the_road(steering, status, c
     assert bool(departures) == bool(status)
 
 
-def test_a_full_disk_costs_the_film_alone(tmp_path, capsys):
-    resource = pytest.importorskip("resource", reason="this system has no limit on the size of files")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-
+def test_a_full_disk_costs_the_film_alone(tmp_path, capsys, longest_file):
     def fills_up(packet, n):
         # The first frames of the film fit, then nothing does, until the drive is nearly over.
-        resource.setrlimit(resource.RLIMIT_FSIZE, (10 if 20 < n < 170 else before[0], before[1]))
+        if n in (21, 170):
+            longest_file(*[10] * (n == 21))
         return [STEER % ("0", "0.3")]
 
     names = [tmp_path / name for name in ("x.mp4", "report.json", "above.png")]
     outputs = [str(word) for pair in zip(("--film", "--report", "--picture"), names, strict=True) for word in pair]
-    try:
-        with Server(fills_up) as server:
-            assert main(["drive", "--laps", "0.05", "--port", str(server.port), *outputs]) == 2
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with Server(fills_up) as server:
+        assert main(["drive", "--laps", "0.05", "--port", str(server.port), *outputs]) == 2
     printed = capsys.readouterr()
     assert re.search(r"python: \S+x\.mp4: .*no film was written", printed.err)
     assert "departures: " in printed.out
