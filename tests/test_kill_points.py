@@ -10,12 +10,12 @@ import re
 import shutil
 import signal
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from commands import ROOT
+from drive_process import ask, awaited
 from kill_points import Watched
 from killed import ALL, KILLED, Trial, check_whole, chosen, spread, writes
 from rendered import render_recording
@@ -157,13 +157,9 @@ def test_recording_on_a_full_disk(tmp_path):
 
 def printed_port(running: Watched, pattern: str) -> int | None:
     """The port that a server prints, None if it is gone."""
-    for _ in range(600):
-        if port := re.search(pattern, running.printed()):
-            return int(port[1])
-        if running.process.poll() is not None:
-            return None
-        time.sleep(0.02)
-    raise AssertionError("the server never listened")
+    awaited(lambda: re.search(pattern, running.printed()) or running.process.poll() is not None)
+    port = re.search(pattern, running.printed())
+    return int(port[1]) if port else None
 
 
 class Car:
@@ -226,7 +222,6 @@ def test_driving_killed_anywhere(driving, jpegs):
         assert trial.run(trial.command).status == trial.done
         assert saved(trial.folder / "run1") == jpegs[:6]
         assert not list((trial.folder / "run1").glob(".*"))
-    print(f"{len(chosen(points, 4))} of {len(points)} points")
 
 
 def test_driving_on_a_full_disk(driving, jpegs):
@@ -240,9 +235,7 @@ def test_driving_on_a_full_disk(driving, jpegs):
         lost = sum(point.startswith("write") and ".jpg" in point for point in points[number - 1 :])
         assert car.answers == 6
         assert ended.status == 1 and "Traceback" not in ended.printed
-        assert (
-            f"session ended: 6 frames driven, 0 unusable; {6 - lost} frames saved in run1, {lost} LOST" in ended.printed
-        )
+        assert f"6 frames driven, 0 unusable; {6 - lost} frames saved in run1, {lost} LOST" in ended.printed
         assert f"drive.py: run1: {lost} of 6 frames were not saved" in ended.printed.splitlines()[-1]
         assert saved(trial.folder / "run1") == jpegs[: 6 - lost]
         assert not list((trial.folder / "run1").glob(".*"))
@@ -261,17 +254,10 @@ class Browser:
     def post(self, running: Watched) -> None:
         if not (port := printed_port(running, r"http://[\d.]+:(\d+)/")):
             return
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-
-        def ask(method: str, path: str, body: str | None = None) -> Any:
-            connection.request(method, path, body, {"Content-Type": "application/json"})
-            return json.loads(connection.getresponse().read())
-
         try:
-            here = f"/recordings/{ask('GET', '/recordings')[0]['id']}"
-            version = ask("GET", f"{here}/details")["version"]
-            self.answer = ask("POST", f"{here}/{self.path}?version={version}", json.dumps(self.content))
-            connection.close()
+            here = f"/recordings/{json.loads(ask(port, '/recordings')[1])[0]['id']}"
+            version = json.loads(ask(port, f"{here}/details")[1])["version"]
+            self.answer = json.loads(ask(port, f"{here}/{self.path}?version={version}", "POST", self.content)[1])
         except (ConnectionError, http.client.HTTPException):
             return
         running.process.send_signal(signal.SIGINT)
@@ -306,18 +292,13 @@ def test_a_cut_killed_anywhere(lake, tmp_path):
         assert sorted(path.name for path in (trial.folder / "lake").iterdir()) == sorted(os.listdir(recorded))
 
 
-def test_an_exported_part_is_whole_or_no_recording(lake, tmp_path):
+def test_an_exported_part_is_whole_or_no_recording(tmp_path):
     """Also with a `lane.csv`; on a full disk nothing is left of it."""
-    recorded = tmp_path / "begin" / "lake"
-    (recorded / "IMG").mkdir(parents=True)
-    images = [[name.decode() for name in names] for names, _ in rows_of(lake)[:3]]
-    lines = (lake / "driving_log.csv").read_text(encoding="utf-8").splitlines(keepends=True)[1:4]
-    (recorded / "driving_log.csv").write_text("".join(lines), encoding="utf-8")
-    known = "".join(f"{center},0.1,0\n" for center, *_ in images)
+    recorded = render_recording(tmp_path / "begin" / "lake", rows=3)
+    centers = [images[0].decode() for images, _ in rows_of(recorded)]
+    known = "".join(f"{center},0.1,0\n" for center in centers)
     header = "center image,lateral offset (m),heading error (radians)\n"
     (recorded / "lane.csv").write_text(header + known, encoding="utf-8")
-    for name in (name for names in images for name in names):
-        shutil.copy(lake / "IMG" / name, recorded / "IMG")
     command = ["-m", "cloning.browse", "lake", "--port", 0]
     trial = Trial(tmp_path / "trial", command, tmp_path / "begin", done=128 + signal.SIGINT)
     browser, part = Browser("export", {"rows": "1-3", "name": "part"}), trial.folder / "part"
@@ -325,7 +306,7 @@ def test_an_exported_part_is_whole_or_no_recording(lake, tmp_path):
 
     def check_part() -> None:
         written = check_images(read_recording(part), show_progress=False)
-        assert [written.name(row) for row in range(len(written))] == [center for center, *_ in images[1:]]
+        assert [written.name(row) for row in range(len(written))] == centers[1:]
         assert (part / "lane.csv").read_text(encoding="utf-8").splitlines() == [header.strip(), *known.splitlines()[1:]]
 
     def next_run(wanted: dict[str, object]) -> None:
@@ -370,28 +351,14 @@ def test_a_data_set_and_a_recording_of_one_killed_anywhere_and_on_a_full_disk(co
 # Films and reports
 
 
-@pytest.fixture
-def filming(jpegs, tmp_path):
+def test_filming_saved_frames_killed_anywhere(jpegs, tmp_path):
     folder = tmp_path / "begin" / "run1"
     folder.mkdir(parents=True)
     for n, jpeg in enumerate(jpegs):
         (folder / f"2018_07_16_17_11_43_{n:03d}.jpg").write_bytes(jpeg)
-    return Trial(tmp_path / "trial", [ROOT / "video.py", "run1"], tmp_path / "begin")
-
-
-def test_filming_saved_frames_killed_anywhere(filming):
-    filming.killed_everywhere(3)
-    filming.killed_at_every_length("run1.mp4", 40 if ALL else 5)
-
-
-OUTPUTS = ("--report", "drive.json", "--picture", "above.png", "--film", "film.mp4")
-
-
-@pytest.fixture
-def simulator_drive(tmp_path):
-    with ServerForAll() as server:
-        command = ["-m", "simulator", "drive", "--laps", "0.002", "--port", server.port, *OUTPUTS]
-        yield Trial(tmp_path / "trial", command)
+    trial = Trial(tmp_path / "trial", [ROOT / "video.py", "run1"], tmp_path / "begin")
+    trial.killed_everywhere(3)
+    trial.killed_at_every_length("run1.mp4", 40 if ALL else 5)
 
 
 class ServerForAll(Server):
@@ -407,10 +374,14 @@ class ServerForAll(Server):
         self.thread.join(20)
 
 
-def test_a_simulated_drive_killed_anywhere_and_on_a_full_disk(simulator_drive):
-    simulator_drive.killed_everywhere(1)
-    simulator_drive.killed_at_every_length("film.mp4", 20 if ALL else 1)
-    simulator_drive.disk_full_everywhere(1, status=2)
+def test_a_simulated_drive_killed_anywhere_and_on_a_full_disk(tmp_path):
+    files = ("--report", "drive.json", "--picture", "above.png", "--film", "film.mp4")
+    with ServerForAll() as server:
+        command = ["-m", "simulator", "drive", "--laps", "0.002", "--port", server.port, *files]
+        trial = Trial(tmp_path / "trial", command)
+        trial.killed_everywhere(1)
+        trial.killed_at_every_length("film.mp4", 20 if ALL else 1)
+        trial.disk_full_everywhere(1, status=2)
 
 
 def test_writing_a_launcher_killed_anywhere_and_on_a_full_disk(tmp_path):
