@@ -28,6 +28,13 @@ def drive(tmp_path_factory):
     return recording.folder, true
 
 
+@pytest.fixture(scope="module")
+def estimate(drive):
+    """What the lane networks read in the same recording."""
+    recording = read_recording(drive[0])
+    return estimate_lane_position(recording, stretches(recording))
+
+
 @pytest.fixture
 def lane(drive, tmp_path):
     """The lane.csv of a copy of the recording, with links to its images."""
@@ -44,13 +51,11 @@ def known(folder):
     return lane_position(recording, stretches(recording))
 
 
-def test_the_simulator_tells_where_its_car_is(drive):
+def test_the_simulator_tells_where_its_car_is(drive, estimate):
     folder, true = drive
     position = known(folder)
     assert position.trusted.all()
     assert position.lateral_offset == pytest.approx(true, abs=1e-4)
-    recording = read_recording(folder)
-    estimate = estimate_lane_position(recording, stretches(recording))
     assert np.abs(estimate.lateral_offset - true).mean() > 0.02, "an estimate is never so exact"
     rolling = slice(15, None)
     assert np.corrcoef(position.heading_error[rolling], estimate.heading_error[rolling])[0, 1] > 0.9  # measured: 0.97
@@ -58,14 +63,13 @@ def test_the_simulator_tells_where_its_car_is(drive):
     assert line.is_lane_centre and line.offset == pytest.approx(position.lateral_offset[line.rows], abs=1e-6)
 
 
-def test_the_browser_shows_the_known_offset_and_without_the_file_it_is_estimated(drive, lane):
+def test_the_browser_shows_the_known_offset_and_without_the_file_it_is_estimated(drive, estimate, lane):
     recording, (_, true) = read_recording(lane.parent), drive
     result, stamp = analyse.lane(recording), analyses.stamp(lane.parent, analyses.LANE)
     assert result.column("offset", recording.images[:, 0]) == pytest.approx(true, abs=1e-4)
     lane.unlink()
     assert analyses.stamp(lane.parent, analyses.LANE) != stamp, "then it is analysed again"
-    expected = estimate_lane_position(recording, stretches(recording))
-    assert np.array_equal(known(lane.parent).lateral_offset, expected.lateral_offset)
+    assert np.array_equal(known(lane.parent).lateral_offset, estimate.lateral_offset)
 
 
 def test_rows_that_it_does_not_name_are_not_trusted(lane, capsys):
