@@ -1,6 +1,7 @@
 """The socket libraries, for the modules of the server's end; commands import those in `main`, to tell of errors."""
 
 import importlib.metadata
+import os
 import warnings
 
 from cloning.base.errors import UserError
@@ -12,6 +13,7 @@ try:
     with warnings.catch_warnings():
         # eventlet advises against using it in new projects, but no server has been used longer with this simulator.
         warnings.simplefilter("ignore")
+        os.environ.setdefault("EVENTLET_NO_GREENDNS", "yes")  # a server looks up no name; else 0.1 s more to load
         import engineio
         import engineio.packet
         import engineio.socket

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import rankdata
 
 from cloning.base.figure import png
 from cloning.road.motion import MPH
@@ -65,6 +64,8 @@ def correlated(measure: np.ndarray, driving: np.ndarray, sign: int) -> tuple[flo
     measure, driving: float64 (n,); sign: see LOSSES; more driving is worse. The interval is that of a bootstrap over
     the networks. nan if either has the same value everywhere.
     """
+    from scipy.stats import rankdata  # large, and only a report needs it
+
     rng, n = np.random.default_rng(0), len(measure)
     draws = np.vstack([np.arange(n), rng.integers(n, size=(RESAMPLES, n))])
     ranks = [rankdata(values[draws], axis=1) - (n + 1) / 2 for values in (measure, driving)]  # centred: n ranks
