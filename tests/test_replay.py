@@ -368,7 +368,7 @@ def interrupt():
         (fail, "not finite", False),
         (kill_itself, "was killed", False),
         (fail, "not finite", True),
-        (interrupt, "", True),
+        (interrupt, None, True),
     ],
 )
 def test_an_error_or_ctrl_c_at_one_limit_ends_the_drives_at_the_others(recording, at_fault, message, here):
@@ -382,7 +382,7 @@ def test_an_error_or_ctrl_c_at_one_limit_ends_the_drives_at_the_others(recording
         rows.append(frame.row)
         return 0.0
 
-    with pytest.raises((SimulatorError, KeyboardInterrupt), match=message):
+    with pytest.raises(SimulatorError if message else KeyboardInterrupt, match=message):
         command.drive_at_limits(recording, human(recording), driver, (1.0, 2.0, 3.0), parallel=True)
     assert len(rows) < 200 and not multiprocessing.active_children() and time.monotonic() - begin < 15
 
