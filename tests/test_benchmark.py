@@ -2,6 +2,7 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -145,20 +146,26 @@ def test_a_benchmark_goes_on_after_the_drives_before_its_server_ended(tmp_path, 
     monkeypatch.setattr(tasks, "quick_tasks", lambda: TINY)
     monkeypatch.setattr(report, "failures", lambda *drives: [])
     ends = 1 + 3  # the connection in the third drive, after one that only asks whether a server is there
-    sessions = ends + 1 + 3
+    most = ends + 1 + 1 + 3  # the fourth drive may begin before the third one's error ends it
 
     def answer(packet, n):
         return None if len(server.requests) == ends and n == 5 else [STEER % ("0", "0")]
 
-    with Server(answer, sessions=sessions) as server:
+    with Server(answer, sessions=most) as server:
         words = ["benchmark", f"127.0.0.1:{server.port}", "--quick", "--folder", str(tmp_path)]
         assert __main__.main(words) == FAILED and "with --resume, the benchmark goes on" in capsys.readouterr().err
         assert __main__.main([words[0], "straight", *words[2:], "--resume"]) == FAILED
         assert "'entry': 'straight'" in capsys.readouterr().err
+        kept = json.loads((tmp_path / "unfinished.json").read_text(encoding="utf-8"))
+        assert list(kept["drives"]) == [task.name for task in TINY[:2]]
+        kept["drives"][TINY[0].name]["mean_m"] = 99  # as no drive has
+        (tmp_path / "unfinished.json").write_text(json.dumps(kept), encoding="utf-8")
         assert __main__.main([*words, "--resume"]) == DONE
-        assert len(server.requests) == sessions
+        while server.thread.is_alive():
+            socket.create_connection(("127.0.0.1", server.port)).close()
     found = json.loads((tmp_path / "benchmark.json").read_text(encoding="utf-8"))
     assert [each["name"] for each in found["drives"]] == [task.name for task in TINY]
+    assert [each["mean_m"] == 99 for each in found["drives"]] == [True, *[False] * 4]
     assert {path.name for path in tmp_path.iterdir()} == {"benchmark.json", "report.html"}
 
 

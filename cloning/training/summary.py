@@ -87,8 +87,8 @@ def sizes(rows: int, observations: int, validation: int) -> str:
 def refuse_rejected(recordings: Iterable[Recording]) -> None:
     """Raise RecordingError if a recording has unusable rows."""
     rejected = [(recording.folder / DRIVING_LOG, row) for recording in recordings for row in recording.rejected]
-    for path, row in rejected:
-        count = plural(len(rejected), "unusable row")
+    if rejected:
+        (path, row), count = rejected[0], plural(len(rejected), "unusable row")
         raise RecordingError(f"{path}: line {row.line}: {row.detail} (--strict stops at {count})")
 
 
