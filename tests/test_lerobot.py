@@ -238,12 +238,13 @@ def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_pat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lake"]
 
 
+@pytest.mark.parametrize(("end", "line"), [(b"\n", 7), (b"\r\r\n", 13)])  # the second has an empty line after each
 @pytest.mark.parametrize("row", ["{", "[]", "{}", '{"cam/image_array": "0_cam_image_array_.jpg", "user/angle": null}'])
-def test_a_damaged_tub_is_reported_with_its_line(tub, tmp_path, row):
+def test_a_damaged_tub_is_reported_with_its_line(tub, tmp_path, row, end, line):
     catalog = tub / "catalog_1.catalog"
-    catalog.write_text(f"{catalog.read_text(encoding='utf-8')}{row}\n", encoding="utf-8")
+    catalog.write_bytes((catalog.read_bytes() + f"{row}\n".encode()).replace(b"\n", end))
     done = run(tub, "--output", tmp_path / "recording")
-    assert done.returncode == 2 and "catalog_1.catalog: line 7: " in done.stderr and done.stderr.count("\n") == 1
+    assert done.returncode == 2 and f"catalog_1.catalog: line {line}: " in done.stderr and done.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["tub"]
 
 

@@ -288,6 +288,7 @@ def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, p
     done = command.drive_at_limits(recording, lines, driver, limits, lambda _, d: watched.append(d.limit), parallel)
     assert done == expected and len(done[0].interventions) < len(done[1].interventions)
     assert watched == [2.5] * len(recording)
+    assert (tmp_path / str(os.getpid())).exists()
     assert len(list(tmp_path.iterdir())) == (3 if parallel and CAN_FORK else 1)
 
 

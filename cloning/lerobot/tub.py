@@ -22,7 +22,7 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
     notes: is added to what does not fit, and how often. Raises RecordingError.
     """
     camera = camera or "cam/image_array"
-    lines = _lines(folder / MANIFEST)
+    lines = list(_lines(folder / MANIFEST).values())
     try:
         paths, deleted = [folder / name for name in lines[4]["paths"]], set(lines[4].get("deleted_indexes") or ())
     except (AttributeError, IndexError, KeyError, TypeError):
@@ -30,7 +30,7 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
         raise RecordingError(f"{folder / MANIFEST}: {remedy}") from None
     index = -1
     for path in paths:
-        for line, row in enumerate(_lines(path), 1):
+        for line, row in _lines(path).items():
             index += 1
             try:
                 if index in deleted:
@@ -51,17 +51,15 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
                 raise RecordingError(f"{path}: line {line}: {problem}; correct or delete the line") from None
 
 
-def _lines(path: Path) -> list[Any]:
-    """Return the JSON in each line of a file. Raises RecordingError."""
-    found: list[Any] = []
+def _lines(path: Path) -> dict[int, Any]:
+    """Return the JSON in each line of a file that is not empty, by the line's number. Raises RecordingError."""
+    found, number = dict[int, Any](), 0
     try:
-        for text in path.read_text(encoding="utf-8").splitlines():
+        for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             if text:  # donkeycar 4.0 ends its lines with \r\r\n on Windows
-                found.append(json.loads(text))
+                found[number] = json.loads(text)
         return found
     except ValueError as error:
-        raise RecordingError(
-            f"{path}: line {len(found) + 1}: {error}; copy the file again, or delete the line"
-        ) from None
+        raise RecordingError(f"{path}: line {number}: {error}; copy the file again, or delete the line") from None
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}; copy it again") from None

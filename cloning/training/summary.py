@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -86,20 +86,23 @@ def sizes(rows: int, observations: int, validation: int) -> str:
 
 def refuse_rejected(recordings: Iterable[Recording]) -> None:
     """Raise RecordingError if a recording has unusable rows."""
-    rejected = [(recording.folder / DRIVING_LOG, row) for recording in recordings for row in recording.rejected]
-    if rejected:
-        (path, row), count = rejected[0], plural(len(rejected), "unusable row")
-        raise RecordingError(f"{path}: line {row.line}: {row.detail} (--strict stops at {count})")
+    if rejected := _rejected(recordings):
+        (path, line, _, detail), count = rejected[0], plural(len(rejected), "unusable row")
+        raise RecordingError(f"{path}: line {line}: {detail} (--strict stops at {count})")
 
 
 def list_rejected(recordings: Iterable[Recording], file: Path) -> None:
-    """Write the unusable rows of all recordings to a csv file, or delete it if there are none."""
-    rejected = [(recording.folder / DRIVING_LOG, *row) for recording in recordings for row in recording.rejected]
-    if rejected:
+    """Write the unusable rows of all recordings to a csv file, or delete it if there are none. Raises OSError."""
+    if rejected := _rejected(recordings):
         write(file, csv_bytes([("file", "line", "finding", "detail"), *rejected]))
         print(f"{plural(len(rejected), 'unusable row')} left out; {file} lists them")
     else:
         file.unlink(missing_ok=True)  # an earlier run's
+
+
+def _rejected(recordings: Iterable[Recording]) -> list[tuple[Any, ...]]:
+    """Return the file, line, finding and detail of each unusable row."""
+    return [(recording.folder / DRIVING_LOG, *row) for recording in recordings for row in recording.rejected]
 
 
 def history_csv(history: list[EpochMetrics]) -> bytes:
