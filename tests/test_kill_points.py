@@ -235,7 +235,8 @@ def test_driving_on_a_full_disk(driving, jpegs):
         lost = sum(point.startswith("write") and ".jpg" in point for point in points[number - 1 :])
         assert car.answers == 6
         assert ended.status == 1 and "Traceback" not in ended.printed
-        assert f"6 frames driven, 0 unusable; {6 - lost} frames saved in run1, {lost} LOST" in ended.printed
+        told = f"session ended: 6 frames driven, 0 unusable; {6 - lost} frames saved in run1, {lost} LOST"
+        assert told in ended.printed
         assert f"drive.py: run1: {lost} of 6 frames were not saved" in ended.printed.splitlines()[-1]
         assert saved(trial.folder / "run1") == jpegs[: 6 - lost]
         assert not list((trial.folder / "run1").glob(".*"))

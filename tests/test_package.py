@@ -29,8 +29,6 @@ for name in installed.COMMANDS:
         assert not end.code, name
 import gymnasium
 print(gymnasium.make("simulator.environment:behavioral-cloning/Drive-v0").reset()[0].shape)
-sys.argv = ["behavioral-cloning", "train", "nowhere"]
-installed.main()
 """
 
 
@@ -59,7 +57,7 @@ def install(wheel: Path, folder: Path) -> Path:
 
 
 def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
-    """It has the project's files and no others; its commands run anywhere, and drive."""
+    """It has the project's files and no others; its commands run anywhere, and drive ten seconds of the lake."""
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     wanted = {name for name in KEPT if name.startswith(("cloning/", "simulator/"))}
@@ -77,19 +75,20 @@ def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
     commands = re.findall(r"^  (\w+)", run(command, "--help").stdout, re.MULTILINE)
     assert commands == ["train", "drive", "video", "simulator", "replay", "browse", "report", "export", "lerobot"]
     done = run(folder / "python", "-c", IN_PYTHON)
-    assert done.returncode == 2 and done.stdout.count("usage:") == len(commands), done.stderr
+    assert done.returncode == 0 and done.stdout.count("usage:") == len(commands), done.stderr
     assert done.stdout.endswith("\n(160, 320, 3)\n")
-    assert "behavioral-cloning train: nowhere: no such folder" in done.stderr
-    assert "`behavioral-cloning simulator record data/lake-ccw`" in done.stderr and not list(elsewhere.iterdir())
+    missing = run(command, "train", "nowhere")
+    assert missing.returncode == 2 and missing.stderr.startswith("behavioral-cloning train: nowhere: no such folder")
+    assert "`behavioral-cloning simulator record data/lake-ccw`" in missing.stderr and not list(elsewhere.iterdir())
 
     server = subprocess.Popen([command, "drive", "--port", "0"], cwd=elsewhere, stderr=subprocess.PIPE, text=True)
     try:
         assert server.stderr
         port = found(r"Listening on [\d.]+:(\d+)", server.stderr.readline() + server.stderr.readline())
         assert ask(int(port), "/")[0] == ask(int(port), "/site/style.css")[0] == 200, "it finds its page"
-        drive = run(command, "simulator", "drive", "--laps", "0.01", "--port", port, "--report", "lap.json")
+        drive = run(command, "simulator", "drive", "--laps", "0.036", "--port", port, "--report", "lap.json")
         assert drive.returncode == 0, drive.stderr
-        assert json.loads((elsewhere / "lap.json").read_text(encoding="utf-8"))["distance_m"] > 10
+        assert json.loads((elsewhere / "lap.json").read_text(encoding="utf-8"))["simulated_seconds"] > 10
     finally:
         server.kill()
         server.wait()

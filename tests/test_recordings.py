@@ -11,11 +11,11 @@ from rendered import render_recording
 from cloning.base import program
 from cloning.base.errors import RecordingError
 from cloning.recordings import rows
+from cloning.recordings.check import check_images
 from cloning.recordings.columns import Finding
 from cloning.recordings.log import Recording, find_folders, read_recording
 
 HEADER = "center,left,right,steering,throttle,brake,speed"
-GERMAN = "mitte,links,rechts,gas,lenkung,bremse,tempo"
 CAMERAS = ("center", "left", "right")
 NUMBERS = ["-0.0597,0.98,0,30.18", "0,1,0,6.9E-05", "0.25,0,0.5,22.14829", "0.125,0.5,0,15.5"]
 VALUES = np.array([row.split(",") for row in NUMBERS], np.float32)
@@ -274,7 +274,6 @@ def test_two_rows_of_one_image_with_different_steering_are_left_out(log):
         (HEADER.encode() + b"\n\n", "nothing was recorded; delete the folder .*, or record again"),
         (b'"\n', "line 1: neither a row nor a header"),
         (b"some words\n", "line 1: neither a row nor a header, .* names center never"),
-        ("\n".join([*usual(), GERMAN]).encode(), "line 5: neither a row nor a .*understood: 'mitte', 'links'"),
         ("\n".join(usual()).encode() + bytes(4 << 20), "line 4: longer than any row: not a csv"),
     ],
 )
@@ -360,8 +359,19 @@ def test_a_speed_that_the_simulator_never_writes_is_left_out(log):
     assert findings(log(*usual(), f"{images(9)},0,1,0,48.58")) == [(5, Finding.OUT_OF_RANGE)]
 
 
+def test_a_header_in_other_words_within_the_file_is_refused(log):
+    words = "line 5: neither a row nor a header, .* not understood: 'mitte', 'links'"
+    with pytest.raises(RecordingError, match=words):
+        log(*usual(), "mitte,links,rechts,gas,lenkung,bremse,tempo", *usual(first=10))
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Folders
+
+
+def test_the_sample_recording_is_whole(tmp_path):
+    found = check_images(read_recording(render_recording(tmp_path / "a b", rows=3)))
+    assert (found.rows_read, len(found), found.rejected, found.repairs) == (3, 3, [], {})
 
 
 def test_folders_are_found_below_links_and_each_once(tmp_path):

@@ -299,7 +299,8 @@ def test_networks_are_measured_as_they_drive(sample_recording, tmp_path):
 def test_a_recording_without_images_is_left_out(linked, tmp_path):
     shutil.rmtree(linked / "IMG")
     done = run_here(linked, "--robust", "--output", tmp_path / "model.pt")
-    assert done.returncode == 2 and "needed: most can't be used, see above" in done.stderr
+    assert done.returncode == 2
+    assert "0 of 60 rows are left, at least 5 are needed: most can't be used, see above" in done.stderr
 
 
 def test_drives_too_short_are_named(tmp_path):
