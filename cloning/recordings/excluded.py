@@ -9,14 +9,14 @@ import csv
 import io
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from cloning.base.errors import RecordingError
-from cloning.base.files import write
+from cloning.base.files import csv_bytes, write
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.images import NONBLOCKING
 
@@ -27,7 +27,7 @@ EXCLUDED, TAGS = "excluded.csv", "tags.csv"
 HEADERS = {EXCLUDED: ("first image", "last image", "reason"), TAGS: ("first image", "last image", "tag")}
 MAX_REASON = 200  # characters
 BYTES = {"encoding": "utf-8", "errors": "surrogateescape"}  # names of files may hold any bytes
-_changing = threading.Lock()  # for Windows, where no other lock is taken
+_one_at_a_time = threading.Lock()  # for Windows, where no other lock is taken
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,16 @@ def cut_rows(folder: Path, cuts: Iterable[Cut], names: np.ndarray, centres: np.n
     path = folder / EXCLUDED
     for cut in cuts:
         where = f"{path}: line {cut.line}" if cut.line else str(path)
-        first, last = (_rows_with(where, name, names, centres) for name in (cut.first, cut.last))
+        found = []
+        for name in (cut.first, cut.last):
+            at = int(np.searchsorted(names, os.fsencode(name)))
+            found.append(np.flatnonzero((centres == at) & (names[at : at + 1] == os.fsencode(name)).any()))
+            if not len(found[-1]):
+                raise RecordingError(
+                    f"{where}: {name} is not the centre image of a usable row of {DRIVING_LOG}; name another one, or "
+                    "delete the line"
+                )
+        first, last = found
         last = last[last >= first[0]]
         if not len(last):
             raise RecordingError(f"{where}: {cut.last} comes before {cut.first} in the recording; exchange the two")
@@ -77,16 +86,8 @@ def cut_rows(folder: Path, cuts: Iterable[Cut], names: np.ndarray, centres: np.n
         yield is_cut[centres]
 
 
-def _rows_with(where: str, name: str, names: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the rows with a centre image, ascending; where: the file and line, for an error."""
-    at = int(np.searchsorted(names, os.fsencode(name)))
-    rows = np.flatnonzero(centres == at) if at < len(names) and names[at] == os.fsencode(name) else np.empty(0, int)
-    if not len(rows):
-        raise RecordingError(
-            f"{where}: {name} is not the centre image of a usable row of {DRIVING_LOG}; name another one, or delete "
-            "the line"
-        )
-    return rows
+class GoneError(RecordingError):
+    """A cut or tag that is to be deleted and is not there any more."""
 
 
 def add_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> None:
@@ -94,20 +95,11 @@ def add_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> None:
 
     Raises RecordingError if the file is not readable as such, and OSError if it cannot be written; then it stays.
     """
-
-    def append(lines: list[str], there: list[Cut]) -> list[str]:
+    with _changing(folder / file) as (lines, there):
         present = {each.row() for each in there}
-        added = [_line(row) for row in dict.fromkeys(cut.row() for cut in cuts) if row not in present]
-        if not added:
-            return lines
-        ended = [line if line.endswith(("\n", "\r")) else f"{line}\n" for line in lines]
-        return [*(ended or [_line(HEADERS[file])]), *added]
-
-    _change(folder / file, append)
-
-
-class GoneError(RecordingError):
-    """A cut or tag that is to be deleted and is not there any more."""
+        if added := [_line(row) for row in dict.fromkeys(cut.row() for cut in cuts) if row not in present]:
+            ended = [line if line.endswith(("\n", "\r")) else f"{line}\n" for line in lines]
+            lines[:] = [*(ended or [_line(HEADERS[file])]), *added]
 
 
 def delete_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> list[Cut]:
@@ -115,15 +107,11 @@ def delete_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> list[Cut]:
 
     Raises GoneError if none of them is there, and the errors of `add_cuts`.
     """
-    found: list[Cut] = []
-
-    def delete(lines: list[str], there: list[Cut]) -> list[str]:
+    with _changing(folder / file) as (lines, there):
         present, gone = {each.row() for each in there}, {cut.row() for cut in cuts}
-        found[:] = (cut for cut in cuts if cut.row() in present)
         deleted = {each.line for each in there if each.row() in gone}  # also if the same one was written twice
-        return [line for number, line in enumerate(lines, 1) if number not in deleted]
-
-    _change(folder / file, delete)
+        lines[:] = [line for number, line in enumerate(lines, 1) if number not in deleted]
+    found = [cut for cut in cuts if cut.row() in present]
     if cuts and not found:
         raise GoneError(
             f"{folder / file}: the stretch from {cuts[0].first} to {cuts[0].last} is not there any more; it was "
@@ -137,13 +125,15 @@ def one_line(reason: str) -> str:
     return " ".join("".join(c if c.isprintable() else " " for c in reason).split())[:MAX_REASON]
 
 
-def _change(path: Path, change: Callable[[list[str], list[Cut]], list[str]]) -> None:
-    """Replace the file's lines by those that `change` returns, while no other thread or process does the same."""
-    with _changing, _locked(path.with_name(DRIVING_LOG)):
+@contextlib.contextmanager
+def _changing(path: Path) -> Iterator[tuple[list[str], list[Cut]]]:
+    """Yield a file's lines, to be changed, and the cuts in them, while no other thread or process changes the file."""
+    with _one_at_a_time, _locked(path.with_name(DRIVING_LOG)):
         lines = _lines(path)
-        changed = change(lines, _parse(path, lines))
-        if changed != lines:
-            write(path, "".join(changed).encode(**BYTES))
+        before = list(lines)
+        yield lines, _parse(path, lines)
+        if lines != before:
+            write(path, "".join(lines).encode(**BYTES))
 
 
 @contextlib.contextmanager
@@ -201,6 +191,4 @@ def _parse(path: Path, lines: list[str]) -> list[Cut]:
 
 def _line(fields: tuple[str, ...]) -> str:
     """Return a line of a csv, with its end."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(fields)
-    return text.getvalue()
+    return csv_bytes([fields]).decode(**BYTES)

@@ -13,6 +13,7 @@ import numpy as np
 
 from cloning.base import program
 from cloning.base.errors import RecordingError
+from cloning.base.outputs import plural
 from cloning.base.table import Column, Table
 from cloning.recordings.columns import Finding, Rejected, UnclearLogError
 from cloning.recordings.excluded import EXCLUDED, Cut, cut_rows, read_cuts
@@ -141,7 +142,8 @@ def print_findings(recording: Recording) -> None:
     """Print a recording's repairs, cuts, and first five rejected rows of each finding, with file, line and remedy."""
     path = recording.folder / DRIVING_LOG
     for repair, (rows, line) in recording.repairs.items():
-        print(f"{path}: line {line}: {repair} ({_rows_are(rows)} read this way; check that it is meant)")
+        are = plural(rows, "row is", "rows are")
+        print(f"{path}: line {line}: {repair} ({are} read this way; check that it is meant)")
     for finding in Finding:
         rejected = [row for row in recording.rejected if row.finding == finding]
         for row in rejected[:SHOWN_REJECTED]:
@@ -150,11 +152,9 @@ def print_findings(recording: Recording) -> None:
             print(f"{path}: … and {len(rejected) - SHOWN_REJECTED} more of this kind")
     for cut, rows in recording.cuts:
         stretch = f"from {cut.first} to {cut.last}: {cut.reason or 'no reason given'}"
-        print(f"{recording.folder / EXCLUDED}: line {cut.line}: {_rows_are(rows)} left out, {stretch}")
-
-
-def _rows_are(count: int) -> str:
-    return "1 row is" if count == 1 else f"{count} rows are"
+        print(
+            f"{recording.folder / EXCLUDED}: line {cut.line}: {plural(rows, 'row is', 'rows are')} left out, {stretch}"
+        )
 
 
 def read_recording(folder: str | Path) -> Recording:

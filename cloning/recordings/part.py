@@ -12,6 +12,7 @@ import numpy as np
 
 from cloning.base.errors import RecordingError
 from cloning.base.files import csv_bytes, write
+from cloning.base.outputs import plural
 from cloning.recordings.format import (
     CAMERAS,
     COLUMNS,
@@ -47,7 +48,7 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
         end = recording.time[-1] + (days * DAY).total_seconds()
         renamed.append(_renamed(recording, days, check=len(recordings) > 1))
         if days:
-            notes.append(f"{recording.folder.name} is put {days} day{'s' * (days > 1)} later, after another drive")
+            notes.append(f"{recording.folder.name} is put {plural(days, 'day')} later, after another drive")
     lanes = [(recording.folder / LANE_FILE).exists() for recording in recordings]
     if any(lanes) and not all(lanes):
         notes.append(f"{LANE_FILE} is left out: {recordings[lanes.index(False)].folder.name} has none")

@@ -4,7 +4,6 @@ import argparse
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 
@@ -23,12 +22,8 @@ from cloning.replay.replay import (
     load_recording,
     reference_lines,
 )
-from cloning.replay.score import ReplayFilm, ReplayReport, plot, replay_report, report_text
+from cloning.replay.score import Metrics, ReplayFilm, plot, replay_report, report_text
 from cloning.road.disturbances import Disturbance
-
-if TYPE_CHECKING:
-    from cloning.replay.model_driver import ModelDriver
-    from cloning.replay.server_driver import ServerDriver
 
 
 def run(options: argparse.Namespace) -> None:
@@ -40,11 +35,22 @@ def run(options: argparse.Namespace) -> None:
     """
     check_folders(options.report, options.picture, options.film, model=options.model)
     folders = find_folders(options.folders)
-    in_process = options.model is not None
-    driver = _driver(options)
+    driver: Driver
+    ending: list[Callable[[], object]] = []
+    if options.model:  # each driver needs a library of its own, PyTorch or wsproto
+        from cloning.network.compute import one_thread
+        from cloning.replay.model_driver import ModelDriver
+
+        one_thread()  # other drives run at the same time
+        driver = ModelDriver(options.model)
+    else:
+        from cloning.replay.server_driver import ServerDriver
+
+        driver = server = ServerDriver(options.host, options.port, options.wait)
+        ending.append(server.close)
     limits = list(dict.fromkeys(options.limits))  # each once
     film = ReplayFilm(options.film) if options.film else None
-    reports: list[ReplayReport] = []
+    reports: list[Metrics] = []
 
     def replay_all() -> None:
         for folder, name in zip(folders, short_names(folders), strict=True):
@@ -59,7 +65,7 @@ def run(options: argparse.Namespace) -> None:
             if film:
                 film.begin(recording)
             watch = film.watch if film else None
-            drives = drive_at_limits(recording, lines, driver, limits, watch, in_process, options.disturb)
+            drives = drive_at_limits(recording, lines, driver, limits, watch, bool(options.model), options.disturb)
             reports.append(replay_report(recording, lines, drives, options.reference, options.disturb))
             print(report_text(reports[-1]), flush=True)
             if options.picture:
@@ -68,26 +74,11 @@ def run(options: argparse.Namespace) -> None:
                     path = path.with_stem(f"{path.stem}-{name.replace('/', '-')}")
                 write_output(path, plot(recording, drives))
 
-    steps: list[Callable[[], object]] = [replay_all, driver.close]
     if film:
-        steps.append(film.close)
+        ending.append(film.close)
     if options.report:
-        report = options.report
-        steps.append(lambda: write_json(report, reports) if reports else None)
-    run_all(*steps)
-
-
-def _driver(options: argparse.Namespace) -> "ModelDriver | ServerDriver":
-    """Return the driver; each needs a library of its own, PyTorch or wsproto. Raises ModelError."""
-    if options.model:
-        from cloning.network.compute import one_thread
-        from cloning.replay.model_driver import ModelDriver
-
-        one_thread()  # other drives run at the same time
-        return ModelDriver(options.model)
-    from cloning.replay.server_driver import ServerDriver
-
-    return ServerDriver(options.host, options.port, options.wait)
+        ending.append(lambda: write_json(options.report, reports) if reports else None)
+    run_all(replay_all, *ending)
 
 
 def drive_at_limits(

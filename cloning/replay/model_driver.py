@@ -21,6 +21,3 @@ class ModelDriver:
             return float(steer(self.network, frame.received(self.rows)))
         except ArithmeticError as error:
             raise SimulatorError(f"{error}: train the model again") from None
-
-    def close(self) -> None:
-        """Do nothing: no connection is open."""

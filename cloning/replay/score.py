@@ -1,7 +1,7 @@
 """Replay metrics, as a report, as text, as a plot and as a film."""
 
 import itertools
-from typing import TypedDict
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,95 +34,14 @@ ORACLE = "oracle"  # the report's key of the recovery steering as the driver: th
 YARDSTICKS = {"steering_zero": "steering 0", "mean_steering": "mean steering", "human": "recorded driver"}  # key: words
 
 
-class DrivingMetrics(TypedDict):
-    """The metrics of one drive: autonomy in percent, and absolute offsets from the reference line in metres."""
-
-    autonomy_percent: float
-    interventions: int
-    distance_mean_m: float
-    distance_p95_m: float
+Metrics = dict[str, Any]  # figures by their names in a report, in JSON's types
 
 
-class SteeringMetrics(TypedDict):
-    """Steering, -1..1, compared with the human driver's.
+def driving_metrics(done: Drive, counted: np.ndarray | None = None) -> Metrics:
+    """Return the metrics of one drive: autonomy in percent, and absolute offsets from the reference line in metres.
 
-    error: root mean squared difference; correlation: of both, averaged over nine rows; None if either is constant.
+    counted: bool (n,), the entries that count, at least one; None: all.
     """
-
-    error: float
-    correlation: float | None
-
-
-class Intervention(TypedDict):
-    """An intervention: the centre image's name, seconds driven until then, and metres right of the reference line."""
-
-    image: str
-    seconds: float
-    metres: float
-
-
-class DriveMetrics(DrivingMetrics):
-    """The metrics of one drive, of all its rows, and separately of those with each kind of reference line.
-
-    by_reference: by `LANE_CENTRE` and `HUMAN_WAY`, those that there are; steering_roughness_per_s: mean absolute change
-    of the steering, -1..1, per second.
-    """
-
-    by_reference: dict[str, DrivingMetrics]
-    steering_roughness_per_s: float
-
-
-class Unknown(TypedDict):
-    """Successive rows whose lane is not known: the first and the last centre image, their number, and why."""
-
-    first: str
-    last: str
-    rows: int
-    why: str
-
-
-class ReferenceMetrics(TypedDict):
-    """What is known of the lane in a recording.
-
-    rows_placed: whose position is that on a known track, or told by the recording itself; None if the lane was not
-    asked for; unknown: where the lane's centre is not the reference; mean_speed_mph: of the rows driven.
-    """
-
-    rows_placed: int | None
-    unknown: list[Unknown]
-    mean_speed_mph: float
-
-
-class LimitReport(DriveMetrics):
-    """The metrics of the drive at one limit; compared: those of the yardsticks, by name."""
-
-    steering: SteeringMetrics
-    where: list[Intervention]
-    compared: dict[str, DrivingMetrics]
-
-
-class ReplayReport(ReferenceMetrics):
-    """The report of one recording.
-
-    disturbance: of what the driver saw, such as "fog:3"; reference_asked: "lane" or "human"; reference: the rows
-    measured from the lane's centre, `lane_centre`, and from the human driver's path, `human_way`; limits: by the limit
-    in metres; steering_compared: of constant steering.
-    """
-
-    recording: str
-    rows: int
-    rows_driven: int
-    stretches: int
-    seconds: float
-    disturbance: str | None
-    reference_asked: str
-    reference: dict[str, int]
-    limits: dict[str, LimitReport]
-    steering_compared: dict[str, SteeringMetrics]
-
-
-def driving_metrics(done: Drive, counted: np.ndarray | None = None) -> DrivingMetrics:
-    """Return the metrics of one drive; counted: bool (n,), the entries that count, at least one; None: all."""
     counted = np.ones(len(done.row), bool) if counted is None else counted
     distance = np.abs(done.offset)[counted]
     interventions = sum(bool(counted[at]) for at in done.interventions)
@@ -134,8 +53,12 @@ def driving_metrics(done: Drive, counted: np.ndarray | None = None) -> DrivingMe
     }
 
 
-def drive_metrics(lines: list[ReferenceLine], done: Drive) -> DriveMetrics:
-    """Return the metrics of the drive along these lines."""
+def drive_metrics(lines: list[ReferenceLine], done: Drive) -> Metrics:
+    """Return the metrics of the drive along these lines.
+
+    by_reference: separately for the rows with each kind of reference line, by `LANE_CENTRE` and `HUMAN_WAY`, those that
+    there are; steering_roughness_per_s: mean absolute change of the steering, -1..1, per second.
+    """
     by_lane = np.repeat([line.is_lane_centre for line in lines], [len(line.stretch) for line in lines])
     seconds, change = np.array(done.seconds), np.abs(np.diff(done.steering, prepend=done.steering[0]))
     inside = seconds > 0  # not the first row of a line
@@ -147,8 +70,13 @@ def drive_metrics(lines: list[ReferenceLine], done: Drive) -> DriveMetrics:
     }
 
 
-def reference_metrics(recording: Recording, lines: list[ReferenceLine], asked: str = "lane") -> ReferenceMetrics:
-    """Return what is known of the lane in a recording; lines, asked: as for `replay_report`."""
+def reference_metrics(recording: Recording, lines: list[ReferenceLine], asked: str = "lane") -> Metrics:
+    """Return what is known of the lane in a recording; lines, asked: as for `replay_report`.
+
+    rows_placed: whose position is that on a known track, or told by the recording itself; None if the lane was not
+    asked for; unknown: successive rows where the lane's centre is not the reference: the first and the last centre
+    image, their number, and why; mean_speed_mph: of the rows driven.
+    """
     by_lane = asked == "lane"
     not_by_lane = NOT_READ if by_lane else AS_ASKED
     why, driven = np.full(len(recording), NOT_DRIVEN, object), np.zeros(len(recording), bool)
@@ -169,8 +97,11 @@ def reference_metrics(recording: Recording, lines: list[ReferenceLine], asked: s
     }
 
 
-def steering_metrics(steering: np.ndarray, human: np.ndarray) -> SteeringMetrics:
-    """Compare steering with the human driver's: float (n,) each, -1..1."""
+def steering_metrics(steering: np.ndarray, human: np.ndarray) -> Metrics:
+    """Compare steering with the human driver's: float (n,) each, -1..1.
+
+    error: root mean squared difference; correlation: of both, averaged over nine rows; None if either is constant.
+    """
     smooth, smooth_human = (
         np.convolve(values, np.ones(SMOOTHED_ROWS) / SMOOTHED_ROWS, "valid") for values in (steering, human)
     )
@@ -187,11 +118,15 @@ def replay_report(
     drives: list[Drive],
     asked: str,
     disturbance: Disturbance | None = None,
-) -> ReplayReport:
+) -> Metrics:
     """Return the report of a recording's drives, one per limit, compared with the oracle and the YARDSTICKS.
 
     lines: of `reference_lines`; asked: the reference that the user chose, "lane" or "human"; disturbance: of the
     drives.
+    It has, beside `reference_metrics`, reference: the rows measured from the lane's centre, `lane_centre`, and from the
+    human driver's path, `human_way`; limits: by the limit in metres, `drive_metrics`, steering, where: each
+    intervention's centre image, seconds driven until then, and metres right of the reference line, and compared: the
+    yardsticks' metrics, by name; steering_compared: of constant steering.
     """
     human = np.array(drives[0].human_steering)
     mean = float(recording.steering.mean())
@@ -204,7 +139,7 @@ def replay_report(
     rows = sum(len(line.stretch) for line in lines)
     by_lane = sum(len(line.stretch) for line in lines if line.is_lane_centre)
 
-    def limit_report(done: Drive) -> LimitReport:
+    def limit_report(done: Drive) -> Metrics:
         return {
             **drive_metrics(lines, done),
             "steering": steering_metrics(np.array(done.steering), human),
@@ -239,7 +174,7 @@ def replay_report(
     }
 
 
-def report_text(report: ReplayReport) -> str:
+def report_text(report: Metrics) -> str:
     """Return a report as lines for a terminal."""
     stretches, rows = plural(report["stretches"], "stretch", "stretches"), report["rows"]
     lines = [
@@ -286,8 +221,7 @@ def report_text(report: ReplayReport) -> str:
     return "\n".join(lines)
 
 
-def _driving(metrics: DrivingMetrics) -> str:
-    """Return the metrics of one drive in the text."""
+def _driving(metrics: Metrics) -> str:
     return (
         f"autonomy {metrics['autonomy_percent']:.1f} %, {plural(metrics['interventions'], 'intervention')}; "
         f"distance: mean {metrics['distance_mean_m']:.2f} m, "

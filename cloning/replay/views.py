@@ -24,6 +24,7 @@ class StretchViews:
 
     def __init__(self, recording: Recording, stretch: Stretch):
         self.recording, self.stretch = recording, stretch
+        self.axles = np.column_stack([stretch.right, stretch.forward])  # m, in the stretch's frame
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - the object lives only while its stretch is driven
     def _image(self, at: int, camera: int) -> tuple[bytes, np.ndarray]:
@@ -45,7 +46,7 @@ class StretchViews:
         rows: of the frame, which are the same whichever others are asked for.
         """
         heading = self.stretch.heading[at] + yaw
-        axle = self._axle(at) + right * right_of(forward_vector(self.stretch.heading[at]))
+        axle = self.axles[at] + right * right_of(forward_vector(self.stretch.heading[at]))
         position = camera_position(axle, forward_vector(heading))
         offset = right + AXLE_TO_CAMERA * np.sin(yaw)
         camera = int(np.argmin([abs(offset - mounted) for mounted in CAMERA_OFFSETS.values()]))
@@ -62,13 +63,9 @@ class StretchViews:
             return road  # another camera's frame may do, and the centre one need not be decoded
         return np.concatenate([road, self.frame(at, 0)[FIRST_BONNET_ROW : rows.stop]])
 
-    def _axle(self, at: int) -> np.ndarray:
-        """Return the middle of the rear axle, float64 (2,): m, right and forward in the stretch's frame."""
-        return np.array([self.stretch.right[at], self.stretch.forward[at]])
-
     def _pose(self, at: int, camera: int, position: np.ndarray, heading: float) -> tuple[float, float, float]:
         """Return a camera's position, (2,), and heading relative to a recorded one: m right, m forward, radians."""
         forward = forward_vector(self.stretch.heading[at])
         mounted = list(CAMERA_OFFSETS.values())[camera]
-        moved = components(position - camera_position(self._axle(at), forward, mounted), forward)
+        moved = components(position - camera_position(self.axles[at], forward, mounted), forward)
         return float(moved[0]), float(moved[1]), float(heading - self.stretch.heading[at])
