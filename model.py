@@ -49,8 +49,8 @@ from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, fing
 from cloning.training.distributed import FirstRankFailed, Ranks
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
-from cloning.training.muon import OPTIMIZERS
 from cloning.training.observations import CameraViews, Choices, Observations, centre_images
+from cloning.training.optimizers import OPTIMIZERS
 from cloning.training.options import Command, Process, Run
 from cloning.training.pictures import batch_pictures, loss_picture
 from cloning.training.pieces import Batch, SquaredErrors, predict, start_batch

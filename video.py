@@ -78,21 +78,16 @@ def make_film(folder: Path, fps: Fraction | None = None, draw: Overlay | None = 
     path = folder.with_name(folder.name + ".mp4")
     unreadable: list[str] = []
     reason: ValueError | None = None  # of the first unreadable frame
-    writer = FilmWriter(path, fps)
-    try:
-        with progress_bar(len(frames), "frame") as bar:
-            for _, frame_path in frames:
-                bar.update()
-                try:
-                    frame = decode(read_jpeg(frame_path))
-                except ValueError as error:
-                    unreadable.append(frame_path.name)
-                    reason = reason or error
-                    continue
-                writer.add(draw(frame) if draw else frame)
-        writer.close()
-    finally:
-        writer.discard()
+    with FilmWriter(path, fps) as writer, progress_bar(len(frames), "frame") as bar:
+        for _, frame_path in frames:
+            bar.update()
+            try:
+                frame = decode(read_jpeg(frame_path))
+            except ValueError as error:
+                unreadable.append(frame_path.name)
+                reason = reason or error
+                continue
+            writer.add(draw(frame) if draw else frame)
     if len(unreadable) == len(frames):
         raise UserError(
             f"{folder}: none of its {len(frames)} frames is readable (the first: {reason}); save new ones with drive.py"

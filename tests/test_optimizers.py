@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from cloning.network.network import Network
-from cloning.training.adam import Adam
-from cloning.training.muon import Muon, orthogonal
+from cloning.training.optimizers import Adam, Muon, orthogonal
 
 
 def networks():

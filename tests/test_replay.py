@@ -31,8 +31,8 @@ from cloning.recordings.check import check_images
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
+from cloning.replay.command import CAN_FORK
 from cloning.replay.model_driver import ModelDriver
-from cloning.replay.processes import CAN_FORK
 from cloning.replay.score import ReplayFilm, driving_metrics, plot, replay_report, report_text, steering_metrics
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH, REAR_AXLE, YAW_LAG, curvature

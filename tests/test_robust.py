@@ -21,11 +21,11 @@ from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curva
 from cloning.road.warp import ground_mask, with_alpha
 from cloning.training import lanes as lanes_module
 from cloning.training import light
-from cloning.training.adam import Adam
 from cloning.training.checkpoint import Progress
 from cloning.training.distributed import Ranks
 from cloning.training.lanes import Lanes, Poses
 from cloning.training.observations import Observations
+from cloning.training.optimizers import Adam
 from cloning.training.options import parse
 from cloning.training.robust import PoseViews, sample_bends_more, select_known_lane
 from model import REPORT, ROBUST

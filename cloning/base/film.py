@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -35,7 +35,8 @@ class FilmWriter:
     """Writes an mp4 film: H.264 in yuv420p, which browsers and desktop players show.
 
     PyAV's wheel contains FFmpeg's libraries with x264, so there is no program to install. Use one writer from one
-    thread only. After an error the unfinished film is deleted at once.
+    thread only. After an error the unfinished film is deleted at once. As a context, it finishes the film at its end,
+    or deletes it after an exception.
     """
 
     def __init__(
@@ -97,6 +98,12 @@ class FilmWriter:
             self.container.close()
         self.temporary.unlink(missing_ok=True)
         self._renaming.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        (self.discard if error else self.close)()
 
     @contextlib.contextmanager
     def _discarded_on_error(self) -> Iterator[None]:

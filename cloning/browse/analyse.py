@@ -29,9 +29,9 @@ from cloning.lane.recovery import LaneAhead
 from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
 from cloning.recordings.check import check_images
-from cloning.recordings.columns import IMAGE_FINDINGS
+from cloning.recordings.columns import Finding
 from cloning.recordings.images import read_frame
-from cloning.recordings.log import Recording, read_uncut
+from cloning.recordings.log import SHOWN_REJECTED, Recording, read_uncut
 from cloning.replay.model_driver import ModelDriver
 from cloning.replay.replay import Drive, ReplayFrame, drive, load_recording, reference_lines
 from cloning.replay.score import drive_metrics, reference_metrics
@@ -40,7 +40,6 @@ from cloning.road.motion import stretches
 PART_ROWS = 256  # that are analysed at once: with their strips, 12 MB
 LANE_COLUMNS = ("offset", "label", "x", "y", "road")  # of an analysis of the lane
 NOTHING = np.empty(0, np.float32)
-SHOWN_REJECTED = 5  # rows with unusable images that the page lists
 
 
 def main() -> int:
@@ -79,8 +78,7 @@ def lane(recording: Recording) -> Result:
     known = known_position(recording)  # first, since the rest takes long
 
     def detect(network: LaneNetwork) -> np.ndarray:
-        of_parts = [detect_centres(part, network) for part in parts(recording)]
-        return np.concatenate(of_parts or [np.empty((0, 3, 5), np.float32)])
+        return np.concatenate([detect_centres(part, network) for part in parts(recording)])
 
     strips = partial(read_strips, recording)
     driven = stretches(recording)
@@ -175,7 +173,8 @@ def parts(recording: Recording) -> Iterator[Recording]:
 
 def rejected(recording: Recording) -> dict[str, object]:
     """Return how many rows have an unusable image, and the first of them: [line, detail]."""
-    unusable = [(row.line, row.detail) for row in recording.rejected if row.finding in IMAGE_FINDINGS]
+    of_images = (Finding.IMAGE_MISSING, Finding.IMAGE_UNUSABLE)
+    unusable = [(row.line, row.detail) for row in recording.rejected if row.finding in of_images]
     return {"unusable": len(unusable), "first_unusable": unusable[:SHOWN_REJECTED]}
 
 

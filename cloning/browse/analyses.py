@@ -41,10 +41,6 @@ class Analysis:
     model: str = ""
     limit: float = 0.0
 
-    def arguments(self) -> list[str]:
-        """Return the arguments for COMMAND, after the recording."""
-        return [self.kind, *[self.model] * bool(self.model), *[f"{self.limit:g}"] * bool(self.limit)]
-
 
 LANE = Analysis("lane")
 Job = tuple[Path, Analysis]  # a recording's folder, and what is analysed in it
@@ -203,11 +199,6 @@ class Analyses:
         if self.process:
             self.process.kill()  # its result is whole or not there
 
-    def _order(self, job: Job) -> tuple[bool, bool, int]:
-        """Return what is least for the analysis to run next."""
-        folder, analysis = job
-        return folder != self.urgent, analysis.kind == "replay", self.waiting[job]
-
     def _run(self) -> None:
         while job := self._next():
             before = ""
@@ -228,7 +219,8 @@ class Analyses:
             self.changed.wait_for(lambda: (self.waiting and not self.paused) or self.closed)
             if self.closed:
                 return None
-            self.running, self.progress, self.ended = min(self.waiting, key=self._order), 0.0, False
+            order = {job: (job[0] != self.urgent, job[1].kind == "replay", size) for job, size in self.waiting.items()}
+            self.running, self.progress, self.ended = min(order, key=order.__getitem__), 0.0, False
             del self.waiting[self.running]
             return self.running
 
@@ -237,7 +229,8 @@ class Analyses:
         with self.changed:
             if self.ended:
                 return ""
-            command = [*COMMAND, str(folder), *analysis.arguments()]
+            command = [*COMMAND, str(folder), analysis.kind]
+            command += [analysis.model] * bool(analysis.model) + [f"{analysis.limit:g}"] * bool(analysis.limit)
             self.process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
             )

@@ -341,13 +341,9 @@ class ShownRecording:
             raise OutputError(f"film: {len(selected)} frames; mark a stretch of at most {MAX_FILM}")
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
-            writer = FilmWriter(path, frame_rate(selected.time.tolist(), SAMPLE_RATE), quality=24)
-            try:
+            with FilmWriter(path, frame_rate(selected.time.tolist(), SAMPLE_RATE), quality=24) as writer:
                 for row in range(len(selected)):
                     writer.add(overlay(read_frame(selected.path(row)), float(selected.steering[row])))
-                writer.close()
-            finally:
-                writer.discard()
             return path.read_bytes()
 
 

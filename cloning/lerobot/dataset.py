@@ -88,16 +88,13 @@ def write_data_set(recordings: Sequence[Recording], folder: Path) -> str:
             for key, camera in FILMS.items():
                 path = temporary / PATHS["video_path"].format(video_key=key, chunk_index=0, file_index=0)
                 path.parent.mkdir(parents=True)
-                film, sampled = FilmWriter(path, rate, key_frames=KEY_FRAMES), []
-                try:
+                sampled = []
+                with FilmWriter(path, rate, key_frames=KEY_FRAMES) as film:
                     for recording, row in rows:
                         frame = read_frame(recording.path(row, CAMERAS.index(camera)))
                         film.add(frame)
                         sampled.append(frame[::SAMPLED, ::SAMPLED].copy())
                         bar.update()
-                    film.close()
-                finally:
-                    film.discard()
                 values[key] = np.stack(sampled)
         _write_table(temporary / f"data/{FIRST_FILE}.parquet", _data(columns))
         _write_table(temporary / f"meta/episodes/{FIRST_FILE}.parquet", _episodes(values, starts, lengths, rate))

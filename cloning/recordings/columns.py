@@ -63,9 +63,6 @@ class Finding(StrEnum):
     IMAGE_UNUSABLE = "image unusable"
 
 
-IMAGE_FINDINGS = (Finding.IMAGE_MISSING, Finding.IMAGE_UNUSABLE)
-
-
 class Rejected(NamedTuple):
     """A row that is left out: its line in the csv, from 1; why; and in words, with the remedy."""
 

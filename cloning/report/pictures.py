@@ -74,11 +74,10 @@ def film_uri(film: Path, most: int) -> str:
                 stream = opened.streams.video[0]
                 seconds = Fraction(opened.duration or 0, av.time_base)
                 rate = Fraction(stream.average_rate or 0) / 2
-                writer = FilmWriter(small, rate, quality=28, max_bits=int(8 * most / seconds))
-                for number, frame in enumerate(opened.decode(stream)):
-                    if number % 2 == 0:
-                        writer.add(frame.to_ndarray(format="rgb24"))
-                writer.close()
+                with FilmWriter(small, rate, quality=28, max_bits=int(8 * most / seconds)) as writer:
+                    for number, frame in enumerate(opened.decode(stream)):
+                        if number % 2 == 0:
+                            writer.add(frame.to_ndarray(format="rgb24"))
             return uri(small.read_bytes(), "video/mp4")
         except (av.FFmpegError, FileNotFoundError, IndexError, ZeroDivisionError):  # unreadable; no frame, stream, time
             raise UserError(f"{film}: not a whole film; make it again") from None

@@ -39,8 +39,8 @@ from cloning.network.network import (
 )
 from cloning.network.tensors import matching, shown
 from cloning.recordings.format import BINS
-from cloning.training.adam import Adam
 from cloning.training.observations import Observations
+from cloning.training.optimizers import Adam
 from cloning.training.options import Command, Process, Run
 from cloning.training.recipe import Recipe, option_name
 from cloning.training.run_files import EpochMetrics, RunFiles, best_epoch

@@ -43,14 +43,9 @@ class Lanes(LaneAhead):
     @classmethod
     def unknown(cls, n: int) -> Self:
         """Return n rows whose lane ahead is unknown, with the values of a car centred on a straight."""
-        return cls(
-            np.zeros(n, np.float32),
-            np.zeros(n, np.float32),
-            np.tile(np.array([0, LOOKAHEAD], np.float32), (n, 1)),
-            np.zeros(n, bool),
-            np.arange(n, dtype=np.int32),
-            np.zeros((n, 3), np.float32),
-        )
+        offset, yaw, moved = np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros((n, 3), np.float32)
+        point = np.tile(np.array([0, LOOKAHEAD], np.float32), (n, 1))
+        return cls(offset, yaw, point, np.zeros(n, bool), np.arange(n, dtype=np.int32), moved)
 
     @classmethod
     def of(cls, recording: Recording) -> Self:
@@ -93,11 +88,8 @@ class Lanes(LaneAhead):
         The camera is random, so that traces of warping in an image do not tell the side from which it was taken.
         """
         n = len(self)
-        offset = np.clip(
-            rng.triangular(-recipe.pose_offset, 0, recipe.pose_offset, n),
-            self.offset - recipe.max_shift,
-            self.offset + recipe.max_shift,
-        )
+        offset = rng.triangular(-recipe.pose_offset, 0, recipe.pose_offset, n)
+        offset = offset.clip(self.offset - recipe.max_shift, self.offset + recipe.max_shift)
         yaw = np.clip(rng.normal(0, recipe.pose_yaw, n), -recipe.max_pose_yaw, recipe.max_pose_yaw)
         eye = offset - self.offset + AXLE_TO_CAMERA * (np.sin(yaw) - np.sin(self.yaw))
         distance = np.abs(eye[:, None] - list(CAMERA_OFFSETS.values()))
@@ -176,14 +168,10 @@ class Poses(Table):
         """Return the pose that an image shows in words, such as `0.8 m left, turned 5° right`; at: index of the row."""
         sign = -1 if self.mirrored[at] else 1
         metres, degrees = sign * round(float(self.offset[at]), 1), sign * round(math.degrees(self.yaw[at]))
-        side = f"{abs(metres):.1f} m {_side(metres)}" if metres else "in the middle"
-        turn = f"turned {abs(degrees)}° {_side(degrees)}" if degrees else "not turned"
+        side = f"{abs(metres):.1f} m {'left' if metres < 0 else 'right'}" if metres else "in the middle"
+        turn = f"turned {abs(degrees)}° {'left' if degrees < 0 else 'right'}" if degrees else "not turned"
         weather = light.name_of(int(self.disturbance[at]))
         return f"{side}, {turn}{weather and f', {weather}'}"
-
-
-def _side(value: float) -> str:
-    return "left" if value < 0 else "right"
 
 
 @functools.cache

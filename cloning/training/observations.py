@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import cv2
 import numpy as np
 import torch
+from numpy.random import Generator
 
 from cloning.base.errors import RecordingError
 from cloning.base.frame import ROAD_ROWS
@@ -225,12 +226,7 @@ class CameraViews:
     """One camera's image of each observation of a batch, from which all augmentations are made."""
 
     def __init__(
-        self,
-        observations: Observations,
-        rows: np.ndarray,
-        cameras: np.ndarray,
-        recipe: Recipe,
-        rng: np.random.Generator,
+        self, observations: Observations, rows: np.ndarray, cameras: np.ndarray, recipe: Recipe, rng: Generator
     ):
         """rows, cameras: int (n,); rng: not needed."""
         self.observations, self.rows, self.cameras = observations, rows, cameras

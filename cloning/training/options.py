@@ -74,19 +74,14 @@ class Command(NamedTuple):
 
 # The options that set fields of the recipe, and those of them that have no effect with --robust.
 COPIES = f"how often a recording counts whose name ends in {' or '.join(PROBLEM_AREAS)}"
+count, any_number = number(int, 1, MAX_COUNT), number(float)
 FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
-    "epochs": (number(int, 1, MAX_COUNT), "epochs in total; may be raised with --resume"),
+    "epochs": (count, "epochs in total; may be raised with --resume"),
     "batch_size": (number(int, 1, MAX_BATCH), "observations in a batch; each gives 3.7 images on average"),
     "learning_rate": (number(float, 1e-9, 10), "learning rate of Adam or, with --robust, of Muon"),
-    "samples_per_epoch": (
-        number(int, 1, MAX_COUNT),
-        "smallest number of images in an epoch; a fifth as many observations validate it",
-    ),
-    "throttle_threshold": (number(float), "drop rows with less throttle, 0 to 1"),
-    "side_correction": (
-        number(float),
-        "steering added to the label of left images, subtracted from that of right ones",
-    ),
+    "samples_per_epoch": (count, "smallest number of images in an epoch; a fifth as many observations validate it"),
+    "throttle_threshold": (any_number, "drop rows with less throttle, 0 to 1"),
+    "side_correction": (any_number, "steering added to the label of left images, subtracted from that of right ones"),
     "repeats": (number(int, 1, MAX_REPEATS), COPIES),
     "disturbed": (number(float, 0, 1), "with --robust: share of the images in foul weather, or of a faulty camera"),
 }

@@ -13,7 +13,7 @@ import numpy as np
 
 from cloning.network.network import NETWORKS, Exposure
 from cloning.network.tensors import shown
-from cloning.training.muon import OPTIMIZERS
+from cloning.training.optimizers import OPTIMIZERS
 
 
 def no_choices(recipe: "Recipe", rng: np.random.Generator, n: int) -> tuple[np.ndarray, ...]:

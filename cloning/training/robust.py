@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator, default_rng
 
 from cloning.network.network import CROP, SEEN_SHAPE
 from cloning.recordings.format import LANE_FILE
@@ -91,7 +92,7 @@ def all_observations(observations: Observations, recipe: Recipe, seed: int) -> O
     return observations
 
 
-def sample_bends_more(observations: Observations, recipe: Recipe, rng: np.random.Generator) -> np.ndarray:
+def sample_bends_more(observations: Observations, recipe: Recipe, rng: Generator) -> np.ndarray:
     """Sample as many observations as there are, with replacement: int (n,), indices.
 
     Bends are sampled more often, and recordings of problem areas, as in the report.
@@ -104,12 +105,7 @@ class PoseViews:
     """Views of a batch's observations from a random pose for each augmentation; some of the poses are mirrored."""
 
     def __init__(
-        self,
-        observations: Observations,
-        rows: np.ndarray,
-        cameras: np.ndarray,
-        recipe: Recipe,
-        rng: np.random.Generator,
+        self, observations: Observations, rows: np.ndarray, cameras: np.ndarray, recipe: Recipe, rng: Generator
     ):
         """rows: int (n,), indices of observations; cameras: not needed, each pose has its own."""
         self.observations, self.rows, n = observations, rows, len(rows)
@@ -134,7 +130,7 @@ class PoseViews:
 def centre_and_poses(observations: Observations, recipe: Recipe, seed: int) -> list[ValidationSet]:
     """Return two validation sets: the centre images, and an image of each observation from a random pose."""
     unmirrored = np.zeros(len(observations), bool)
-    poses = observations.lanes.sample_poses(recipe, np.random.default_rng([seed, 5]), unmirrored)
+    poses = observations.lanes.sample_poses(recipe, default_rng([seed, 5]), unmirrored)
     return [
         ValidationSet(observations.center, observations.steering),
         ValidationSet(lambda rows: warped(observations, rows, [poses.take(rows)])[0], poses.steering),
