@@ -48,14 +48,8 @@ def _render(view: _View, transform: TransformState) -> list[bytes]:
 
 def sample(run: Run) -> dict[str, Any]:
     """Return what a recording keeps of the run's present state besides the images, as RecordingWriter.add takes it."""
-    return {
-        "time": run.time,
-        "steering": run.steering,
-        "throttle": max(0.0, run.throttle),
-        "brake": max(0.0, -run.throttle),
-        "speed": run.speed_mph,
-        "lane": run.lane,
-    }
+    numbers = (run.steering, max(0.0, run.throttle), max(0.0, -run.throttle), run.speed_mph)
+    return {"time": run.time, "numbers": numbers, "lane": run.lane}
 
 
 def write_row(recording: RecordingWriter, cameras: Cameras, run: Run) -> None:

@@ -19,9 +19,8 @@ from test_excluded import center
 
 from cloning.base.errors import ModelError
 from cloning.browse import analyse, analyses, attend, runs
-from cloning.browse.analyses import Analysis, stamp, write_result
+from cloning.browse.analyses import Analysis, UnknownError, stamp, write_result
 from cloning.browse.attention import Attention
-from cloning.browse.replays import NotReplayedError
 from cloning.network.attention import visual_backprop
 from cloning.network.network import load_checkpoint, load_model, steer
 from cloning.recordings.excluded import Cut, add_cuts
@@ -72,7 +71,7 @@ def test_a_replay_on_the_page_is_that_of_the_command(linked, model_file, tmp_pat
             assert np.abs(seen.astype(int) - decode(jpeg)).mean() < 0.5
             steered = recording.column("driver-0-1")[row + 5]
             assert steered == pytest.approx(float(steer(load_model(model_file), decode(jpeg))), abs=1e-6)
-        with pytest.raises(NotReplayedError):
+        with pytest.raises(UnknownError):
             recording.jpeg(4, "replay-0-1")
         add_cuts(linked, Cut(center(linked, 50), center(linked, 59), "crash"))
         assert recording.details("1")["replays"] == [{"state": "none"}], "of other cuts"

@@ -92,21 +92,15 @@ def end_on_interrupt(program: str, message: str = "stopped") -> None:
         signal.signal(signal.SIGINT, stop)
 
 
-def missing_library(error: ModuleNotFoundError) -> str:
-    """Return in a sentence which library is missing, and what to do."""
-    library = str(error.name).partition(".")[0]
-    return (
-        f"the library {library} is missing: activate the environment, in the project's folder (`{ACTIVATE}`); "
-        f"where that does not help, `pip install {PACKAGES.get(library, library)}`"
-    )
-
-
 def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """Print an error that ends the process: a missing library in one sentence, others with their traceback."""
-    if not isinstance(error, ModuleNotFoundError) or str(error.name).partition(".")[0] in OWN_PACKAGES:
+    library = str(error.name).partition(".")[0] if isinstance(error, ModuleNotFoundError) else None
+    if library is None or library in OWN_PACKAGES:
         sys.__excepthook__(kind, error, trace)
         return
-    print(f"{name}: {missing_library(error)}", file=sys.stderr, flush=True)
+    activate = f"activate the environment, in the project's folder (`{ACTIVATE}`)"
+    install = f"where that does not help, `pip install {PACKAGES.get(library, library)}`"
+    print(f"{name}: the library {library} is missing: {activate}; {install}", file=sys.stderr, flush=True)
     os._exit(FAILED)
 
 

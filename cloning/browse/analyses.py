@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from cloning.base.errors import RecordingError, message_of
+from cloning.base.errors import RecordingError, UserError, message_of
 from cloning.base.files import written_whole
 from cloning.recordings.check import cache_file
 from cloning.recordings.excluded import read_cuts
@@ -28,18 +28,17 @@ COMMAND = (sys.executable, "-m", "cloning.browse.analyse")
 PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
 
 
+class UnknownError(UserError):
+    """A recording, row, column or run that the page asks for and that does not exist."""
+
+
 @dataclass(frozen=True)
 class Analysis:
-    """What can be analysed in a recording.
+    """What can be analysed in a recording."""
 
-    kind   "lane": where the car is; "steering": a model's in each frame; "replay": a drive with a model as the driver
-    model  its file, unless the lane is analysed
-    limit  m from the reference line at which a replay counts an intervention
-    """
-
-    kind: str
-    model: str = ""
-    limit: float = 0.0
+    kind: str  # lane: where the car is; steering: a model's in each frame; replay: a drive with a model as the driver
+    model: str = ""  # its file, unless the lane is analysed
+    limit: float = 0.0  # m from the reference line at which a replay counts an intervention
 
 
 LANE = Analysis("lane")
@@ -48,16 +47,11 @@ Job = tuple[Path, Analysis]  # a recording's folder, and what is analysed in it
 
 @dataclass(frozen=True)
 class Result:
-    """What an analysis has found.
+    """What an analysis has found."""
 
-    images  int32 (k,): the centre images, as in `Recording.images`, that the columns belong to
-    columns float32 (k,), by name
-    about   everything else, in JSON's types
-    """
-
-    images: np.ndarray
-    columns: dict[str, np.ndarray]
-    about: dict[str, Any]
+    images: np.ndarray  # int32 (k,): the centre images, as in `Recording.images`, that the columns belong to
+    columns: dict[str, np.ndarray]  # float32 (k,), by name
+    about: dict[str, Any]  # everything else, in JSON's types
 
     def column(self, name: str, centres: np.ndarray) -> np.ndarray:
         """Return a column in the rows with these centre images: float32 (n,), nan in those not analysed."""

@@ -17,7 +17,7 @@ from cloning.base.film import FilmWriter, frame_rate
 from cloning.base.frame import FRAME
 from cloning.base.outputs import short_names
 from cloning.browse import replays, summary
-from cloning.browse.analyses import LANE, Analyses, Analysis, Result, file_stamp, read_result, stamp
+from cloning.browse.analyses import LANE, Analyses, Analysis, Result, UnknownError, file_stamp, read_result, stamp
 from cloning.browse.attention import Attention
 from cloning.browse.filter import matching, stretches_of
 from cloning.recordings.excluded import EXCLUDED, TAGS, Cut, add_cuts, cut_rows, delete_cuts, one_line, read_cuts
@@ -34,10 +34,6 @@ MAX_FILM = 300 * SAMPLE_RATE  # rows: five minutes, which take half a minute to 
 
 _wanted: dict[Path, threading.Lock] = {}
 _reading = threading.Lock()
-
-
-class UnknownError(UserError):
-    """A recording, row or column that the page asks for and that does not exist."""
 
 
 class Library:
@@ -265,7 +261,7 @@ class ShownRecording:
     def jpeg(self, row: int, picture: str, version: str | None = None) -> bytes:
         """Return the JPEG of a frame; picture: one of CAMERAS, or a replay's column: what its car sees there.
 
-        Raises UnknownError, NotReplayedError, and RecordingError if a frame is unusable.
+        Raises UnknownError, and RecordingError if a frame is unusable.
         """
         recording = self._with_row(row, version)
         replay, name = self.analysed.get(picture, (LANE, ""))

@@ -9,8 +9,8 @@ import flask
 import numpy as np
 
 from cloning.base.errors import UserError, message_of
-from cloning.browse.library import Library, ShownRecording, UnknownError
-from cloning.browse.replays import NotReplayedError
+from cloning.browse.analyses import UnknownError
+from cloning.browse.library import Library, ShownRecording
 from cloning.browse.runs import Runs
 from cloning.recordings.excluded import BYTES, EXCLUDED, TAGS, Cut, GoneError
 from cloning.road.autonomy import LIMITS
@@ -57,8 +57,8 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     @app.errorhandler(UserError)
     @app.errorhandler(OSError)
     def explain(error: UserError | OSError) -> tuple[dict[str, str], int]:
-        is_unknown = isinstance(error, UnknownError | NotReplayedError)
-        return {"message": message_of(error)}, 404 if is_unknown else 410 if isinstance(error, GoneError) else 409
+        status = 404 if isinstance(error, UnknownError) else 410 if isinstance(error, GoneError) else 409
+        return {"message": message_of(error)}, status
 
     @app.after_request
     def keep(response: flask.Response) -> flask.Response:

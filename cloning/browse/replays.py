@@ -4,17 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from cloning.base.errors import UserError
-from cloning.browse.analyses import Result
+from cloning.browse.analyses import Result, UnknownError
 from cloning.recordings.images import encode
 from cloning.recordings.log import Recording
 from cloning.replay.views import StretchViews
 from cloning.road.camera import VIEW_JPEG_QUALITY
 from cloning.road.motion import Stretch
-
-
-class NotReplayedError(UserError):
-    """A row that a replay left out: it is cut, has an unusable image, or is no part of two seconds of driving."""
 
 
 def rows_with(images: np.ndarray, centres: np.ndarray) -> np.ndarray:
@@ -42,10 +37,10 @@ def figures(result: Result, centres: np.ndarray) -> dict[str, Any]:
 
 
 def index_of(result: Result, image: int) -> int:
-    """Return the index of a centre image in the result's columns. Raises NotReplayedError."""
+    """Return the index of a centre image in the result's columns. Raises UnknownError for a row left out."""
     indices = np.flatnonzero(result.images == image)
     if not len(indices):
-        raise NotReplayedError("not replayed here: cut, an unusable image, off the road, or standing")
+        raise UnknownError("not replayed here: cut, an unusable image, off the road, or standing")
     return int(indices[-1])
 
 

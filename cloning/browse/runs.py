@@ -9,7 +9,7 @@ from typing import Any
 
 from cloning.base.errors import UserError, message_of
 from cloning.base.outputs import short_names
-from cloning.browse.library import UnknownError
+from cloning.browse.analyses import UnknownError
 from cloning.training.run_files import RunFiles, best_epoch, judged_by
 
 PICTURE = re.compile(r"training_generator_(LRC_|augmented-)([0-9]{1,12})\.png")

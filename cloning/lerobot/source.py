@@ -34,15 +34,11 @@ SIDES_MADE = (
 
 @dataclass(frozen=True)
 class Sample:
-    """A moment of a drive.
+    """A moment of a drive."""
 
-    time      s; a drive that begins earlier than the one before it ended is moved behind it
-    images    uint8 (rows, columns, 3), RGB, of any size: of the centre, left and right camera, or of the centre's alone
-    numbers   steering, right positive, and what the source has of throttle, which brakes below 0, brake, and speed, mph
-    """
-
-    time: float
-    images: list[np.ndarray]
+    time: float  # s; a drive that begins earlier than the one before it ended is moved behind it
+    images: list[np.ndarray]  # uint8 (rows, columns, 3), RGB, of any size: centre, left, right, or the centre's alone
+    # Steering, right positive, and what the source has of throttle, which brakes below 0, brake, and speed, mph.
     numbers: dict[str, float]
 
 

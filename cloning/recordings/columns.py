@@ -79,7 +79,6 @@ class UnclearRowError(ValueError):
     """A row is not understood; the message says what would settle it."""
 
     def __init__(self, finding: Finding, detail: str):
-        """Keep the finding, and the detail as the message."""
         super().__init__(detail)
         self.finding = finding
 

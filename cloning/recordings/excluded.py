@@ -32,17 +32,12 @@ _one_at_a_time = threading.Lock()  # for Windows, where no other lock is taken
 
 @dataclass(frozen=True)
 class Cut:
-    """A stretch that is cut, or tagged.
+    """A stretch that is cut, or tagged."""
 
-    first, last  file names of the centre images of its first and last row
-    reason       or the tag: one line of text, perhaps empty
-    line         in its file, from 1; 0 for one that is not written yet
-    """
-
-    first: str
-    last: str
-    reason: str
-    line: int = 0
+    first: str  # file name of the centre image of its first row
+    last: str  # and of its last row
+    reason: str  # or the tag: one line of text, perhaps empty
+    line: int = 0  # in its file, from 1; 0 for one that is not written yet
 
     def row(self) -> tuple[str, str, str]:
         """Return its fields, in the order of HEADERS."""

@@ -33,37 +33,23 @@ STAMP_SEPARATORS = [4, 7, 10, 13, 16, 19]  # where its underscores are
 
 @dataclass(frozen=True)
 class Recording(Table):
-    """The rows of one recording, sorted by their time stamps; without time stamps, in the order of the csv.
+    """The rows of one recording, sorted by their time stamps; without time stamps, in the order of the csv."""
 
-    folder     contains `driving_log.csv` and `IMG/`
-    names      bytes (m,): file names in `IMG/`, sorted, without duplicates
-    images     int32 (n, 3): indices into `names` of a row's centre, left and right image
-    steering   float32 (n,): -1..1, right positive
-    throttle   float32 (n,): 0..1
-    brake      float32 (n,): 0..1
-    speed      float32 (n,): mph
-    time       float64 (n,): seconds since 1970 by the recording computer's clock; without time stamps, line / 15
-    lines      int32 (n,): line in the csv, from 1
-    rows_read  rows in the csv, usable or not
-    repairs    rows that were interpreted: how -> [rows, first line]
-    rejected   rows that were left out
-    cuts       stretches that `excluded.csv` leaves out, and how many rows each leaves out that none before it does
-    frames     keeps decoded frames in memory for `road`; none unless `check_images` is given a larger one
-    """
-
-    folder: Path
-    names: np.ndarray
-    images: Column
-    steering: Column
-    throttle: Column
-    brake: Column
-    speed: Column
-    time: Column
-    lines: Column
-    rows_read: int
-    repairs: dict[str, list[int]] = field(default_factory=dict)
-    rejected: list[Rejected] = field(default_factory=list)
+    folder: Path  # contains `driving_log.csv` and `IMG/`
+    names: np.ndarray  # bytes (m,): file names in `IMG/`, sorted, without duplicates
+    images: Column  # int32 (n, 3): indices into `names` of a row's centre, left and right image
+    steering: Column  # float32 (n,): -1..1, right positive
+    throttle: Column  # float32 (n,): 0..1
+    brake: Column  # float32 (n,): 0..1
+    speed: Column  # float32 (n,): mph
+    time: Column  # float64 (n,): s since 1970 by the recording computer's clock; without time stamps, line / 15
+    lines: Column  # int32 (n,): line in the csv, from 1
+    rows_read: int  # rows in the csv, usable or not
+    repairs: dict[str, list[int]] = field(default_factory=dict)  # of rows read otherwise: how -> [rows, first line]
+    rejected: list[Rejected] = field(default_factory=list)  # rows that were left out
+    # Stretches that `excluded.csv` leaves out, and how many rows each leaves out that none before it does.
     cuts: list[tuple[Cut, int]] = field(default_factory=list)
+    # Keeps decoded frames in memory for `road`; none unless `check_images` is given a larger one.
     frames: FrameCache = field(default_factory=FrameCache)
 
     def without_copies(self) -> Self:
@@ -89,12 +75,9 @@ class Recording(Table):
 
 @dataclass(frozen=True, kw_only=True)
 class CheckedRecording(Recording):
-    """A recording whose images `check_images` has decoded.
+    """A recording whose images `check_images` has decoded."""
 
-    digests  uint64 (m,): of the image files' contents
-    """
-
-    digests: np.ndarray
+    digests: np.ndarray  # uint64 (m,): of the image files' contents
 
 
 def find_folders(given: Iterable[str | Path]) -> list[Path]:

@@ -76,18 +76,12 @@ def _encoding(path: Path) -> str:
 
 
 class RowReader:
-    """Reads the lines of a csv in their order, and then returns their rows.
-
-    rows_read  rows so far, usable or not
-    repairs    rows that were interpreted: how -> [rows, first line]
-    rejected   rows that were left out
-    """
+    """Reads the lines of a csv in their order, and then returns their rows."""
 
     def __init__(self) -> None:
-        """Begin a file."""
-        self.rows_read = 0
-        self.repairs: dict[str, list[int]] = {}
-        self.rejected: list[Rejected] = []
+        self.rows_read = 0  # so far, usable or not
+        self.repairs: dict[str, list[int]] = {}  # of rows that were interpreted: how -> [rows, first line]
+        self.rejected: list[Rejected] = []  # rows that were left out
         self._columns: tuple[str, ...] = COLUMNS  # below the last header, as `header_columns` returns them
         self._headers = {0: False}  # line -> whether it names all columns; 0 for none
         self._lines: list[int] = []  # of the rows

@@ -116,15 +116,12 @@ class SessionFolder:
 
     It is the time of its arrival, or, if the simulator tells its own time, that since the session's first frame: so a
     film of a simulator that waits for its answers plays as fast as the car drove.
-
-    saved, lost   frames that the thread has written, and could not write
-    error         why it lost the last one
     """
 
     def __init__(self, path: Path, jobs: Jobs):
         """jobs: the queue of the thread that writes the frames."""
         self.path, self._queue = path, jobs
-        self.saved, self.lost, self.error = 0, 0, ""
+        self.saved, self.lost, self.error = 0, 0, ""  # frames written, and not; why the last one was lost
         self._booted = datetime.now(UTC) - timedelta(seconds=time.monotonic())  # the clock may be set while it drives
         self._last = datetime.min.replace(tzinfo=UTC)  # time in the last frame's name
         self._zero: datetime | None = None  # of the simulator's clock

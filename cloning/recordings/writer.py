@@ -3,6 +3,7 @@
 import errno
 import math
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -69,24 +70,16 @@ class RecordingWriter:
         self.start = start
         self.rows = 0
 
-    def add(
-        self,
-        time: float,
-        images: list[bytes],
-        steering: float,
-        throttle: float,
-        brake: float,
-        speed: float,
-        lane: tuple[float, float],
-    ) -> None:
+    def add(self, time: float, images: list[bytes], numbers: Sequence[float], lane: tuple[float, float]) -> None:
         """Write a sample; time: simulated seconds; images: JPEGs of the centre, left and right camera.
 
-        steering, throttle: -1..1; brake: 0..1; speed: mph; lane: lateral offset, m, and heading error, radians, as in
-        `LanePosition`. Raises RecordingError if the disk is full; what was written of this sample is then removed.
+        numbers: steering, -1..1, throttle and brake, 0..1, speed, mph; lane: lateral offset, m, and heading error,
+        radians, as in `LanePosition`. Raises RecordingError if the disk is full; what was written of this sample is
+        then removed.
         """
         stamp = time_stamp(self.start + timedelta(seconds=time))
         paths = [self.images / f"{name}_{stamp}.jpg" for name in CAMERAS]
-        row = ",".join([*map(str, paths), *map(csharp_number, (steering, throttle, brake, speed))]) + "\n"
+        row = ",".join([*map(str, paths), *map(csharp_number, numbers)]) + "\n"
         header = "" if self.rows else ",".join(LANE_COLUMNS) + "\n"
         lane_row = f"{header}{paths[0].name},{lane[0]:.4f},{lane[1]:.5f}\n"
         sizes = {file: os.fstat(file.fileno()).st_size for file in (self.log, self.lane)}
@@ -103,9 +96,8 @@ class RecordingWriter:
                     os.ftruncate(file.fileno(), size)
                 for path in paths:
                     path.unlink(missing_ok=True)
-            raise RecordingError(
-                f"{self.folder}: {error.strerror}; the {self.rows} rows before it are complete"
-            ) from error
+            complete = f"the {self.rows} rows before it are complete"
+            raise RecordingError(f"{self.folder}: {error.strerror}; {complete}") from error
         self.rows += 1
 
     def begin_drive(self) -> None:

@@ -26,15 +26,11 @@ MOST_PIECES = 32  # a minute of driving
 
 
 class Piece(NamedTuple):
-    """A piece of a recording.
-
-    line  the driver's path
-    aim   m from the driver's car at the piece's end to where the network's should be, right positive
-    """
+    """A piece of a recording."""
 
     recording: Recording
-    line: ReferenceLine
-    aim: float
+    line: ReferenceLine  # the driver's path
+    aim: float  # m from the driver's car at the piece's end to where the network's should be, right positive
 
     def drift(self, driver: Driver) -> float:
         """Return how far from where it should be a driver's car is at the end, m. Raises what the driver raises."""

@@ -43,22 +43,14 @@ class NothingToReplay(RecordingError):
 
 @dataclass(frozen=True)
 class ReferenceLine:
-    """The line from which lateral offsets are measured, over one stretch of a recording.
+    """The line from which lateral offsets are measured, over one stretch of a recording."""
 
-    stretch         of the recording, or a part of one
-    offset          float64 (n,): m from the line to the human driver's car, right positive
-    yaw             float64 (n,): radians from the line to the human driver's heading, right positive
-    is_lane_centre  if not, the line is the human driver's path, and offset and yaw are 0
-    placed          rows in which the lane is not read from single frames: see `LanePosition`
-    ahead           the lane ahead at each row, along the same line, known or extended
-    """
-
-    stretch: Stretch
-    offset: np.ndarray
-    yaw: np.ndarray
-    is_lane_centre: bool
-    placed: int
-    ahead: LaneAhead
+    stretch: Stretch  # of the recording, or a part of one
+    offset: np.ndarray  # float64 (n,): m from the line to the human driver's car, right positive
+    yaw: np.ndarray  # float64 (n,): radians from the line to the human driver's heading, right positive
+    is_lane_centre: bool  # if not, the line is the human driver's path, and offset and yaw are 0
+    placed: int  # rows in which the lane is not read from single frames: see `LanePosition`
+    ahead: LaneAhead  # the lane ahead at each row, along the same line, known or extended
 
     @staticmethod
     def human_path(stretch: Stretch) -> "ReferenceLine":
@@ -75,26 +67,16 @@ class ReferenceLine:
 
 @dataclass
 class Drive:
-    """The result of one replay of a recording at one limit; each list has an entry per row driven.
+    """The result of one replay of a recording at one limit; each list has an entry per row driven."""
 
-    limit                m from the reference line
-    row                  of the recording
-    seconds              since the previous row of the same stretch
-    offset               m from the reference line, right positive
-    offset_from_human    m from the human driver's path, right positive
-    steering             the driver's, -1..1
-    human_steering       -1..1
-    interventions        the entry at which the car was set back -> its offset then, m
-    """
-
-    limit: float
-    row: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    offset: list[float] = field(default_factory=list)
-    offset_from_human: list[float] = field(default_factory=list)
-    steering: list[float] = field(default_factory=list)
-    human_steering: list[float] = field(default_factory=list)
-    interventions: dict[int, float] = field(default_factory=dict)
+    limit: float  # m from the reference line
+    row: list[int] = field(default_factory=list)  # of the recording
+    seconds: list[float] = field(default_factory=list)  # since the previous row of the same stretch
+    offset: list[float] = field(default_factory=list)  # m from the reference line, right positive
+    offset_from_human: list[float] = field(default_factory=list)  # m from the human driver's path, right positive
+    steering: list[float] = field(default_factory=list)  # the driver's, -1..1
+    human_steering: list[float] = field(default_factory=list)  # -1..1
+    interventions: dict[int, float] = field(default_factory=dict)  # entry at which the car was set back -> offset, m
 
     def autonomy(self) -> float:
         """Return NVIDIA's measure; see `autonomy.autonomy`."""

@@ -64,17 +64,12 @@ class Shots:
 
 
 class Lap(NamedTuple):
-    """A lap in the stand-in simulator.
+    """A lap in the stand-in simulator."""
 
-    title          the name of its picture
-    figures        in words; "" if its report is not beside the picture
-    picture, film  data URIs; film: "" if there is none
-    """
-
-    title: str
-    figures: str
-    picture: str
-    film: str
+    title: str  # the name of its picture
+    figures: str  # in words; "" if its report is not beside the picture
+    picture: str  # data URI, as the next
+    film: str  # "" if there is none
 
     @classmethod
     def of(cls, picture: Path, most: int) -> "Lap":

@@ -96,25 +96,18 @@ CAMERA_POSITIONS = {
 MOUNT_PITCH = 8.0
 
 
-def mounting_rotation() -> np.ndarray:
-    """Return the matrix that takes directions in the car to directions in the camera: float64 (3, 3).
-
-    In the car: (right, forward, up); in the camera: (right, ahead, up).
-    """
-    yaw, pitch, roll = np.radians((CAMERA_YAW, MOUNT_PITCH, CAMERA_ROLL))
-    by_yaw = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    by_pitch = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
-    by_roll = np.array([[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]])
-    return by_roll @ by_pitch @ by_yaw
-
-
 def height_at_rows(rows: np.ndarray, right: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """Return the height at which a point of the car appears in a given row of the centre camera's frame: float64, m.
 
     rows: of the frame; right, forward: m from the car's origin to the point, whose height is measured from there, too.
     The arguments are broadcast.
     """
-    _, ahead, up = mounting_rotation()
+    yaw, pitch, roll = np.radians((CAMERA_YAW, MOUNT_PITCH, CAMERA_ROLL))
+    by_yaw = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    by_pitch = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    by_roll = np.array([[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]])
+    # From directions in the car, (right, forward, up), to those in the camera, (right, ahead, up).
+    _, ahead, up = by_roll @ by_pitch @ by_yaw
     x, y, z = np.array(CAMERA_POSITIONS["center"])
     slope = (FRAME[0] / 2 - np.asarray(rows, float)) / FOCAL_LENGTH
     level = up - slope[..., None] * ahead  # its product with the direction from the camera to the point is zero

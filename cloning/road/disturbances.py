@@ -22,17 +22,13 @@ STRENGTHS = (1, 2, 3, 4, 5)
 
 
 class Kind(NamedTuple):
-    """A kind of disturbance.
+    """A kind of disturbance."""
 
-    change     (image, parameter, seed, frame) -> the changed image, both uint8 (rows, columns, 3), RGB; seed: of what
-               lasts for a drive; frame: random numbers of one frame
-    strengths  the parameter of each strength
-    caption    what the parameter is
-    """
-
+    # (image, parameter, seed, frame) -> the changed image, both uint8 (rows, columns, 3), RGB; seed: of what lasts for
+    # a drive; frame: random numbers of one frame.
     change: Callable[[np.ndarray, float, int, Generator], np.ndarray]
-    strengths: tuple[float, float, float, float, float]
-    caption: str
+    strengths: tuple[float, float, float, float, float]  # the parameter of each strength
+    caption: str  # what the parameter is
 
 
 def _drive(seed: int) -> Generator:

@@ -23,34 +23,20 @@ APART = 50.0  # m or more along the road are between two parts of it that must k
 
 @dataclass(frozen=True)
 class Course:
-    """What all generated roads of one kind have in common; ranges are (least, most).
+    """What all generated roads of one kind have in common; ranges are (least, most)."""
 
-    seed        of their random numbers, before a road's own number
-    corners     of the polygon
-    nearest     range of the distance from the middle to the nearest corner, as a share of that to the farthest
-    radius      m, of the centre line, at least
-    rounding    m over which corners are averaged, so that the steering need not jump at them
-    turns       full circles that the bends to both sides have together, at least
-    clearance   m between the centre lines of two parts of the road
-    flat        share of roads without hills
-    wave        m, the shortest wave of the hills
-    grade       the steepest, dz/ds
-    steepness   range of a road's steepest grade, as a share of `grade`
-    crest       m, radius of the height over the distance, at least
-    """
-
-    seed: tuple[int, ...]
-    corners: tuple[int, int]
-    nearest: tuple[float, float]
-    radius: float
-    rounding: float
-    turns: tuple[float, float]
-    clearance: float
-    flat: float
-    wave: float
-    grade: float
-    steepness: tuple[float, float]
-    crest: float
+    seed: tuple[int, ...]  # of their random numbers, before a road's own number
+    corners: tuple[int, int]  # of the polygon
+    nearest: tuple[float, float]  # distance from the middle to the nearest corner, as a share of that to the farthest
+    radius: float  # m, of the centre line, at least
+    rounding: float  # m over which corners are averaged, so that the steering need not jump at them
+    turns: tuple[float, float]  # full circles that the bends to both sides have together, at least
+    clearance: float  # m between the centre lines of two parts of the road
+    flat: float  # share of roads without hills
+    wave: float  # m, the shortest wave of the hills
+    grade: float  # the steepest, dz/ds
+    steepness: tuple[float, float]  # a road's steepest grade, as a share of `grade`
+    crest: float  # m, radius of the height over the distance, at least
 
 
 COURSES = {
@@ -90,26 +76,16 @@ NAME = re.compile(f"({'|'.join(COURSES)})-([1-9][0-9]{{0,8}})")
 
 @dataclass(frozen=True, eq=False)
 class PointRoad:
-    """A road given by the points of its centre line; roads of the same content are equal.
+    """A road given by the points of its centre line; roads of the same content are equal."""
 
-    name     of the track
-    points   float64 (n, 3): m east, north and up; the first point of a closed loop is not repeated
-    width    m, of the road surface
-    marking  one of MARKINGS
-    land     one of LANDS
-    closed   whether it is a loop; an open road is driven from its first point to its last
-    lead     m that an open road goes on straight before its first and after its last point
-    seed     of the random numbers of its land and light
-    """
-
-    name: str
-    points: np.ndarray
-    width: float
-    marking: str
-    land: str
-    closed: bool = True
-    lead: float = 0.0
-    seed: int = 0
+    name: str  # of the track
+    points: np.ndarray  # float64 (n, 3): m east, north and up; the first point of a closed loop is not repeated
+    width: float  # m, of the road surface
+    marking: str  # one of MARKINGS
+    land: str  # one of LANDS
+    closed: bool = True  # whether it is a loop; an open road is driven from its first point to its last
+    lead: float = 0.0  # m that an open road goes on straight before its first and after its last point
+    seed: int = 0  # of the random numbers of its land and light
 
     def _content(self) -> tuple[object, ...]:
         return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in vars(self).values())
@@ -165,7 +141,9 @@ def draw_loop(rng: Generator, course: Course, winding: float) -> np.ndarray | No
     length = len(loop) * SPACING
     if not MIN_LENGTH + SPACING < length < MAX_LENGTH - SPACING or np.abs(bends).max() * 1.02 > 1 / course.radius:
         return None
-    if np.abs(bends).sum() * SPACING < winding or closest_approach(loop) < course.clearance:
+    shifts = range(round(APART / SPACING), len(loop) // 2 + 1)
+    nearest = (np.linalg.norm(loop - np.roll(loop, shift, axis=0), axis=1).min() for shift in shifts)
+    if np.abs(bends).sum() * SPACING < winding or min(nearest) < course.clearance:
         return None
     start = np.argmin(moving_average(np.abs(bends)[:, None], round(40 / SPACING))[:, 0])  # where it is straightest
     return np.roll(loop, -start, axis=0) - (loop.min(axis=0) + loop.max(axis=0)) / 2
@@ -213,14 +191,6 @@ def curvatures(loop: np.ndarray) -> np.ndarray:
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     sides = [np.linalg.norm(side, axis=1) for side in (before, after, before + after)]
     return 2 * cross / np.prod(sides, axis=0)
-
-
-def closest_approach(loop: np.ndarray) -> float:
-    """Return the smallest distance in m between parts of a closed curve that are APART along it."""
-    n, skipped = len(loop), round(APART / SPACING)
-    return min(
-        float(np.linalg.norm(loop - np.roll(loop, shift, axis=0), axis=1).min()) for shift in range(skipped, n // 2 + 1)
-    )
 
 
 def hills(rng: Generator, course: Course, n: int) -> np.ndarray:

@@ -83,20 +83,14 @@ class Stretch:
     radians per m/s² of lateral acceleration; a recorded car is localised on the track best with 0.005, and what its
     cameras show fits the track better with it than without in two real recordings of the jungle, too. Only the
     localisation on a track counts it: the trajectory and the recovery steering are those of a car that does not slide.
-
-    rows            of the recording
-    right, forward  float64 (n,): m, position of the rear axle's middle, in the frame of its pose in the first row
-    heading         float64 (n,): radians, right positive, 0 in the first row
-    driven          float64 (n,): m since the first row
-    slip            float64 (n - 1,): radians from the heading to the path, between rows, right positive
     """
 
-    rows: slice
-    right: np.ndarray
-    forward: np.ndarray
-    heading: np.ndarray
-    driven: np.ndarray
-    slip: np.ndarray
+    rows: slice  # of the recording
+    right: np.ndarray  # float64 (n,): m, of the rear axle's middle, in the frame of its pose in the first row
+    forward: np.ndarray  # likewise
+    heading: np.ndarray  # float64 (n,): radians, right positive, 0 in the first row
+    driven: np.ndarray  # float64 (n,): m since the first row
+    slip: np.ndarray  # float64 (n - 1,): radians from the heading to the path, between rows, right positive
 
     def __len__(self) -> int:
         return len(self.driven)

@@ -16,53 +16,37 @@ LEFT, RIGHT = -1, 1  # sides of a road, with the signs of lateral offsets
 
 @dataclass(frozen=True)
 class Pose:
-    """A pose on the road: position in metres, heading in radians, grade.
+    """A pose on the road."""
 
-    x is east, y north, z up; heading is 0 towards the east and grows counter-clockwise; grade is dz/ds.
-    """
-
-    x: float
-    y: float
-    z: float
-    heading: float
-    grade: float
+    x: float  # m, east
+    y: float  # m, north
+    z: float  # m, up
+    heading: float  # radians, 0 towards the east, growing counter-clockwise
+    grade: float  # dz/ds
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of one side of a road, in the direction in which the track's points are listed.
+    """A section of one side of a road, in the direction in which the track's points are listed."""
 
-    side        LEFT or RIGHT
-    start, end  metres along the centre line; a negative start lies before the first point
-    """
-
-    side: int
-    start: float
+    side: int  # LEFT or RIGHT
+    start: float  # m along the centre line; negative before the first point
     end: float
 
 
 @dataclass(frozen=True)
 class Road:
-    """The properties of a track besides its centre line.
+    """The properties of a track besides its centre line."""
 
-    forward               direction in which its points are listed, "cw" or "ccw"; the real simulator's direction
-    edge                  metres from the centre line to the edge of the road surface
-    bridge                its start and end, metres along the centre line; equal where there is none
-    bridge_edge           as edge, on the bridge; None if it is the same
-    kerbs, kerb_edge      sections with a kerb, and the edge of the road surface there
-    centre_line           whether a line is painted along the centre
-    training, autonomous  x, y at which these modes start, in metres; None: the first point listed
-    """
-
-    forward: str
-    edge: float
-    bridge: tuple[float, float] = (0.0, 0.0)
-    bridge_edge: float | None = None
-    kerbs: tuple[Section, ...] = ()
-    kerb_edge: float = 0.0
-    centre_line: bool = False
-    training: tuple[float, float] | None = None
-    autonomous: tuple[float, float] | None = None
+    forward: str  # direction in which its points are listed, "cw" or "ccw"; the real simulator's direction
+    edge: float  # m from the centre line to the edge of the road surface
+    bridge: tuple[float, float] = (0.0, 0.0)  # its start and end, m along the centre line; equal where there is none
+    bridge_edge: float | None = None  # as edge, on the bridge; None if it is the same
+    kerbs: tuple[Section, ...] = ()  # sections with a kerb
+    kerb_edge: float = 0.0  # as edge, where there is a kerb
+    centre_line: bool = False  # whether a line is painted along the centre
+    training: tuple[float, float] | None = None  # x, y where this mode starts, m; None: at the first point listed
+    autonomous: tuple[float, float] | None = None  # likewise
 
 
 # The real simulator's two. Kerbs and bridges were measured in its recordings, aligned to the centre lines.
@@ -116,21 +100,19 @@ def centre_line(source: str | PointRoad) -> np.ndarray:
 
 
 class Track:
-    """A track driven in one direction, as points about 1 m apart; s is the distance from the first point in metres.
+    """A track driven in one direction, as points about 1 m apart; s is the distance from the first point in metres."""
 
-    points     float64 (n, 3): m
-    heading    float64 (n,): radians, continuous
-    rightward  float64 (n, 2): unit vectors to the right
-    curvature  float64 (n,): 1/m, right positive
-    grade      float64 (n,): dz/ds
-    edges      float64 (n, 2): metres from the centre line to the left and the right edge of the road surface
-    length     of a lap, m
-    step       between two points, m
-    source     what it was made from, see `find_points`
-    closed     whether it is a loop
-    first      number of points before s = 0: an open road goes on straight beyond both ends
-    starts     s at which the modes "training" and "autonomous" start
-    """
+    points: np.ndarray  # float64 (n, 3): m
+    heading: np.ndarray  # float64 (n,): radians, continuous
+    rightward: np.ndarray  # float64 (n, 2): unit vectors to the right
+    curvature: np.ndarray  # float64 (n,): 1/m, right positive
+    grade: np.ndarray  # float64 (n,): dz/ds
+    edges: np.ndarray  # float64 (n, 2): m from the centre line to the left and the right edge of the road surface
+    length: float  # of a lap, m
+    step: float  # between two points, m
+    closed: bool  # whether it is a loop
+    first: int  # number of points before s = 0: an open road goes on straight beyond both ends
+    starts: dict[str, float]  # s at which the modes "training" and "autonomous" start
 
     def __init__(self, source: str | PointRoad, direction: str | None = None):
         """Load a track; source: see `find_points`; direction: "cw", "ccw" or None for the road's `forward`.
@@ -148,7 +130,6 @@ class Track:
         self.direction, self.closed = direction or road.forward, of_points is None or of_points.closed
         if listed.shape[1] == 2:
             listed = np.c_[listed, np.zeros(len(listed))]
-        self.points: np.ndarray
         self._place_points(listed, of_points.lead if of_points else 0.0)
         n = len(self.points)
         self.edges = np.full((n, 2), road.edge)

@@ -57,23 +57,16 @@ HUBER = {"squared": None, "huber": 0.1}  # the loss, in checkpoints of earlier v
 
 @dataclass
 class Progress:
-    """The progress of a run.
+    """The progress of a run."""
 
-    number                 of the next batch, from 0, counted over all epochs
-    images, loss, seconds  so far in this epoch; loss is the sum of squared errors
-    smooth                 mean loss of the last batches: an exponential moving average over some 10
-    trail                  smooth after every `trail_every` batches, of all epochs: the losses within them
-    history                the metrics of each finished epoch
-    run                    a random identifier, by which a run recognises its own files; None from an earlier version
-    """
-
-    number: int = 0
-    images: int = 0
-    loss: float = 0.0
+    number: int = 0  # of the next batch, counted over all epochs
+    images: int = 0  # so far in this epoch, as the next two
+    loss: float = 0.0  # sum of squared errors
     seconds: float = 0.0
-    smooth: float = 0.0
-    trail: list[float] = field(default_factory=list)
-    history: list[EpochMetrics] = field(default_factory=list)
+    smooth: float = 0.0  # mean loss of the last batches: an exponential moving average over some 10
+    trail: list[float] = field(default_factory=list)  # smooth after every `trail_every` batches, of all epochs
+    history: list[EpochMetrics] = field(default_factory=list)  # the metrics of each finished epoch
+    # A random identifier, by which a run recognises its own files; None from an earlier version.
     run: str | None = field(default_factory=lambda: uuid.uuid4().hex)
 
     def as_json(self) -> dict[str, Any]:
@@ -130,21 +123,18 @@ class Progress:
 
 
 class SavedRun(NamedTuple):
-    """A checkpoint of a run, which is to be continued.
-
-    contents  of the file, of which network and optimizer are not looked at yet
-    """
+    """A checkpoint of a run, which is to be continued."""
 
     path: Path
     run: Run
     progress: Progress
-    contents: dict[str, Any]
+    contents: dict[str, Any]  # of the file, of which network and optimizer are not looked at yet
 
 
 class FirstWeights(NamedTuple):
-    """The weights with which a new run begins; contents: of the model file, which fit this program's network."""
+    """The weights with which a new run begins."""
 
-    contents: dict[str, Any]
+    contents: dict[str, Any]  # of the model file, which fit this program's network
 
 
 def read_first_weights(path: str, recipe: Recipe) -> FirstWeights:

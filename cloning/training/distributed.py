@@ -21,12 +21,11 @@ class FirstRankFailed(UserError):
 class Ranks:
     """The processes of a run, one for each rank; without torchrun there is one, of rank 0.
 
-    rank   of this process; rank 0 reads the recordings, prints, and writes the files
-    world  number of processes
+    Rank 0 reads the recordings, prints, and writes the files.
     """
 
     def __init__(self, rank: int = 0, world: int = 1):
-        """Know a rank among so many, of which nothing is started; `join` finds those that torchrun started."""
+        """rank: of this process; world: number of processes; `join` finds those that torchrun started."""
         self.rank, self.world = rank, world
 
     @classmethod

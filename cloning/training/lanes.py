@@ -31,14 +31,10 @@ VIEW = CroppedView(CROP)
 
 @dataclass(frozen=True)
 class Lanes(LaneAhead):
-    """The lane ahead at each of n rows of recordings, and an earlier row that shows what a warped frame lacks.
+    """The lane ahead at each of n rows of recordings, and an earlier row that shows what a warped frame lacks."""
 
-    earlier  int32 (n,): the recording's row EARLIER_FRAME metres earlier, or the first one of the stretch
-    moved    float32 (n, 3): the rear axle in the earlier row, relative to this one: m right, m forward, radians
-    """
-
-    earlier: Column
-    moved: Column
+    earlier: Column  # int32 (n,): the recording's row EARLIER_FRAME metres earlier, or the first one of the stretch
+    moved: Column  # float32 (n, 3): rear axle in the earlier row, relative to this one: m right, m forward, radians
 
     @classmethod
     def unknown(cls, n: int) -> Self:
@@ -102,29 +98,19 @@ class Lanes(LaneAhead):
 
 @dataclass(frozen=True)
 class Poses(Table):
-    """The poses from which n rows are seen, with everything that is needed to make their images.
+    """The poses from which n rows are seen, with everything that is needed to make their images."""
 
-    offset    float (n,): lateral offset from the lane's centre, m; as the next, before the world is mirrored
-    yaw       float (n,): heading error, radians
-    camera    int (n,): the camera whose frame is warped: 0 centre, 1 left, 2 right
-    mirrored  bool (n,): whether the image shows the mirrored world, as seen by the same, slightly rolled camera
-    warps     float64 (n, 2, 2, 3, 3): homographies from a frame's `ROAD_ROWS` to what the network sees: from the
-              row's own frame and from the earlier one, for the ground and for the sky
-    steering  float32 (n,): the label, -1..1
-    colours   float32 (n, 3, 3): matrices by which (red, green, blue) is multiplied, see `light.tints`
-    shade     int16 (n,): shadows, see `light.sample_shades`
-    disturbance  int32 (n,): foul weather and the like, see `light.sample_disturbances`
-    """
-
-    offset: Column
-    yaw: Column
-    camera: Column
-    mirrored: Column
+    offset: Column  # float (n,): lateral offset from the lane's centre, m; as the next, before the world is mirrored
+    yaw: Column  # float (n,): heading error, radians
+    camera: Column  # int (n,): the camera whose frame is warped: 0 centre, 1 left, 2 right
+    mirrored: Column  # bool (n,): whether the image shows the mirrored world, seen by the same, slightly rolled camera
+    # float64 (n, 2, 2, 3, 3): homographies from a frame's `ROAD_ROWS` to what the network sees, from the row's own
+    # frame and from the earlier one, for the ground and for the sky.
     warps: Column
-    steering: Column
-    colours: Column
-    shade: Column
-    disturbance: Column
+    steering: Column  # float32 (n,): the label, -1..1
+    colours: Column  # float32 (n, 3, 3): matrices by which (red, green, blue) is multiplied, see `light.tints`
+    shade: Column  # int16 (n,): shadows, see `light.sample_shades`
+    disturbance: Column  # int32 (n,): foul weather and the like, see `light.sample_disturbances`
 
     @classmethod
     def of(cls, lanes: Lanes, offset: np.ndarray, yaw: np.ndarray, camera: np.ndarray, mirrored: np.ndarray) -> Self:

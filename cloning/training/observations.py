@@ -25,31 +25,20 @@ from cloning.training.recipe import Recipe
 
 
 class ValidationSet(NamedTuple):
-    """Images and labels for validation.
+    """Images and labels for validation."""
 
-    images  from indices of observations, int (k,), to their images, uint8 (k, 75, 320, 3), RGB
-    labels  float32 (n,): steering of all observations, -1..1
-    """
-
-    images: Callable[[np.ndarray], np.ndarray]
-    labels: np.ndarray
+    images: Callable[[np.ndarray], np.ndarray]  # from indices, int (k,), to images, uint8 (k, 75, 320, 3), RGB
+    labels: np.ndarray  # float32 (n,): steering of all observations, -1..1
 
 
 class Example(NamedTuple):
-    """One observation for the diagnostic pictures.
+    """One observation for the diagnostic pictures."""
 
-    frames         uint8 (160, 320, 3), RGB: of the centre, left and right camera
-    camera_labels  float32 (3,): their labels
-    images         uint8 (1, rows, 320, 3) for each augmentation: before it changes them
-    first_row      the row of the full frame that is the first of `images`
-    titles         of these images
-    """
-
-    frames: list[np.ndarray]
-    camera_labels: np.ndarray
-    images: list[np.ndarray]
-    first_row: int
-    titles: list[str]
+    frames: list[np.ndarray]  # uint8 (160, 320, 3), RGB: of the centre, left and right camera
+    camera_labels: np.ndarray  # float32 (3,): their labels
+    images: list[np.ndarray]  # uint8 (1, rows, 320, 3) for each augmentation: before it changes them
+    first_row: int  # the row of the full frame that is the first of `images`
+    titles: list[str]  # of these images
 
 
 class Views(Protocol):
@@ -71,46 +60,28 @@ class Views(Protocol):
 
 
 class Choices(NamedTuple):
-    """The random choices for one batch: n observations, from which m images are made.
+    """The random choices for one batch: n observations, from which m images are made."""
 
-    observation  int (n,): indices of the observations
-    camera       int (n,): the camera whose image is used, 0 centre, 1 left, 2 right
-    slots        int (n, augmentations): where in the batch each image is, -1 if it is not made
-    keep         bool (m, 4224): the units of the flattened layer that dropout keeps; None: all
-    augmenting   each augmentation's choices: arrays of n entries each
-    views        the images before augmentation, and the labels
-    """
-
-    observation: np.ndarray
-    camera: np.ndarray
-    slots: np.ndarray
-    keep: np.ndarray | None
-    augmenting: list[tuple[np.ndarray, ...]]
-    views: Views
+    observation: np.ndarray  # int (n,): indices of the observations
+    camera: np.ndarray  # int (n,): the camera whose image is used, 0 centre, 1 left, 2 right
+    slots: np.ndarray  # int (n, augmentations): where in the batch each image is, -1 if it is not made
+    keep: np.ndarray | None  # bool (m, 4224): the units of the flattened layer that dropout keeps; None: all
+    augmenting: list[tuple[np.ndarray, ...]]  # each augmentation's choices: arrays of n entries each
+    views: Views  # the images before augmentation, and the labels
 
 
 @dataclass(frozen=True)
 class Observations(Table):
-    """Observations in columns: one entry for each row of a recording that is used, or for a copy of it.
+    """Observations in columns: one entry for each row of a recording that is used, or for a copy of it."""
 
-    recordings  the Recordings that the rows come from
-    recording   int16 (n,): index into `recordings`
-    row         int32 (n,): row of that recording
-    steering    float32 (n,): the label, -1..1, right positive
-    frame       uint64 (n,): digest of the centre image's file
-    time        float64 (n,): seconds
-    lanes       the lane at each of them, which the report's training does not know
-    gpu         their frames in a GPU's memory, if images are made there
-    """
-
-    recordings: list[Recording]
-    recording: Column
-    row: Column
-    steering: Column
-    frame: Column
-    time: Column
-    lanes: Lanes
-    gpu: GpuFrames | None = None
+    recordings: list[Recording]  # that the rows come from
+    recording: Column  # int16 (n,): index into `recordings`
+    row: Column  # int32 (n,): row of that recording
+    steering: Column  # float32 (n,): the label, -1..1, right positive
+    frame: Column  # uint64 (n,): digest of the centre image's file
+    time: Column  # float64 (n,): seconds
+    lanes: Lanes  # the lane at each of them, which the report's training does not know
+    gpu: GpuFrames | None = None  # their frames in a GPU's memory, if images are made there
 
     @classmethod
     def of_rows(cls, recording: CheckedRecording, rows: np.ndarray, steering: np.ndarray, lanes: Lanes) -> Self:

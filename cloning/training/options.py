@@ -23,16 +23,12 @@ SAVE_SECONDS = 30.0  # between two saved states: the most work that a killed run
 
 @dataclass(frozen=True)
 class Run:
-    """What belongs to a training run, and is saved with it.
-
-    recordings  folders of recordings, or of folders with recordings
-    from_model  the model file with whose weights the run begins; "": random weights
-    """
+    """What belongs to a training run, and is saved with it."""
 
     recipe: Recipe
-    recordings: tuple[str, ...] = ("data",)
+    recordings: tuple[str, ...] = ("data",)  # folders of recordings, or of folders with recordings
     seed: int = 0
-    from_model: str = ""
+    from_model: str = ""  # the model file with whose weights the run begins; "": random weights
 
     def saved(self) -> dict[str, Any]:
         """Return the run as plain values, for a checkpoint."""
@@ -42,34 +38,25 @@ class Run:
 
 @dataclass(frozen=True)
 class Process:
-    """What belongs to one process of a run: a run may be resumed with others.
+    """What belongs to one process of a run: a run may be resumed with others."""
 
-    output        the model file; all other files are written to its folder
-    device        one of DEVICES
-    save_seconds  between two saved states
-    """
-
-    output: str = "model.pt"
-    device: str = "auto"
+    output: str = "model.pt"  # the model file; all other files are written to its folder
+    device: str = "auto"  # one of DEVICES
     strict: bool = False
     resume: bool = False
-    save_seconds: float = SAVE_SECONDS
+    save_seconds: float = SAVE_SECONDS  # between two saved states
 
 
 EVERY_NAME = frozenset(item.name for kind in (Run, Recipe) for item in fields(kind)) - {"recordings"}
 
 
 class Command(NamedTuple):
-    """What model.py is asked to do.
-
-    given    the names of the run's and the recipe's fields that the user gave, and "robust"; EVERY_NAME: all
-    recipes  those that a checkpoint may have been trained by, by their names
-    """
+    """What model.py is asked to do."""
 
     run: Run
     process: Process
-    given: frozenset[str]
-    recipes: Mapping[str, Recipe]
+    given: frozenset[str]  # names of the run's and recipe's fields that the user gave, and "robust"; EVERY_NAME: all
+    recipes: Mapping[str, Recipe]  # those that a checkpoint may have been trained by, by their names
 
 
 # The options that set fields of the recipe, and those of them that have no effect with --robust.

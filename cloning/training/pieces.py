@@ -26,18 +26,12 @@ PIECE = 28  # images at most: their activations fit a CPU's cache, which is twic
 
 @dataclass
 class Batch:
-    """One process's share of a batch.
+    """One process's share of a batch."""
 
-    images  uint8 (n, 75, 320, 3), RGB, cropped; a tensor if they were made on a GPU
-    labels  float32 (n,): steering, -1..1
-    keep    bool (n, units): the units of the flattened layer that dropout keeps; None: all
-    total   images in the whole batch, of all processes
-    """
-
-    images: Any
-    labels: np.ndarray
-    keep: np.ndarray | None
-    total: int
+    images: Any  # uint8 (n, 75, 320, 3), RGB, cropped; a tensor if they were made on a GPU
+    labels: np.ndarray  # float32 (n,): steering, -1..1
+    keep: np.ndarray | None  # bool (n, units): the units of the flattened layer that dropout keeps; None: all
+    total: int  # images in the whole batch, of all processes
 
     def part(self, piece: slice) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
         """Return some images, their labels, and the units that are kept."""

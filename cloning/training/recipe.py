@@ -27,43 +27,28 @@ def unchanged(images: np.ndarray, first_row: int) -> np.ndarray:
 
 
 class Augmentation(NamedTuple):
-    """A kind of image that batches contain of their observations.
+    """A kind of image that batches contain of their observations."""
 
-    name     identifies it
-    change   (images, first_row, *choices) -> the changed images, uint8 (k, rows, 320, 3), RGB, as `images`, which is
-             not to be changed itself; first_row: the row of the full frame that is the images' first; choices: those of
-             these k images
-    choose   (recipe, rng, n) -> the random choices for n observations: arrays of n entries each
-    share    of the observations that have such an image, 0..1, or the name of the recipe's field that says it
-    mirrors  whether it begins with the mirrored image, and the negative label
-    caption  of the diagnostic picture: a format for the choices, such as "brightness x {:.2f}"
-    """
-
-    name: str
+    name: str  # identifies it
+    # (images, first_row, *choices) -> the changed images, uint8 (k, rows, 320, 3), RGB, as `images`, which is not to be
+    # changed itself; first_row: the row of the full frame that is the images' first; choices: those of these k images.
     change: Callable[..., np.ndarray] = unchanged
+    # (recipe, rng, n) -> the random choices for n observations: arrays of n entries each
     choose: Callable[["Recipe", np.random.Generator, int], tuple[np.ndarray, ...]] = no_choices
-    share: float | str = 1.0
-    mirrors: bool = False
-    caption: str = ""
+    share: float | str = 1.0  # of the observations that have it, 0..1, or the name of the recipe's field that says it
+    mirrors: bool = False  # whether it begins with the mirrored image, and the negative label
+    caption: str = ""  # of the diagnostic picture: a format for the choices, such as "brightness x {:.2f}"
 
 
 class Words(NamedTuple):
-    """What a run prints of its recipe.
+    """What a run prints of its recipe."""
 
-    dropped       what `select` drops, as the title of a column; a format for `recipe`
-    too_few       the reason if it leaves too few rows
-    label_source  whose steering the label is
-    aimed_at      where the car should be
-    remedy        what helps a network that drives badly
-    val_loss      how it differs from the errors of the summary's table, after a line end; "" if it does not
-    """
-
-    dropped: str
-    too_few: str
-    label_source: str
-    aimed_at: str
-    remedy: str
-    val_loss: str
+    dropped: str  # what `select` drops, as the title of a column; a format for `recipe`
+    too_few: str  # the reason if it leaves too few rows
+    label_source: str  # whose steering the label is
+    aimed_at: str  # where the car should be
+    remedy: str  # what helps a network that drives badly
+    val_loss: str  # how it differs from the errors of the summary's table, after a line end; "" if it does not
 
 
 @dataclass(frozen=True)

@@ -26,13 +26,11 @@ class StopSignals:
 
     SIGHUP is that of a closed terminal; what is printed after it is lost. What the process ignores already, as after
     `nohup`, it still does.
-
-    received  the number of the signal, 0 without one
     """
 
     def __init__(self) -> None:
-        """Install no handlers yet; entering the context does."""
-        self.received, self._waiting = 0, False
+        self.received = 0  # the number of the signal, 0 without one
+        self._waiting = False
 
     def __enter__(self) -> "StopSignals":
         self._terminals = [file for file in (1, 2) if os.isatty(file)]
