@@ -35,8 +35,7 @@ class FilmWriter:
     """Writes an mp4 film: H.264 in yuv420p, which browsers and desktop players show.
 
     PyAV's wheel contains FFmpeg's libraries with x264, so there is no program to install. Use one writer from one
-    thread only. After an error the unfinished film is deleted at once. As a context, it finishes the film at its end,
-    or deletes it after an exception.
+    thread only. As a context, it finishes the film at its end. After an error the unfinished film is deleted at once.
     """
 
     def __init__(

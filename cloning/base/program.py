@@ -2,8 +2,7 @@
 
 A command imports this first, calls `end_on_interrupt` at once (for a tool, its package does), and `run` at the end of
 its file. Its exit status is DONE, INCOMPLETE, FAILED, or 128 + the number of the signal that ended it (130 for Ctrl-C).
-Until `end_on_interrupt`, Ctrl-C gives Python's traceback, so nothing is loaded here that Python has not loaded at its
-start.
+Until `end_on_interrupt`, Ctrl-C gives Python's traceback, so this loads nothing that Python has not loaded already.
 """
 
 from __future__ import annotations

@@ -214,8 +214,7 @@ class ShownRecording:
         """Return the rows that meet a condition: their number, and the stretches of them that are not cut.
 
         A stretch is [first row, row after the last, the names of the first's and the last's centre image]. Columns are
-        called as on the page: model1, driver1 and replay1 belong to the first model, the last two at a replay's limit.
-        Raises UserError.
+        called as on the page: model1, driver1, replay1: the first model's, the last two at a limit. Raises UserError.
         """
         recording = self.read(version)
         names = {"offset": "offset", "label": "label"} | {name: name for name in COLUMNS}

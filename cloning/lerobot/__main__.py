@@ -20,9 +20,8 @@ from pathlib import Path
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import OutputError, RecordingError, UserError
 from cloning.base.outputs import plural
-from cloning.lerobot.driven import read_driven
+from cloning.lerobot.drives import MANIFEST, read_driven, read_tub
 from cloning.lerobot.source import write_recording
-from cloning.lerobot.tub import MANIFEST, read_tub
 from cloning.recordings.check import check_images
 from cloning.recordings.format import LANE_FILE
 from cloning.recordings.log import find_folders, print_findings, read_recording

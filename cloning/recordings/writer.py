@@ -74,8 +74,7 @@ class RecordingWriter:
         """Write a sample; time: simulated seconds; images: JPEGs of the centre, left and right camera.
 
         numbers: steering, -1..1, throttle and brake, 0..1, speed, mph; lane: lateral offset, m, and heading error,
-        radians, as in `LanePosition`. Raises RecordingError if the disk is full; what was written of this sample is
-        then removed.
+        radians, as in `LanePosition`. Raises RecordingError if the disk is full; then nothing of the sample is left.
         """
         stamp = time_stamp(self.start + timedelta(seconds=time))
         paths = [self.images / f"{name}_{stamp}.jpg" for name in CAMERAS]

@@ -1,8 +1,7 @@
 """How far a network's car is from where it should be after two seconds: a quick replay, for each epoch of a training.
 
 The car begins where the driver's was, and goes where the network steers it by what it then sees. A loss compares
-steering on the driver's path only; here errors add up, and steering back counts. writeup_report.md says how well both
-foretell the driving.
+steering on the driver's path only; here errors add up, and steering back counts: see writeup_report.md.
 """
 
 import math

@@ -99,8 +99,7 @@ MOUNT_PITCH = 8.0
 def height_at_rows(rows: np.ndarray, right: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """Return the height at which a point of the car appears in a given row of the centre camera's frame: float64, m.
 
-    rows: of the frame; right, forward: m from the car's origin to the point, whose height is measured from there, too.
-    The arguments are broadcast.
+    rows: of the frame; right, forward: m from the car's origin, as the height, to the point. All are broadcast.
     """
     yaw, pitch, roll = np.radians((CAMERA_YAW, MOUNT_PITCH, CAMERA_ROLL))
     by_yaw = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])

@@ -78,8 +78,7 @@ ROADS = {
 def find_points(source: str | PointRoad) -> PointRoad | None:
     """Return the road of points that a track's source is, or None for the real simulator's tracks.
 
-    source: a key of ROADS, road-N or mountain-N for a generated road, or a road of points itself. Raises TrackError
-    if there is no such track.
+    source: a key of ROADS, road-N or mountain-N, which are generated, or a road of points. Raises TrackError.
     """
     if isinstance(source, PointRoad) or source in ROADS:
         return source if isinstance(source, PointRoad) else None
@@ -102,6 +101,7 @@ def centre_line(source: str | PointRoad) -> np.ndarray:
 class Track:
     """A track driven in one direction, as points about 1 m apart; s is the distance from the first point in metres."""
 
+    source: str | PointRoad  # what it was made from, see `find_points`
     points: np.ndarray  # float64 (n, 3): m
     heading: np.ndarray  # float64 (n,): radians, continuous
     rightward: np.ndarray  # float64 (n, 2): unit vectors to the right
@@ -225,8 +225,7 @@ class Track:
     def locate(self, x: float, y: float, near: float | None = None) -> tuple[float, float]:
         """Return s and the lateral offset, in metres, of the position (x, y).
 
-        near: s shortly before. Only points within 15 m of it are searched, which is fast and keeps the car on its road
-        where the track crosses itself.
+        near: s shortly before. Only points within 15 m of it are searched: it is fast, and right where roads cross.
         """
         if near is None:
             indices = np.arange(len(self.points))

@@ -84,8 +84,7 @@ class GpuViews:
     ) -> torch.Tensor:
         """Return n views: uint8 (n, 75, 320, 3).
 
-        road, earlier: uint8 (n, 90, 320, 3), `ROAD_ROWS` of each pose's own and earlier frame; the others are columns
-        of `lanes.Poses`.
+        road, earlier: uint8 (n, 90, 320, 3), `ROAD_ROWS` of a pose's own and earlier frame; others: of `lanes.Poses`.
         """
         to_frames = np.linalg.inv(warps).reshape(-1, 36)
         packed = np.concatenate([to_frames, colours.reshape(-1, 9), mirrored[:, None], shade[:, None]], axis=1)

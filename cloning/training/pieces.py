@@ -42,8 +42,7 @@ class Batch:
 def pieces(images: int, most: int = PIECE) -> list[slice]:
     """Return the pieces of a batch of this many images: of about the same size, at most `most`.
 
-    Their number is even, so that two threads finish together, and the same on every machine, as are then the sums; none
-    is empty.
+    Their number is even, for two threads, and the same on every machine, as are then the sums; none is empty.
     """
     count = min(images, 2 * math.ceil(images / (2 * most)))
     edges = [images * piece // count for piece in range(count + 1)] if count else [0]
@@ -146,8 +145,7 @@ class SquaredErrors(nn.Module):
     def forward(self, batch: Batch, meanwhile: Callable[[], None] = lambda: None) -> torch.Tensor:
         """Return the sum over this process's images: a scalar, float32.
 
-        meanwhile: called while the batch is being computed, when its work is in the pool's queue: what it gives to the
-        pool is done later.
+        meanwhile: called when the batch's work is in the pool's queue: what it gives to the pool is done later.
         """
         if self.device.type == "cpu":
             in_pieces = functools.partial(self.in_pieces, batch, meanwhile)
@@ -223,8 +221,7 @@ def predict(
 ) -> np.ndarray:
     """Return the network's steering for these observations: float32 (len(rows),).
 
-    rows: int (k,), indices; images: from indices to images, as in ValidationSet; pool: its threads share the work
-    on a CPU.
+    rows: int (k,), indices; images: from indices to images, as in ValidationSet; pool: its threads do it on a CPU.
     """
 
     def part(chosen: np.ndarray) -> np.ndarray:

@@ -164,8 +164,7 @@ def duration(seconds: float) -> str:
 def error_table(labels: np.ndarray, mean: float, models: Mapping[Path, np.ndarray], recipe: Recipe) -> str:
     """Return a table of mean squared error by range of |label|, and correlation, for constant steering and for models.
 
-    labels: steering, float32 (n,); mean: of the training labels; models: file -> predictions, float32 (n,), the last
-    epoch's model first.
+    labels: steering, float32 (n,); mean: of the training labels; models: file -> predictions, float32 (n,), last first.
     """
     edges, label_source = (0, recipe.straight, *recipe.turn, 1), recipe.words.label_source
     predictions = {"steer 0": np.zeros_like(labels), "steer mean": np.full_like(labels, mean)}
