@@ -22,6 +22,7 @@ NONBLOCKING = getattr(os, "O_NONBLOCK", 0)  # opening a named pipe without a wri
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; all with Huffman codes
 SCAN_HEADER = 0xDA
 OTHER_SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, restart interval, comment, application data
+COPY_OR_DELETE = "copy it again, or delete its row from the log"
 MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7]")  # the first one ends the scan; restart markers do not
 
 
@@ -135,18 +136,18 @@ def read_jpeg(path: Path) -> bytes:
         raise ValueError(error.strerror or str(error)) from error
 
 
-def read_image(path: Path) -> tuple[bytes, np.ndarray]:
+def read_image(path: Path, remedy: str = COPY_OR_DELETE) -> tuple[bytes, np.ndarray]:
     """Return the bytes of a recorded image, and its frame: uint8 (160, 320, 3), RGB.
 
-    Raises RecordingError if the file cannot be read, or is not a whole JPEG of a frame's size.
+    Raises RecordingError, with the remedy, if the file cannot be read, or is not a whole JPEG of a frame's size.
     """
     try:
         jpeg = read_jpeg(path)
         return jpeg, decode(jpeg)
     except ValueError as error:
-        raise RecordingError(f"{path}: {error}; copy it again, or delete its row from the log") from error
+        raise RecordingError(f"{path}: {error}; {remedy}") from error
 
 
-def read_frame(path: Path) -> np.ndarray:
+def read_frame(path: Path, remedy: str = COPY_OR_DELETE) -> np.ndarray:
     """Read and decode a recorded image: uint8 (160, 320, 3), RGB. Raises RecordingError; see `read_image`."""
-    return read_image(path)[1]
+    return read_image(path, remedy)[1]

@@ -73,11 +73,6 @@ class Lanes(LaneAhead):
         weights = straight + np.abs(self.steering(centred, centred).astype(float))
         return weights / weights.sum()
 
-    def camera_labels(self, row: int) -> np.ndarray:
-        """Return the recovery steering if the centre camera were where each of the three cameras is: float32 (3,)."""
-        lane = self.take(np.array([row]))
-        return lane.steering(lane.offset + np.array(list(CAMERA_OFFSETS.values())), lane.yaw)
-
     def sample_poses(self, recipe: Recipe, rng: np.random.Generator, mirrored: np.ndarray) -> "Poses":
         """Sample a pose for each row, and a camera near it whose frame will be warped; mirrored: bool (n,).
 

@@ -12,16 +12,18 @@ import numpy as np
 import torch
 from numpy.random import Generator
 
-from cloning.base.errors import RecordingError
 from cloning.base.frame import ROAD_ROWS
 from cloning.base.table import Column, Table
 from cloning.network.network import SEEN_ROWS
 from cloning.recordings.format import CAMERAS, DRIVE_GAP, PROBLEM_AREAS
-from cloning.recordings.images import decode, read_jpeg
+from cloning.recordings.images import read_frame
 from cloning.recordings.log import CheckedRecording, Recording
 from cloning.training.gpu import GpuFrames
 from cloning.training.lanes import Lanes
 from cloning.training.recipe import Recipe
+
+RESTORE = "the image was usable when the run began. Restore it and continue with --resume"
+read_checked = functools.partial(read_frame, remedy=RESTORE)  # of a file that may have become unusable after the check
 
 
 class ValidationSet(NamedTuple):
@@ -124,7 +126,7 @@ class Observations(Table):
         return self.recordings[self.recording[at]].path(self.row[at], camera)
 
     def frames(self, at: int) -> list[np.ndarray]:
-        """Return an observation's whole frames of the centre, left and right camera, as `read_checked` does."""
+        """Return an observation's whole frames of the centre, left and right camera, as `read_frame` does."""
         return [read_checked(self.path(at, camera)) for camera in range(len(CAMERAS))]
 
     def road(self, at: int, row: int, camera: int) -> np.ndarray:
@@ -176,16 +178,6 @@ class Observations(Table):
         recording = self.recording[at]
         images = [self.recordings[r].images[i, c] for r, i, c in zip(recording, row, camera, strict=True)]
         return self.gpu.road(recording, np.array(images))
-
-
-def read_checked(path: Path) -> np.ndarray:
-    """Return a frame, uint8 (160, 320, 3), RGB. Raises RecordingError if it became unusable after the check."""
-    try:
-        return decode(read_jpeg(path))
-    except ValueError as error:
-        raise RecordingError(
-            f"{path}: {error}; the image was usable when the run began. Restore it and continue with --resume"
-        ) from None
 
 
 def centre_images(observations: Observations, recipe: Recipe, seed: int) -> list[ValidationSet]:

@@ -5,13 +5,13 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from cloning.network.compute import Graphed, in_precision
 from cloning.network.network import CROP, SEEN_SHAPE
@@ -33,7 +33,7 @@ class Batch:
     keep: np.ndarray | None  # bool (n, units): the units of the flattened layer that dropout keeps; None: all
     total: int  # images in the whole batch, of all processes
 
-    def part(self, piece: slice) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    def part(self, piece: slice) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return some images, their labels, and the units that are kept."""
         keep = None if self.keep is None else torch.from_numpy(self.keep[piece])
         return torch.as_tensor(self.images[piece]), torch.from_numpy(self.labels[piece]), keep
@@ -50,7 +50,7 @@ def pieces(images: int, most: int = PIECE) -> list[slice]:
 
 
 def start_batch(
-    choices: Choices, augmentations: Sequence[Augmentation], share: slice, pool: ThreadPoolExecutor | None
+    choices: Choices, augmentations: Sequence[Augmentation], share: slice, pool: Executor | None
 ) -> Callable[[], Batch]:
     """Start making a process's share of a batch; return a function that waits for it and returns it.
 
@@ -89,13 +89,13 @@ def start_batch(
 
 
 def squared_errors(
-    network: Callable[..., torch.Tensor],
-    images: torch.Tensor,
-    labels: torch.Tensor,
-    keep: torch.Tensor | None,
+    network: Callable[..., Tensor],
+    images: Tensor,
+    labels: Tensor,
+    keep: Tensor | None,
     huber: float | None = None,
-    real: torch.Tensor | None = None,
-) -> torch.Tensor:
+    real: Tensor | None = None,
+) -> Tensor:
     """Return the sum over the images of (predicted - label)², a scalar, float32.
 
     images, labels, keep: as in Batch; real: float32 (n,), 0 for an image that does not count, else 1; huber: error
@@ -114,15 +114,13 @@ class WithGradients(torch.autograd.Function):
     """A sum whose gradients are computed together with it, before `backward` asks for them."""
 
     @staticmethod
-    def forward(
-        context: Any, compute: Callable[[], tuple[torch.Tensor, list[torch.Tensor]]], *parameters: nn.Parameter
-    ) -> torch.Tensor:
+    def forward(context: Any, compute: Callable[[], tuple[Tensor, list[Tensor]]], *parameters: nn.Parameter) -> Tensor:
         """Return the sum, a scalar; compute: returns it and the gradient of each parameter."""
         total, context.gradients = compute()
         return total
 
     @staticmethod
-    def backward(context: Any, scale: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(context: Any, scale: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradients of the parameters, times `scale`."""
         return None, *torch._foreach_mul(context.gradients, scale)
 
@@ -130,9 +128,7 @@ class WithGradients(torch.autograd.Function):
 class SquaredErrors(nn.Module):
     """Sums a batch's squared errors; a module, so that DistributedDataParallel can wrap it."""
 
-    def __init__(
-        self, network: nn.Module, precision: torch.dtype, pool: ThreadPoolExecutor, huber: float | None = None
-    ):
+    def __init__(self, network: nn.Module, precision: torch.dtype, pool: Executor, huber: float | None = None):
         """pool: its threads compute the pieces on a CPU; huber: see `squared_errors`."""
         super().__init__()
         self.network, self.precision, self.pool, self.huber = network, precision, pool, huber
@@ -142,7 +138,7 @@ class SquaredErrors(nn.Module):
         # In a tuple, because the weights of the copy are not this module's parameters.
         self.converted = (network if is_usable else copy.deepcopy(network).to(precision),)
 
-    def forward(self, batch: Batch, meanwhile: Callable[[], None] = lambda: None) -> torch.Tensor:
+    def forward(self, batch: Batch, meanwhile: Callable[[], None] = lambda: None) -> Tensor:
         """Return the sum over this process's images: a scalar, float32.
 
         meanwhile: called when the batch's work is in the pool's queue: what it gives to the pool is done later.
@@ -160,7 +156,7 @@ class SquaredErrors(nn.Module):
             keep = None if keep is None else keep.to(self.device)
             return squared_errors(self.network, images.to(self.device), labels.to(self.device), keep, self.huber)
 
-    def on_gpu(self, batch: Batch) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    def on_gpu(self, batch: Batch) -> tuple[Tensor, list[Tensor]]:
         """Return the sum and its gradients; images that do not count fill the batch up to one of a few sizes."""
         n = len(batch.labels)
         room = -(-n // GPU_SIZES) * GPU_SIZES
@@ -172,21 +168,19 @@ class SquaredErrors(nn.Module):
         total, *gradients = self.graphed(*arguments)
         return total, gradients
 
-    def gradients(
-        self, images: torch.Tensor, labels: torch.Tensor, real: torch.Tensor, keep: torch.Tensor | None = None
-    ) -> list[torch.Tensor]:
+    def gradients(self, images: Tensor, labels: Tensor, real: Tensor, keep: Tensor | None = None) -> list[Tensor]:
         """Return the sum of the squared errors of real images, and its gradients."""
         # As new variables, because what autograd keeps of the parameters belongs to another of the GPU's streams.
         weights = {name: each.detach().requires_grad_() for name, each in self.network.named_parameters()}
 
-        def network(*inputs: torch.Tensor | None) -> torch.Tensor:
+        def network(*inputs: Tensor | None) -> Tensor:
             return torch.func.functional_call(self.network, weights, inputs)
 
         with torch.enable_grad(), in_precision(self.precision, self.device):
             total = squared_errors(network, images, labels, keep, self.huber, real)
             return [total.detach(), *torch.autograd.grad(total, list(weights.values()))]
 
-    def in_pieces(self, batch: Batch, meanwhile: Callable[[], None]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    def in_pieces(self, batch: Batch, meanwhile: Callable[[], None]) -> tuple[Tensor, list[Tensor]]:
         """Return the sum and its gradients, computed in pieces, each by one thread of the pool.
 
         They are added in the order of the pieces, so that the result does not depend on which thread was faster.
@@ -196,7 +190,7 @@ class SquaredErrors(nn.Module):
         with torch.no_grad():
             torch._foreach_copy_([*weights], [*parameters])
 
-        def compute(part: slice) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        def compute(part: slice) -> tuple[Tensor, tuple[Tensor, ...]]:
             with torch.enable_grad():
                 images, labels, keep = batch.part(part)
                 errors = squared_errors(network, images, labels, keep, self.huber)
@@ -217,7 +211,7 @@ def predict(
     rows: np.ndarray,
     device: torch.device,
     precision: torch.dtype,
-    pool: ThreadPoolExecutor,
+    pool: Executor,
 ) -> np.ndarray:
     """Return the network's steering for these observations: float32 (len(rows),).
 

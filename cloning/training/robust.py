@@ -15,6 +15,7 @@ from numpy.random import Generator, default_rng
 from cloning.network.network import CROP, SEEN_SHAPE
 from cloning.recordings.format import LANE_FILE
 from cloning.recordings.log import CheckedRecording
+from cloning.road.camera import CAMERA_OFFSETS
 from cloning.road.warp import with_alpha
 from cloning.training.lanes import Lanes, Poses
 from cloning.training.observations import Example, Observations, ValidationSet
@@ -120,8 +121,9 @@ class PoseViews:
     def example(self, i: int) -> Example:
         """See `observations.Views`."""
         frames = self.observations.frames(self.rows[i])
-        labels = self.observations.lanes.camera_labels(self.rows[i])
         one = np.array([i])
+        lane = self.observations.lanes.take(self.rows[one])  # the labels: as if the centre camera were at each camera
+        labels = lane.steering(lane.offset + np.array(list(CAMERA_OFFSETS.values())), lane.yaw)
         images = warped(replace(self.observations, gpu=None), self.rows[one], [each.take(one) for each in self.poses])
         return Example(frames, labels, images, CROP[0], [each.title(i) for each in self.poses])
 
