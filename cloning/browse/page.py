@@ -23,27 +23,19 @@ KEPT = 600  # s for which a browser does not ask again for a frame
 
 
 def create_app(library: Library, runs: Runs) -> flask.Flask:
-    """Return the web application.
+    """Return the web application; an error is {"message"}.
 
-    `/` is the page; `/recordings` lists identifiers. Below `/recordings/ID`: `overview` and `details`, JSON;
-    `columns/NAME`, little-endian float32 (n,), and POST tries its analysis again, which failed; `rows/N`, JSON,
-    `rows/N/PICTURE.jpg`, and what a model looks at on it, `rows/N/PICTURE/MODEL.png`; `cuts` and `tags`, to which POST
-    adds and DELETE deletes some, [{"first", "last", "reason"}, …]; they answer with the details, and with the changed
-    ones as "changed", or with 410 if none to be deleted is there any more.
-    `replays/LIMIT`: POST begins a recording's replays, DELETE ends them; `details?limit=` tells how far they are.
-    `matches?condition=` has the stretches that meet a condition, `compared?limit=` the models' figures, and POST begins
-    what they need. `export` writes a recording, {"rows", "name", "others"}, with all of these other recordings, "ID,…";
-    it answers what did not fit as "notes". `film.mp4?rows=` is a film: rows are "first-end,…".
-    What depends on the log takes `?version=`, and is refused with 409 when it has changed since. `/analyses`: DELETE
-    pauses them, POST goes on. `/runs` and `/runs/N` tell of training runs, `/runs/N/NAME` is a picture of one, and
-    `/runs/N/report.html` its report. An error is {"message"}.
+    What depends on the log takes `?version=`, and is refused with 409 when it has changed since. Columns are
+    little-endian float32 (n,); POST tries one's analysis again, which failed. `cuts` and `tags` take [{"first", "last",
+    "reason"}, …] to add or, by DELETE, to delete; they answer with the details and the "changed" ones, or with 410 if
+    none to be deleted is there any more. POST begins what replays, comparisons and analyses need, DELETE ends or pauses
+    it. `export` takes {"rows", "name", "others"}, "first-end,…" and "ID,…", and answers what did not fit as "notes".
     """
     from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
 
     eventlet.tpool.setup()  # now, since it fails for good if there are no file handles
     app = flask.Flask(__name__)
     site.prepare(app, "img-src 'self' data:", "media-src data:")
-
     scripts = sorted(path.name for path in Path(app.static_folder or "").glob("*.js"))  # all are asked for at once
 
     def shown(identifier: str) -> ShownRecording:

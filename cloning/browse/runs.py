@@ -80,15 +80,7 @@ class Runs:
 
 
 def overview(files: RunFiles) -> dict[str, Any]:
-    """Return what the page shows of a run.
-
-    run: its identifier, or None; state: running, finished or stopped; history: a dict of METRICS and val_drift for each
-    finished epoch; epochs, samples_per_epoch; images and loss so far in this epoch, with their age in s; rate in
-    images/s, and left, s of training from there on, None if unknown; pictures: numbers of observations, ascending;
-    trail: [epochs done, loss] within the epochs; best: the epoch whose model is model-best.pt, and by which metric;
-    options: what the run was given, by name; has_report: whether its report is written.
-    Raises UserError, OSError.
-    """
+    """Return what the page shows of a run. Raises UserError, OSError."""
     if not files.arguments.exists():
         command = f"`python model.py --output {files.last}`"
         raise UserError(f"{files.last.parent}: no training run in this folder yet; {command} begins one")
@@ -110,18 +102,19 @@ def overview(files: RunFiles) -> dict[str, Any]:
     left = epoch * max(0.0, epochs - finished - min(1.0, images / samples)) if epoch and state == "running" else None
     recordings, robust = options.get("recordings"), options.get("robust") is True or options.get("name") == "robust"
     return {
-        "run": progress.get("run"),
+        "run": progress.get("run"),  # its identifier, or None
         "state": state,
         "robust": robust,
         "recordings": [str(each) for each in recordings] if isinstance(recordings, list) else [],
         "epochs": epochs,
         "samples_per_epoch": samples,
+        # Of each finished epoch METRICS and val_drift.
         "history": [{key: value if math.isfinite(value) else None for key, value in row.items()} for row in history],
-        "images": images,
+        "images": images,  # so far in this epoch, as the loss
         "loss": progress.get("loss"),
-        "age": age,
-        "rate": rate,
-        "left": left,
+        "age": age,  # of these two, s
+        "rate": rate,  # images/s, None if unknown, as the next
+        "left": left,  # s of training from there on
         "trail": _trail(progress, finished + min(1.0, images / samples)),
         "best": _best(history, options.get("best_by") or ("val_loss" if robust else "val_drift")),
         "options": _flat(options),

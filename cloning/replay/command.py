@@ -75,7 +75,8 @@ def run(options: argparse.Namespace) -> None:
                 film.begin(recording)
             watch = film.watch if film else None
             drives = drive_at_limits(recording, lines, driver, limits, watch, bool(options.model), options.disturb)
-            reports.append(replay_report(recording, lines, drives, options.reference, options.disturb))
+            disturbed = options.disturb and str(options.disturb)
+            reports.append(replay_report(recording, lines, drives, options.reference, disturbed))
             print(report_text(reports[-1]), flush=True)
             if options.picture:
                 path = Path(options.picture)

@@ -14,7 +14,6 @@ from cloning.recordings.log import Recording
 from cloning.replay.replay import Drive, Driver, ReferenceLine, ReplayFrame, drive
 from cloning.road.autonomy import autonomy
 from cloning.road.camera import FIRST_BONNET_ROW
-from cloning.road.disturbances import Disturbance
 from cloning.road.motion import stretch_rows
 from cloning.road.overlay import overlay
 
@@ -102,9 +101,8 @@ def steering_metrics(steering: np.ndarray, human: np.ndarray) -> Metrics:
 
     error: root mean squared difference; correlation: of both, averaged over nine rows; None if either is constant.
     """
-    smooth, smooth_human = (
-        np.convolve(values, np.ones(SMOOTHED_ROWS) / SMOOTHED_ROWS, "valid") for values in (steering, human)
-    )
+    kernel = np.ones(SMOOTHED_ROWS) / SMOOTHED_ROWS
+    smooth, smooth_human = (np.convolve(values, kernel, "valid") for values in (steering, human))
     varies = np.ptp(smooth) > 0 and np.ptp(smooth_human) > 0
     return {
         "error": round(float(np.sqrt(np.mean((steering - human) ** 2))), 4),
@@ -113,20 +111,12 @@ def steering_metrics(steering: np.ndarray, human: np.ndarray) -> Metrics:
 
 
 def replay_report(
-    recording: Recording,
-    lines: list[ReferenceLine],
-    drives: list[Drive],
-    asked: str,
-    disturbance: Disturbance | None = None,
+    recording: Recording, lines: list[ReferenceLine], drives: list[Drive], asked: str, disturbance: str | None = None
 ) -> Metrics:
     """Return the report of a recording's drives, one per limit, compared with the oracle and the YARDSTICKS.
 
-    lines: of `reference_lines`; asked: the reference that the user chose, "lane" or "human"; disturbance: of the
-    drives.
-    It has, beside `reference_metrics`, reference: the rows measured from the lane's centre, `lane_centre`, and from the
-    human driver's path, `human_way`; limits: by the limit in metres, `drive_metrics`, steering, where: each
-    intervention's centre image, seconds driven until then, and metres right of the reference line, and compared: the
-    yardsticks' metrics, by name; steering_compared: of constant steering.
+    lines: of `reference_lines`; asked: the reference that the user chose, "lane" or "human"; disturbance: of what the
+    driver saw, such as "fog:3".
     """
     human = np.array(drives[0].human_steering)
     mean = float(recording.steering.mean())
@@ -136,14 +126,13 @@ def replay_report(
         "human": lambda frame: frame.human_steering,
         ORACLE: ReplayFrame.recovery_steering,
     }
-    rows = sum(len(line.stretch) for line in lines)
     by_lane = sum(len(line.stretch) for line in lines if line.is_lane_centre)
 
     def limit_report(done: Drive) -> Metrics:
         return {
             **drive_metrics(lines, done),
             "steering": steering_metrics(np.array(done.steering), human),
-            "where": [
+            "where": [  # s driven until then, and m right of the reference line
                 {
                     "image": recording.name(done.row[at]),
                     "seconds": round(sum(done.seconds[: at + 1]), 2),
@@ -159,14 +148,14 @@ def replay_report(
     return {
         "recording": str(recording.folder),
         "rows": len(recording),
-        "rows_driven": rows,
+        "rows_driven": len(human),
         "stretches": len(lines),
         "seconds": round(sum(drives[0].seconds), 2),
         **reference_metrics(recording, lines, asked),
-        "disturbance": None if disturbance is None else str(disturbance),
+        "disturbance": disturbance,
         "reference_asked": asked,
-        "reference": {LANE_CENTRE: by_lane, HUMAN_WAY: rows - by_lane},
-        "limits": {f"{done.limit:g}": limit_report(done) for done in drives},
+        "reference": {LANE_CENTRE: by_lane, HUMAN_WAY: len(human) - by_lane},  # rows measured from each
+        "limits": {f"{done.limit:g}": limit_report(done) for done in drives},  # by the limit in m
         "steering_compared": {
             "steering_zero": steering_metrics(np.zeros_like(human), human),
             "mean_steering": steering_metrics(np.full_like(human, mean), human),

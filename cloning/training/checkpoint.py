@@ -70,17 +70,14 @@ class Progress:
     run: str | None = field(default_factory=lambda: uuid.uuid4().hex)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the contents of training_progress.json: the run, finished epochs, and the position in the next one.
-
-        loss is the mean squared error so far in this epoch, None before its first batch; trail as in `Progress`.
-        """
+        """Return the contents of training_progress.json: the run, finished epochs, and the position in the next one."""
         return {
             "run": self.run,
             "finished": len(self.history),
             "batches": self.number,
             "images": self.images,
             "seconds": round(self.seconds, 3),
-            "loss": self.loss / self.images if self.images else None,
+            "loss": self.loss / self.images if self.images else None,  # mean squared error so far in this epoch
             "trail_every": self.trail_every,
             "trail": [float(f"{loss:.4g}") for loss in self.trail],
         }

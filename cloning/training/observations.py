@@ -44,12 +44,9 @@ class Example(NamedTuple):
 
 
 class Views(Protocol):
-    """The images of a batch's observations before augmentation, one for each augmentation, and their labels.
+    """The images of a batch's observations before augmentation, one for each augmentation, and their labels."""
 
-    labels  float32 (n, augmentations): steering, -1..1
-    """
-
-    labels: np.ndarray
+    labels: np.ndarray  # float32 (n, augmentations): steering, -1..1
 
     def images(self, part: np.ndarray) -> list[np.ndarray]:
         """Return the images of some observations, for each augmentation uint8 (k, 75, 320, 3), RGB.

@@ -55,34 +55,30 @@ class Words(NamedTuple):
 class Recipe:
     """How a network is trained. Shares and probabilities are 0..1, steering is -1..1, ranges are (least, most).
 
-    Functions, of which a checkpoint contains the names; observations, views and sets are those of `observations.py`:
-
-    select           (recording, recipe) -> the observations of a checked recording that are used, with their labels
-    resample         (observations, recipe, seed) -> those for training, some left out and others repeated
-    order            (observations, recipe, rng) -> that of one pass over them: int (n,), indices
-    views            (observations, rows, cameras, recipe, rng) -> images and labels of these rows, int (k,), before
-                     augmentation; cameras: int (k,), 0 centre, 1 left, 2 right
-    validation_sets  (observations, recipe, seed) -> the sets to validate with
+    A checkpoint contains the names of its functions; observations, views and sets are those of `observations.py`.
     """
 
     name: str
     words: Words
     # Data preprocessing
+    # (recording, recipe) -> the observations of a checked recording that are used, with their labels
     select: Callable[..., Any]
     throttle_threshold: float  # rows with less throttle are dropped
     side_cameras: bool  # whether images are taken from all three cameras, not from the centre one alone
     side_correction: float  # steering added to the label of left images, subtracted from that of right ones
-    resample: Callable[..., Any]
+    resample: Callable[..., Any]  # (observations, recipe, seed) -> those for training; some left out, some repeated
     straight: float  # |steering| below which an observation is straight driving
     keep_straight: float  # probability that it is kept
     turn: tuple[float, float]  # range of |steering| in which a copy is added
     jitter: float  # by up to this share the copy's steering is changed
     repeats: int  # how often a recording of problem areas counts
-    order: Callable[..., np.ndarray]
+    order: Callable[..., np.ndarray]  # (observations, recipe, rng) -> that of one pass over them: int (n,), indices
     # Data subdivision
     block_seconds: float  # of driving that are together for training or for validation
     folds: int  # one block of so many is for validation
     # Augmentation
+    # (observations, rows, cameras, recipe, rng) -> images and labels of these rows, int (k,), before augmentation;
+    # cameras: int (k,), 0 centre, 1 left, 2 right
     views: Callable[..., Any]
     augmentations: tuple[Augmentation, ...]
     flip: float  # share of the observations with a flipped image
@@ -101,7 +97,7 @@ class Recipe:
     batch_size: int  # observations; each gives 3.7 images on average
     samples_per_epoch: int  # images at least; a fifth as many observations validate an epoch
     epochs: int
-    validation_sets: Callable[..., list[Any]]
+    validation_sets: Callable[..., list[Any]]  # (observations, recipe, seed) -> the sets to validate with
     best_by: str  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
     # Recovery steering from other poses, in other light (--robust); the report has neither.
     exposure: Exposure = (0.0, 0.0)  # least mean and standard deviation of the images by which the network drives
