@@ -163,7 +163,6 @@ class ShownRecording:
         }
 
     def _replays(self, limit: str) -> list[str]:
-        """Return the columns of the replays at a limit, one a model."""
         return [f"replay-{index}-{limit}" for index in range(len(self.models))]
 
     def _replay(self, recording: Recording, column: str, begin: bool = False) -> dict[str, Any]:

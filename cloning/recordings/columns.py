@@ -172,9 +172,8 @@ def check_numbers(lines: np.ndarray, numbers: np.ndarray, is_named: bool) -> np.
     both = (throttle > 0) & (brake > 0)
     if not is_named and (both.any() or brake.sum() > throttle.sum()):
         at = lines[both if both.any() else brake > 0].min()
-        doubt = (
-            "with the throttle" if both.any() else "more than the throttle in the rows without a header that names both"
-        )
+        more = "more than the throttle in the rows without a header that names both"
+        doubt = "with the throttle" if both.any() else more
         raise UnclearLogError(
             f"line {at}: the brake is pressed {doubt}: are they other columns, or in another order? If not, {REMEDY}",
         )
@@ -192,9 +191,7 @@ def decimal_comma_readings(tokens: Sequence[str]) -> list[list[str]]:
         row = [".".join(tokens[start:end]) for start, end in itertools.pairwise(ends)]
         if ends[-1] == len(tokens) and all(map(SIMULATOR_NUMBER.fullmatch, row)):
             values = [float(text) for text in row]
-            is_within = all(
-                least <= v <= greatest for v, (least, greatest) in zip(values, RANGES.values(), strict=True)
-            )
-            if is_within and not (values[1] and values[2]):
+            limits = zip(values, RANGES.values(), strict=True)
+            if all(least <= value <= greatest for value, (least, greatest) in limits) and not (values[1] and values[2]):
                 readings.append(row)
     return readings

@@ -1,5 +1,6 @@
 """The simulator's car on the road: how steering turns it, and the trajectory that a recorded car drove."""
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import TypeVar
@@ -120,17 +121,8 @@ def stretch_rows(recording: "Recording") -> list[slice]:
     """Return the rows of each of a recording's `stretches`."""
     speed = np.abs(recording.speed.astype(float)) * MPH
     pause = np.diff(recording.time)
-    continuous = (
-        (pause > 0)
-        & (pause < MAX_GAP)
-        & (np.abs(np.diff(speed)) < MAX_ACCELERATION * np.maximum(pause, 1 / SAMPLE_RATE))
-    )
+    steady = np.abs(np.diff(speed)) < MAX_ACCELERATION * np.maximum(pause, 1 / SAMPLE_RATE)
     moving = speed > MIN_SPEED
-    joined = continuous & moving[1:] & moving[:-1]
-    starts = np.flatnonzero(np.r_[True, ~joined])
-    ends = np.r_[starts[1:], len(speed)]
-    return [
-        slice(start, end)
-        for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
-        if end - start >= MIN_STRETCH_ROWS
-    ]
+    joined = (pause > 0) & (pause < MAX_GAP) & steady & moving[1:] & moving[:-1]
+    edges = [*np.flatnonzero(np.r_[True, ~joined]).tolist(), len(speed)]
+    return [slice(*ends) for ends in itertools.pairwise(edges) if ends[1] - ends[0] >= MIN_STRETCH_ROWS]

@@ -123,10 +123,7 @@ def _numbers(points: Iterable[Sequence[float]]) -> np.ndarray:
                 f"point {i} has {len(row)} numbers, the first one {len(rows[0])}: all must have z, or none"
             )
         rows.append(row)
-    numbers = np.zeros((len(rows), 3))
-    if rows:
-        numbers[:, : len(rows[0])] = rows
-    return numbers
+    return np.array([[*row, 0.0][:3] for row in rows]).reshape(-1, 3)
 
 
 def _fault(road: PointRoad) -> str:

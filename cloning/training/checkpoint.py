@@ -69,19 +69,6 @@ class Progress:
     # A random identifier, by which a run recognises its own files; None from an earlier version.
     run: str | None = field(default_factory=lambda: uuid.uuid4().hex)
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the contents of training_progress.json: the run, finished epochs, and the position in the next one."""
-        return {
-            "run": self.run,
-            "finished": len(self.history),
-            "batches": self.number,
-            "images": self.images,
-            "seconds": round(self.seconds, 3),
-            "loss": self.loss / self.images if self.images else None,  # mean squared error so far in this epoch
-            "trail_every": self.trail_every,
-            "trail": [float(f"{loss:.4g}") for loss in self.trail],
-        }
-
     def add(self, images: int, loss: float) -> None:
         """Count a batch; loss: its sum of squared errors."""
         self.smooth = SMOOTHED * self.smooth + (1 - SMOOTHED) * loss / images if self.number else loss / images
@@ -315,7 +302,18 @@ class Checkpoint:
         self._write_progress(progress)  # last, so that it never tells of more than --resume continues with
 
     def _write_progress(self, progress: Progress) -> None:
-        write(self.files.progress, json.dumps(progress.as_json()).encode())
+        """Write training_progress.json: the run, finished epochs, and the position in the next one."""
+        position = {
+            "run": progress.run,
+            "finished": len(progress.history),
+            "batches": progress.number,
+            "images": progress.images,
+            "seconds": round(progress.seconds, 3),
+            "loss": progress.loss / progress.images if progress.images else None,  # mean squared error in this epoch
+            "trail_every": progress.trail_every,
+            "trail": [float(f"{loss:.4g}") for loss in progress.trail],
+        }
+        write(self.files.progress, json.dumps(position).encode())
 
     def restore(self, begin: SavedRun | FirstWeights | None) -> Progress:
         """Load weights and, of a saved run, the optimizer's state, and return the run's progress.
