@@ -158,16 +158,9 @@ class Report:
             ]
             is_given = folder.resolve() in [each["folder"].resolve() for each in self.recordings]
             other = "was held out" if self.knows_all else "it may have been trained on"
-            self.replays.append(
-                {
-                    **report,
-                    "which": "it was trained on" if is_given else other,
-                    "table": rows,
-                    "plot": uri(plot(recording, drives), "image/png"),
-                    "interventions": len(where),
-                    "pictures": pictures,
-                }
-            )
+            shown = {"which": "it was trained on" if is_given else other, "table": rows, "pictures": pictures}
+            shown |= {"plot": uri(plot(recording, drives), "image/png"), "interventions": len(where)}
+            self.replays.append(report | shown)
             self.looked_at = recording  # the network has not seen it, which tells more
 
     def examples(self) -> list[dict[str, str]]:
@@ -183,14 +176,10 @@ class Report:
                 steering, mask = visual_backprop(self.network, frame)
             except ArithmeticError as error:
                 raise ModelError(f"{self.model}: {error}; train the model again") from None
-            shown.append(
-                {
-                    "name": bend(human),
-                    "recorded": picture_uri(panel(frame, recording.name(row), human)),
-                    "attention": frame_uri(overlay(frame, steering, mask)),
-                    "steering": f"{steering:+.2f}, the driver {human:+.2f}",
-                }
-            )
+            recorded = picture_uri(panel(frame, recording.name(row), human))
+            attention = frame_uri(overlay(frame, steering, mask))
+            words = {"name": bend(human), "steering": f"{steering:+.2f}, the driver {human:+.2f}"}
+            shown.append({**words, "recorded": recorded, "attention": attention})
         return shown
 
     def next_steps(self) -> list[tuple[str, str]]:
