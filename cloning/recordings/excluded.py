@@ -18,7 +18,7 @@ import numpy as np
 from cloning.base.errors import RecordingError
 from cloning.base.files import csv_bytes, write
 from cloning.recordings.format import DRIVING_LOG
-from cloning.recordings.images import NONBLOCKING
+from cloning.recordings.images import nonblocking
 
 if os.name != "nt":
     import fcntl
@@ -123,28 +123,20 @@ def one_line(reason: str) -> str:
 @contextlib.contextmanager
 def _changing(path: Path) -> Iterator[tuple[list[str], list[Cut]]]:
     """Yield a file's lines, to be changed, and the cuts in them, while no other thread or process changes the file."""
-    with _one_at_a_time, _locked(path.with_name(DRIVING_LOG)):
+    log = path.with_name(DRIVING_LOG)
+    try:
+        locked = open(log, "rb", opener=nonblocking)  # noqa: SIM115 - closed at the end of the context below
+    except OSError as error:
+        raise RecordingError(f"{log}: {error.strerror}; put the recording back, or forget its cuts") from None
+    with _one_at_a_time, locked:
+        if os.name != "nt":
+            with contextlib.suppress(OSError):  # a network's file system without locks
+                fcntl.flock(locked, fcntl.LOCK_EX)
         lines = _lines(path)
         before = list(lines)
         yield lines, _parse(path, lines)
         if lines != before:
             write(path, "".join(lines).encode(**BYTES))
-
-
-@contextlib.contextmanager
-def _locked(log: Path) -> Iterator[None]:
-    """Wait for the lock of a recording's log and hold it until the block ends; on Windows there is none."""
-    try:
-        file = os.open(log, os.O_RDONLY | NONBLOCKING)
-    except OSError as error:
-        raise RecordingError(f"{log}: {error.strerror}; put the recording back, or forget its cuts") from None
-    try:
-        if os.name != "nt":
-            with contextlib.suppress(OSError):  # a network's file system without locks
-                fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(file)
 
 
 def _lines(path: Path) -> list[str]:

@@ -18,12 +18,16 @@ MAX_SEGMENTS = 100  # a camera's JPEG has 10
 MAX_SCANS = 20  # a progressive JPEG usually has 10; each one may take as long as the whole frame
 
 BLOCK_ROWS = 16  # of a frame that `encode` compresses together: colour has half the resolution, in blocks of 8 x 8
-NONBLOCKING = getattr(os, "O_NONBLOCK", 0)  # opening a named pipe without a writer would block; Windows has none
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; all with Huffman codes
 SCAN_HEADER = 0xDA
 OTHER_SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, restart interval, comment, application data
 COPY_OR_DELETE = "copy it again, or delete its row from the log"
 MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7]")  # the first one ends the scan; restart markers do not
+
+
+def nonblocking(path: str, flags: int) -> int:
+    """Open a file for `open`, without waiting if it is a named pipe that has no writer; Windows has none."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def jpeg_size(jpeg: bytes) -> tuple[int, int]:
@@ -127,7 +131,7 @@ def read_jpeg(path: Path) -> bytes:
     Raises ValueError with the reason if it cannot be read, or is not a regular file: a pipe would never end.
     """
     try:
-        with open(path, "rb", buffering=0, opener=lambda name, flags: os.open(name, flags | NONBLOCKING)) as file:
+        with open(path, "rb", buffering=0, opener=nonblocking) as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise ValueError("not a regular file")
