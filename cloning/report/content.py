@@ -158,8 +158,8 @@ class Report:
             ]
             is_given = folder.resolve() in [each["folder"].resolve() for each in self.recordings]
             other = "was held out" if self.knows_all else "it may have been trained on"
-            shown = {"which": "it was trained on" if is_given else other, "table": rows, "pictures": pictures}
-            shown |= {"plot": uri(plot(recording, drives), "image/png"), "interventions": len(where)}
+            which, curves = "it was trained on" if is_given else other, uri(plot(recording, drives), "image/png")
+            shown = {"which": which, "table": rows, "plot": curves, "interventions": len(where), "pictures": pictures}
             self.replays.append(report | shown)
             self.looked_at = recording  # the network has not seen it, which tells more
 
