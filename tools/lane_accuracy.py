@@ -4,7 +4,7 @@
 
 For rendered frames the true position is known. Single frames from random poses and whole drives are rendered, in looks
 that the network was not trained on; with --edges, also drives along each kind of edge. For real recordings only the
-position of the side cameras in the car is known, and in the jungle the line that is painted along the road's centre.
+position of the side cameras in the car is known.
 """
 
 import itertools
@@ -19,10 +19,7 @@ import numpy as np
 
 from cloning.base import program
 from cloning.base.arguments import command_line, number
-from cloning.lane import marking
-from cloning.lane.follow import TrackFilter
-from cloning.lane.localise import estimate_lane_position, follow_line, line_deviations
-from cloning.lane.parts import WINDOW
+from cloning.lane.localise import estimate_lane_position
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
     MOUNT_OFFSETS,
@@ -33,7 +30,6 @@ from cloning.lane.reader import (
     load_network,
     read_strips,
 )
-from cloning.lane.search import localise
 from cloning.recordings.log import Recording, find_folders, read_recording
 from cloning.road.generated import COURSES, generate
 from cloning.road.motion import MPH, stretches
@@ -150,29 +146,6 @@ def measure_recording(folder: Path, network: LaneNetwork) -> None:
     )
     ms = np.diff([started, decoded, estimated, finished]) / len(recording) * 1e3
     print(f"  {'ms a row':32}{ms.sum():.2f}: decode {ms[0]:.2f}, network {ms[1]:.2f}, fuse {ms[2]:.2f}")
-    measure_line(recording, strips, centres)
-
-
-def measure_line(recording: Recording, strips: np.ndarray, centres: np.ndarray) -> None:
-    """Print how far the line painted along the road is from the lane's centre, before and after this is corrected.
-
-    strips: of `read_strips`; centres: of `estimate_centres`.
-    """
-    for stretch in stretches(recording):
-        if len(stretch) < WINDOW:
-            continue
-        detected, seen = centres[stretch.rows], strips.__getitem__
-        found = localise(stretch, detected)
-        if not ROADS[found.track.name].centre_line:
-            continue
-        follower, followed = TrackFilter(stretch, detected, found.track), follow_line(found, stretch, detected, seen)
-        for label, localisation in (("painted line, m from the centre", found), ("when followed", followed)):
-            away = line_deviations(follower.lines_at(localisation.states, marking.AHEAD), stretch, seen)
-            median = np.nanmedian(away)
-            print(
-                f"  {label:32}median {median:+.2f}, median deviation {np.nanmedian(np.abs(away - median)):.2f}; "
-                f"found in {np.mean(~np.isnan(away).all(1)):.0%} of the rows"
-            )
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -53,7 +53,7 @@ def line_deviations(expected: np.ndarray, stretch: Stretch, strips: Strips) -> n
 def follow_line(localisation: Localisation, stretch: Stretch, centres: np.ndarray, strips: Strips) -> Localisation:
     """Return the localisation of a stretch, corrected by the line that is painted along the track's centre.
 
-    centres: as for `localise`. Raises RecordingError for unreadable images.
+    centres: float32 (n, 3, 5): of `reader.detect_centres`, in the stretch's rows. Raises RecordingError.
     """
     follower = TrackFilter(stretch, centres, localisation.track)
     for _ in range(LINE_ROUNDS):

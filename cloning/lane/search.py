@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from cloning.lane.follow import Candidate, TrackFilter
-from cloning.road.motion import Stretch
 from cloning.road.track import ROADS, Track
 
 PROFILE_LENGTH, PROFILE_STEP = 200.0, 2.0  # m: part of the trajectory whose heading is compared, and its step
@@ -135,15 +134,6 @@ def search(filters: list[TrackFilter], first: int, end: int) -> list[Candidate]:
         best = sorted(found, key=lambda candidate: candidate[0])[:count]
         found = [(-candidate.follow(min(first + rows, end)), candidate) for _, candidate in best]
     return [candidate for _, candidate in sorted(found, key=lambda candidate: candidate[0])]
-
-
-def localise(stretch: Stretch, centres: np.ndarray) -> Localisation:
-    """Localise a whole stretch on the track and direction that it fits best.
-
-    centres: float32 (n, 3, 5): of `reader.detect_centres`, in the stretch's rows.
-    """
-    found = search([TrackFilter(stretch, centres, track) for track in known_tracks()], 0, len(stretch))
-    return followed(found[0], len(stretch))
 
 
 def followed(candidate: Candidate, end: int) -> Localisation:
