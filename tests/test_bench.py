@@ -1,4 +1,4 @@
-"""The benchmarks of training and of the stand-in simulator, and the speed run, each in its quickest form."""
+"""The benchmark of training and the speed run, each in its quickest form."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from drive_process import warm_python
 import model
 from cloning.base.program import DONE, INCOMPLETE
 from cloning.network.network import Network
-from tools import bench_simulator, bench_training, speedrun
+from tools import bench_training, speedrun
 
 
 def test_the_training_benchmark_measures_the_epoch_and_the_step(sample_recording, capsys, monkeypatch):
@@ -25,15 +25,6 @@ def test_the_operations_are_those_of_the_network():
     convolutions = (36 * 158 * 24 * 75, 16 * 77 * 36 * 600, 6 * 37 * 48 * 900, 4 * 35 * 64 * 432, 2 * 33 * 64 * 576)
     dense = 4224 * 100 + 100 * 50 + 50 * 10 + 10
     assert bench_training.flops(Network()) == 2 * (3 * (sum(convolutions) + dense) - convolutions[0])
-
-
-def test_the_simulator_benchmark_measures_both_tracks(capsys):
-    assert bench_simulator.main(["--laps", "0.01", "--repeat", "1", "--frames", "5"]) == DONE
-    printed = capsys.readouterr().out
-    for track in ("lake", "jungle"):
-        [row] = re.findall(rf"^{track} (.*)$", printed, re.MULTILINE)
-        speeds = [float(number) for number in re.findall(r"[\d.]+", row)]
-        assert len(speeds) == 7 and min(speeds) > 0
 
 
 def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording, capsys, monkeypatch):

@@ -23,8 +23,7 @@ from cloning.base.errors import UserError
 from cloning.base.processes import interrupt_deferred
 from cloning.network.network import SHIPPED_MODEL
 from tools.attacks import Attack, all_attacks, frames
-from tools.command import ROOT
-from tools.server_process import ServerProcess
+from tools.command import ROOT, ServerProcess
 from tools.simulator_client import Simulator, telemetry_message
 
 OPEN_FILES = 1024  # that the server may have: Linux's usual limit

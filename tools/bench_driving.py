@@ -1,12 +1,12 @@
-"""Measure how fast drive.py answers, compared with the lower bound and with a typical server.
+"""Measure how fast drive.py answers, compared with the lower bound.
 
     python -m tools.bench_driving model.pt data/lake-ccw                     # one or two minutes
     python -m tools.bench_driving model.pt data/lake-ccw --frames 50000      # shows whether memory use grows
 
 Each server has a client that sends telemetry over loopback, in the simulator's fragments and without TCP_NODELAY, and
-waits for each answer. The lower bound is the time to decode the JPEG and run one forward pass (batch size 1, one
-thread). The servers take turns, so that other load on the machine affects all of them equally. Needs Linux, because CPU
-time and memory are read from /proc.
+waits for each answer. One only drives, one saves the frames, and one has its page open. The lower bound is the time to
+decode the JPEG and run one forward pass (batch size 1, one thread). The servers take turns, so that other load on the
+machine affects all of them equally. Needs Linux, because CPU time and memory are read from /proc.
 """
 
 import itertools
@@ -28,13 +28,12 @@ from cloning.base.arguments import command_line, number
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
 from cloning.server.page import DrivenFrame
-from tools.command import ROOT
-from tools.server_process import ServerProcess
+from tools.command import ROOT, ServerProcess
 from tools.simulator_client import Simulator, fragments, telemetry_message
 
 TURN = 100  # frames that a server answers in one turn
 WARM_UP = 50  # frames that are not counted
-PAGE_OPEN, TYPICAL = "drive.py, page open", "typical server"  # names in the table
+PAGE_OPEN = "drive.py, page open"  # a name in the table
 
 
 class Server(ServerProcess):
@@ -61,8 +60,7 @@ class Server(ServerProcess):
             sent = time.perf_counter()
             for fragment in message:
                 self.client.socket.sendall(fragment)
-            while self.client.receive() == "2":  # a ping: without an answer, the typical server closes after 20 s
-                self.client.send("3")
+            self.client.receive()
             if count:
                 self.round_trips.append(time.perf_counter() - sent)
         if count:
@@ -116,7 +114,6 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
             "drive.py": drive,
             "drive.py, saving frames": (*drive, Path(folder) / "run1"),
             PAGE_OPEN: drive,
-            TYPICAL: ("-c", "from tools.classic_server import main; main()", model),
         }
         servers = [stack.enter_context(Server(name, *command)) for name, command in commands.items()]
         for server in servers:
@@ -128,8 +125,7 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
             for server in servers:
                 with open_page(server.port) if server.name == PAGE_OPEN else nullcontext():
                     server.drive(messages[turn])
-                if server.name != TYPICAL:
-                    server.read_latencies(TURN)
+                server.read_latencies(TURN)
     return bounds, servers
 
 
@@ -157,8 +153,7 @@ def main(argv: list[str] | None = None) -> int:
             f"{server.name:24} {milliseconds(server.round_trips, bounds)} {count / server.seconds:9.1f} "
             f"{server.cpu_time / count * 1e3:10.2f} {server.megabytes[0]:9.0f} {server.megabytes[-1]:5.0f}"
         )
-        if server.latencies:
-            print(f"{'  in the server':24} {milliseconds(server.latencies, bounds)}")
+        print(f"{'  in the server':24} {milliseconds(server.latencies, bounds)}")
     return program.DONE
 
 

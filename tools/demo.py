@@ -28,8 +28,7 @@ from cloning.base.errors import SimulatorError, UserError
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.log import find_folders
 from cloning.road.autonomy import lap_in_words
-from tools.command import ROOT, python
-from tools.server_process import ServerProcess
+from tools.command import ROOT, ServerProcess, python
 from tools.shipped import Lap, render
 
 FOLDER, OWN = Path("demo"), Path("demo", "own")  # the second one: with recordings of one's own

@@ -196,11 +196,6 @@ class Part(NamedTuple):
     departure: float | None
 
     @property
-    def leaves(self) -> bool:
-        """Whether the car left the road at the part's end."""
-        return self.departure is not None
-
-    @property
     def coming(self) -> np.ndarray:
         """The greatest distance from the centre LATEST to EARLIEST s later, (n,), m; NaN where the part ends before."""
         found = np.full(len(self.time), np.nan)
@@ -270,7 +265,7 @@ def risks(among: Sequence[Part], kind: str, risk: Callable[[Part], np.ndarray]) 
     found: tuple[list[float], list[float]] = ([], [])
     for part in among:
         if part.kind == kind:
-            found[not part.leaves].extend(greatest(part, risk(part)))
+            found[part.departure is None].extend(greatest(part, risk(part)))
     return np.array(found[0]), np.array(found[1])
 
 

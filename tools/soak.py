@@ -18,7 +18,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -42,18 +41,11 @@ TURNS = 10  # with each server, at the end
 MAX_RATIO = 1.2  # of their 99th percentiles
 
 
-@dataclass(frozen=True)
 class Reading:
-    """The server at one moment: memory in MB, open files and sockets, its own processor time in s."""
+    """A server at this moment: memory in MB, open files and sockets, its own processor time in s."""
 
-    memory: float
-    files: int
-    seconds: float
-
-    @staticmethod
-    def of(server: Target) -> "Reading":
-        """Read it."""
-        return Reading(server.memory(), server.open_files(), server.cpu_seconds())
+    def __init__(self, server: Target):
+        self.memory, self.files, self.seconds = server.memory(), server.open_files(), server.cpu_seconds()
 
 
 class Company:
@@ -130,7 +122,7 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
     lines = [head("frames", "MB", "open files", "ms of processor time", "p50, ms", "p99, ms")]
     car.ask(car.messages[0])  # so that its frames' file is open, too
     time.sleep(SETTLE)
-    early = before = Reading.of(server)
+    early = before = Reading(server)
     alone = before.files
     bar = progress_bar(count, "frame")
     with Company(server.port, new_car, folder) as company, bar:
@@ -141,12 +133,12 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
                     car.simulator.socket.close()
                     car, leaves = new_car(), n + 1 + int(random.expovariate(1 / STAY))
                 if n == count // (2 * TENTHS):
-                    early = Reading.of(server)
+                    early = Reading(server)
                 is_right, passed = timed(car, n)
                 wrong += not is_right
                 times.append(passed)
                 bar.update()
-            now, answered = Reading.of(server), len(times) + company.answered - others
+            now, answered = Reading(server), len(times) + company.answered - others
             spent = 1000 * (now.seconds - before.seconds) / answered
             p50, p99 = np.quantile(times, (0.5, 0.99))
             figures = f"{now.memory:.1f}", now.files, f"{spent:.2f}", f"{p50:.1f}", f"{p99:.1f}"
