@@ -17,19 +17,13 @@ import torch
 from torch import nn
 
 from cloning.base.errors import ModelError
-from cloning.lane.reader import (
-    ANY_ROAD_WEIGHTS,
-    DISTANCES_AHEAD,
-    extract_strip,
-    fold_norms,
-    load_network,
-    normalize,
-)
+from cloning.lane.reader import ANY_ROAD_WEIGHTS, DISTANCES_AHEAD, extract_strip, fold_norms, load_network, normalize
 from cloning.lane.recovery import LOOKAHEAD
 from cloning.network import tensors
 from cloning.network.network import Network, steer
 
-ENDING = ".limits.pt"  # of the file beside a network's
+ENDING = ".limits.pt"  # of the file beside a network's, and its arrays
+ARRAYS = ("weights", "steering", "activations", "activations_factor", "hidden", "hidden_factor")
 MOST_UNITS = 100  # of the driving network's layer whose activations are compared
 MEAN_TIMES = np.array([0.3, 1.5], np.float32)  # s, of the signs' exponential means
 MAX_STEP = 1.0  # s: a longer pause counts as this
@@ -224,16 +218,11 @@ def fingerprint(network: Network) -> str:
 
 def save_limits(model: Path, network: Network, limits: Limits) -> None:
     """Write the limits beside the file of their network. Raises OSError."""
-    numbers = {"weights": limits.weights, **_flat(limits.ordinary)}
+    steering, activations, hidden = limits.ordinary
+    numbers = dict(zip(ARRAYS, (limits.weights, steering, *activations, *hidden), strict=True))
     arrays = {name: torch.from_numpy(np.asarray(value, np.float32)) for name, value in numbers.items()}
     about = {"fingerprint": fingerprint(network), "bias": limits.bias, "stop": limits.stop}
     tensors.save(limits_file(model), {**about, "arrays": arrays})
-
-
-def _flat(ordinary: Ordinary) -> dict[str, np.ndarray]:
-    steering, activations, hidden = ordinary
-    names = ("steering", "activations", "activations_factor", "hidden", "hidden_factor")
-    return dict(zip(names, (steering, *activations, *hidden), strict=True))
 
 
 def load_limits(model: Path, network: Network) -> Limits | None:
@@ -258,17 +247,10 @@ def _read(saved: Mapping[str, Any]) -> Limits:
     found = saved["arrays"]
     units, hidden, distances = len(found["activations"]), len(found["hidden"]), len(DISTANCES_AHEAD)
     signs = len(MEAN_TIMES) * (3 * distances + 5)
-    shapes: dict[str, tuple[int, ...]] = {
-        "weights": (signs,),
-        "steering": (distances,),
-        "activations": (units,),
-        "hidden": (hidden,),
-    }
-    shapes |= {"activations_factor": (units, units), "hidden_factor": (hidden, hidden)}
-    arrays = tensors.matching(found, {name: torch.empty(shape) for name, shape in shapes.items()})
+    shapes = (signs,), (distances,), (units,), (units, units), (hidden,), (hidden, hidden)
+    arrays = tensors.matching(found, dict(zip(ARRAYS, map(torch.empty, shapes), strict=True)))
     if not all(tensors.is_number(saved[name]) for name in ("bias", "stop")):
         raise ValueError("bias and stop are no numbers")
-    number = {name: value.numpy() for name, value in arrays.items()}
-    activations = Normal(number["activations"], number["activations_factor"])
-    ordinary = Ordinary(number["steering"], activations, Normal(number["hidden"], number["hidden_factor"]))
-    return Limits(ordinary, number["weights"], float(saved["bias"]), float(saved["stop"]))
+    weights, steering, *normals = (arrays[name].numpy() for name in ARRAYS)
+    ordinary = Ordinary(steering, Normal(*normals[:2]), Normal(*normals[2:]))
+    return Limits(ordinary, weights, float(saved["bias"]), float(saved["stop"]))

@@ -39,11 +39,7 @@ class Network(nn.Module):
     units = 4224  # of the flattened layer; dropout keeps half of them
 
     def __init__(
-        self,
-        crop: tuple[int, int] = CROP,
-        scale: float = 127.5,
-        offset: float = 1.0,
-        exposure: Exposure = (0.0, 0.0),
+        self, crop: tuple[int, int] = CROP, scale: float = 127.5, offset: float = 1.0, exposure: Exposure = (0.0, 0.0)
     ):
         """Make the layers with random weights, from torch's generator.
 
