@@ -29,25 +29,18 @@ gamepad (Logitech F310 and similar): left stick throttle,
 right stick steering, D pad set speed, A cruise, B record,
 X save position, Y jump back"""
 
-# Key or gamepad button -> action
-ACTIONS = {
-    "space": "cruise",
-    "pad a": "cruise",
-    "r": "record",
-    "pad b": "record",
-    "x": "save",
-    "pad x": "save",
-    "y": "jump",
-    "pad y": "jump",
-    "+": "faster",
-    "=": "faster",
-    "pad up": "faster",
-    "-": "slower",
-    "pad down": "slower",
-    "c": "view",
-    "f1": "help",
-    "escape": "quit",
+KEYS = {  # keys and gamepad buttons by action
+    "cruise": ("space", "pad a"),
+    "record": ("r", "pad b"),
+    "save": ("x", "pad x"),
+    "jump": ("y", "pad y"),
+    "faster": ("+", "=", "pad up"),
+    "slower": ("-", "pad down"),
+    "view": ("c",),
+    "help": ("f1",),
+    "quit": ("escape",),
 }
+ACTIONS = {key: action for action, keys in KEYS.items() for key in keys}
 # Direction -> the keys that are held for it
 HELD = {
     "left": ("arrow_left", "a"),

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from cloning.road.autonomy import LIMITS, lap_in_words
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import STEP
-from simulator.client import Client, DriveEnd
+from simulator.client import Client
 from simulator.run import Run
 
 if TYPE_CHECKING:
@@ -23,60 +23,16 @@ MAP_INCHES, MARGIN = 6.0, 15.0  # the longer side of the map, and m that it show
 ARROW_OFFSET, ARROW_LENGTH = 11.0, 35.0  # m from the centre line to the right, and m
 
 
-class DepartureReport(TypedDict):
-    """Where the car left the road; x is east, y is north."""
+def lap_report(run: Run, client: Client | None = None) -> dict[str, Any]:
+    """Return the report of a run, for JSON, with the metrics of the client that drove it, if there is one.
 
-    time_s: float
-    along_m: float
-    side: str
-    speed_mph: float
-    x_m: float
-    y_m: float
-
-
-class RoundTrips(TypedDict):
-    """Milliseconds from a telemetry to its answer."""
-
-    median: float
-    p95: float
-    max: float
-
-
-class LapReport(TypedDict):
-    """The metrics of a drive; offsets are absolute distances from the centre line, steering is -1..1.
-
-    disturbance, such as "fog:3", exists if there was one. The keys from `ended` on exist if a server drove, those after
-    it if it has answered. own_ms_a_frame is the time that the simulator itself used, which is measured in lock-step
-    only.
+    Offsets are absolute distances from the centre line, steering is -1..1, x is east and y north. A server's drive has
+    its end (see `DriveEnd`), and once it has answered, times from a telemetry to its answer, and the time that the
+    simulator itself used, which is measured in lock-step only.
     """
-
-    track: str
-    direction: str
-    laps: int
-    seconds_a_lap: list[float]
-    simulated_seconds: float
-    distance_m: float
-    mean_speed_mph: float
-    departures: list[DepartureReport]
-    autonomy: float
-    offset_mean_m: float
-    offset_max_m: float
-    steering_roughness_per_s: float
-    disturbance: NotRequired[str]
-    ended: NotRequired[DriveEnd]
-    frames: NotRequired[int]
-    frames_per_simulated_second: NotRequired[float]
-    round_trip_ms: NotRequired[RoundTrips]
-    own_ms_a_frame: NotRequired[float | None]
-    unusable_answers: NotRequired[int]
-    reconnections: NotRequired[int]
-
-
-def lap_report(run: Run, client: Client | None = None) -> LapReport:
-    """Return the report of a run, with the metrics of the client that drove it, if there is one."""
     offset = np.abs(run.trajectory.offset) if run.trajectory.offset else np.zeros(1)
     lap_times = np.diff([0.0, *run.lap_times])
-    report: LapReport = {
+    report: dict[str, Any] = {
         "track": run.track.name,
         "direction": run.track.direction,
         "laps": run.laps,
@@ -122,7 +78,7 @@ def lap_report(run: Run, client: Client | None = None) -> LapReport:
     return report
 
 
-def report_text(report: LapReport) -> str:
+def report_text(report: dict[str, Any]) -> str:
     """Return a report as lines for a terminal."""
     lines = [
         f"{report['track']} {report['direction']}: {plural(report['laps'], 'lap')}, {report['distance_m']:.0f} m in "

@@ -25,15 +25,6 @@ class Driven(TypedDict):
     alarms: tuple[int, int] | None  # in so many of so many windows, see `alarmed`; None: the entry foretells nothing
 
 
-class Figures(TypedDict):
-    """What is told of a group of drives; score: 0..100."""
-
-    drives: int
-    score: float
-    departures: int
-    mean_m: float
-
-
 def percent(autonomy: float) -> float:
     """Return the score of a drive, 0..100."""
     return round(100 * max(0.0, autonomy), DIGITS)
@@ -86,9 +77,9 @@ def driven(task: Task, drive: Drive) -> Driven:
     }
 
 
-def by_group(drives: Sequence[Driven]) -> dict[str, Figures]:
-    """Return the figures of each group that was driven."""
-    found: dict[str, Figures] = {}
+def by_group(drives: Sequence[Driven]) -> dict[str, dict[str, Any]]:
+    """Return the figures of each group that was driven; score: 0..100, mean_m: from the lane's centre."""
+    found = {}
     for group in dict.fromkeys(each["group"] for each in drives):
         chosen = [each for each in drives if each["group"] == group]
         found[group] = {
@@ -100,7 +91,7 @@ def by_group(drives: Sequence[Driven]) -> dict[str, Figures]:
     return found
 
 
-def score(groups: dict[str, Figures]) -> float:
+def score(groups: dict[str, dict[str, Any]]) -> float:
     """Return the score, 0..100: the mean of the groups' scores, without the replays, which not everybody can drive."""
     return round(fmean(groups[name]["score"] for name in GROUPS), DIGITS)
 

@@ -5,6 +5,7 @@ Positions of features along the road were read off frames of the real simulator,
 
 import numpy as np
 from numpy.random import Generator
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
@@ -96,18 +97,7 @@ class JungleTerrain:
 
     def height_at(self, positions: np.ndarray) -> np.ndarray:
         """Interpolate the height, (n,), at positions (n, 2), in m."""
-        rows, columns = self.height.shape
-        column, row = self.grid_coordinates(positions)
-        column, row = np.clip(column, 0, columns - 1.001), np.clip(row, 0, rows - 1.001)
-        i, j = row.astype(int), column.astype(int)
-        u, v = row - i, column - j
-        z = self.height
-        return (
-            (1 - u) * (1 - v) * z[i, j]
-            + (1 - u) * v * z[i, j + 1]
-            + u * (1 - v) * z[i + 1, j]
-            + u * v * z[i + 1, j + 1]
-        )
+        return map_coordinates(self.height, self.grid_coordinates(positions)[::-1], order=1, mode="nearest")
 
     def sunlit(self, points: np.ndarray, light: Light) -> np.ndarray:
         """Return, for points (n, 3), 1 where the sun reaches them and 0 in the ground's shadow: (n,)."""

@@ -63,10 +63,7 @@ class LakeTerrain:
         """Return the heights above the road, (n,), at positions (n, 2), in m."""
         distance, s, side = self.nearest_road(positions)
         length = self.track.length
-        left, right = (
-            np.interp(s, np.r_[known - length, known, known + length], np.tile(heights, 3))
-            for known, heights in self.heights
-        )
+        left, right = (np.interp(s, known, heights, period=length) for known, heights in self.heights)
         near = np.where(side == LEFT, left, right)
         near = np.where(near > 0, self.relief * near, near)
         cliff = in_sections((CLIFF,), s, side, length)
