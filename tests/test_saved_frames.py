@@ -1,4 +1,4 @@
-"""Frames that cannot be saved are counted and reported, and driving goes on."""
+"""Saved frames: their folders and names; those that cannot be saved are counted and reported, and driving goes on."""
 
 import errno
 import itertools
@@ -13,6 +13,37 @@ import pytest
 
 from cloning.base.errors import UserError
 from cloning.recordings import saved_frames as frames
+
+
+def test_each_session_saves_in_a_folder_of_its_own(tmp_path):
+    saver = frames.FrameSaver(tmp_path / "run1")
+    first, second = saver.start_session(), saver.start_session()
+    for n in range(300):  # many within one millisecond
+        first.save(b"first %d" % n, (0, 0, 0))
+        second.save(b"second %d" % n, (0, 0, 0))
+    saver.close()
+    for name, session in (("run1", b"first"), ("run1-2", b"second")):
+        paths = sorted((tmp_path / name).glob("*.jpg"))
+        assert [path.read_bytes() for path in paths] == [b"%s %d" % (session, n) for n in range(300)]
+        assert all(frames.taken_at(path.name) for path in paths)
+
+
+def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
+    folder = tmp_path / "run1"
+    folder.mkdir()
+    (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
+    (folder / frames.DRIVEN).write_bytes(b"old")
+    frames.empty_folder(folder)
+    assert list(folder.iterdir()) == []
+    for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "center_2018_07_16_17_11_43_382.jpg"):
+        (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
+        (folder / foreign).write_bytes(b"mine")
+        with pytest.raises(UserError, match=foreign):
+            frames.empty_folder(folder)
+        assert len(list(folder.iterdir())) == 2
+        (folder / foreign).unlink()
+    with pytest.raises(UserError, match="not a folder"):
+        frames.empty_folder(Path(__file__))
 
 
 @pytest.mark.parametrize("trouble", [OSError(errno.ENOSPC, "No space left on device"), ValueError("a bug")])
