@@ -39,6 +39,16 @@ def drive(env, actions, **reset):
     return np.stack([frame for frame, _ in steps]), [info for _, info in steps]
 
 
+def end_of_episode(env, *action):
+    """The rewards of driving in this way to the end of an episode, and what its last step returned."""
+    rewards, ended = [], False
+    while not ended:
+        last = env.step(np.asarray(action))
+        rewards.append(last[1])
+        ended = last[2] or last[3]
+    return rewards, last
+
+
 @pytest.mark.filterwarnings("error")
 def test_gymnasium_finds_no_fault():
     env = gymnasium.make(environment.ID, track="jungle", random_start=True, render_mode="rgb_array")
@@ -55,8 +65,7 @@ def test_the_observation_is_the_centre_cameras_frame(lake):
     run.set_back(1.5)
     eyes = Cameras(Scene(scenery.build("lake")), ("center",))
     assert np.array_equal(frame, eyes.frames(run.car.node.get_transform())[0])
-    assert (info["s"], info["offset"]) == (300, 1.5)
-    assert info["speed"] == 0
+    assert (info["s"], info["offset"], info["speed"]) == (300, 1.5, 0)
 
 
 def test_a_step_lasts_until_the_next_of_15_frames_a_second(lake):
@@ -71,11 +80,8 @@ def test_a_step_lasts_until_the_next_of_15_frames_a_second(lake):
 def test_rewards_are_the_metres_driven_and_steering_is_right_positive(lake):
     for side in (-1, 1):
         _, before = lake.reset(options=STRAIGHT)
-        rewards, truncated = [], False
-        while not truncated:
-            _, reward, terminated, truncated, info = lake.step(np.asarray([side * 0.1, 1]))
-            assert not terminated
-            rewards.append(reward)
+        rewards, (_, _, terminated, truncated, info) = end_of_episode(lake, side * 0.1, 1)
+        assert (terminated, truncated) == (False, True)
         assert sum(rewards) == pytest.approx(info["s"] - before["s"], abs=1e-6)
         assert 0.01 * lake.track.length <= sum(rewards) < 0.012 * lake.track.length
         assert 0.1 < side * info["offset"] < 2
@@ -84,11 +90,8 @@ def test_rewards_are_the_metres_driven_and_steering_is_right_positive(lake):
 
 def test_the_episode_ends_where_the_car_leaves_the_road(lake):
     lake.reset(options={**STRAIGHT, "offset": 2})
-    rewards, terminated = [], False
-    while not terminated:
-        frame, reward, terminated, truncated, info = lake.step(np.asarray([0.5, 1]))
-        assert not truncated
-        rewards.append(reward)
+    rewards, (frame, _, terminated, truncated, info) = end_of_episode(lake, 0.5, 1)
+    assert (terminated, truncated) == (True, False)
     assert min(rewards[:-1]) > -0.01
     assert -100 <= rewards[-1] < -98
     run = Run(lake.track, "autonomous")
@@ -105,6 +108,15 @@ def test_the_episode_ends_where_the_car_leaves_the_road(lake):
     again, info = lake.reset()
     assert info["departures"] == info["offset"] == 0
     assert not np.array_equal(frame, again)
+
+
+def test_an_episode_on_an_open_road_ends_with_success_at_its_end():
+    env = environment.Drive(make_road([(0, 0), (30, 0)], width=6), speed=15)
+    env.reset()
+    frame, _, terminated, truncated, info = end_of_episode(env, 0, 1)[1]
+    assert (terminated, truncated, info["laps"]) == (False, True, 1)
+    assert frame[100:].std() > 5
+    env.close()
 
 
 def test_the_car_never_exceeds_the_set_speed_and_a_lap_is_counted():
@@ -230,8 +242,7 @@ def test_info_has_the_names_that_users_of_gym_donkeycar_know():
     assert first == env.run.lap_times[0] > 2
     while info["hit"] == "none":
         info = env.step(np.asarray([-1, 1]))[4]
-    assert info["hit"] == "left"
-    assert info["last_lap_time"] == first
+    assert (info["hit"], info["last_lap_time"]) == ("left", first)
 
 
 def test_a_pickled_environment_drives_as_the_original():
