@@ -54,16 +54,14 @@ def test_a_whole_demo_and_then_nothing_is_done_again(commands, capsys):
     assert sum(words[0] == "server" for words in commands) == commands.count(["stopped"]) == 3
     laps = [lap.picture for lap in DRIVES]
     assert commands[-1] == ["-m", "cloning.report", "demo", "--lap", *map(str, laps)]
-    assert {*(demo.FOLDER / "laps").iterdir()} == {
-        lap.with_suffix(kind) for lap in laps for kind in (".png", ".json", ".mp4")
-    }
+    files = {lap.with_suffix(kind) for lap in laps for kind in (".png", ".json", ".mp4")}
+    assert {*(demo.FOLDER / "laps").iterdir()} == files
     printed = capsys.readouterr()
     assert printed.err == ""
     named = [program.ACTIVATE, *(command.format("demo") for command, _ in demo.NEXT)]
     assert all(command in printed.out for command in named)
-    assert (
-        "1138 m at 30 mph, never left the road; 0.07 m from the centre line on average, 0.28 m at most" in printed.out
-    )
+    driven = "1138 m at 30 mph, never left the road; 0.07 m from the centre line on average, 0.28 m at most"
+    assert driven in printed.out
     for lap in DRIVES:  # nobody waits a minute without knowing for what
         assert 0 < printed.out.index(f"{lap.title}: it sets off") < printed.out.index(f"{lap.title}: 1138 m")
     commands.clear()
