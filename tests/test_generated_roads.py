@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scenes import recorded
 
 from cloning.road.generated import MARKINGS, generate
 from cloning.road.motion import MPH
@@ -16,19 +15,7 @@ from simulator.scenery.generated import road as road_meshes
 from simulator.scenery.looks import Look
 
 NUMBERS = range(1, 101)
-NO_ROADS = [
-    "mountain-0",
-    "road-0",
-    "road--1",
-    "road-1.5",
-    "road-x",
-    "road-01",
-    "road-",
-    "road-1e3",
-    "Road-1",
-    "moon",
-    "",
-]
+NO_ROADS = ["mountain-0", *(f"road-{n}" for n in ("0", "-1", "1.5", "x", "01", "", "1e3")), "Road-1", "moon", ""]
 
 
 def generated(name):
@@ -112,8 +99,7 @@ def test_bends_grades_and_widths_stay_within_limits_and_come_near_them(roads):
     assert np.mean(1 / np.array(sharpest) < 20) > 0.5
     assert 0.22 < max(steepest) <= 0.25
     assert min(steepest) == 0, "some roads are flat, as the lake's is"
-    assert 6 <= min(widths) < 6.5
-    assert 9.5 < max(widths) <= 10
+    assert 6 <= min(widths) < 6.5 and 9.5 < max(widths) <= 10
     assert {road.marking for road in roads[:10]} == set(MARKINGS)
 
 
@@ -149,7 +135,7 @@ def test_a_road_that_does_not_exist_is_a_clear_error(command, name, capsys, tmp_
 
 
 @pytest.mark.parametrize(("name", "direction"), [("road-3", "cw"), ("road-5", "ccw")])
-def test_expert_drives_a_lap_of_a_generated_road(name, direction, tmp_path):
+def test_expert_drives_a_lap_of_a_generated_road(name, direction):
     """Both have bends of less than 15 m radius and grades of more than 0.15; road-3 is 6.3 m wide."""
     run = Run(Track(name, direction))
     assert np.abs(run.track.curvature).max() > 1 / 15
@@ -160,13 +146,6 @@ def test_expert_drives_a_lap_of_a_generated_road(name, direction, tmp_path):
         run.step(*expert.drive(run))
     assert not run.departures
     assert report.lap_report(run)["track"] == name
-    report.write_picture(tmp_path / "map.png", run)
-    assert (tmp_path / "map.png").stat().st_size > 10_000
-
-
-def test_records_a_generated_road(tmp_path):
-    recording, _ = recorded(tmp_path / "a", Track("road-2"), 0.005, 30)
-    assert len(recording) > 10
 
 
 @pytest.mark.parametrize("number", range(1, 6))
