@@ -28,6 +28,14 @@ def render_frame(bend: float, offset: float, rng: np.random.Generator) -> np.nda
     return np.clip(frame + rng.integers(-10, 11, frame.shape, np.int8), 0, 255).astype(np.uint8)
 
 
+def film_of(path: Path) -> tuple[float, list[np.ndarray]]:
+    """A film's frames a second, and its frames: uint8, BGR; decoded by OpenCV's own FFmpeg."""
+    capture, frames = cv2.VideoCapture(str(path)), []
+    while (read := capture.read())[0]:
+        frames.append(read[1])
+    return capture.get(cv2.CAP_PROP_FPS), frames
+
+
 def render_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = "/Users/driver/data/IMG/") -> Path:
     """A folder as the simulator records it: no header, absolute paths, 15 rows a second, throttle 0 in every tenth."""
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""video.py as a user calls it, with the films decoded by OpenCV's own FFmpeg."""
+"""video.py as a user calls it, and its films."""
 
 import os
 import sys
@@ -13,6 +13,7 @@ import pytest
 import torch
 import warm
 from commands import ROOT
+from rendered import film_of
 
 import video
 from cloning.base import program
@@ -58,21 +59,13 @@ def run(tmp_path, monkeypatch, capsys):
     return run
 
 
-def frames_of(path: Path) -> tuple[float, list[np.ndarray]]:
-    capture, seen = cv2.VideoCapture(str(path)), []
-    while (read := capture.read())[0]:
-        seen.append(read[1])
-    return capture.get(cv2.CAP_PROP_FPS), seen
-
-
 def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
     save(tmp_path / "run1", 30)
-    result = warm.run(
-        [sys.executable, str(ROOT / "video.py"), "run1/"], cwd=tmp_path, capture_output=True, text=True, timeout=120
-    )
+    command = [sys.executable, str(ROOT / "video.py"), "run1/"]
+    result = warm.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0 and "run1.mp4: 30 frames at 20 frames/s" in result.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run1", "run1.mp4"]
-    fps, seen = frames_of(tmp_path / "run1.mp4")
+    fps, seen = film_of(tmp_path / "run1.mp4")
     assert fps == pytest.approx(20) and len(seen) == 30
     for index, frame in enumerate(seen):
         assert np.abs(frame.mean((0, 1)) - red_frame(index).mean((0, 1))).max() < 4, "in order, red still red"
@@ -95,7 +88,7 @@ def test_other_files_and_unreadable_frames_are_left_out_and_named(run, tmp_path)
     assert status == 1, "the film lacks frames"
     assert "unreadable (the first: 160x80 pixels where 320x160 are expected): 2018_07_16_17_11_44_000.jpg, " in printed
     assert "2018_07_16_17_11_44_900.jpg, 2018_07_16_17_11_44_901.jpg\n" in printed
-    fps, seen = frames_of(tmp_path / "run.1.mp4")
+    fps, seen = film_of(tmp_path / "run.1.mp4")
     assert fps == pytest.approx(60) and len(seen) == 10
     assert {frame.shape for frame in seen} == {(160, 320, 3)}
 
@@ -106,7 +99,7 @@ def test_a_first_frame_of_another_size_is_left_out(run, tmp_path, rows, columns)
     cv2.imwrite(str(tmp_path / "run1" / FIRST), np.zeros((rows, columns, 3), np.uint8))
     status, printed = run("run1")
     assert status == 1 and f"(the first: {columns}x{rows} pixels" in printed
-    assert len(frames_of(tmp_path / "run1.mp4")[1]) == 3
+    assert len(film_of(tmp_path / "run1.mp4")[1]) == 3
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pipes in folders")
@@ -165,7 +158,7 @@ def test_odd_sizes_lose_a_row_and_a_column(tmp_path):
     writer = FilmWriter(tmp_path / "odd.mp4", 15)
     writer.add(red_frame(0, 121, 161))
     writer.close()
-    assert frames_of(tmp_path / "odd.mp4")[1][0].shape == (120, 160, 3)
+    assert film_of(tmp_path / "odd.mp4")[1][0].shape == (120, 160, 3)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +213,7 @@ def test_the_overlay_draws_steering_and_attention(run, tmp_path):
     save_model(tmp_path / "model.pt", network)
     save(tmp_path / "run1", 3)
     assert run("run1", "--overlay", "model.pt")[0] == 0
-    frame = frames_of(tmp_path / "run1.mp4")[1][0]
+    frame = film_of(tmp_path / "run1.mp4")[1][0]
     assert frame.shape == (320, 640, 3)
     green = (frame[..., 1] > 150).nonzero()[1]
     assert len(green) > 200 and green.min() < 280 and green.max() < 330, "the line bends to the left"
