@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,6 +47,12 @@ def ask(port: int, path: str, method: str = "GET", body: object = None, **header
         return answer.status, answer.read(), dict(answer.headers)
     finally:
         connection.close()
+
+
+def live(port: int, query: str = "") -> dict:
+    """The figures that drive.py's page is given first."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/live{query}", timeout=30) as events:
+        return json.loads(events.readline()[6:])
 
 
 class Process:

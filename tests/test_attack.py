@@ -7,19 +7,16 @@ import socket
 import subprocess
 import sys
 import time
-import urllib.error
-import urllib.request
 from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import warm
-from drive_process import awaited, serving
+from drive_process import ask, awaited, live, serving
 
 import drive
 from cloning.base.errors import UserError
-from cloning.network.network import Network
 from cloning.server import page
 from cloning.server.connections import MAX_CONNECTIONS
 from cloning.server.libraries import engineio, eventlet
@@ -62,12 +59,8 @@ def test_the_attacks_find_a_fault(server, jpegs, expected):
     """What a car is told must be right: an answer that is not the expected one, and none at all, are found."""
     other = [expected[0]] * len(expected)
     assert "wrong" in attack.run(None, server, jpegs, other, SECONDS).faults()
-    assert attack.Report(attack.Drive(asked=2, round_trips=[0.01]), 500.0, 100.0, 9.0, 1).faults(timely=False) == [
-        "lost",
-        "memory",
-        "new car",
-        "left open",
-    ]
+    report = attack.Report(attack.Drive(asked=2, round_trips=[0.01]), 500.0, 100.0, 9.0, 1)
+    assert report.faults(timely=False) == ["lost", "memory", "new car", "left open"]
 
 
 INTERRUPTED = """
@@ -112,8 +105,7 @@ def test_a_client_that_reads_nothing_is_disconnected(server):
 @pytest.mark.parametrize("text", [b"42[", b"7", b"3", b"", b'42["other",1]'])
 def test_a_client_whose_messages_have_no_answer_is_disconnected(server, text):
     """So that the server does not work for long on what is left of a client that has gone."""
-    with Simulator(server.port) as stranger:
-        stranger.open()
+    with Simulator(server.port).open() as stranger:
         for _ in range(20):
             stranger.socket.sendall(frame(text) * 90)
             stranger.send("2")
@@ -124,8 +116,7 @@ def test_a_client_whose_messages_have_no_answer_is_disconnected(server, text):
 
 
 def test_a_long_ping_is_not_answered(server):
-    with Simulator(server.port) as stranger:
-        stranger.open()
+    with Simulator(server.port).open() as stranger:
         stranger.send("2" + "x" * 100_000)
         stranger.send("2")
         assert stranger.receive() == "3"
@@ -177,17 +168,13 @@ def test_the_client_that_was_served_longest_ago_goes_first():
         served.append(client.sid)
         client.served = time.perf_counter()
 
-    for sid in "314502":
+    for sid in "314520":
         client = engine.sockets[sid] = Client(engine, sid)
-        client.served, client.waits = client.served - 10 + int(sid), sid != "5"
-    engine.sockets["5"].served -= 10
-    engine.sockets["5"].websocket = SimpleNamespace(parts=["its message arrives"], arrived=time.perf_counter() - 1)
-    arriving = engine.sockets.pop("0")
-    arriving.websocket, arriving.waits = (
-        SimpleNamespace(parts=["so does this"], arrived=time.perf_counter() + 60),
-        False,
-    )
-    engine.sockets["0"] = arriving
+        client.served, client.waits = client.served - 10 + int(sid), sid not in "50"
+    slow, arriving, now = engine.sockets["5"], engine.sockets["0"], time.perf_counter()
+    slow.served -= 10
+    for each, until in ((slow, now - 1), (arriving, now + 60)):
+        each.websocket = SimpleNamespace(parts=["a message arrives"], arrived=until)
     waiting = [client for client in engine.sockets.values() if client.waits]
     threads = [eventlet.spawn(serve, client) for client in waiting]
     eventlet.sleep(0)
@@ -204,23 +191,19 @@ def test_a_new_car_takes_the_place_of_a_connection_without_a_request(server, jpe
             idle = stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
             if n >= 20:
                 idle.sendall(b"POST /set-speed HTTP/1.1\r\nContent-Length: 99\r\n\r\n{")
-        simulator = stack.enter_context(Simulator(server.port))
-        simulator.open()
-        simulator.drive(telemetry(jpegs[0]))
+        stack.enter_context(Simulator(server.port).open()).drive(telemetry(jpegs[0]))
 
 
 @pytest.mark.parametrize("clock", ["100 * now()", "now() + 3600 * next(hours)"])
 def test_no_change_of_the_clock_costs_an_answer(model_file, jpegs, clock):
     """Two minutes pass in 1.2 seconds there, or an hour forwards or back, beside a car that never pings."""
     first = f"import itertools, time; now, hours = time.time, itertools.cycle([0, 1, -1]); time.time = lambda: {clock}"
-    with serving(model_file, first=first) as process, Simulator(process.port) as simulator:
-        simulator.open()
+    with serving(model_file, first=first) as process, Simulator(process.port).open() as simulator:
         until = time.monotonic() + 1.2
         while time.monotonic() < until:
             simulator.drive(telemetry(jpegs[0]))
             time.sleep(0.05)
-        with urllib.request.urlopen(f"http://127.0.0.1:{process.port}/live", timeout=10) as live:
-            shown = json.loads(live.readline()[6:])
+        shown = live(process.port)
         assert shown["state"] == "driving" and 5 < shown["rate"] < 20
 
 
@@ -228,11 +211,9 @@ def test_only_a_client_that_asks_for_a_connection_is_pinged(model_file, jpegs):
     often = "import cloning.wire.protocol as protocol; protocol.PING_INTERVAL = 0.2"
     with (
         serving(model_file, first=often) as process,
-        Simulator(process.port) as simulator,
-        Simulator(process.port) as other,
+        Simulator(process.port).open() as simulator,
+        Simulator(process.port).open() as other,
     ):
-        simulator.open()
-        other.open()
         other.send("40")
         for _ in range(3):
             assert other.receive() == "2"
@@ -253,9 +234,8 @@ def test_only_a_client_that_asks_for_a_connection_is_pinged(model_file, jpegs):
     ],
 )
 def test_an_odd_request_is_told_why_it_is_refused(server, query, reason):
-    with pytest.raises(urllib.error.HTTPError, match="400") as error:
-        urllib.request.urlopen(f"http://127.0.0.1:{server.port}/socket.io/?{query}", timeout=10)
-    assert error.value.read().decode().startswith(reason)
+    status, body, _ = ask(server.port, f"/socket.io/?{query}")
+    assert status == 400 and body.decode().startswith(reason)
 
 
 def test_closed_pages_are_noticed_while_nobody_drives(server):
@@ -269,14 +249,11 @@ def test_closed_pages_are_noticed_while_nobody_drives(server):
         before = server.open_files()
         for opened in [open_page() for _ in range(20)]:
             opened.close()
-        until = time.monotonic() + 20
-        while server.open_files() > before and time.monotonic() < until:
-            time.sleep(0.05)
-        assert server.open_files() <= before
+        awaited(lambda: server.open_files() <= before, 20)
 
 
-def test_all_pages_share_a_picture(jpegs, monkeypatch):
-    server, drawn, now = drive.DriveServer(Network().eval()), list[float](), [0.0]
+def test_all_pages_share_a_picture(network, jpegs, monkeypatch):
+    server, drawn, now = drive.DriveServer(network), list[float](), [0.0]
     session = server.sessions["sid"] = drive.Session(server)
 
     def image(*_):
@@ -301,8 +278,8 @@ def test_all_pages_share_a_picture(jpegs, monkeypatch):
     assert pages.open == 0
 
 
-def test_a_new_page_gets_the_last_minute_in_as_many_rows_as_it_can_show(jpegs, monkeypatch):
-    server, now = drive.DriveServer(Network().eval()), time.monotonic()
+def test_a_new_page_gets_the_last_minute_in_as_many_rows_as_it_can_show(network, jpegs, monkeypatch):
+    server, now = drive.DriveServer(network), time.monotonic()
     session = server.sessions["sid"] = drive.Session(server)
     session.answer(telemetry(jpegs[0]))
     session.history.extend(page.DrivenFrame(now - 50 + at / 120, 0, 9, 0.5, 3) for at in range(5 * page.SHOWN_FRAMES))

@@ -64,8 +64,7 @@ def test_other_socket_libraries_are_refused_by_the_command_and_no_harm_to_an_imp
 
 
 def test_which_model_drives(jpegs, tmp_path, monkeypatch):
-    with serving(cwd=tmp_path) as process, Simulator(process.port) as simulator:
-        simulator.open()
+    with serving(cwd=tmp_path) as process, Simulator(process.port).open() as simulator:
         answer = np.float32(simulator.drive(telemetry(jpegs[0]))["steering_angle"])
         assert answer == steer(load_model(SHIPPED_MODEL), decode(jpegs[0]))
         assert f"Driving with {SHIPPED_MODEL} (the model that comes with the project).\n" in process.lines
@@ -96,8 +95,7 @@ for module, name in [(socket, "TCP_QUICKACK"), (signal, "SIGTERM"), (os, "fork")
 
 def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, steering, tmp_path):
     folder = tmp_path / "run1"
-    with serving(model_file, folder, first=ELSEWHERE) as process, Simulator(process.port) as simulator:
-        simulator.open()
+    with serving(model_file, folder, first=ELSEWHERE) as process, Simulator(process.port).open() as simulator:
         for n in range(8):
             assert np.float32(simulator.drive(telemetry(jpegs[n]))["steering_angle"]) == steering[n]
         assert process.stop() == 128 + STOP
@@ -108,8 +106,7 @@ def test_driving_and_filming_without_what_only_linux_has(model_file, jpegs, stee
 
 
 def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path):
-    with serving(model_file, "run1", cwd=tmp_path) as process, Simulator(process.port) as simulator:
-        simulator.open()
+    with serving(model_file, "run1", cwd=tmp_path) as process, Simulator(process.port).open() as simulator:
         for n in range(60):
             simulator.drive(telemetry(jpegs[n % 8]))
         simulator.drive({})
@@ -137,11 +134,9 @@ def test_a_terminal_that_nobody_reads_and_requests_that_fill_it_stop_no_car(mode
             with socket.create_connection(("127.0.0.1", port), 10) as client:
                 client.sendall(b"G\r\n\r\n")
                 client.recv(10)
-        with Simulator(port) as simulator:
-            simulator.open()
+        with Simulator(port).open() as simulator:
             for _ in range(500):
-                with Simulator(port) as other:
-                    other.open()
+                with Simulator(port).open() as other:
                     other.drive({})  # a warning of its own session, and a line about its end
                 simulator.drive(telemetry(jpegs[0]))
         process.send_signal(STOP)

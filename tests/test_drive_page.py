@@ -1,6 +1,5 @@
 """The page of drive.py: what it says goes on, the set speed that it changes, and its looks in a real Chromium."""
 
-import http.client
 import json
 import threading
 import time
@@ -13,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import LOOKS, decoded, needs_chromium
-from drive_process import ask, serving
+from drive_process import ask, live, serving
 
 import drive
 from cloning.base import program
@@ -39,32 +38,25 @@ def change_set_speed(server, body: object, **headers: str) -> tuple[int, bytes]:
 def shown(server, query: str = "") -> dict:
     """The figures that a page is given first."""
     time.sleep(2 * drive_page.UPDATE_INTERVAL)  # all pages get the same in an interval
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
-    connection.request("GET", f"/live{query}")
-    try:
-        return json.loads(connection.getresponse().readline()[6:])
-    finally:
-        connection.close()
+    return live(server.port, query)
 
 
 def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_in_it(server, jpegs):
-    with Simulator(server.port) as simulator:
-        simulator.open()
+    with Simulator(server.port).open() as simulator:
         for _ in range(3):
             simulator.drive(telemetry(jpegs[0], speed="8.5000"))
         for query in ("", "?attention"):
-            live = shown(server, query)
-            time_stamp, _, speed, throttle, latency, *_ = live["rows"][-1]
+            figures = shown(server, query)
+            time_stamp, _, speed, throttle, latency, *_ = figures["rows"][-1]
             assert abs(time_stamp - time.monotonic()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
-            assert live["image"].startswith("/9j/")
+            assert figures["image"].startswith("/9j/")
         measured: Any = SimpleNamespace(port=server.port, latencies=[])
         bench_driving.Server.read_latencies(measured, 2)
     assert len(measured.latencies) == 2 and all(0 < seconds < 60 for seconds in measured.latencies)
 
 
 def test_the_page_changes_the_set_speed_of_a_car_that_drives(server, jpegs):
-    with Simulator(server.port) as simulator:
-        simulator.open()
+    with Simulator(server.port).open() as simulator:
         for set_speed in (11.5, 9.0):
             own = {"Origin": f"http://127.0.0.1:{server.port}", "Sec_Fetch_Site": "same-origin"}
             status, answer = change_set_speed(server, {"set_speed": f"{set_speed}"}, **own)
@@ -197,8 +189,7 @@ def feeding(port: int, message: object):
             simulator.receive()
             time.sleep(0.02)
 
-    with Simulator(port) as simulator:
-        simulator.open()
+    with Simulator(port).open() as simulator:
         thread = threading.Thread(target=feed)
         thread.start()
         try:
@@ -299,8 +290,7 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
 @needs_chromium
 def test_a_spike_does_not_squash_the_rest(server, jpegs, page):
     page.open(f"http://127.0.0.1:{server.port}/")
-    with Simulator(server.port) as simulator:
-        simulator.open()
+    with Simulator(server.port).open() as simulator:
         for n in range(30):
             simulator.drive(telemetry(jpegs[n % 8], speed="300.0000" if n == 20 else f"{8 + n / 30:.4f}"))
         page.shows("#plots", "beyond the scale: 300.0 mph")

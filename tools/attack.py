@@ -69,8 +69,7 @@ class Car:
             if time.monotonic() > until:
                 raise ConnectionError("the server refuses a new car")
             time.sleep(0.1)
-        self.simulator = simulator
-        self.simulator.open()
+        self.simulator = simulator.open()
         self.messages = [telemetry_message(jpeg) for jpeg in jpegs]
         self.expected = expected or [self.ask(message) for message in self.messages]
 

@@ -62,9 +62,11 @@ class Simulator:
             (length,) = struct.unpack(">H", self._take(2))
         return self._take(length).decode()
 
-    def open(self) -> list[str]:
-        """Return the server's first three packets: 0{…}, the first steer, 40."""
-        return [self.receive() for _ in range(3)]
+    def open(self) -> Self:
+        """Receive the server's first three packets: 0{…}, the first steer, 40."""
+        for _ in range(3):
+            self.receive()
+        return self
 
     def drive(self, telemetry: object) -> dict[str, str]:
         """Send a telemetry and return its answer, the data of `steer`."""
