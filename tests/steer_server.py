@@ -2,12 +2,12 @@
 
 import base64
 import contextlib
+import functools
 import hashlib
 import re
 import socket
 import struct
 import threading
-from typing import Any, cast
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from cloning.road.track import Track
 from simulator.cameras import Cameras
 from simulator.client import Client
 from simulator.run import Run
+from tools import attacks
 
 STEER = '42["steer",{"steering_angle":"%s","throttle":"%s"}]'
 
@@ -43,12 +44,15 @@ def accept_websocket(client, headers=b""):
     accept = base64.b64encode(hashlib.sha1(key + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11").digest())
     client.sendall(
         b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        + headers
-        + b"Sec-WebSocket-Accept: "
-        + accept
-        + b"\r\n\r\n"
+        b"%sSec-WebSocket-Accept: %s\r\n\r\n" % (headers, accept)
     )
     return request.decode()
+
+
+def frame(payload, opcode=1, final=True):
+    """A websocket frame of a server, which is not masked; opcode: 1 text."""
+    payload = payload.encode() if isinstance(payload, str) else payload
+    return attacks.frame(payload, 0x80 * final | opcode, masked=0)
 
 
 class Server:
@@ -76,17 +80,15 @@ class Server:
     def run(self):
         try:
             for _ in range(self.sessions):
-                client, _ = self.listener.accept()
-                client.settimeout(20)
-                with client, contextlib.suppress(ConnectionError):
-                    self.session(client)
+                self.client, _ = self.listener.accept()
+                self.client.settimeout(20)
+                with self.client, contextlib.suppress(ConnectionError):
+                    self.session(self.client)
         except Exception as error:
             self.error = error
 
     def send(self, client, text):
-        data = text.encode()
-        size = bytes([len(data)]) if len(data) < 126 else b"\x7e" + struct.pack(">H", len(data))
-        client.sendall(b"\x81" + size + data)
+        client.sendall(frame(text))
 
     def session(self, client):
         self.requests.append(accept_websocket(client))
@@ -143,9 +145,11 @@ class Blank(Cameras):
 LAPS = 0.004  # a drive of 1.4 s
 
 
+lake = functools.cache(lambda: Track("lake"))
+
+
 def drive(server, laps=LAPS, wait=5.0, realtime=False):
-    run, cameras = Run(Track("lake"), "autonomous"), cast(Any, Blank())
-    client = Client(run, cameras, "127.0.0.1", server.port, wait, realtime)
+    client = Client(Run(lake(), "autonomous"), Blank(), "127.0.0.1", server.port, wait, realtime)
     client.drive(laps)
     return client
 

@@ -1,10 +1,26 @@
-"""Foul weather and faulty cameras: deterministic, stronger by strength, and lasting where they last."""
+"""Foul weather and faulty cameras: deterministic, stronger by strength, wherever frames are disturbed, and measured."""
+
+import base64
+import json
 
 import numpy as np
 import pytest
+from rendered import render_recording
+from scenes import Here
+from steer_server import STEER, Server
 
+from cloning.base.errors import SimulatorError
+from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.images import decode
+from cloning.recordings.log import read_recording
+from cloning.replay import replay
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber, disturb
+from cloning.road.track import Track
+from simulator import driving
+from simulator.__main__ import main
+from simulator.dialects import Episodes, Stage
+from simulator.environment import Drive
+from tools import robustness
 
 IMAGE_KINDS = [kind for kind in KINDS if kind not in ("dropped", "late")]
 
@@ -51,16 +67,9 @@ def test_strength_3_is_that_of_the_benchmarks(frames):
 
 def test_drops_and_dirt_stay_where_they_are_and_rain_falls():
     grey = np.full((160, 320, 3), 128, np.uint8)
-    for kind, stays in (
-        ("dirt", True),
-        ("occluded", True),
-        ("fog", True),
-        ("sun", True),
-        ("rain", False),
-        ("noise", False),
-    ):
+    for kind in ("dirt", "occluded", "fog", "sun", "rain", "noise"):
         disturber = Disturber(Disturbance(kind, 3), 5)
-        assert np.array_equal(disturber(grey), disturber(grey)) == stays, kind
+        assert np.array_equal(disturber(grey), disturber(grey)) == (kind not in ("rain", "noise")), kind
     other = Disturber(Disturbance("dirt", 3), 6)(grey)
     assert not np.array_equal(Disturber(Disturbance("dirt", 3), 5)(grey), other), "another drive has other dirt"
 
@@ -86,3 +95,142 @@ def test_what_is_no_disturbance_is_refused(text):
     with pytest.raises(ValueError, match=r"is not KIND:STRENGTH, such as fog:3; kinds: rain, fog"):
         Disturbance.parse(text)
     assert str(Disturbance.parse("fog:3")) == "fog:3"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Where they are used: in drives, recordings, replays, other programs' episodes, Gymnasium and tools.robustness
+
+
+def sent(tmp_path, *options):
+    """The images that a server gets in a short drive, and the drive's report."""
+    images, report = [], tmp_path / "report.json"
+
+    def steer(packet, n):
+        images.append(base64.b64decode(json.loads(packet[2:])[1]["image"]))
+        return [STEER % (f"{0.02 * (n * 7919 % 5 - 2):.3f}", "0.7")]
+
+    with Server(steer) as server:
+        words = ["drive", "--laps", "0.01", "--port", str(server.port), "--report", str(report), *options]
+        assert main(words) == 0
+    return images, json.loads(report.read_text(encoding="utf-8"))
+
+
+def test_late_lost_and_rainy_frames_reach_the_driver_so_and_the_report_says_it(tmp_path, capsys):
+    clear, report = sent(tmp_path)
+    assert "disturbance" not in report and report["departures"] == []
+    late, again = sent(tmp_path, "--disturb", "late:3")
+    assert len(late) == len(clear) > 20
+    assert late == [clear[max(0, i - 3)] for i in range(len(late))]
+    assert again.pop("disturbance") == "late:3"
+    assert {key for key in again if again[key] != report[key]} <= {"round_trip_ms", "own_ms_a_frame"}, "the same drive"
+    assert "disturbance: late:3\n" in capsys.readouterr().out
+    lost, _ = sent(tmp_path, "--disturb", "dropped:3")
+    repeated = [i for i in range(1, len(lost)) if lost[i] == lost[i - 1]]
+    assert 0.3 < len(repeated) / len(lost) < 0.8
+    assert all(lost[i] == clear[i] for i in range(len(lost)) if i not in repeated)
+    rain, again = (sent(tmp_path, "--disturb", "rain:4")[0] for _ in range(2))
+    assert rain == again != clear
+
+
+def test_a_recording_shows_the_disturbance_in_all_cameras_and_is_the_same_again(tmp_path):
+    def recorded(name, *options):
+        assert main(["record", str(tmp_path / name), "--laps", "0.004", *options]) == 0
+        recording = read_recording(tmp_path / name)
+        return [[recording.path(row, camera).read_bytes() for camera in range(3)] for row in range(len(recording))]
+
+    clear = recorded("clear")
+    assert recorded("late", "--disturb", "late:2") == [clear[max(0, i - 2)] for i in range(len(clear))]
+    dirty = recorded("dirty", "--disturb", "dirt:4")
+    assert dirty == recorded("again", "--disturb", "dirt:4")
+    change = np.abs(np.array([decode(image) for image in dirty[5]]).astype(int) - [decode(image) for image in clear[5]])
+    assert (change.max(axis=-1) > 25).mean((1, 2)) == pytest.approx(0.3, abs=0.07), "of each camera's lens"
+
+
+def test_a_replay_disturbs_the_warped_frame_once_whoever_looks(tmp_path):
+    recording = replay.load_recording(render_recording(tmp_path / "lake", rows=60))
+    lines = replay.reference_lines(recording, by_lane=False)
+    views, seen = [], []
+
+    def clear(frame):
+        views.append(frame.view)
+        return frame.human_steering + 0.05
+
+    def foggy(frame):
+        seen.append((frame.received(slice(60, 135)), frame.view, decode(frame.jpeg())))
+        return frame.human_steering + 0.05
+
+    replay.drive(recording, lines, 9.0, clear)
+    replay.drive(recording, lines, 9.0, foggy, disturbance=Disturbance("rain", 4))
+    expected = list(map(Disturber(Disturbance("rain", 4), 0), views))
+    for rain, (received, view, sent_so) in zip(expected, seen, strict=True):
+        assert np.array_equal(view, rain)
+        assert np.array_equal(received, sent_so[60:135])
+    assert np.abs(seen[30][2].astype(int) - expected[30]).mean() < 5
+
+
+def test_episodes_begin_anew_and_rain_falls_in_rainy_weather():
+    def images(stage, weather):
+        program = Episodes(stage)
+        found = []
+        for _ in range(2):
+            program.start("lake", weather, "day")
+            found.append([decode(base64.b64decode(program.state()["image"])) for _ in range(2)])
+        return np.array(found)
+
+    noisy = images(Stage("lake", None, 0, {}, Disturbance("noise", 4)), "sunny")
+    assert np.array_equal(noisy[0], noisy[1]) and not np.array_equal(noisy[0, 0], noisy[0, 1])
+    rainy, foggy = (images(Stage("lake", None, 0, {}), weather) for weather in ("rainy", "foggy"))
+    assert not np.array_equal(rainy[0, 0], rainy[0, 1]), "the drops fall"
+    assert np.array_equal(foggy[0, 0], foggy[0, 1]), "the haze stands"
+
+
+def test_an_environment_is_disturbed_by_its_seed_until_another_disturbance_is_chosen():
+    env = Drive(disturb="drops:4")
+    first, again, other = (env.reset(seed=seed)[0] for seed in (1, 1, 2))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+    clear = env.reset(options={"disturb": None})[0]
+    assert np.array_equal(clear, env.reset()[0])
+    assert np.abs(clear.astype(int) - first).mean() > 1
+    for wrong in ("hail:3", 3):
+        with pytest.raises(SimulatorError, match=r"disturb: .* is not KIND:STRENGTH, such as fog:3; kinds: rain"):
+            env.reset(options={"disturb": wrong})
+
+
+@pytest.mark.parametrize("command", [["drive"], ["record", "x"], ["replay", "x"], ["window"]])
+def test_a_wrong_text_is_refused(command, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main([*command, "--disturb", "hail:3"])
+    assert "--disturb: 'hail:3' is not KIND:STRENGTH, such as fog:3; kinds: rain, fog" in capsys.readouterr().err
+
+
+def test_drives_and_replays_are_measured_once_and_a_run_goes_on(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(robustness, "started_workers", Here)
+    folder = render_recording(tmp_path / "lake", rows=40)
+    words = ["--kinds", "late", "--strengths", "5", "--tracks", "lake", "--laps", "0.01"]
+    words += ["--recordings", str(folder), "--output", str(tmp_path / "found")]
+    assert robustness.main(words) == 0
+    file = tmp_path / "found" / "robustness.json"
+    found = json.loads(file.read_text(encoding="utf-8"))
+    assert len(found) == 6 and all(name.startswith("shipped ") for name in found)
+
+    def of(words):
+        return next(name for name in found if name.endswith(words))
+
+    late = of(" lake cw, 30 mph, look 0, 0.01 laps, late:5")
+    conditions = driving.Conditions(str(SHIPPED_MODEL), 30, 0, "cw", 0.01 * Track("lake").length, seed=1)
+    alone = driving.drive(conditions._replace(set_back=True, disturbance=Disturbance("late", 5)), "lake")
+    assert found[late] == {"autonomy": 100, "departures": 0, "distance": round(alone.mean, 3)}
+    for course in (" lake cw, 30 mph, look 0, 0.01 laps", f"{folder}"):
+        assert found[of(f"{course}, clear")]["distance"] != found[of(f"{course}, late:5")]["distance"]
+    assert (tmp_path / "found" / "robustness.png").read_bytes().startswith(b"\x89PNG")
+    capsys.readouterr()
+
+    found[late]["departures"] = 9
+    missing = of("lake cw, 30 mph, look 0, 0.01 laps, clear")
+    file.write_text(json.dumps({name: found[name] for name in found if name != missing}), encoding="utf-8")
+    assert robustness.main(words) == 0
+    assert json.loads(file.read_text(encoding="utf-8")) == found, "only what was missing is driven"
+    printed = capsys.readouterr().out
+    assert printed == (tmp_path / "found" / "robustness.md").read_text(encoding="utf-8")
+    assert "| late (held out) | 100.0 %, 9, " in printed
+    assert "| **held out: kinds without a departure** | 0 of 1 |" in printed

@@ -1,105 +1,69 @@
 """The simulator's end of the wire against servers that break the protocol, flood it, or never answer."""
 
 import contextlib
-import functools
-import re
 import socket
+import socketserver
 import struct
 import threading
 import time
 import tracemalloc
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from steer_server import STEER, Blank, Server, accept_websocket
+import steer_server
+from steer_server import STEER, Blank, Server, accept_websocket, frame, lake
 
 from cloning.base.errors import SimulatorError
 from cloning.replay.server_driver import ServerDriver
-from cloning.road.track import Track
 from cloning.wire.client import parse_answer
-from simulator.__main__ import main
-from simulator.client import Client, RemoteDriver
+from simulator.client import RemoteDriver
 from simulator.run import Run
 
 WAIT = 0.2  # s of patience
 TICK = 0.02  # s between a server's looks at the clock
 SLACK = 8.0  # s: more than the client takes beyond its patience on a busy machine; then the server gives up
-TEXT, BINARY, CLOSE, PING = 1, 2, 8, 9
+BINARY, CLOSE, PING = 2, 8, 9
 OPENED = '0{"sid":"x","upgrades":[],"pingTimeout":60000,"pingInterval":25000}'
 AHEAD = STEER % ("0.0", "1.0")
 
 
-def frame(payload, opcode=TEXT, final=True):
-    """A frame of a server, which is not masked."""
-    payload = payload.encode() if isinstance(payload, str) else payload
-    if len(payload) < 126:
-        size = bytes([len(payload)])
-    elif len(payload) < 1 << 16:
-        size = b"\x7e" + struct.pack(">H", len(payload))
-    else:
-        size = b"\x7f" + struct.pack(">Q", len(payload))
-    return bytes([0x80 * final | opcode]) + size + payload
-
-
 @dataclass
 class Case:
-    """What a server does to each client that connects: in the order of the fields; at last it closes the connection.
+    """What a server does to each client that connects: in the order of the fields; at last it closes the connection."""
 
-    message  what the client's error says, a regular expression
-    accepts  whether it accepts the websocket, with these headers
-    packets  that it sends then; None: none at all
-    reads    whether it reads first
-    once     bytes that it sends, with a pause after each
-    flood    bytes that it sends again and again
-    holds    whether it reads until the client closes
-    """
-
-    message: str
-    accepts: bool = True
+    message: str  # what the client's error says, a regular expression
+    accepts: bool = True  # the websocket, with these headers
     headers: bytes = b""
-    packets: tuple[str, ...] | None = ("40",)
-    reads: bool = False
-    once: bytes = b""
+    packets: tuple[str, ...] | None = ("40",)  # that it sends then; None: none at all
+    reads: bool = False  # before what follows
+    once: bytes = b""  # that it sends, with a pause after each
     pause: float = 0.0
-    flood: bytes = b""
-    holds: bool = False
+    flood: bytes = b""  # that it sends again and again
+    holds: bool = False  # it reads until the client closes
 
 
-class Hostile:
+class Hostile(socketserver.ThreadingTCPServer):
     """A server that does what a case says, for WAIT + SLACK seconds at most."""
 
     def __init__(self, case):
-        self.case, self.until = case, time.monotonic() + WAIT + SLACK
-        self.listener = socket.create_server(("127.0.0.1", 0))
-        self.port = self.listener.getsockname()[1]
-        self.threads = [threading.Thread(target=self.run)]
-        self.threads[0].start()
-
-    def __enter__(self):
-        return self
+        super().__init__(("127.0.0.1", 0), socketserver.BaseRequestHandler)
+        self.case, self.until, self.port = case, time.monotonic() + WAIT + SLACK, self.server_address[1]
+        threading.Thread(target=self.serve_forever, args=(TICK,)).start()
 
     def __exit__(self, *_):
         self.until = 0
-        for thread in self.threads:
-            thread.join(20)
-            assert not thread.is_alive()
+        self.shutdown()
+        self.server_close()  # waits for its threads
 
     @property
     def open(self):
         return time.monotonic() < self.until
 
-    def run(self):
-        self.listener.settimeout(TICK)
-        with self.listener:
-            while self.open:
-                with contextlib.suppress(TimeoutError):
-                    client, _ = self.listener.accept()
-                    self.threads.append(threading.Thread(target=self.serve, args=(client,)))
-                    self.threads[-1].start()
-
-    def serve(self, client):
+    def finish_request(self, client, _):
+        """Serve a client, in a thread of its own."""
         client.settimeout(TICK)
         case = self.case
         with client, contextlib.suppress(OSError):
@@ -167,6 +131,7 @@ CASES = {
 # The error names the last loss of the connection: an attempt that the end of the patience cut short, at times.
 LATE = "|accepts connections but does not answer"
 hostile = pytest.mark.parametrize("name", CASES)
+WAITING, SILENT = "waiting for drive.py", ("never answers", "sends the handshake slowly")
 
 
 @pytest.fixture(autouse=True)
@@ -175,15 +140,7 @@ def short_goodbye(monkeypatch):
     monkeypatch.setattr("cloning.wire.client.CLOSE_TIMEOUT", 0.1)
 
 
-@functools.cache
-def lake():
-    return Track("lake")
-
-
-def drive(server, realtime, laps=0.01, wait=WAIT):
-    client = Client(Run(lake(), "autonomous"), Blank(), "127.0.0.1", server.port, wait, realtime)
-    client.drive(laps)
-    return client
+drive = partial(steer_server.drive, laps=0.01, wait=WAIT)
 
 
 @hostile
@@ -191,7 +148,7 @@ def drive(server, realtime, laps=0.01, wait=WAIT):
 def test_a_drive_ends_when_its_patience_does(name, realtime, capsys):
     with Hostile(CASES[name]) as server:
         with pytest.raises(SimulatorError, match=CASES[name].message + LATE) as caught:
-            drive(server, realtime)
+            drive(server, realtime=realtime)
         assert server.open, "the client ended by itself"
     text = str(caught.value)
     assert f"no usable answer in {WAIT:g} s" in text and text.isprintable() and len(text) < 300
@@ -204,7 +161,7 @@ def test_what_a_server_sends_without_end_is_not_kept(name):
     tracemalloc.start()
     try:
         with Hostile(CASES[name]) as server, pytest.raises(SimulatorError):
-            drive(server, realtime=False)
+            drive(server)
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
         tracemalloc.stop()
@@ -215,8 +172,9 @@ def test_a_flood_of_answers_drives_on(realtime):
     """A server that answers without being asked, as fast as it can."""
     with Hostile(Case("", flood=frame(AHEAD) * 100)) as server:
         # What the client sends fills a small buffer at once, on any machine: nobody reads it.
-        server.listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
-        client = drive(server, realtime, laps=0.002, wait=3 * WAIT)  # the server is slow where others need the cores
+        server.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
+        # The server is slow where others need the cores.
+        client = drive(server, laps=0.002, wait=3 * WAIT, realtime=realtime)
         assert server.open
     assert client.run.travelled >= 0.002 * client.run.track.length
 
@@ -224,7 +182,7 @@ def test_a_flood_of_answers_drives_on(realtime):
 @pytest.mark.parametrize("realtime", [False, True])
 def test_answers_given_twice_drive_on(realtime):
     with Server(lambda packet, n: [AHEAD, AHEAD]) as server:
-        assert drive(server, realtime, laps=0.005).run.travelled > 5
+        assert drive(server, laps=0.005, realtime=realtime).run.travelled > 5
 
 
 @pytest.mark.parametrize("name", ["greets and closes", "floods what is no answer", "nests deep"])
@@ -238,27 +196,20 @@ def test_a_replay_over_the_wire_ends_as_well(name):
         assert server.open
 
 
-def test_the_command_ends_with_status_2(capsys):
-    with Hostile(CASES["closes at once"]) as server:
-        assert main(["drive", "--wait", str(WAIT), "--port", str(server.port)]) == 2
-    printed = capsys.readouterr().err
-    assert re.search(r"^python: .*no usable answer in 0\.2 s", printed, re.MULTILINE) and "Traceback" not in printed
-
-
 @hostile
 def test_the_window_is_not_held_up(name):
     """No server can end the window, or hold up a picture for as long as it takes to connect or to give up."""
     run = Run(lake(), "autonomous")
     with Hostile(CASES[name]) as server:
         remote, slowest, busiest = RemoteDriver("127.0.0.1", server.port, Blank()), 0.0, 0.0
-        until = time.monotonic() + 0.4
-        while time.monotonic() < until:
+        begun = time.monotonic()
+        while time.monotonic() < begun + 0.4 or (remote.state == WAITING and name not in SILENT and server.open):
             begin, busy = time.monotonic(), time.thread_time()
             remote.poll(False, run)
             slowest = max(slowest, time.monotonic() - begin)
             busiest = max(busiest, time.thread_time() - busy)
             time.sleep(0.01)
-        assert remote.state != "waiting for drive.py" or name in ("never answers", "sends the handshake slowly")
+        assert remote.state != WAITING or name in SILENT
         remote.close()
     assert busiest < 0.25  # s of this thread's computing, whatever else the machine does
     assert slowest < 2
