@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from commands import ROOT
+from drive_process import awaited
 from panda3d.core import GamepadButton, InputDevice
 
 from cloning.road.motion import FULL_LOCK, MPH, WHEELBASE
@@ -172,13 +173,6 @@ def test_the_f310s_buttons_act_once_a_press():
     assert (controls.set_speed, controls.throttle) == (30, 0.4)
 
 
-def until(condition, seconds=40):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 @pytest.fixture
 def screen():
     """The environment of programs that use a screen of their own."""
@@ -275,10 +269,10 @@ def test_the_window_is_driven_and_records(screen, tmp_path, drives, status):
 
     try:
         xdotool("search", "--sync", "--name", "lake ccw")
-        until(recording)  # the first presses may come before the window listens
+        awaited(recording)  # the first presses may come before the window listens
         if drives:
             xdotool("keydown", "w", "keydown", "d")
-            until(lambda: row()[0] > 0.1 and row()[1] == 1 and row()[3] > 0.1)
+            awaited(lambda: row()[0] > 0.1 and row()[1] == 1 and row()[3] > 0.1)
             xdotool("keyup", "w", "keyup", "d")
         if status:
             window.send_signal(signal.SIGINT)
@@ -294,12 +288,7 @@ def test_the_window_is_driven_and_records(screen, tmp_path, drives, status):
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux names its screen in $DISPLAY")
 def test_without_a_screen_it_reports_that(tmp_path):
     environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
-    done = subprocess.run(
-        [sys.executable, "-m", "simulator", "window", "--folder", str(tmp_path / "x")],
-        capture_output=True,
-        text=True,
-        env=environment,
-    )
+    command = [sys.executable, "-m", "simulator", "window", "--folder", str(tmp_path / "x")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 2
-    assert "DISPLAY" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "DISPLAY" in done.stderr and "Traceback" not in done.stderr
