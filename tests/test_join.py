@@ -160,12 +160,12 @@ def test_each_road_has_the_weather_sent_before_it():
 
 def test_a_driver_in_another_thread_is_waited_for_and_gets_the_same_drive_however_slow_it_is():
     """The program answers at once, with the last command of a driver that has seen another frame meanwhile."""
-    drives = []
-    for pause in (0.005, 0.03):
+
+    def drive(pause):
         tests, lock = RoadTests([0.0]), threading.Condition()
         latest: dict[str, Any] = {}
 
-        def think(tests=tests, lock=lock, latest=latest, pause=pause):
+        def think():
             while latest.get("over") is None:
                 with lock:
                     if not lock.wait_for(lambda: "data" in latest, 1):
@@ -175,7 +175,7 @@ def test_a_driver_in_another_thread_is_waited_for_and_gets_the_same_drive_howeve
                 steering = -0.6 * number(data, "cte") + number(data, "angl") / 25
                 latest["command"] = steer(steering, 1 - (number(data, "speed") / 10) ** 2)
 
-        def answer(data, n, tests=tests, lock=lock, latest=latest):
+        def answer(data, n):
             answers = tests(data, n)
             if not answers or answers[0][0] != "steer":
                 return answers
@@ -191,10 +191,10 @@ def test_a_driver_in_another_thread_is_waited_for_and_gets_the_same_drive_howeve
         latest["over"] = True
         driver.join()
         assert tests.results[0][0] == "end of the road"
-        moving = {json.dumps(data): None for data in program.data if number(data, "speed") > 1}
-        drives.append(list(moving))
-    assert len(drives[0]) > 12
-    assert drives[0] == drives[1]
+        return list({json.dumps(data): None for data in program.data if number(data, "speed") > 1})
+
+    fast = drive(0.005)
+    assert len(fast) > 12 and fast == drive(0.03)
 
 
 def test_a_text_that_is_no_road_ends_the_drive_with_its_reason(capsys):

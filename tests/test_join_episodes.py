@@ -136,8 +136,7 @@ def test_episodes_have_weather_pauses_metrics_and_segments():
     assert len(set(map(tuple, segments.reshape(-1, 3)))) <= 6
     assert len(set(seen["paused"][1:])) == 1
     heard = [event for event, _ in program.heard]
-    assert "sim_paused" in heard
-    assert "sim_resumed" in heard
+    assert {"sim_paused", "sim_resumed"} <= set(heard)
     before, metrics = (data for event, data in program.heard if event == "episode_metrics")
     assert (before["outOfTrackCount"], metrics["outOfTrackCount"], metrics["collisionCount"]) == (0, 1, 0)
     assert metrics["track"] == "lake"
@@ -177,5 +176,4 @@ def test_unknown_names_are_refused_and_known_ones_all_start():
         dialect.start(*names)
         images.append(json.loads(dialect.telemetry()[2:])[1]["image"])
         assert dialect.track.direction == "ccw", "also in the jungle, whose own is cw"
-    assert dialect.ready
-    assert images[0] != images[1]
+    assert dialect.ready and images[0] != images[1]
