@@ -27,6 +27,7 @@ def test_what_is_left_to_measure_with_is_not_trained_on():
     assert all(scene.look % SHADOWED <= 100 for scene in taught)
     some = [lap.name for lap in laps(21, 10, {"road": 40, "mountain": 30})]
     assert len(set(some)) == len(some) == 2 * (2 * 3 + 20) + 10 + 40 + 30
+    assert sum(name.startswith("jungle-") and name.endswith("-fast") for name in some) == 10
 
 
 def test_each_track_is_rendered_in_both_directions_and_lights():
@@ -66,10 +67,6 @@ def test_roads_that_a_search_found_are_rendered_in_both_directions(tmp_path, mon
     assert all(len(read_recording(recording)) > 20 for recording in render(tmp_path, chosen))
     with pytest.raises(RecordingError, match="evolution-1-17-ccw-look21001: two roads have the same name; rename"):
         render(tmp_path, [chosen[0], *chosen])
-
-
-def test_a_fast_lap_has_a_name_of_its_own():
-    assert Lap("jungle", "cw", 1001, lateral=shipped.FAST).name == "jungle-cw-look1001-fast"
 
 
 def test_a_lap_that_left_the_road_is_not_trained_on(tmp_path, monkeypatch):
