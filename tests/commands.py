@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import unittest.mock
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from cloning.base import program
 
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
+TINY = ("--epochs", 1, "--samples-per-epoch", 16, "--batch-size", 8, "--device", "cpu")
 PICTURE = cv2.imencode(".png", np.zeros((100, 160, 3), np.uint8))[1].tobytes()  # for one that takes 0.2 s to draw
 HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from another folder
 
@@ -68,8 +70,27 @@ def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.
     return done, folder
 
 
+def begun_training(*arguments) -> Any:
+    """model.py's TrainingRun before its first batch, with the pool that its caller ends."""
+    import model
+    from cloning.training.distributed import Ranks
+    from cloning.training.options import parse
+
+    asked = parse(list(map(str, arguments)), model.REPORT, model.ROBUST)
+    return model.TrainingRun(model.prepare(asked), asked.process, Ranks())
+
+
 def weights(path: Path) -> dict[str, torch.Tensor]:
     return torch.load(path, weights_only=True)["network"]
+
+
+@contextlib.contextmanager
+def edited(path: Path) -> Iterator[dict[str, Any]]:
+    """The contents of a model file, which are written back without their digest, as earlier versions did."""
+    contents = torch.load(path, weights_only=True)
+    yield contents
+    contents.pop("digest", None)
+    torch.save(contents, path)
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:

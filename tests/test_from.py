@@ -5,11 +5,9 @@ import shutil
 
 import pytest
 import torch
-from commands import SHORT, run_here, same, weights
+from commands import SHORT, begun_training, edited, run_here, same, weights
 
-import model
 from cloning.network import tensors
-from cloning.training.distributed import Ranks
 from cloning.training.options import parse
 from model import REPORT, ROBUST
 
@@ -24,17 +22,13 @@ def base(finished, tmp_path):
 
 def set_preprocessing(path, **preprocessing):
     """Change some of the preprocessing in a model file."""
-    saved = torch.load(path, weights_only=True)
-    saved["recipe"] |= preprocessing
-    del saved["digest"]
-    torch.save(saved, path)
+    with edited(path) as saved:
+        saved["recipe"] |= preprocessing
 
 
 def test_a_run_begins_with_the_weights_of_the_file_and_nothing_else_of_it(sample_recording, base, tmp_path):
     set_preprocessing(base, exposure=(80.0, 20.0))
-    command = [str(sample_recording), "--from", str(base), "--output", str(tmp_path / "run" / "model.pt")]
-    asked = parse(command, REPORT, ROBUST)
-    run = model.TrainingRun(model.prepare(asked), asked.process, Ranks())
+    run = begun_training(sample_recording, "--from", base, "--output", tmp_path / "run" / "model.pt")
     run.pool.shutdown()
     assert same(run.network.state_dict(), weights(base))
     assert run.progress.number == 0 and not run.progress.history and not run.optimizer.state
@@ -54,13 +48,19 @@ def test_a_run_keeps_the_recipe_of_the_network_that_it_begins_with(base, recipe)
             assert parse(["--from", str(base), *option], REPORT, ROBUST).run.recipe.name == wanted.name
 
 
-def test_it_is_resumed_exactly_without_the_file(sample_recording, base, tmp_path):
-    whole, parts = tmp_path / "whole" / "model.pt", tmp_path / "parts" / "model.pt"
+def test_it_keeps_the_file_also_as_its_own_output_and_is_resumed_exactly_without_it(sample_recording, base, tmp_path):
+    """`model.py --from model.pt` in the folder of the earlier run, the shortest command, against a run in two parts."""
+    before, parts = weights(base), tmp_path / "parts" / "model.pt"
     command = (sample_recording, *FEW, "--from", base)
-    assert run_here(*command, "--output", whole).returncode == 0
     begun = run_here(*command, "--epochs", 1, "--output", parts)
     assert f"begins with the weights of {base}" in begun.stdout
-    base.unlink()
+    done = run_here(*command, "--output", base)
+    assert done.returncode == 0, done.stderr
+    assert same(weights(tmp_path / "base-previous.pt"), before)
+    whole = base.rename(tmp_path / "whole.pt")
+    assert not same(weights(whole), before)
+    refused = run_here("--resume", "--from", "other.pt", "--output", parts)
+    assert refused.returncode == 2 and f"the run began with --from {str(base)!r}, not 'other.pt'" in refused.stderr
     resumed = run_here("--epochs", 2, "--resume", "--output", parts)
     assert resumed.returncode == 0 and "resumed in epoch 2" in resumed.stdout
     assert same(weights(whole), weights(parts))
@@ -68,20 +68,7 @@ def test_it_is_resumed_exactly_without_the_file(sample_recording, base, tmp_path
         assert json.loads(output.with_name("training_arguments.json").read_bytes())["from_model"] == str(base)
 
 
-def test_a_run_from_its_own_output_keeps_the_earlier_model(sample_recording, base, tmp_path):
-    """`model.py --from model.pt` in the folder of the earlier run, the shortest command."""
-    before = weights(base)
-    done = run_here(sample_recording, *FEW, "--epochs", 1, "--from", base, "--output", base)
-    assert done.returncode == 0, done.stderr
-    assert same(weights(tmp_path / "base-previous.pt"), before)
-    assert not same(weights(base), before)
-
-
-def test_resume_refuses_another_file_to_begin_with(finished, sample_recording, base, tmp_path):
-    output = tmp_path / "run" / "model.pt"
-    assert run_here(sample_recording, *FEW, "--epochs", 1, "--from", base, "--output", output).returncode == 0
-    refused = run_here("--resume", "--from", "other.pt", "--output", output)
-    assert refused.returncode == 2 and f"the run began with --from {str(base)!r}, not 'other.pt'" in refused.stderr
+def test_resume_of_a_run_without_a_file_to_begin_with_refuses_one(finished, base, tmp_path):
     plain = shutil.copytree(finished[1], tmp_path / "plain")
     refused = run_here("--resume", "--from", base, "--output", plain / "model.pt")
     assert refused.returncode == 2 and "the run began with --from ''" in refused.stderr
