@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from commands import SHORT, finished_run, run_here, same, started_run, weights
+from commands import SHORT, begun_training, edited, finished_run, run_here, same, started_run, weights
 from rendered import render_recording, without_files
 
 import model
@@ -22,11 +22,9 @@ from cloning.road.warp import ground_mask, with_alpha
 from cloning.training import lanes as lanes_module
 from cloning.training import light
 from cloning.training.checkpoint import Progress
-from cloning.training.distributed import Ranks
 from cloning.training.lanes import Lanes, Poses
 from cloning.training.observations import Observations
 from cloning.training.optimizers import Adam
-from cloning.training.options import parse
 from cloning.training.robust import PoseViews, sample_bends_more, select_known_lane
 from model import REPORT, ROBUST
 
@@ -218,14 +216,12 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_r
 
 def test_a_robust_run_of_an_earlier_version_goes_on_as_it_began(finished, tmp_path):
     shutil.copytree(finished[1], tmp_path, dirs_exist_ok=True)
-    saved = torch.load(tmp_path / "model-resume.pt", weights_only=True)
     figures = ("epochs", "batch_size", "learning_rate", "samples_per_epoch", "repeats")
-    flat = {name: saved["arguments"]["recipe"][name] for name in figures}
-    saved["arguments"] = {"recordings": saved["arguments"]["recordings"], "seed": 0, "robust": True, **flat}
     optimizer = Adam(Network().parameters())
-    saved["training"]["optimizer"]["state"] = {number: optimizer.zeros(number) for number in range(18)}
-    del saved["digest"]
-    torch.save(saved, tmp_path / "model-resume.pt")
+    with edited(tmp_path / "model-resume.pt") as saved:
+        flat = {name: saved["arguments"]["recipe"][name] for name in figures}
+        saved["arguments"] = {"recordings": saved["arguments"]["recordings"], "seed": 0, "robust": True, **flat}
+        saved["training"]["optimizer"]["state"] = {number: optimizer.zeros(number) for number in range(18)}
     done = run_here("--output", tmp_path / "model.pt", "--resume", "--epochs", 3)
     assert done.returncode == 0, done.stderr
     after = torch.load(tmp_path / "model-resume.pt", weights_only=True)
@@ -261,9 +257,7 @@ def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
 
 
 def test_validation_counts_centre_images_and_other_poses_alike(sample_recording, tmp_path):
-    command = [str(sample_recording), *map(str, OPTIONS), "--output", str(tmp_path / "model.pt")]
-    asked = parse(command, REPORT, ROBUST)
-    run = model.TrainingRun(model.prepare(asked), asked.process, Ranks())
+    run = begun_training(sample_recording, *OPTIONS, "--output", tmp_path / "model.pt")
     with run.pool:
         both, _ = run.validate()
         (center, labels), (warped, other_labels) = run.validation_sets
@@ -277,9 +271,7 @@ def test_validation_counts_centre_images_and_other_poses_alike(sample_recording,
 
 def test_networks_are_measured_as_they_drive(sample_recording, tmp_path):
     """Ordinary frames are dark to this network, which brightens them when it drives, and not when it learns."""
-    command = [str(sample_recording), *map(str, OPTIONS), "--output", str(tmp_path / "model.pt")]
-    asked = parse(command, REPORT, ROBUST)
-    run = model.TrainingRun(model.prepare(asked), asked.process, Ranks())
+    run = begun_training(sample_recording, *OPTIONS, "--output", tmp_path / "model.pt")
     run.network.exposure = (200.0, 60.0)
     run.files.pictures.mkdir()
     with run.pool:
@@ -296,16 +288,13 @@ def test_networks_are_measured_as_they_drive(sample_recording, tmp_path):
     assert errors[-1] == errors[-2]
 
 
-def test_a_recording_without_images_is_left_out(linked, tmp_path):
+def test_recordings_without_images_and_too_short_ones_are_named(linked, tmp_path):
     shutil.rmtree(linked / "IMG")
-    done = run_here(linked, "--robust", "--output", tmp_path / "model.pt")
-    assert done.returncode == 2
-    assert "0 of 60 rows are left, at least 5 are needed: most can't be used, see above" in done.stderr
-
-
-def test_drives_too_short_are_named(tmp_path):
-    done = run_here(render_recording(tmp_path / "short", rows=20), *OPTIONS, "--output", tmp_path / "model.pt")
-    assert done.returncode == 2 and "too short" in done.stderr
+    short = render_recording(tmp_path / "short", rows=20)
+    no_images = "0 of 60 rows are left, at least 5 are needed: most can't be used, see above"
+    for folder, words in ((linked, no_images), (short, "too short")):
+        done = run_here(folder, *OPTIONS, "--output", tmp_path / "model.pt")
+        assert done.returncode == 2 and words in done.stderr
 
 
 def test_tints_keep_grey_nearly_grey():
@@ -364,16 +353,13 @@ def test_problem_areas_are_sampled_so_many_times_as_often(monkeypatch, repeats):
 def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monkeypatch):
     many = lanes(monkeypatch, 0.4)
     both = Lanes.joined([Lanes.unknown(2000), many.take(np.full(2000, 100))])
-    n, drive = len(both), recording(0.4)
-    rows = np.full(n, 100, np.int32)
-    labels = both.steering(both.offset, both.yaw)
-    everything = Observations([drive], np.zeros(n, int), rows, labels, np.arange(n, dtype=np.uint64), rows, both)
+    n, rows = len(both), np.full(len(both), 100, np.int32)
+    labels, frames = both.steering(both.offset, both.yaw), np.arange(len(both), dtype=np.uint64)
+    everything = Observations([recording(0.4)], np.zeros(n, int), rows, labels, frames, rows, both)
     turn = sample_bends_more(everything, ROBUST, np.random.default_rng(0))
     assert len(turn) == n
     expected = both.weights(ROBUST.straight_weight)[2000:].sum()  # of the rows in a bend
-    bend = abs(
-        both.steering(np.zeros(n), np.zeros(n))[-1]
-    )  # its |steering| is its weight, and 0.2 more as of a straight
+    bend = abs(both.steering(np.zeros(n), np.zeros(n))[-1])  # is its weight, and 0.2 more as of a straight
     assert bend > 0.2 and expected == pytest.approx((0.2 + bend) / (0.4 + bend), rel=1e-5)
     assert (turn >= 2000).mean() == pytest.approx(expected, abs=0.03)
     views = PoseViews(everything, turn, np.zeros(n, int), ROBUST, np.random.default_rng(1))
