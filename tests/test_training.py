@@ -5,7 +5,6 @@ import math
 import os
 import re
 import shutil
-import subprocess
 import sys
 import warnings
 from dataclasses import fields, replace
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 import warm
-from commands import HERE, ROOT, SHORT, log, run_here, run_model, same, weights
+from commands import HERE, ROOT, SHORT, TINY, begun_training, log, run_here, run_model, same, weights
 from PIL import Image
 from rendered import render_recording
 from steer_server import unused_port
@@ -117,16 +116,9 @@ def test_a_diagnostic_picture_names_the_pose_that_its_image_shows():
 
 def test_what_a_run_leaves(finished):
     folder = finished[1]
-    assert {path.name for path in folder.iterdir()} == {
-        "model.pt",
-        "model-best.pt",
-        "model-resume.pt",
-        "training_loss.png",
-        "training_log.csv",
-        "training_arguments.json",
-        "training_progress.json",
-        "diagnostic_images",
-    }
+    models = {"model.pt", "model-best.pt", "model-resume.pt", "diagnostic_images"}
+    figures = {"training_loss.png", "training_log.csv", "training_arguments.json", "training_progress.json"}
+    assert {path.name for path in folder.iterdir()} == models | figures
     rows = log(folder)
     assert [row["epoch"] for row in rows] == ["1", "2"]
     assert all(int(row["images"]) >= 150 and float(row["loss"]) > 0 < float(row["val_loss"]) for row in rows)
@@ -151,9 +143,9 @@ def test_training_learns(sample_recording, tmp_path):
 
 
 def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_recording, tmp_path):
-    command = parse([str(sample_recording), "--output", str(tmp_path / "m.pt")])
-    prepared = model.prepare(command)
-    _, training, validation, _ = prepared
+    run = begun_training(sample_recording, "--output", tmp_path / "m.pt")
+    run.pool.shutdown()
+    training, validation = run.generator.observations, run.validation
     rows = np.loadtxt(sample_recording / "driving_log.csv", delimiter=",", usecols=(3, 4))
     assert not set(training.frame) & set(validation.frame)
     used, driven = {*training.row, *validation.row}, set(np.flatnonzero(rows[:, 1]))  # throttle is 0 in the others
@@ -162,9 +154,6 @@ def test_a_run_trains_on_resampled_rows_and_validates_on_other_frames(sample_rec
     times = np.bincount(training.row, minlength=len(rows))[training.row]
     size = np.abs(rows[training.row, 0])
     assert set(times[(size > 0.2) & (size <= 0.5)]) == {2} and set(times[size < 0.2]) == {1}
-    run = model.TrainingRun(prepared, command.process, Ranks())
-    run.pool.shutdown()
-    assert run.generator.observations is training and run.validation is validation
 
 
 def test_a_link_may_name_a_recording_a_problem_area(linked, tmp_path):
@@ -182,7 +171,7 @@ def test_a_link_may_name_a_recording_a_problem_area(linked, tmp_path):
 
 def test_every_recording_under_data_is_the_default(linked, tmp_path):
     render_recording(linked.with_name("turn-repetitive"), rows=20, seed=1)
-    done = run_here(*SHORT, "--epochs", 1, "--samples-per-epoch", 16, cwd=tmp_path)
+    done = run_here(*TINY, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert next(line.split()[1] for line in done.stdout.splitlines() if line.startswith("total")) == "80"
 
@@ -197,8 +186,7 @@ def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_pat
         "import model\n"
         "sys.exit(model.main())"
     )
-    short = (*SHORT, "--epochs", 1, "--samples-per-epoch", 16)
-    arguments = (sample_recording, *short, "--output", tmp_path / "model.pt")
+    arguments = (sample_recording, *TINY, "--output", tmp_path / "model.pt")
     done = run_model(*arguments, command=[sys.executable, "-c", code], env=HERE)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "model.pt").exists()
@@ -264,8 +252,7 @@ def test_why_too_few_rows_are_left(linked, tmp_path):
 def test_a_damaged_image_is_named_and_left_out_and_strict_stops(copied, tmp_path):
     damaged = sorted((copied / "IMG").glob("left*"))[3]
     damaged.write_bytes(damaged.read_bytes()[:1000])
-    short = (*SHORT, "--epochs", 1, "--samples-per-epoch", 16)
-    lenient = run_here(copied, *short, "--output", tmp_path / "model.pt")
+    lenient = run_here(copied, *TINY, "--output", tmp_path / "model.pt")
     assert lenient.returncode == 0, lenient.stderr
     assert f"line 4: left out: IMG/{damaged.name}: cut short" in lenient.stdout
     header, row = (tmp_path / "rejected_rows.csv").read_text(encoding="utf-8").splitlines()
@@ -311,24 +298,6 @@ def test_importing_does_nothing(tmp_path):
 
 TORCHRUN = [sys.executable, *["-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0", "--standalone"]]
 TORCHRUN.append(str(ROOT / "model.py"))
-without_libuv = pytest.mark.skipif(sys.platform == "win32", reason="PyTorch for Windows has no libuv for torchrun")
-
-
-@pytest.fixture(scope="module")
-def two_processes(sample_recording, tmp_path_factory) -> tuple[subprocess.CompletedProcess, Path]:
-    """Two epochs by two processes: what they printed, and their folder; not to be changed."""
-    folder = tmp_path_factory.mktemp("two processes")
-    done = run_model(sample_recording, *SHORT, "--output", folder / "model.pt", command=TORCHRUN)
-    assert done.returncode == 0, done.stderr
-    return done, folder
-
-
-def run_ranks(*arguments) -> None:
-    """model.py in two processes, as torchrun starts them."""
-    environment = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(unused_port())}
-    command = [sys.executable, str(ROOT / "model.py"), *map(str, arguments)]
-    ranks = [warm.Popen(command, env={**os.environ, **environment, "RANK": str(rank)}) for rank in range(2)]
-    assert [rank.wait(300) for rank in ranks] == [0, 0]
 
 
 def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
@@ -338,27 +307,27 @@ def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
         assert (a[name] - b[name]).abs().mean() < 2e-6
 
 
-@without_libuv
-def test_two_processes_train_as_one(finished, two_processes):
+@pytest.mark.skipif(sys.platform == "win32", reason="PyTorch for Windows has no libuv for torchrun")
+def test_two_processes_train_and_go_on_as_one(finished, sample_recording, tmp_path):
     """Two ranks with half of every batch each end where one process ends; they print once, and the losses of both."""
-    assert_equal_up_to_rounding(finished[1] / "model.pt", two_processes[1] / "model.pt")
-    one, two = (
+    one, two = shutil.copytree(finished[1], tmp_path / "one") / "model.pt", tmp_path / "two" / "model.pt"
+    done = run_model(sample_recording, *SHORT, "--output", two, command=TORCHRUN)
+    assert done.returncode == 0, done.stderr
+    assert_equal_up_to_rounding(one, two)
+    losses, of_both = (
         [float(loss) for line in run.stdout.splitlines() for loss in re.findall(r"loss: ([\d.]+)", line)]
-        for run in (finished[0], two_processes[0])
+        for run in (finished[0], done)
     )
-    assert len(one) == 4 and two == pytest.approx(one, abs=2e-4)  # the global losses; bfloat16 rounds
+    assert len(losses) == 4 and of_both == pytest.approx(losses, abs=2e-4)  # the global losses; bfloat16 rounds
 
-
-@without_libuv
-def test_two_processes_continue_with_the_runs_own_arguments(finished, two_processes, tmp_path):
-    one, two = (
-        shutil.copytree(folder, tmp_path / name) for (_, folder), name in ((finished, "one"), (two_processes, "two"))
-    )
-    more = ("--resume", "--epochs", 3)
-    assert run_here("--output", one / "model.pt", *more).returncode == 0
-    run_ranks("--output", two / "model.pt", *more)
-    assert [row["epoch"] for row in log(two)] == ["1", "2", "3"]
-    assert_equal_up_to_rounding(one / "model.pt", two / "model.pt")
+    more = ("--resume", "--epochs", 3)  # with the run's own arguments, and in processes as torchrun starts them
+    assert run_here("--output", one, *more).returncode == 0
+    environment = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(unused_port())}
+    command = [sys.executable, str(ROOT / "model.py"), "--output", str(two), *map(str, more)]
+    ranks = [warm.Popen(command, env={**os.environ, **environment, "RANK": str(rank)}) for rank in range(2)]
+    assert [rank.wait(300) for rank in ranks] == [0, 0]
+    assert [row["epoch"] for row in log(two.parent)] == ["1", "2", "3"]
+    assert_equal_up_to_rounding(one, two)
 
 
 def test_a_rank_prints_the_error_that_it_alone_meets(tmp_path, capsys):
