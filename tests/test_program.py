@@ -32,6 +32,13 @@ TOOLS = [
 ]
 
 
+def run(*words, modules="") -> subprocess.CompletedProcess[str]:
+    """A command of this Python in a process of its own; modules: a folder that shadows libraries."""
+    environment = {**os.environ, "PYTHONPATH": str(modules)}
+    command = [sys.executable, *words]
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+
+
 @pytest.mark.parametrize(
     ("program", "library", "command"),
     [
@@ -49,9 +56,7 @@ TOOLS = [
 )
 def test_ctrl_c_while_the_libraries_are_loaded(tmp_path, sample_recording, program, library, command):
     (tmp_path / f"{library}.py").write_text(INTERRUPTED_LIBRARY, encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, *(str(sample_recording) if word == "RECORDING" else word for word in command)]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    done = run(*(str(sample_recording) if word == "RECORDING" else word for word in command), modules=tmp_path)
     assert done.returncode == 130
     assert done.stderr.startswith(f"{program}: stopped") and done.stderr.count("\n") == 1
 
@@ -62,8 +67,9 @@ def test_no_library_is_loaded_before_ctrl_c_has_its_handler():
         "import sys; before = {*sys.modules, *sys.builtin_module_names}; from cloning.base import program\n"
         "print(*{*sys.modules} - before)"
     )
-    loaded = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert {*loaded.split()} <= {"cloning", "cloning.base", "cloning.base.program", "__future__", "atexit"}
+    done = run("-c", code)
+    assert done.returncode == 0, done.stderr
+    assert {*done.stdout.split()} <= {"cloning", "cloning.base", "cloning.base.program", "__future__", "atexit"}
 
 
 LOADING_MAIN = """
@@ -89,9 +95,7 @@ program.run(main)
 )
 def test_ctrl_c_while_main_loads_a_library(tmp_path, library, printed):
     (tmp_path / "large.py").write_text(f"import os, signal, time\n{library}", encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-c", LOADING_MAIN]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+    done = run("-c", LOADING_MAIN, modules=tmp_path)
     assert (done.returncode, done.stdout.splitlines(), done.stderr) == (130, printed, "test: stopped\n")
 
 
@@ -109,8 +113,7 @@ def test_a_missing_library_is_told_in_one_sentence(tmp_path, program, library, c
     """As where the environment was forgotten."""
     missing = f"raise ModuleNotFoundError({library!r}, name={library!r})"
     (tmp_path / f"{library}.py").write_text(missing, encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True)
+    done = run(*command, modules=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (FAILED, 1), done.stderr
     assert f"{library} is missing: activate the environment" in done.stderr and remedy in done.stderr
     assert done.stderr.startswith(f"{program.split()[0]}")
@@ -121,15 +124,14 @@ def test_a_missing_library_is_told_in_one_sentence(tmp_path, program, library, c
     [["model.py"], ["drive.py"], ["video.py", "run1"], *(["-m", name] for name in ("simulator", "cloning.browse"))],
 )
 def test_a_forgotten_environment_is_told_in_one_sentence(command):
-    done = subprocess.run([sys.executable, "-S", *command], cwd=ROOT, capture_output=True, text=True)
+    done = run("-S", *command)
     assert (done.returncode, done.stderr.count("\n")) == (FAILED, 1), done.stderr
     assert "is missing: activate the environment" in done.stderr
 
 
 def test_an_old_python_is_told_in_one_sentence():
     version = "import sys; sys.version_info, sys.hexversion = (3, 10, 4), 0x30A04F0"
-    old = f"{version}; import runpy; runpy.run_path('model.py', run_name='__main__')"
-    done = subprocess.run([sys.executable, "-c", old], cwd=ROOT, capture_output=True, text=True)
+    done = run("-c", f"{version}; import runpy; runpy.run_path('model.py', run_name='__main__')")
     assert done.returncode == FAILED and done.stderr.count("\n") == 1
     assert "Python 3.11 or later is needed, and" in done.stderr and "is Python 3.10.4" in done.stderr
 
@@ -210,8 +212,7 @@ program.run(main)
     ids=["alone", "beside a thread", "by Ctrl-C"],
 )
 def test_a_command_ends_when_all_is_done_and_printed(arguments, later, status, errors):
-    command = [sys.executable, "-c", ENDING_MAIN, *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = run("-c", ENDING_MAIN, *arguments)
     assert (done.returncode, done.stdout.splitlines(), done.stderr) == (status, ["main done", *later], errors)
 
 
@@ -270,4 +271,4 @@ def test_ctrl_c_stays_deferred_when_the_first_process_starts():
         "    multiprocessing.get_context('forkserver').Process(target=print).start()\n"
         "    assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])"
     )
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+    assert run("-c", code).returncode == 0
