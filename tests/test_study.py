@@ -114,9 +114,8 @@ def test_errors_on_recorded_frames(recording):
 def test_laps_and_recovery_in_the_simulator(monkeypatch, steering, departures):
     """Steered by the known position, the car stays and comes back; steered to one side, it leaves the road."""
     simulator = Simulator(Network(), "lake", "ccw", 15)
-    monkeypatch.setattr(
-        simulator, "steering", lambda run: follow(run) if steering is None else steering
-    )  # without rendering
+    without_rendering = follow if steering is None else lambda run: steering
+    monkeypatch.setattr(simulator, "steering", without_rendering)
     run, _ = simulator.lap(0.05)
     assert (len(run.departures) > 0) == departures
     assert (np.abs(run.trajectory.offset).max() < 1) == (not departures)
