@@ -307,20 +307,23 @@ def test_unusable_arguments_are_reported(sample_recording, model_file, arguments
     assert message in capsys.readouterr().err
 
 
-def test_recordings_of_which_nothing_can_be_replayed_are_left_out(sample_recording, model_file, tmp_path, capsys):
+def test_what_cannot_be_replayed_is_left_out_of_the_others_report(sample_recording, model_file, tmp_path, capsys):
+    """Pictures of recordings with one name are kept apart, as of two people who each have a recording called lake."""
     short, unusable = render_recording(tmp_path / "short", rows=20), render_recording(tmp_path / "unusable", rows=20)
     for image in (unusable / "IMG").iterdir():
         image.write_bytes(b"")
-    options = ("--model", model_file, "--reference", "human", "--report", tmp_path / "r.json")
+    options = ("--model", model_file, "--reference", "human", "--limit", 1, "--report", tmp_path / "r.json")
     assert run(short, unusable, *options) == 2
     printed = capsys.readouterr()
     assert f"left out: {short}: no two seconds" in printed.out
     assert f"{unusable / 'driving_log.csv'}: no usable row" in printed.err
-    assert run(short, sample_recording, unusable, *options) == 0
+    folders = [shutil.copytree(sample_recording, tmp_path / person / "lake") for person in ("a", "b")]
+    assert run(short, folders[0], unusable, folders[1], *options, "--picture", tmp_path / "way.png") == 0
     printed = capsys.readouterr()
     assert printed.out.count("left out: ") == 2 + 5, "recordings, and the first of the images"
-    [report] = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
-    assert report["recording"] == str(sample_recording)
+    reports = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    assert [report["recording"] for report in reports] == list(map(str, folders))
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["way-a-lake.png", "way-b-lake.png"]
 
 
 def film_widths(path) -> list[int]:
@@ -339,14 +342,6 @@ def test_a_full_disk_costs_the_film_alone(sample_recording, model_file, tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.png", "r.json"]
     assert "autonomy" in printed.out
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]["2"]
-
-
-def test_pictures_of_recordings_with_the_same_name_are_kept_apart(sample_recording, model_file, tmp_path):
-    """As of two people who each have a recording called lake."""
-    folders = [shutil.copytree(sample_recording, tmp_path / person / "lake") for person in ("a", "b")]
-    options = "--model", model_file, "--reference", "human", "--limit", "1", "--picture", tmp_path / "way.png"
-    assert run(*folders, *options) == 0
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["way-a-lake.png", "way-b-lake.png"]
 
 
 def kill_itself():
