@@ -1,6 +1,5 @@
 """Kills, signals, full disks and --resume: nothing is lost, and no run takes the models of an earlier one away."""
 
-import contextlib
 import json
 import os
 import shutil
@@ -12,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from commands import ROOT, SHORT, finished_run, log, run_here, run_model, same, started_run, weights
+from commands import ROOT, SHORT, TINY, edited, finished_run, log, run_here, run_model, same, started_run, weights
 from killed import ALL
 from rendered import render_recording
 
@@ -23,18 +22,6 @@ from model import REPORT
 
 class Killed(BaseException):
     """As if the process were killed here: nothing in the program catches it."""
-
-
-@contextlib.contextmanager
-def edited(path):
-    """The contents of a file, which are written back without their digest, as earlier versions did."""
-    contents = torch.load(path, weights_only=True)
-    yield contents
-    contents.pop("digest", None)
-    torch.save(contents, path)
-
-
-TINY = ("--epochs", 1, "--samples-per-epoch", 16, "--batch-size", 8, "--device", "cpu")
 
 
 def seed_of(path):
