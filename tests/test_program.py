@@ -8,7 +8,7 @@ import time
 
 import pytest
 import warm
-from commands import HERE, ROOT
+from commands import HERE, ROOT, run_model
 
 from cloning.base import progress
 from cloning.base.program import FAILED
@@ -175,9 +175,8 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
     ],
 )
 def test_an_error_of_the_user_is_a_line_and_status_2(tmp_path, command):
-    command = [ROOT / word if word.endswith(".py") else word for word in command]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = warm.run([sys.executable, *command], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    words = [ROOT / word if word.endswith(".py") else word for word in command]
+    done = run_model(command=[sys.executable, *words], cwd=tmp_path, env=HERE)
     assert done.returncode == FAILED == 2
     assert "nowhere" in done.stderr.splitlines()[-1] and "Traceback" not in done.stderr
 
