@@ -229,9 +229,8 @@ def test_decimal_commas_of_four_numbers_may_be_three_that_all_have_one(log):
 
 def test_decimal_commas_that_can_be_read_in_two_ways_are_left_out(log):
     found = log(*usual(numbers=["-0,004694836,1,0,30,19023", "0,1,0,30,19", "0,0,1,0,5"]))
-    np.testing.assert_array_equal(
-        numbers(found), np.array([(-0.004694836, 1, 0, 30.19023), (0, 1, 0, 30.19)], np.float32)
-    )
+    wanted = np.array([(-0.004694836, 1, 0, 30.19023), (0, 1, 0, 30.19)], np.float32)
+    np.testing.assert_array_equal(numbers(found), wanted)
     assert findings(found) == [(3, Finding.COLUMNS)]  # 0 | 0,1 | 0 | 5 or 0 | 0 | 1 | 0,5
     assert "four numbers with decimal commas in 2 ways" in found.rejected[0].detail
     for row in ('"0","100001","0","0","0"', "0,100001,0,0,0,"):  # a counter, perhaps before an empty column
@@ -299,9 +298,8 @@ def test_a_header_is_understood_by_whole_names_only(log, name, written):
     line = HEADER.replace(name, written)
     unknown = "" if written == "0" else f"not understood: '{re.escape(written)}'"
     for rest in ("", ",lap", ",human"):
-        with pytest.raises(
-            RecordingError, match=rf"line 1: .* names {name} never.*{unknown}.*{HEADER}, in their order"
-        ):
+        words = rf"line 1: .* names {name} never.*{unknown}.*{HEADER}, in their order"
+        with pytest.raises(RecordingError, match=words):
             log(line + rest, *[row + rest for row in usual()])
     with pytest.raises(RecordingError, match=rf"driving_log.csv: line 5: .* names {name} never"):
         log(*usual(), line, *usual(first=10))
