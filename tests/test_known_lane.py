@@ -77,10 +77,9 @@ def test_rows_that_it_does_not_name_are_not_trusted(lane, capsys):
     lane.write_bytes(b"".join(lines[:31]) + b"another.jpg,9,3\n")
     position = known(lane.parent)
     assert position.trusted[:30].all() and not position.trusted[30:].any()
-    unknown, rows = len(position.trusted) - 30, len(position.trusted)
-    assert (
-        capsys.readouterr().out == f"{lane}: the lane is unknown in {unknown} of {rows} rows, which it does not name\n"
-    )
+    rows = len(position.trusted)
+    printed = f"{lane}: the lane is unknown in {rows - 30} of {rows} rows, which it does not name\n"
+    assert capsys.readouterr().out == printed
     assert np.abs(position.lateral_offset).max() < 2
     lane.write_bytes(b"".join(lines[:11])[:-3])
     assert known(lane.parent).trusted.sum() == 9, "a line cut by a kill is left out; the log has no row for it"
