@@ -59,20 +59,12 @@ def number_rows(draw, size):
 def image_rows(draw, start, size):
     """The images of each row: camera -> file name. Time stamps count on from `start`."""
     form = draw(st.sampled_from(IMAGES if draw(st.integers(0, 9)) else UNCLEAR_IMAGES))
-    return [
-        {
-            name: form.format(
-                camera=name,
-                Camera=name.title(),
-                letter=name[0],
-                german=GERMAN[name],
-                stamp=f"2018_07_16_17_11_{at % 60:02d}_{at:03d}",
-                at=at,
-            )
-            for name in CAMERAS
-        }
-        for at in range(start, start + size)
-    ]
+
+    def image(camera: str, at: int) -> str:
+        words = {"camera": camera, "Camera": camera.title(), "letter": camera[0], "german": GERMAN[camera]}
+        return form.format(**words, stamp=f"2018_07_16_17_11_{at % 60:02d}_{at:03d}", at=at)
+
+    return [{camera: image(camera, at) for camera in CAMERAS} for at in range(start, start + size)]
 
 
 @st.composite
@@ -122,11 +114,8 @@ def programs(draw, start, is_headed):
             factor, summand = units.get(column, (1, 0))
             is_text = isinstance(value, str)
             fields.append(value if is_text else form.format(value * factor + summand).replace(".", mark))
-        row = (
-            [names[camera].rpartition("/")[2] for camera in CAMERAS],
-            [float(form.format(numbers[n])) for n in NUMBERS],
-        )
-        lines.append((joined(fields), row))
+        files = [names[camera].rpartition("/")[2] for camera in CAMERAS]
+        lines.append((joined(fields), (files, [float(form.format(numbers[n])) for n in NUMBERS])))
     return lines
 
 
