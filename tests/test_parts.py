@@ -57,9 +57,8 @@ def test_an_s_bend_after_a_pause_is_not_driven_the_wrong_way():
     """From both of its ends it looks the same; by itself, the other direction was the likelier one."""
     recording, centres = driven("jungle", 701, 128, 10, "cw")
     recording = recording.take(slice(None), time=recording.time + 3 * (np.arange(701) >= 400))
-    found = [
-        (part.rows, each.track.direction) for part, each in certain_parts(recording, stretches(recording), centres)
-    ]
+    parts = certain_parts(recording, stretches(recording), centres)
+    found = [(part.rows, each.track.direction) for part, each in parts]
     assert found == [(slice(0, 400), "cw"), (slice(400, 701), "cw")]
 
 
@@ -158,19 +157,12 @@ def test_no_row_of_another_road_is_taken_for_the_track(lake, rows, pause):
     check(offset, ~foreign)
 
 
-def test_rows_after_which_the_car_is_back_at_once_are_another_road(lake):
-    """They fit the track where the part before them ends, but there was no time to come back from where they end."""
-    recording, centres = pieces(lake, np.r_[0:450], np.r_[477:547], np.r_[450:900], pause=2.0)
-    foreign = np.r_[np.zeros(450, bool), np.ones(70, bool), np.zeros(450, bool)]
-    offset = placed(recording, centres)
-    assert np.isnan(offset[foreign]).all()
-    check(offset, ~foreign)
-
-
-def test_a_stretch_of_which_only_the_start_fits_is_another_road(lake):
-    recording, centres = pieces(lake, np.r_[0:450], np.r_[477:727], np.r_[450:900], pause=2.0)
-    centres[530:700] = np.random.default_rng(1).uniform(-4, 4, centres[530:700].shape)
-    foreign = np.r_[np.zeros(450, bool), np.ones(250, bool), np.zeros(450, bool)]
+@pytest.mark.parametrize(("rows", "unlike"), [(70, slice(0)), (250, slice(530, 700))])
+def test_a_stretch_that_fits_only_where_the_part_before_it_ends_is_another_road(lake, rows, unlike):
+    """From the end of 70 rows there was no time to come back to where the lake goes on; of 250 only the start fits."""
+    recording, centres = pieces(lake, np.r_[0:450], np.r_[477 : 477 + rows], np.r_[450:900], pause=2.0)
+    centres[unlike] = np.random.default_rng(1).uniform(-4, 4, centres[unlike].shape)
+    foreign = np.r_[np.zeros(450, bool), np.ones(rows, bool), np.zeros(450, bool)]
     offset = placed(recording, centres)
     assert np.isnan(offset[foreign]).all()
     check(offset, ~foreign)
@@ -201,10 +193,8 @@ def test_rows_of_a_crash_are_cut_off_the_end_of_a_piece(lake, slowest):
 def test_a_short_piece_that_was_followed_away_from_where_the_car_should_be_is_not_certain(monkeypatch, away, certain):
     """A piece of a generated road was, 27 m back, and was taken for the jungle."""
     recording, centres = driven("lake", 100)
-    track, reach = (
-        next(i for i, each in enumerate(known_tracks()) if (each.name, each.direction) == ("lake", "ccw")),
-        22.0,
-    )
+    track = next(i for i, each in enumerate(known_tracks()) if (each.name, each.direction) == ("lake", "ccw"))
+    reach = 22.0
 
     def part(stretch, start):
         states = np.stack([start + 0.8 * np.arange(70.0), np.zeros(70), np.zeros(70)], axis=1)
