@@ -166,7 +166,7 @@ def test_what_measures_was_not_tuned_on():
 # The file
 
 
-def test_limits_belong_to_one_network(limits, network, tmp_path):
+def test_limits_belong_to_one_network_and_a_damaged_file_is_refused(limits, network, tmp_path):
     model, frame = tmp_path / "model.pt", render_frame(0.2, 0.3, np.random.default_rng(6))
     assert foretell.load_limits(model, network) is None, "no file"
     foretell.save_limits(model, network, limits)
@@ -176,10 +176,6 @@ def test_limits_belong_to_one_network(limits, network, tmp_path):
     assert risks[0] == risks[1] and (read.bias, read.stop) == (limits.bias, limits.stop)
     assert foretell.limits_file(model).stat().st_size < 200_000
     assert foretell.load_limits(model, Network().eval()) is None, "another network has no figure"
-
-
-def test_a_damaged_file_is_refused(limits, network, tmp_path):
-    model = tmp_path / "model.pt"
     foretell.save_limits(model, network, limits._replace(weights=limits.weights[:-1]))
     with pytest.raises(ModelError, match=r"model.limits.pt: .*python -m tools.foretell"):
         foretell.load_limits(model, network)
