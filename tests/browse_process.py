@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -38,14 +38,20 @@ class Browse:
     def ask(self, path: str, *arguments, **headers: str) -> tuple[int, bytes, dict]:
         return ask(self.port, path, *arguments, **headers)
 
-    def get(self, path: str) -> Any:
-        status, data, _ = self.ask(path)
+    def answer(self, path: str, *arguments) -> Any:
+        """The JSON of an answer that is no error."""
+        status, data, _ = self.ask(path, *arguments)
         assert status == 200, data
         return json.loads(data)
 
+    def refuses(self, words: str, path: str, *arguments, status: int = 409) -> None:
+        """Check that an error is answered, with these words."""
+        answered, data, _ = self.ask(path, *arguments)
+        assert answered == status and words in json.loads(data)["message"], data
+
     def recordings(self) -> dict[str, str]:
         """Where each recording is, by its folder's name."""
-        return {Path(each["folder"]).name: f"/recordings/{each['id']}" for each in self.get("/recordings")}
+        return {Path(each["folder"]).name: f"/recordings/{each['id']}" for each in self.answer("/recordings")}
 
     def hash(self, name: str) -> str:
         """The page's address of a recording, after the server's; name: its folder's."""
@@ -65,11 +71,8 @@ def browsing(*arguments, **more):
 @contextmanager
 def opened(folder: Path, *models: Path):
     """A recording as the page shows it, without a server."""
-    library = Library([folder], list(models))
-    try:
+    with closing(Library([folder], list(models))) as library:
         yield library[next(iter(library.recordings))]
-    finally:
-        library.close()
 
 
 def written(folder: Path, analysis: Analysis, columns: dict[str, np.ndarray], **about: object) -> None:

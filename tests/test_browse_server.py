@@ -1,7 +1,6 @@
 """The server of recordings over a real socket: what it tells, what it refuses, and cuts."""
 
 import json
-import shutil
 import socket
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -43,26 +42,26 @@ def served(sample_recording, model_file, tmp_path_factory):
 
 def test_the_server_tells_what_the_reader_tells(served, sample_recording):
     here = served.recordings()["lake sample"]
-    recording, details = read_recording(sample_recording), served.get(f"{here}/details")
+    recording, details = read_recording(sample_recording), served.answer(f"{here}/details")
     assert details["frames"] == details["rows_read"] == 60 and details["cuts"] == [] and details["rejected"] == 0
-    assert served.get(f"{here}/overview")["outline"] and not {"outline", "path"} & details.keys(), "sent once"
+    assert served.answer(f"{here}/overview")["outline"] and not {"outline", "path"} & details.keys(), "sent once"
     for name in ("steering", "throttle", "speed"):
         status, data, _ = served.ask(f"{here}/columns/{name}?version={details['version']}")
         assert status == 200
         np.testing.assert_array_equal(np.frombuffer(data, "<f4"), getattr(recording, name))
-    assert served.get(f"{here}/rows/7") == {"line": 8, "images": [recording.name(7, camera) for camera in range(3)]}
+    assert served.answer(f"{here}/rows/7") == {"line": 8, "images": [recording.name(7, camera) for camera in range(3)]}
     for camera, name in enumerate(("center", "left", "right")):
         status, data, headers = served.ask(f"{here}/rows/7/{name}.jpg")
         assert (status, data) == (200, recording.path(7, camera).read_bytes())
         assert headers["Cache-Control"] == "private, max-age=600" and headers["Content-Type"] == "image/jpeg"
         assert served.ask(f"{here}/rows/7/{name}.jpg", If_None_Match=headers["Etag"])[:2] == (304, b"")
-    spoilt = served.get(f"{served.recordings()['spoilt']}/overview")
+    spoilt = served.answer(f"{served.recordings()['spoilt']}/overview")
     assert "driving_log.csv: line 1: neither a row nor a header" in spoilt["message"] and "frames" not in spoilt
 
 
 def test_replays_and_runs_over_the_socket(served, sample_recording):
     here = served.recordings()["lake sample"]
-    shown = served.get(f"{here}/details?limit=1")["replays"][0]
+    shown = served.answer(f"{here}/details?limit=1")["replays"][0]
     assert shown["where"] == [[29, 1.2]] and shown["autonomy_percent"] == 90
     status, data, _ = served.ask(f"{here}/columns/replay-0-1")
     assert status == 200 and np.frombuffer(data, "<f4")[-1] == 0.5
@@ -70,13 +69,12 @@ def test_replays_and_runs_over_the_socket(served, sample_recording):
     recorded = read_frame(read_recording(sample_recording).path(59))
     assert status == 200 and headers["Content-Type"] == "image/jpeg"
     assert np.abs(decode(data).astype(int) - recorded).mean() > 1, "moved half a metre to the right"
-    assert served.get(f"{here}/details?limit=2.5")["replays"][0]["state"] == "none"
-    status, data, _ = served.ask(f"{here}/columns/offset", "POST")
-    assert status == 200 and json.loads(data)["lane"]["state"] == "ready", "what is there stays"
-    empty, found = served.get("/runs")
+    assert served.answer(f"{here}/details?limit=2.5")["replays"][0]["state"] == "none"
+    assert served.answer(f"{here}/columns/offset", "POST")["lane"]["state"] == "ready", "what is there stays"
+    empty, found = served.answer("/runs")
     assert "no training run in this folder yet" in empty["message"]
     assert found["id"] == 1 and found["state"] == "finished" and "pictures" not in found
-    assert served.get("/runs/1")["pictures"] == [0, 1200]
+    assert served.answer("/runs/1")["pictures"] == [0, 1200]
     status, data, headers = served.ask("/runs/1/training_generator_LRC_0.png")
     assert (status, data, headers["Content-Type"]) == (200, PNG, "image/png")
     status, data, headers = served.ask("/runs/1/training_generator_LRC_5.png")
@@ -88,7 +86,8 @@ def test_a_film_and_a_new_recording_of_a_selection(linked, tmp_path):
     add_cuts(linked, Cut(center(linked, 0), center(linked, 4), "off"))
     with browsing(linked) as server:
         here = server.recordings()["lake"]
-        version = server.get(f"{here}/details")["version"]
+        version = server.answer(f"{here}/details")["version"]
+        export = f"{here}/export?version={version}"
         status, data, headers = server.ask(f"{here}/film.mp4?rows=0-10,20-25&version={version}")
         assert status == 200 and headers["Content-Type"] == "video/mp4"
         (tmp_path / "film.mp4").write_bytes(data)
@@ -100,18 +99,16 @@ def test_a_film_and_a_new_recording_of_a_selection(linked, tmp_path):
         recording = read_uncut(linked)
         wanted = overlay(read_frame(recording.path(20)), float(recording.steering[20]))[..., ::-1]
         assert np.abs(frames[5].astype(int) - wanted).mean() < 12
-        status, data, _ = server.ask(f"{here}/export?version={version}", "POST", {"rows": "0-10,50-60", "name": "part"})
-        made = json.loads(data)
-        assert status == 200 and len(read_recording(made["folder"])) == 15
-        assert server.get(f"/recordings/{made['id']}/overview")["frames"] == 15, "the list has it"
+        made = server.answer(export, "POST", {"rows": "0-10,50-60", "name": "part"})
+        assert len(read_recording(made["folder"])) == 15
+        assert server.answer(f"/recordings/{made['id']}/overview")["frames"] == 15, "the list has it"
         body = {"rows": "0-60", "name": "two", "others": made["id"]}
-        made = json.loads(server.ask(f"{here}/export?version={version}", "POST", body)[1])
+        made = server.answer(export, "POST", body)
         assert made["notes"] == ["part is put 1 day later, after another drive"]
         assert len(read_recording(made["folder"])) == 70, "without what is cut"
-        assert server.ask(f"{here}/export?version={version}", "POST", body | {"others": "gone"})[0] == 404
+        assert server.ask(export, "POST", body | {"others": "gone"})[0] == 404
         for name, words in (("part", "exists already"), ("../part", "not the name of a folder"), (".", "not the name")):
-            status, data, _ = server.ask(f"{here}/export?version={version}", "POST", {"rows": "0-9", "name": name})
-            assert status == 409 and words in json.loads(data)["message"]
+            server.refuses(words, export, "POST", {"rows": "0-9", "name": name})
         assert server.ask(f"{here}/film.mp4?rows=0-5&version={version}")[0] == 409, "all of it is cut"
         assert server.ask(f"{here}/export", "POST", {"rows": "0-9", "name": "other"})[0] == 409, "of no version"
         for rows in ("", "1", "a-b", "1-" + "9" * 10):
@@ -184,18 +181,12 @@ def test_cuts_over_the_socket(linked):
     cuts = linked / "excluded.csv"
     with browsing(linked) as server:
         here = server.recordings()["lake"]
-        version = server.get(f"{here}/details")["version"]
-
-        def refused(words: str, path: str, *arguments: object, status: int = 409) -> None:
-            answered, data, _ = server.ask(f"{here}/{path}", *arguments)
-            assert answered == status and words in json.loads(data)["message"]
-
+        version = server.answer(f"{here}/details")["version"]
         one = {"first": names[3], "last": names[5], "reason": "off"}
         two = {"first": names[10], "last": names[10], "reason": "crash, hard"}
         assert server.ask(f"{here}/cuts", "POST", [one])[0] == 200
-        status, data, _ = server.ask(f"{here}/cuts", "POST", [two])
-        details = json.loads(data)
-        assert status == 200 and details["cut_frames"] == 4 and details["changed"] == [two | {"line": 0}]
+        details = server.answer(f"{here}/cuts", "POST", [two])
+        assert details["cut_frames"] == 4 and details["changed"] == [two | {"line": 0}]
         assert [(cut["reason"], cut["frames"], cut["stretches"]) for cut in details["cuts"]] == [
             ("off", 3, [[3, 6]]),
             ("crash, hard", 1, [[10, 11]]),
@@ -203,14 +194,13 @@ def test_cuts_over_the_socket(linked):
         assert len(read_recording(linked)) == 56
         assert server.ask(f"{here}/tags", "POST", [one, two])[0] == 200
         assert server.ask(f"{here}/tags", "DELETE", [one])[0] == 200
-        assert [tag["reason"] for tag in server.get(f"{here}/details")["tags"]] == ["crash, hard"]
-        assert server.get(f"{here}/overview")["tags"] == ["crash, hard"], "by which the list is searched"
-        refused("is not there any more", "cuts", "DELETE", [one | {"reason": "other"}], status=410)
-        status, data, _ = server.ask(f"{here}/cuts", "DELETE", [one, one | {"reason": "other"}])
-        details = json.loads(data)
-        assert status == 200 and details["cut_frames"] == 1, "what was deleted elsewhere keeps no other one"
+        assert [tag["reason"] for tag in server.answer(f"{here}/details")["tags"]] == ["crash, hard"]
+        assert server.answer(f"{here}/overview")["tags"] == ["crash, hard"], "by which the list is searched"
+        server.refuses("is not there any more", f"{here}/cuts", "DELETE", [one | {"reason": "other"}], status=410)
+        details = server.answer(f"{here}/cuts", "DELETE", [one, one | {"reason": "other"}])
+        assert details["cut_frames"] == 1, "what was deleted elsewhere keeps no other one"
         assert [cut["reason"] for cut in details["changed"]] == ["off"]
-        refused("not there any more", "cuts", "DELETE", [one], status=410)
+        server.refuses("not there any more", f"{here}/cuts", "DELETE", [one], status=410)
         wrongs: tuple[object, ...] = ([], one, [1], [{"first": 1, "last": "b", "reason": ""}], [one | {"more": ""}])
         for wrong in wrongs:
             assert server.ask(f"{here}/cuts", "POST", wrong)[0] == 400
@@ -219,52 +209,47 @@ def test_cuts_over_the_socket(linked):
         for path in ("cuts", "export"):
             status, data, _ = server.ask(f"{here}/{path}", "POST", b"[" * 100_000)
             assert status == 400 and b"nested too deeply" in data
-        refused("is not the centre image", "cuts", "POST", [two, one | {"first": "../x"}])
-        refused("comes before", "cuts", "POST", [one | {"last": names[2]}])
+        server.refuses("is not the centre image", f"{here}/cuts", "POST", [two, one | {"first": "../x"}])
+        server.refuses("comes before", f"{here}/cuts", "POST", [one | {"last": names[2]}])
         text = f'first image,last image,reason\n{names[10]},{names[10]},"crash, hard"\n'
         assert cuts.read_text(encoding="utf-8") == text
         cuts.write_text(text + "spoilt\n", encoding="utf-8")
-        refused("excluded.csv: line 3: 1 fields where 3", "cuts", "POST", [one])
+        server.refuses("excluded.csv: line 3: 1 fields where 3", f"{here}/cuts", "POST", [one])
         assert cuts.read_text(encoding="utf-8") == text + "spoilt\n"
         cuts.write_text(text, encoding="utf-8")
         assert (linked / "driving_log.csv").read_bytes() == log
         (linked / "driving_log.csv").write_bytes(log[log.index(b"\n") + 1 :])
-        refused("has changed since this page read it", f"rows/0/left.jpg?version={version}")
-        assert server.get(f"{here}/details")["frames"] == 59
+        server.refuses("has changed since this page read it", f"{here}/rows/0/left.jpg?version={version}")
+        assert server.answer(f"{here}/details")["frames"] == 59
         linked.rename(linked.with_name("elsewhere"))
         gone = "driving_log.csv: No such file"
-        refused(gone, "details")
-        refused(gone, "rows/0")
-        refused(gone, "cuts", "POST", [one])
-        refused(gone, "columns/offset", "POST")
-        assert gone in server.get(f"{here}/overview")["message"]
+        server.refuses(gone, f"{here}/details")
+        server.refuses(gone, f"{here}/rows/0")
+        server.refuses(gone, f"{here}/cuts", "POST", [one])
+        server.refuses(gone, f"{here}/columns/offset", "POST")
+        assert gone in server.answer(f"{here}/overview")["message"]
         assert (linked.with_name("elsewhere") / "excluded.csv").read_text(encoding="utf-8") == text
 
 
-def test_a_recording_that_is_new_is_in_the_list(linked, tmp_path):
-    with browsing(linked.parent) as server:
-        assert list(server.recordings()) == ["lake"]
-        new = shutil.copytree(linked, linked.with_name("new"))
-        assert list(server.recordings()) == ["lake", "new"]
-        linked.rename(tmp_path / "lake")
-        new.rename(tmp_path / "new")
-        assert list(server.recordings()) == ["lake", "new"], "what is gone is told in its card"
-
-
-def test_others_are_answered_while_a_long_log_is_read(linked):
+def test_a_recording_that_is_new_is_in_the_list_and_others_are_answered_while_its_long_log_is_read(linked, tmp_path):
     long = linked.with_name("long")
-    long.mkdir()
     rows = [f"center_{n}.jpg,left_{n}.jpg,right_{n}.jpg,0,1,0,9\n" for n in range(200_000)]
-    (long / "driving_log.csv").write_text("".join(rows), encoding="utf-8")
     with browsing(linked.parent) as server, ThreadPoolExecutor() as pool:
+        assert list(server.recordings()) == ["lake"]
+        long.mkdir()
+        (long / "driving_log.csv").write_text("".join(rows), encoding="utf-8")
         here, answered = server.recordings(), 0
-        server.get(f"{here['lake']}/rows/0")  # reads it
+        assert list(here) == ["lake", "long"]
+        server.answer(f"{here['lake']}/rows/0")  # reads it
         reading = pool.submit(server.ask, f"{here['long']}/columns/throttle")
         while not reading.done():
             answered += server.ask(f"{here['lake']}/rows/0/center.jpg")[0] == 200
         status, data, _ = reading.result()
         assert status == 200 and np.array_equal(np.frombuffer(data, "<f4"), np.ones(200_000))
-    assert answered > 3, "one may be answered before it is read"
+        assert answered > 3, "one may be answered before it is read"
+        for folder in (linked, long):
+            folder.rename(tmp_path / folder.name)
+        assert list(server.recordings()) == ["lake", "long"], "what is gone is told in its card"
 
 
 def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, monkeypatch, capsys):
