@@ -8,7 +8,7 @@ import select
 import shutil
 import subprocess
 import time
-from contextlib import contextmanager, suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -115,38 +115,37 @@ class Page:
     def click(self, selector: str) -> None:
         self.run(f"document.querySelector({selector!r}).click()")
 
-    def press(self, key: str, shift: bool = False) -> None:
-        """Press and release a key, by its name in JavaScript."""
-        character = {"text": "\r" if key == "Enter" else key} if len(key) == 1 or key == "Enter" else {}
+    def press(self, *keys: str, shift: bool = False) -> None:
+        """Press and release keys one after the other, by their names in JavaScript."""
         codes = {"Enter": 13, "Escape": 27, " ": 32, "Tab": 9, "ArrowLeft": 37, "ArrowRight": 39}
-        code = {"windowsVirtualKeyCode": codes[key]} if key in codes else {}
-        both = {"key": key, "modifiers": 8 * shift, **code}
-        self.send("Input.dispatchKeyEvent", type="keyDown", **both, **character)
-        self.send("Input.dispatchKeyEvent", type="keyUp", **both)
+        for key in keys:
+            character = {"text": "\r" if key == "Enter" else key} if len(key) == 1 or key == "Enter" else {}
+            code = {"windowsVirtualKeyCode": codes[key]} if key in codes else {}
+            both = {"key": key, "modifiers": 8 * shift, **code}
+            self.send("Input.dispatchKeyEvent", type="keyDown", **both, **character)
+            self.send("Input.dispatchKeyEvent", type="keyUp", **both)
+
+    def box(self, selector: str) -> tuple[float, float, float, float]:
+        """An element's left edge, top, width and height in the window, in px."""
+        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
+        return self.run(f"(({{x, y, width, height}}) => [x, y, width, height])({box})")
 
     def drag(self, selector: str, begin: float, end: float, height: float = 0.5) -> None:
         """Drag the mouse over an element; begin, end, height: shares of its width and height."""
-        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
-        left, top, width, tall = self.run(f"(({{x, y, width, height}}) => [x, y, width, height])({box})")
-        moves = [
-            ("mousePressed", begin),
-            ("mouseMoved", (begin + end) / 2),
-            ("mouseMoved", end),
-            ("mouseReleased", end),
-        ]
-        for kind, share in moves:
+        left, top, width, tall = self.box(selector)
+        kinds, shares = ("Pressed", "Moved", "Moved", "Released"), (begin, (begin + end) / 2, end, end)
+        for kind, share in zip(kinds, shares, strict=True):
             place = {"x": left + share * width, "y": top + height * tall}
-            self.send("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **place)
+            self.send("Input.dispatchMouseEvent", type=f"mouse{kind}", button="left", buttons=1, clickCount=1, **place)
             self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")  # moves are late
 
     def swipe(self, selector: str, *fingers: tuple[float, float]) -> None:
         """Move fingers over an element, each from one share of its width to another."""
         self.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=len(fingers))
-        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
-        left, width, middle = self.run(f"(({{x, y, width, height}}) => [x, width, y + height / 2])({box})")
+        left, top, width, height = self.box(selector)
         for kind, share in (("touchStart", 0.0), ("touchMove", 0.3), ("touchMove", 1.0)):
             across = [left + width * (begin + share * (end - begin)) for begin, end in fingers]
-            points = [{"x": x, "y": middle, "id": finger} for finger, x in enumerate(across)]
+            points = [{"x": x, "y": top + height / 2, "id": finger} for finger, x in enumerate(across)]
             self.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
             self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
         self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
@@ -154,9 +153,9 @@ class Page:
 
     def wheel(self, selector: str, pixels: float) -> None:
         """Turn the mouse's wheel over the middle of an element."""
-        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
-        x, y = self.run(f"(({{x, y, width, height}}) => [x + width / 2, y + height / 2])({box})")
-        self.send("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=pixels)
+        left, top, width, height = self.box(selector)
+        middle = {"x": left + width / 2, "y": top + height / 2}
+        self.send("Input.dispatchMouseEvent", type="mouseWheel", **middle, deltaX=0, deltaY=pixels)
 
     def look(self, width: int, height: int, dark: bool = False) -> None:
         """Choose the window's size in px and the system's colours."""
@@ -167,14 +166,16 @@ class Page:
 
     def screenshot(self) -> np.ndarray:
         """What the window shows: BGR."""
-        picture = base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
-        return decoded(picture)
+        return decoded(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
+
+    def canvas(self, camera: str) -> np.ndarray:
+        """What a camera's canvas shows: BGR."""
+        pixels = f"document.querySelector('#{camera}').getContext('2d').getImageData(0, 0, 320, 160).data"
+        return np.array(self.run(f"[...{pixels}].join()").split(","), np.uint8).reshape(160, 320, 4)[..., 2::-1]
 
     def difference(self, camera: str, picture: bytes) -> float:
         """The mean difference between a camera's canvas and an image file's contents, in grey levels."""
-        pixels = f"document.querySelector('#{camera}').getContext('2d').getImageData(0, 0, 320, 160).data"
-        shown = np.array(self.run(f"[...{pixels}].join()").split(","), np.uint8).reshape(160, 320, 4)[..., 2::-1]
-        return float(np.abs(shown.astype(int) - decoded(picture)).mean())
+        return float(np.abs(self.canvas(camera).astype(int) - decoded(picture)).mean())
 
     def complaints(self) -> list[str]:
         """What the page's console has said: errors, and what the Content-Security-Policy has stopped."""
@@ -237,10 +238,5 @@ def decoded(picture: bytes) -> np.ndarray:
     return pixels
 
 
-@contextmanager
-def chromium(profile: Path):
-    page = Page(profile)
-    try:
-        yield page
-    finally:
-        page.close()
+def chromium(profile: Path) -> closing[Page]:
+    return closing(Page(profile))

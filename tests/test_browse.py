@@ -6,6 +6,7 @@ import shutil
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -248,13 +249,11 @@ def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, t
 
 
 def test_an_analysis_tells_how_far_it_is_and_why_it_failed(recording, linked, monkeypatch):
-    code = (
-        "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nanalyse: no model')"
-    )
+    code = "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nanalyse: spoilt')"
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
     states = ended(recording.analyses, linked)
     assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
-    assert states[-1] == {"state": "failed", "message": "analyse: no model"}
+    assert states[-1] == {"state": "failed", "message": "analyse: spoilt"}
     recording.retry("offset")
     assert recording.analyses.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
     assert ended(recording.analyses, linked)[-1] == states[-1]
@@ -318,13 +317,11 @@ def test_a_recording_is_shown_though_its_images_and_a_model_are_gone(linked, tmp
 
 def test_what_has_the_same_name_is_told_apart(linked, tmp_path):
     copies = [shutil.copytree(linked, tmp_path / person / "lake") for person in ("b", "c/b")]
-    shown = Library([linked, *copies], [tmp_path / name for name in ("a/m.pt", "a/../b/m.pt", "a/x.pt")])
-    try:
+    models = [tmp_path / name for name in ("a/m.pt", "a/../b/m.pt", "a/x.pt")]
+    with closing(Library([linked, *copies], models)) as shown:
         assert list(shown.models) == ["a/m.pt", "b/m.pt", "x.pt"]
         names = ["data/lake", f"{tmp_path.name}/b/lake", "c/b/lake"]
         assert list(shown.names.values()) == names == [shown[each].overview()["name"] for each in shown.recordings]
-    finally:
-        shown.close()
 
 
 def test_without_file_handles_no_file_is_blamed():

@@ -10,7 +10,6 @@ from browser import needs_chromium
 from test_excluded import center
 
 from cloning.browse.analyses import Analysis
-from cloning.recordings.log import read_recording
 
 pytestmark = needs_chromium
 
@@ -89,27 +88,8 @@ def test_what_is_wrong_or_gone_is_told_and_shown_again_once_it_is_mended(linked,
         at(page, 59)
 
 
-def test_what_another_tab_cuts_is_shown_and_undone(linked, page):
-    """A browser tells a tab when another one has changed what it keeps."""
-    placed(linked, np.zeros(60))
-    cut = {"first": center(linked, 0), "last": center(linked, 1), "reason": "off"}
-    with browsing(linked) as server:
-        page.open(f"{server.base}{server.hash('lake')}")
-        at(page, 0)
-        (linked / "excluded.csv").write_text(f"{','.join(cut.values())}\n", encoding="utf-8")
-        key, done = (
-            f"cuts-{server.hash('lake').removeprefix('#/')}",
-            {"kind": "cuts", "method": "DELETE", "cuts": [cut]},
-        )
-        page.run(f"localStorage.setItem('{key}', JSON.stringify({{done: [{json.dumps(done)}], undone: []}}))")
-        page.run(f"dispatchEvent(new StorageEvent('storage', {{key: '{key}'}}))")
-        page.shows("#cuts", "2 frames: off")
-        page.press("z")
-        page.shows("#cuts", "None")
-
-
-def test_an_undo_that_fails_can_be_tried_again(linked, page):
-    """If the cut was deleted elsewhere, the one before it is undone."""
+def test_an_undo_that_fails_can_be_tried_again_and_what_another_tab_cuts_is_shown_and_undone(linked, page):
+    """The one before a cut that was deleted elsewhere is undone. A browser tells a tab what another one changes."""
     placed(linked, np.zeros(60))
     file, header = linked / "excluded.csv", "first image,last image,reason\n"
     cuts = [f"{center(linked, row)},{center(linked, row)},off\n" for row in (0, 1)]
@@ -117,8 +97,7 @@ def test_an_undo_that_fails_can_be_tried_again(linked, page):
         page.open(f"{server.base}{server.hash('lake')}")
         for row in range(2):
             at(page, row)
-            for key in "iox":
-                page.press(key)
+            page.press(*"iox")
             page.wait("document.querySelector('#reason[open]')")
             page.run("document.querySelector('#reason-text').value = 'off'")
             page.press("Enter")
@@ -131,9 +110,8 @@ def test_an_undo_that_fails_can_be_tried_again(linked, page):
         page.shows("#notice", "not a regular file")
         file.rmdir()
         file.write_text(header + "".join(cuts), encoding="utf-8")
-        for key, buttons in (("zz", 0), ("yy", 4)):
-            page.press(key[0])
-            page.press(key[1])
+        for keys, buttons in (("zz", 0), ("yy", 4)):
+            page.press(*keys)
             page.wait(f"document.querySelectorAll('#cuts button').length == {buttons}")
         assert file.read_text(encoding="utf-8") == header + "".join(cuts)
         file.write_text(header + cuts[0], encoding="utf-8")
@@ -142,6 +120,15 @@ def test_an_undo_that_fails_can_be_tried_again(linked, page):
         page.press("z")
         page.shows("#cuts", "None")
         assert file.read_text(encoding="utf-8") == header and page.run("document.querySelector('#notice').hidden")
+        cut = {"first": center(linked, 0), "last": center(linked, 1), "reason": "off"}
+        file.write_text(f"{','.join(cut.values())}\n", encoding="utf-8")
+        key = f"cuts-{server.hash('lake').removeprefix('#/')}"
+        kept = {"done": [{"kind": "cuts", "method": "DELETE", "cuts": [cut]}], "undone": []}
+        page.run(f"localStorage.setItem('{key}', JSON.stringify({json.dumps(kept)}))")
+        page.run(f"dispatchEvent(new StorageEvent('storage', {{key: '{key}'}}))")
+        page.shows("#cuts", "2 frames: off")
+        page.press("z")
+        page.shows("#cuts", "None")
 
 
 def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, page, tmp_path, model_file):
@@ -195,23 +182,3 @@ def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, 
         page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
         page.shows("#notice", "does not answer")
         page.wait("document.querySelector('#notice').hidden")
-
-
-def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(linked, page):
-    """As while many others are loaded; an error there would stop all frames in the end."""
-    placed(linked, np.zeros(60))
-    with browsing(linked) as server:
-        page.open(f"{server.base}{server.hash('lake')}")
-        at(page, 0)
-        page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
-        page.run("""const own = fetch; fetch = async (...what) => {
-            if (what[0].includes("/rows/1/") && !window.late) await new Promise(go => late = go);
-            return own(...what);
-        }; 0""")
-        page.press("ArrowRight")
-        page.wait("window.late")
-        page.run("import('/static/state.js').then(({page: {open: {frames}}}) => frames.forget(1))")
-        page.run("new Promise(done => setTimeout(done, 2000)).then(late)")
-        frame = read_recording(linked).path(1, 1).read_bytes()
-        page.until(lambda: page.difference("left", frame) < 3, 20)
-        assert page.complaints() == []

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import closing
 
 import cv2
 import numpy as np
@@ -116,8 +117,7 @@ def test_the_attention_laid_over_a_frame_is_that_of_the_films(sample_recording, 
 
 def test_attention_comes_from_a_process_that_is_started_again_when_it_has_ended(sample_recording, model_file, tmp_path):
     jpeg = read_recording(sample_recording).path(20).read_bytes()
-    attention = Attention()
-    try:
+    with closing(Attention()) as attention:
         png = attention.png(jpeg, str(model_file))
         assert png == attend.picture(jpeg, str(model_file))
         first = attention.process
@@ -128,8 +128,6 @@ def test_attention_comes_from_a_process_that_is_started_again_when_it_has_ended(
         (tmp_path / "spoilt.pt").write_bytes(b"no model")
         with pytest.raises(ModelError, match=r"spoilt\.pt: "):
             attention.png(jpeg, str(tmp_path / "spoilt.pt"))
-    finally:
-        attention.close()
     assert attention.process not in (None, first) and attention.process.poll() is not None
 
 
@@ -183,9 +181,8 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
     found = runs.overview(RunFiles(str(finished[1] / "model.pt")))
     assert (found["state"], found["epochs"], len(found["history"]), found["pictures"]) == ("finished", 2, 2, [0])
     best = load_checkpoint(finished[1] / "model-best.pt")["history"]
-    assert found["best"] == {"epoch": len(best), "by": "val_loss", "value": best[-1]["val_loss"]}, (
-        "too few rows to drift"
-    )
+    least = {"epoch": len(best), "by": "val_loss", "value": best[-1]["val_loss"]}
+    assert found["best"] == least, "too few rows to drift"
     files = written_run(tmp_path / "old", finished=4, images=0, losses=(0.5, float("nan"), 0.3))
     files.progress.unlink()
     found = runs.overview(files)
@@ -256,16 +253,13 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         average = page.run("import('/static/run.js').then(({average}) => average([1, 0, null, 0], 0.5))")
         assert average == [1, pytest.approx(1 / 3), None, pytest.approx(1 / 7)], "sums of 1, 1/2, 1/4, 1/8"
         page.run("smooth.focus()")
-        page.press("ArrowLeft")  # which elsewhere shows earlier pictures
-        page.press("ArrowRight")
-        page.press("ArrowRight")
+        page.press("ArrowLeft", "ArrowRight", "ArrowRight")  # which elsewhere show other pictures
         page.wait("location.hash == '#/run/0?with=1&smooth=0.51'")
         page.press("ArrowLeft")
         page.wait("location.hash == '#/run/0?with=1&smooth=0.5'")
         page.run("smooth.blur(); dispatchEvent(new HashChangeEvent('hashchange'))")
-        page.wait(
-            "smoothed.textContent == '0.50' && document.querySelectorAll('#losses .u-series.smoothed').length == 6"
-        )
+        page.wait("smoothed.textContent == '0.50'")
+        page.wait("document.querySelectorAll('#losses .u-series.smoothed').length == 6")
         page.click("#run-options summary")
         assert page.text("#run-table").split("\n") == ["option\ta\tb", "epochs\t4\t5"]
         page.shows("#run-which", "after 1,200 observations")
