@@ -123,9 +123,8 @@ def test_the_last_lines_say_in_words_how_the_network_will_drive():
         return driving(list(history), recipe, still, files)
 
     found = text(REPORT, epoch(1, 0.1, 0.4), epoch(2, 0.2, 1.0))
-    assert (
-        "Steered by net.pt for two seconds, from where the driver was, a car is 1.00 m from the driver's path" in found
-    )
+    told = "Steered by net.pt for two seconds, from where the driver was, a car is 1.00 m from the driver's path"
+    assert told in found
     assert "2 held-out stretches; 0.40 m by net-best.pt of epoch 1, 2.50 m with the wheels straight ahead" in found
     assert found.endswith("leave the road now and then.")
     assert text(REPORT, epoch(1, 0.1, 0.4)).endswith("stay on the road.")

@@ -256,10 +256,11 @@ def test_the_cause_of_missing_images_is_named(copied, tmp_path, change, remedy, 
     if (copied / "img").exists():
         pytest.skip("this file system ignores case")
     change(copied)
-    done = run_here(copied, "--output", tmp_path / "model.pt")
-    assert done.returncode == 2 and "0 of 60 rows are left" in done.stderr
     first = f"{copied / 'driving_log.csv'}: line 1: left out: IMG/center_2018_07_16_17_11_43_067.jpg: missing; {remedy}"
-    assert first in done.stdout
+    for options in ((), ("--robust",)):
+        done = run_here(copied, *options, "--output", tmp_path / "model.pt")
+        assert done.returncode == 2 and first in done.stdout
+        assert "0 of 60 rows are left, at least 5 are needed: most can't be used, see above" in done.stderr
     with pytest.raises(RecordingError, match=r"driving_log\.csv: no usable row is left to replay"):
         replay.load_recording(copied)
     assert first in capsys.readouterr().out

@@ -20,14 +20,8 @@ def test_model_file_carries_what_driving_needs(network, tmp_path):
     frames = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (5, 160, 320, 3), np.uint8))
     save_model(path, network, arguments={"seed": 1})
     saved = torch.load(path, weights_only=True)
-    assert saved["recipe"] == {
-        "frame": (160, 320, 3),
-        "colour": "RGB",
-        "crop": (60, 25),
-        "scale": 127.5,
-        "offset": 1.0,
-        "exposure": (0.0, 0.0),
-    }
+    wanted = dict(frame=(160, 320, 3), colour="RGB", crop=(60, 25), scale=127.5, offset=1.0, exposure=(0.0, 0.0))
+    assert saved["recipe"] == wanted
     assert saved["arguments"] == {"seed": 1}
     assert {"torch", "opencv", "numpy", "python"} <= set(saved["versions"])
     torch.testing.assert_close(load_model(path)(frames), network(frames))

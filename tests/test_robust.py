@@ -288,13 +288,9 @@ def test_networks_are_measured_as_they_drive(sample_recording, tmp_path):
     assert errors[-1] == errors[-2]
 
 
-def test_recordings_without_images_and_too_short_ones_are_named(linked, tmp_path):
-    shutil.rmtree(linked / "IMG")
-    short = render_recording(tmp_path / "short", rows=20)
-    no_images = "0 of 60 rows are left, at least 5 are needed: most can't be used, see above"
-    for folder, words in ((linked, no_images), (short, "too short")):
-        done = run_here(folder, *OPTIONS, "--output", tmp_path / "model.pt")
-        assert done.returncode == 2 and words in done.stderr
+def test_drives_too_short_are_named(tmp_path):
+    done = run_here(render_recording(tmp_path / "short", rows=20), *OPTIONS, "--output", tmp_path / "model.pt")
+    assert done.returncode == 2 and "too short" in done.stderr
 
 
 def test_tints_keep_grey_nearly_grey():
