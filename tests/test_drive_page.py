@@ -55,6 +55,15 @@ def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_i
     assert len(measured.latencies) == 2 and all(0 < seconds < 60 for seconds in measured.latencies)
 
 
+def test_the_benchmark_answers_a_ping_and_waits_for_the_answer():
+    packets, sent = ["first", "2", "second"], list[str]()
+    telemetries = SimpleNamespace(sendall=lambda data: None)
+    client = SimpleNamespace(socket=telemetries, receive=lambda: packets.pop(0), send=sent.append)
+    measured: Any = SimpleNamespace(client=client, cpu_seconds=float)
+    bench_driving.Server.drive(measured, [[b"1"], [b"2"]], count=False)
+    assert not packets and sent == ["3"]
+
+
 def test_the_page_changes_the_set_speed_of_a_car_that_drives(server, jpegs):
     with Simulator(server.port).open() as simulator:
         for set_speed in (11.5, 9.0):

@@ -5,6 +5,7 @@ Thresholds are about 1.25 times what was measured with bfloat16; with float32 th
 
 import copy
 import re
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from scenes import Here, lake_drive, recorded
 
 from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
-from cloning.lane import reader
+from cloning.lane import parts, reader
 from cloning.lane.ahead import centre_ahead
 from cloning.lane.follow import TrackFilter
 from cloning.lane.localise import estimate_lane_position, localise_recording
@@ -40,7 +41,7 @@ from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, camera_position
 from cloning.road.motion import REAR_AXLE, Stretch, stretches
 from cloning.road.track import ROADS, Track
 from simulator import __main__ as simulator
-from tools import lane_accuracy, lane_frames, train_lane
+from tools import lane_accuracy, lane_frames, likeness, train_lane
 from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
 
@@ -311,6 +312,30 @@ def test_a_damaged_image_is_named(copied):
     damaged.write_bytes(damaged.read_bytes()[:-200])
     with pytest.raises(RecordingError, match=f"{damaged.name}: cut short"):
         detect_centres(read_recording(copied))
+
+
+def test_what_a_network_may_notice_of_a_frame_is_measured():
+    flat, sharp = np.full((1, 20, 30, 3), (40, 20, 20), np.uint8), np.full((1, 20, 30, 3), 100, np.uint8)
+    sharp[:, :, 15:] = 200
+    assert likeness.measures(flat).tolist() == [100, 127.5 + 0.5, 0, 0]  # dark, half saturated
+    dark, saturation, edges, laplacian = likeness.measures(sharp)
+    assert (dark, saturation) == (0, 0) and edges == pytest.approx(100 / 30) and laplacian > 100
+
+
+def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsys):
+    """The table of differences, of a rendered recording against the same places rendered again."""
+    recording, _ = drive
+    monkeypatch.setattr("cloning.lane.parts.WINDOW", len(recording) // 2)  # the drive is short
+    picture = tmp_path / "both.png"
+    monkeypatch.setitem(parts.ANCHOR_TURN_RESIDUAL, "lake", ((0, 1), (0.5, 0.5)))
+    assert likeness.main([str(recording.folder), "--frames", "8", "--picture", str(picture)]) == 0
+    table = capsys.readouterr().out
+    assert table.startswith(f"lake, ccw, {len(stretches(recording)[0])} rows\n")
+    shown: Any = cv2.imread(str(picture))
+    assert shown.shape == (8 * FRAME[0], 6 * FRAME[1], 3)
+    assert likeness.main([str(recording.folder), "--frames", "8", "--look", "3"]) == 0
+    same, other = (float(re.findall(r"mean difference ([\d.]+)", text)[0]) for text in (table, capsys.readouterr().out))
+    assert same < 5 and other > 2 * same  # not 0, because so short a drive is placed only to some metres
 
 
 @pytest.mark.parametrize("main, options", [(train_lane.main, []), (lane_accuracy.main, ["--laps", "0"])])

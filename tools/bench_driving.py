@@ -1,12 +1,12 @@
-"""Measure how fast drive.py answers, compared with the lower bound.
+"""Measure how fast drive.py answers, compared with the lower bound and with a typical server.
 
     python -m tools.bench_driving model.pt data/lake-ccw                     # one or two minutes
     python -m tools.bench_driving model.pt data/lake-ccw --frames 50000      # shows whether memory use grows
 
 Each server has a client that sends telemetry over loopback, in the simulator's fragments and without TCP_NODELAY, and
-waits for each answer. One only drives, one saves the frames, and one has its page open. The lower bound is the time to
-decode the JPEG and run one forward pass (batch size 1, one thread). The servers take turns, so that other load on the
-machine affects all of them equally. Needs Linux, because CPU time and memory are read from /proc.
+waits for each answer. The lower bound is the time to decode the JPEG and run one forward pass (batch size 1, one
+thread). The servers take turns, so that other load on the machine affects all of them equally. Needs Linux, because CPU
+time and memory are read from /proc.
 """
 
 import itertools
@@ -33,7 +33,7 @@ from tools.simulator_client import Simulator, fragments, telemetry_message
 
 TURN = 100  # frames that a server answers in one turn
 WARM_UP = 50  # frames that are not counted
-PAGE_OPEN = "drive.py, page open"  # a name in the table
+PAGE_OPEN, TYPICAL = "drive.py, page open", "typical server"  # names in the table
 
 
 class Server(ServerProcess):
@@ -60,7 +60,8 @@ class Server(ServerProcess):
             sent = time.perf_counter()
             for fragment in message:
                 self.client.socket.sendall(fragment)
-            self.client.receive()
+            while self.client.receive() == "2":  # a ping: without an answer, the typical server closes after 20 s
+                self.client.send("3")
             if count:
                 self.round_trips.append(time.perf_counter() - sent)
         if count:
@@ -114,6 +115,7 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
             "drive.py": drive,
             "drive.py, saving frames": (*drive, Path(folder) / "run1"),
             PAGE_OPEN: drive,
+            TYPICAL: ("-c", "from tools.classic_server import main; main()", model),
         }
         servers = [stack.enter_context(Server(name, *command)) for name, command in commands.items()]
         for server in servers:
@@ -125,7 +127,8 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
             for server in servers:
                 with open_page(server.port) if server.name == PAGE_OPEN else nullcontext():
                     server.drive(messages[turn])
-                server.read_latencies(TURN)
+                if server.name != TYPICAL:
+                    server.read_latencies(TURN)
     return bounds, servers
 
 
@@ -153,7 +156,8 @@ def main(argv: list[str] | None = None) -> int:
             f"{server.name:24} {milliseconds(server.round_trips, bounds)} {count / server.seconds:9.1f} "
             f"{server.cpu_time / count * 1e3:10.2f} {server.megabytes[0]:9.0f} {server.megabytes[-1]:5.0f}"
         )
-        print(f"{'  in the server':24} {milliseconds(server.latencies, bounds)}")
+        if server.latencies:
+            print(f"{'  in the server':24} {milliseconds(server.latencies, bounds)}")
     return program.DONE
 
 
