@@ -31,6 +31,7 @@ from cloning.lane.reader import (
     extract_strip,
     fuse_detections,
     load_network,
+    read_strips,
 )
 from cloning.lane.recovery import LanePosition
 from cloning.lane.search import MIN_LOG_LIKELIHOOD, Localisation, followed, known_tracks, search
@@ -194,6 +195,10 @@ def test_a_road_that_no_network_was_trained_on(tmp_path):
     error = np.abs(found.lateral_offset - true)
     assert error[SAMPLE_RATE:].mean() < 0.13  # measured: 0.104
     assert found.trusted.mean() > 0.95  # measured: 1
+
+
+def test_strips_are_those_of_the_rows_asked_for(drive):
+    assert np.array_equal(read_strips(drive[0], slice(5, 9)), read_strips(drive[0], slice(0, 10))[5:9])
 
 
 def test_cameras_and_rows_are_fused(drive):

@@ -163,18 +163,22 @@ def estimate_centres(strips: np.ndarray, network: LaneNetwork | None = None) -> 
     return centres.reshape(*strips.shape[:-3], len(DISTANCES_AHEAD))
 
 
-def read_strips(recording: Recording) -> np.ndarray:
-    """Return the strips of a recording's three cameras in its rows: uint8 (n, 3, 32, 160, 3). Raises RecordingError."""
-    strips = np.empty((len(recording), 3, *STRIP_SHAPE), np.uint8)
+def read_strips(recording: Recording, rows: slice = slice(None)) -> np.ndarray:
+    """Return the strips of a recording's three cameras in these rows: uint8 (n, 3, 32, 160, 3). Raises RecordingError.
+
+    rows: without a step.
+    """
+    first, end, _ = rows.indices(len(recording))
+    strips = np.empty((end - first, 3, *STRIP_SHAPE), np.uint8)
 
     def read(row: int) -> None:
         frame = np.zeros(FRAME, np.uint8)
         for camera in range(3):
             frame[ROAD_ROWS] = recording.road(row, camera)
-            strips[row, camera] = extract_strip(frame)
+            strips[row - first, camera] = extract_strip(frame)
 
     with ThreadPoolExecutor(threads()) as pool:
-        list(pool.map(read, range(len(recording))))  # raises what reading a row raised
+        list(pool.map(read, range(first, end)))  # raises what reading a row raised
     return strips
 
 
