@@ -29,6 +29,7 @@ def exported(tmp_path_factory):
     done = run(SHIPPED_MODEL, path)
     assert done.returncode == 0, done.stderr
     assert "opset 20" in done.stdout and not done.stderr
+    assert str(ROOT).encode() not in path.read_bytes(), "no folder of the machine that made it"
     return path
 
 

@@ -206,5 +206,5 @@ def test_code_in_a_model_file_is_not_run(tmp_path):
             return open, (str(tmp_path / "sprung"), "w")
 
     torch.save({"format": "behavioral-cloning", "version": 1, "network": Trap()}, tmp_path / "model.pt")
-    refused(tmp_path / "model.pt", "")
+    refused(tmp_path / "model.pt", "damaged")
     assert not (tmp_path / "sprung").exists()

@@ -61,12 +61,17 @@ def export(network: Network, path: Path) -> None:
 
 
 def onnx_program(network: nn.Module, images: torch.Tensor, **options: Any) -> torch.onnx.ONNXProgram:
-    """Return a network as an ONNX program, quietly; images: an example of its input; options: more of torch's."""
+    """Return a network as an ONNX program, quietly; images: an example of its input; options: more of torch's.
+
+    It does not tell, as torch would, which lines of which files on this machine its nodes are from.
+    """
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it reports its steps as warnings
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # torch 2.13 warns of its own code
         exported = torch.onnx.export(network, (images,), dynamo=True, opset_version=OPSET, verbose=False, **options)
     assert exported, "torch returns the program with dynamo=True"
+    for node in exported.model.graph.all_nodes():
+        node.metadata_props.clear()
     return exported
 
 
