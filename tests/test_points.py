@@ -84,6 +84,7 @@ def test_equal_roads_are_equal_also_in_another_process():
 EIGHT = np.c_[60 * np.cos(TURN), 40 * np.sin(2 * TURN)]
 REFUSED = [
     ({"points": EIGHT}, r"crosses itself, 107 m along it \(0.1, 0.2\) and 322 m along it"),
+    ({"points": CIRCLE[:-1]}, "comes within .*; if it is a loop, repeat the first point at the end"),
     ({"points": [(0, 0), (60, 0), (75, 7), (75, 13), (60, 7), (0, 7)]}, "folds|comes within"),
     ({"points": np.c_[4 * np.cos(TURN), 60 * np.sin(TURN)]}, r"folds within its own width, \d+ m along it \(-?0"),
     ({"points": [(0, 0), (5, 0)]}, "5.0 m long; it must be 20 to 5000 m"),

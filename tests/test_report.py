@@ -174,8 +174,9 @@ def test_what_cannot_be_shown_of_the_recordings_is_named_and_those_with_the_same
     recordings = json.dumps(["gone/<lake>", str(lossy.parent), str(sample_recording)])
     moved = re.sub(r'"recordings": \[[^]]*\]', f'"recordings": {recordings}', arguments)
     (copy / "training_arguments.json").write_text(moved, encoding="utf-8")
-    assert not (done := report(copy)).returncode, done.stderr
+    assert not (done := report(copy, "--held-out", lossy)).returncode, done.stderr
     page = (copy / "report.html").read_text(encoding="utf-8")
+    assert "other/lake sample: no two seconds of driving without a break to replay" in page
     assert "Not shown: gone/&lt;lake&gt;: no such folder" in page and "No recording was held out" in page
     assert "a spoilt one/driving_log.csv: line 1: neither a row nor a header" in page
     assert ">other/lake sample</th><td>10</td><td>0</td><td>50</td>" in page, "rows, cut, unusable"

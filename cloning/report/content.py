@@ -24,7 +24,7 @@ from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, find_folders, read_recording
 from cloning.replay.command import drive_at_limits
 from cloning.replay.model_driver import ModelDriver
-from cloning.replay.replay import Drive, ReplayFrame, load_recording, reference_lines
+from cloning.replay.replay import Drive, NothingToReplay, ReplayFrame, load_recording, reference_lines
 from cloning.replay.score import ORACLE, YARDSTICKS, captioned, plot, replay_report
 from cloning.report.pictures import epochs_chart, film_uri, frame_uri, picture_uri, steering_chart, uri
 from cloning.road.autonomy import LIMITS, lap_in_words
@@ -135,10 +135,14 @@ class Report:
         self.looked_at = self.looked_at or recording
 
     def replay(self, folders: list[Path]) -> None:
-        """Let the network drive recordings, at both limits. Raises UserError."""
+        """Let the network drive recordings, at both limits, but those too short for it. Raises UserError."""
         for folder in folders:
-            recording, shots = load_recording(folder), Shots()
-            lines, limits = reference_lines(recording), sorted(LIMITS, reverse=True)
+            try:
+                recording, shots = load_recording(folder), Shots()
+                lines, limits = reference_lines(recording), sorted(LIMITS, reverse=True)
+            except NothingToReplay as error:
+                self.missing.append(message_of(error))
+                continue
             drives = drive_at_limits(recording, lines, ModelDriver(self.network), limits, shots.watch, parallel=True)
             drives.reverse()  # the one at the lower limit was driven last, because that is watched
             report = replay_report(recording, lines, drives, "lane")

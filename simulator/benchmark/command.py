@@ -33,8 +33,9 @@ def drive_all(
     kept: dict[str, scores.Driven] = {}
     if resume and file.exists():
         found = json.loads(file.read_text(encoding="utf-8"))
-        if found["about"] != about:
-            raise UserError(f"{file}: has drives of {found['about']}, not of {about}; leave out --resume")
+        before = found["about"]
+        if others := [f"{key} {before[key]}, not {own}" for key, own in about.items() if before[key] != own]:
+            raise UserError(f"{file}: has drives of {'; '.join(others)}; leave out --resume")
         kept = found["drives"]
     missing = [task for task in chosen if task.name not in kept]
     for task, done in zip(missing, results(pool, functools.partial(drive, driver), missing, "drive"), strict=True):
