@@ -5,10 +5,10 @@ import socket
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 import pytest
 from browse_process import browsing, opened, placed, replayed, written_run
+from rendered import film_of
 from test_excluded import center
 
 from cloning.base.errors import RecordingError
@@ -91,10 +91,7 @@ def test_a_film_and_a_new_recording_of_a_selection(linked, tmp_path):
         status, data, headers = server.ask(f"{here}/film.mp4?rows=0-10,20-25&version={version}")
         assert status == 200 and headers["Content-Type"] == "video/mp4"
         (tmp_path / "film.mp4").write_bytes(data)
-        film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
-        frames = []
-        while (read := film.read())[0]:
-            frames.append(read[1])
+        _, frames = film_of(tmp_path / "film.mp4")
         assert len(frames) == 10 and frames[0].shape == (320, 640, 3), "without the five that are cut"
         recording = read_uncut(linked)
         wanted = overlay(read_frame(recording.path(20)), float(recording.steering[20]))[..., ::-1]

@@ -28,9 +28,11 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     A process killed at any time leaves the old file or the new one, complete. After an exception the temporary file
     is deleted and the old file stays. The block writes and closes the temporary file; if it does not create it, an
     existing `path` stays as it is. The temporary file (`.NAME.RANDOM.part`) is no other process's, so several may write
-    `path` at the same time, and the last one to finish wins. The first use in a folder deletes what killed ones left.
+    `path` at the same time, and the last one to finish wins. The first use in a folder deletes those that are a day
+    old, which killed processes left.
 
-    Raises OSError with the name `path`, not the temporary one, and at once when `path` is a folder.
+    Raises OSError with the name `path`, not the temporary one, for example when the disk is full, and at once when
+    `path` is a folder.
     """
     path = Path(path)
     if path.is_dir():
@@ -70,7 +72,8 @@ def folder_written_whole(path: str | Path) -> Iterator[Path]:
     """Yield an empty folder beside `path`, and rename it to `path` when the block ends without an exception.
 
     A process killed at any time leaves `path` absent or complete. The temporary folder is as `written_whole`'s file. Of
-    several that write `path` at the same time the first one to finish wins. Raises OSError, also if `path` exists.
+    several that write `path` at the same time the first one to finish wins. Raises OSError, with the name `path`, also
+    if that exists.
     """
     path = Path(path).absolute()
     if os.path.lexists(path):

@@ -102,7 +102,11 @@ class FilmWriter:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        (self.discard if error else self.close)()
+        try:
+            if error is None:
+                self.close()
+        finally:
+            self.discard()  # also if Ctrl-C comes while it is finished
 
     @contextlib.contextmanager
     def _discarded_on_error(self) -> Iterator[None]:

@@ -70,7 +70,8 @@ def lagged_curvature(turning: float, bend: float, pause: float) -> float:
     """Return the curvature that the car drives after `pause` seconds with its wheels set to the curvature `bend`.
 
     turning: the curvature driven before; all in 1/m. The yaw between successive frames, measured in their far
-    background, fits a first-order lag of 0.15 s in three real recordings; after a keyboard it halves the residual.
+    background, fits a first-order lag of 0.15 s in three real recordings; where a keyboard steered, the lag halves the
+    residual.
     """
     return turning + (bend - turning) * (1 - math.exp(-pause / YAW_LAG))
 

@@ -225,7 +225,8 @@ class Track:
     def locate(self, x: float, y: float, near: float | None = None) -> tuple[float, float]:
         """Return s and the lateral offset, in metres, of the position (x, y).
 
-        near: s shortly before. Only points within 15 m of it are searched: it is fast, and right where roads cross.
+        near: s shortly before. Only points within 15 m of it are searched, which is fast and keeps the car on its road
+        where the track crosses itself.
         """
         if near is None:
             indices = np.arange(len(self.points))
