@@ -1,10 +1,12 @@
 """video.py as a user calls it, and its films."""
 
+import gc
 import os
 import sys
 from datetime import datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import av
 import cv2
@@ -20,6 +22,7 @@ from cloning.base import program
 from cloning.base.errors import UserError
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.network.network import Network, save_model
+from cloning.replay import command
 
 FIRST, SECOND = "2018_07_16_17_11_42_000.jpg", "2018_07_16_17_11_42_001.jpg"  # before those of `save`
 
@@ -152,6 +155,24 @@ def test_ctrl_c_in_the_first_frame_leaves_no_film(tmp_path, monkeypatch):
     monkeypatch.undo()
     writer.close()
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not command.CAN_FORK, reason="on this system drives follow one another")
+def test_drives_in_processes_do_not_wait_for_the_threads_of_an_old_film(tmp_path):
+    """A fork copies none of them: where a film was garbage by then, its collection in a process never ended."""
+    collect: list[Any] = [gc.collect]
+    gc.disable()
+    try:
+        with FilmWriter(tmp_path / "old.mp4", 15) as writer:
+            writer.add(red_frame(1))
+        old: list[object] = [writer]
+        old.append(old)
+        del writer, old
+        with command.ForkedDrives(collect) as forked:
+            forked.collect(20)
+        assert forked.results
+    finally:
+        gc.enable()
 
 
 def test_odd_sizes_lose_a_row_and_a_column(tmp_path):

@@ -1,5 +1,6 @@
 """Processes that a command starts."""
 
+import gc
 import signal
 import sys
 from collections.abc import Iterator
@@ -30,3 +31,16 @@ def interrupt_deferred() -> Iterator[None]:
             signal.signal(signal.SIGINT, handler)
         if received:
             signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def garbage_kept() -> Iterator[None]:
+    """A context in which this process is forked: what is garbage by then is never collected in the copy.
+
+    To free a film, open or read, is to wait for its threads. A fork copies none, so the copy would wait for ever.
+    """
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
