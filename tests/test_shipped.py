@@ -5,10 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from scenes import Here
 
-from cloning.base.errors import RecordingError
+from cloning.base.errors import ModelError, RecordingError
 from cloning.base.program import DONE, INCOMPLETE
+from cloning.network.network import Network, load_checkpoint, load_model, save_model
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import IMAGE_FOLDER, PROBLEM_AREAS
 from cloning.recordings.log import read_recording, read_uncut
@@ -148,3 +150,27 @@ def test_a_trained_network_is_measured(sample_recording, tmp_path, rendered, com
     assert training[training.index("--output") + 1] == driving[3] == str(out / "model.pt")
     assert replaying[:6] == ["-m", "simulator", "replay", str(sample_recording), "--model", str(out / "model.pt")]
     assert driving[:3] == ["-m", "simulator", "benchmark"]
+
+
+def test_a_network_that_is_trained_on_becomes_the_mean_of_both(sample_recording, tmp_path, rendered, commands):
+    before, out = tmp_path / "before.pt", tmp_path / "out"
+    trained = out / "trained-on" / "model.pt"
+    options = [str(sample_recording), "--from", str(before), "--folder", str(out)]
+    with pytest.raises(ModelError, match=r"before\.pt: no such file"):
+        shipped.main(options)
+    assert not commands.run and not rendered
+    trained.parent.mkdir(parents=True)
+    for seed, path in enumerate((before, trained)):
+        torch.manual_seed(seed)
+        save_model(path, Network(), history=[{"epoch": seed}])
+    assert shipped.main(options) == DONE
+    training = commands.run[0]
+    assert training[training.index("--from") :][:4] == ["--from", str(before), "--output", str(trained)]
+    assert (
+        training[training.index("--epochs") + 1] == "4" and training[training.index("--learning-rate") + 1] == "0.0005"
+    )
+    assert commands.run[2][3] == str(out / "model.pt")
+    mean, *others = (load_model(path).state_dict() for path in (out / "model.pt", before, trained))
+    for name, tensor in mean.items():
+        torch.testing.assert_close(tensor, (others[0][name] + others[1][name]) / 2)
+    assert load_checkpoint(out / "model.pt")["history"] == [{"epoch": 1}]

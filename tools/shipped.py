@@ -2,7 +2,10 @@
 
     make shipped RECORDINGS="data/lake-ccw data/lake-cw data/jungle data/jungle-shadows"     # or the same without make:
     python -m tools.shipped data/lake-ccw data/lake-cw data/jungle data/jungle-shadows
-    python -m tools.shipped data/lake-ccw … --road found/evolution-*.json   # and on failures of tools.search
+    python -m tools.shipped data/lake-ccw … --road found/*-*.json --from cloning/network/shipped.pt
+
+The last one gives a network the roads on which it failed, which tools.search has found: it is trained on with these and
+all the others, and its weights become the mean of those before and after, which drives better than either.
 
 Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
 The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Roads and
@@ -25,6 +28,8 @@ from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError
+from cloning.network import tensors
+from cloning.network.network import load_checkpoint, load_model
 from cloning.recordings.excluded import EXCLUDED
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE, PROBLEM_AREAS
 from cloning.recordings.log import find_folders
@@ -46,7 +51,8 @@ from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 REPEATS = 16  # how often each real recording counts, because the rendered ones are many
 EPOCH = 60_000  # images
 DISTURBED = 0.4  # share of the images in foul weather, or of a faulty camera
-LEARNING_RATE = 2e-3  # half of --robust's: this training is longer
+EPOCHS, LEARNING_RATE = 22, 2e-3  # half of --robust's rate: this training is longer
+EPOCHS_ON, LEARNING_RATE_ON = 4, 5e-4  # with --from
 DIRECTIONS = ("ccw", "cw")
 FIRST_LOOK = 1001  # the first look, besides look 0, that is trained on
 LAPS = 0.5  # of a generated road: of so many images, more roads teach more than whole laps
@@ -151,6 +157,17 @@ def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
     return list(twins)
 
 
+def write_mean(before: Path, after: Path, path: Path) -> None:
+    """Write a model file with the mean of two networks' weights; all else is as the second one's file tells.
+
+    A network that was trained on, and that from which it began: Wortsman et al., "Robust fine-tuning of zero-shot
+    models", CVPR 2022. Raises ModelError, OSError.
+    """
+    saved, weights = load_checkpoint(after), load_model(before).state_dict()
+    mean = {name: (weights[name] + tensor) / 2 for name, tensor in load_model(after).state_dict().items()}
+    tensors.save(path, saved | {"network": mean})
+
+
 def main(argv: list[str] | None = None) -> int:
     """Render, train and measure; return the exit status. Raises UserError, OSError."""
     parser = command_line("python -m tools.shipped", __doc__)
@@ -161,20 +178,30 @@ def main(argv: list[str] | None = None) -> int:
     add("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
     add("--mountains", type=number(int, 0, 1000), default=100, help="generated mountain roads (default %(default)s)")
     add("--road", nargs="+", default=[], metavar="FILE", help="roads by points, such as those that tools.search found")
-    add("--epochs", type=number(int, 1), default=22, help=f"of {EPOCH:,} images (default %(default)s)")
+    text = "train on from this model file, and take the mean of its weights and the new ones"
+    add("--from", dest="start", type=Path, metavar="MODEL", help=text)
+    text = f"of {EPOCH:,} images (default {EPOCHS}; with --from {EPOCHS_ON})"
+    add("--epochs", type=number(int, 1), help=text)
     add("--seed", type=number(int, 0), default=0, help="of the training (default %(default)s)")
     add("--folder", type=Path, default=Path("shipped"), help="where to write (default %(default)s)")
     options = parser.parse_args(argv)
     model, points = options.folder / "model.pt", [read_road(file) for file in options.road]
+    trained, epochs, rate, begin = model, EPOCHS, LEARNING_RATE, tuple[str | Path, ...]()
+    if start := options.start:
+        load_model(start)  # before all is rendered
+        trained, epochs, rate = options.folder / "trained-on" / "model.pt", EPOCHS_ON, LEARNING_RATE_ON
+        begin = ("--from", start)
     real = repeat(options.folder / "real", find_folders(options.recordings))  # first, since rendering takes long
     number_of = {"road": options.roads, "mountain": options.mountains}
     rendered = render(options.folder / "rendered", laps(options.looks, options.fast, number_of, points))
-    length = ("--epochs", options.epochs, "--samples-per-epoch", EPOCH, "--learning-rate", LEARNING_RATE)
+    length = ("--epochs", options.epochs or epochs, "--samples-per-epoch", EPOCH, "--learning-rate", rate)
     training = ("--robust", *length, "--repeats", REPEATS, "--disturbed", DISTURBED, "--seed", options.seed, "--resume")
     # By name, since the folders may also hold what an earlier run with other options left there.
-    status = python(ROOT / "model.py", *real, *rendered, "--output", model, *training).returncode
+    status = python(ROOT / "model.py", *real, *rendered, *begin, "--output", trained, *training).returncode
     if status != program.DONE:
         return status
+    if start:
+        write_mean(start, trained, model)
     replays = (*options.recordings, "--model", model, "--report", options.folder / "replays.json")
     status = python("-m", "simulator", "replay", *replays).returncode
     if status != program.DONE:
