@@ -26,7 +26,7 @@ SETTLE = 0.2  # s without a word from the server, after which its greeting is ov
 STILL = 1 / 15  # s of real time between two telemetries while simulated time stands still
 # How long a driver in another thread than the program's answers is waited for, s: until one is known to be there, and
 # then. Commands may be constant, and drivers in the same thread, so after so many vain attempts it is not waited for.
-BRIEFLY, PATIENTLY, ATTEMPTS = 0.15, 2.0, 3
+BRIEFLY, PATIENTLY, ATTEMPTS = 0.5, 2.0, 3
 LAUNCHER = "#!/bin/sh\nPYTHONPATH="  # how one begins; another file of its name may be the real simulator
 MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 200,000
 
