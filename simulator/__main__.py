@@ -213,7 +213,7 @@ def _add_benchmark(commands: "Subparsers") -> None:
     parser = add_command(commands, run_benchmark, "score a driver on fixed tasks: see LEADERBOARD.md")
     add = parser.add_argument
     add("entry", help="model file, .onnx file, HOST:PORT of a server, straight (steering 0) or expert")
-    add("--quick", action="store_true", help="fewer and shorter drives: two minutes on 2 cores, else up to an hour")
+    add("--quick", action="store_true", help="fewer and shorter drives: two minutes on 2 cores, else up to two hours")
     text = "for report.html and benchmark.json (default: %(default)s)"
     add("--folder", type=Path, default=Path("benchmark"), help=text)
     add("--resume", action="store_true", help="go on there after the drives of a benchmark that was interrupted")

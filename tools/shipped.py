@@ -164,7 +164,7 @@ def write_mean(before: Path, after: Path, path: Path) -> None:
     models", CVPR 2022. Raises ModelError, OSError.
     """
     saved, weights = load_checkpoint(after), load_model(before).state_dict()
-    mean = {name: (weights[name] + tensor) / 2 for name, tensor in load_model(after).state_dict().items()}
+    mean = {name: (weights[name] + tensor) / 2 for name, tensor in saved["network"].items()}
     tensors.save(path, saved | {"network": mean})
 
 
