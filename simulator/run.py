@@ -1,6 +1,6 @@
 """A simulated run: the car on its track, its trajectory, and its departures from the road."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -82,7 +82,7 @@ class Run:
         offset: lateral, m, right positive; speed: m/s, along its heading; turn: radians from the road to the right.
         """
         pose = self.track.at(self.s, offset)
-        self.car.place(replace(pose, heading=pose.heading - turn))  # headings grow to the left
+        self.car.place(pose._replace(heading=pose.heading - turn))  # headings grow to the left
         self.car.settle()
         self.car.body.set_linear_velocity(self.car.node.get_quat().get_forward() * speed)
         self.offset = offset

@@ -4,7 +4,7 @@ import numpy as np
 
 from cloning.lane.reader import DISTANCES_AHEAD
 from cloning.road.camera import CAMERA_HEIGHT
-from cloning.road.motion import AXLE_TO_CAMERA, WHEELBASE, components
+from cloning.road.motion import AXLE_TO_CAMERA, WHEELBASE
 from cloning.road.track import Track
 
 VISIBLE_POINTS = np.arange(-6, 40)  # indices, relative to the car, of a track's points that the camera may see
@@ -42,11 +42,13 @@ def line_ahead(track: Track, s: float, camera: np.ndarray, heading: float, dista
     return _until_it_turns_back(distances, forward * factor, right * factor, factor)
 
 
-def _points_ahead(track: Track, s: float, camera: np.ndarray, heading: float) -> np.ndarray:
-    """Return the centre line's points near s: float64 (3, n), m to the camera's right, ahead of it, and z."""
-    near = track.points[(round(s / track.step) + VISIBLE_POINTS) % len(track.points)]
-    along = np.array([np.cos(heading), np.sin(heading)])
-    return np.vstack([components(near[:, :2] - camera, along).T, near[:, 2]])
+def _points_ahead(
+    track: Track, s: float, camera: np.ndarray, heading: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the centre line's points near s: float64 (n,) each, m to the camera's right, ahead of it, and z."""
+    x, y, z = track.points[(round(s / track.step) + VISIBLE_POINTS) % len(track.points)].T
+    x, y, along, across = x - camera[0], y - camera[1], np.cos(heading), np.sin(heading)
+    return x * across - y * along, x * along + y * across, z
 
 
 def _until_it_turns_back(distances: np.ndarray, forward: np.ndarray, *values: np.ndarray) -> np.ndarray:

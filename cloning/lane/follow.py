@@ -30,6 +30,7 @@ NOISE_PER_ROW = np.array([0, 0, 0.003])
 INITIAL_COVARIANCE = np.diag([4.0**2, 4.0, 0.05])
 SLOPE_STEP = 0.5  # m before and behind a distance ahead, over which the centre line's slope is taken
 NEIGHBOURS = np.array([[0], [-SLOPE_STEP], [SLOPE_STEP]])
+CENTRE_DISTANCES, LINE_DISTANCES = DISTANCES_AHEAD + NEIGHBOURS, marking.DISTANCES + NEIGHBOURS
 
 
 class TrackFilter:
@@ -104,16 +105,16 @@ class TrackFilter:
         """Return the expected measurement, (k,), and its Jacobian by the state, (k, 3); nan out of sight."""
         s, right, yaw = state
         camera = self.camera_at(state)
-        seen, factor = centre_ahead(self.track, s, *camera, DISTANCES_AHEAD + NEIGHBOURS), np.ones(len(DISTANCES_AHEAD))
+        seen, factor = centre_ahead(self.track, s, *camera, CENTRE_DISTANCES), np.ones(len(DISTANCES_AHEAD))
         if self.has_marks:
-            line, factors = line_ahead(self.track, s, *camera, marking.DISTANCES + NEIGHBOURS)
+            line, factors = line_ahead(self.track, s, *camera, LINE_DISTANCES)
             seen, factor = np.concatenate([seen, line], axis=1), np.r_[factor, factors[0]]
         centre, before, after = seen
         slope = (after - before) / (2 * SLOPE_STEP)
-        bend = self.curvature(s)
+        bend, cos, sin = self.curvature(s), np.cos(yaw), np.sin(yaw)
         by_yaw = -(self.distances + AXLE_TO_CAMERA * factor) - slope * centre  # the car turns about its rear axle
-        by_s = (1 - bend * right) * (slope * np.cos(yaw) + np.sin(yaw)) * factor + bend * by_yaw
-        return centre, np.stack([by_s, (slope * np.sin(yaw) - np.cos(yaw)) * factor, by_yaw], axis=1)
+        by_s = (1 - bend * right) * (slope * cos + sin) * factor + bend * by_yaw
+        return centre, np.array([by_s, (slope * sin - cos) * factor, by_yaw]).T
 
 
 def short_of_bend(measured: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -127,6 +128,34 @@ def short_of_bend(measured: np.ndarray, seen: np.ndarray) -> np.ndarray:
         return np.full(len(measured), np.inf)
     side = np.sign(seen[-1] - (seen[-2] if len(seen) > 1 else 0))
     return np.maximum(0, side * (seen[-1] - measured))
+
+
+def corrected(
+    x: np.ndarray, p: np.ndarray, about: np.ndarray, differences: np.ndarray, jacobian: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a state's mean and covariance, (3,) and (3, 3), corrected by k measurements, one after the other.
+
+    about: the state at which they are linearised; differences: (k,), of what is measured from what is expected there;
+    jacobian: (k, 3), of what is expected, by the state; noise: (k,), standard deviations. Computed with floats, since
+    arrays of three take eight times as long.
+    """
+    s, right, yaw = (x - about).tolist()
+    (ss, sr, sy), (_, rr, ry), (_, _, yy) = p.tolist()
+    for difference, (by_s, by_right, by_yaw), deviation in zip(
+        differences.tolist(), jacobian.tolist(), noise.tolist(), strict=True
+    ):
+        spread_s = ss * by_s + sr * by_right + sy * by_yaw
+        spread_right = sr * by_s + rr * by_right + ry * by_yaw
+        spread_yaw = sy * by_s + ry * by_right + yy * by_yaw
+        variance, variance_measured = by_s * spread_s + by_right * spread_right + by_yaw * spread_yaw, deviation**2
+        innovation = difference - (by_s * s + by_right * right + by_yaw * yaw)
+        outlier = max(1.0, innovation**2 / (variance + variance_measured) / OUTLIER_THRESHOLD**2)
+        total = variance + variance_measured * outlier
+        gain_s, gain_right, gain_yaw = spread_s / total, spread_right / total, spread_yaw / total
+        s, right, yaw = s + gain_s * innovation, right + gain_right * innovation, yaw + gain_yaw * innovation
+        ss, sr, sy = ss - gain_s * spread_s, sr - gain_s * spread_right, sy - gain_s * spread_yaw
+        rr, ry, yy = rr - gain_right * spread_right, ry - gain_right * spread_yaw, yy - gain_yaw * spread_yaw
+    return about + np.array([s, right, yaw]), np.array([[ss, sr, sy], [sr, rr, ry], [sy, ry, yy]])
 
 
 class Candidate:
@@ -172,14 +201,8 @@ class Candidate:
                 error = np.where(visible, error, np.minimum(short, MISSING_DETECTION))
             error = error[counted]
             self.fits.append(-float(np.log1p(error * error).sum()) / len(error))
-            for k in np.flatnonzero(visible & counted):
-                h = jacobian[k]
-                spread = p @ h
-                innovation = float(measured[k] - expected[k] - h @ (x - about))
-                variance, variance_measured = float(h @ spread), float(noise[k]) ** 2
-                outlier = max(1.0, innovation**2 / (variance + variance_measured) / OUTLIER_THRESHOLD**2)
-                gain = spread / (variance + variance_measured * outlier)
-                x, p = x + gain * innovation, p - gain[:, None] * spread
+            used = visible & counted
+            x, p = corrected(x, p, about, (measured - expected)[used], jacobian[used], noise[used])
             self.filtered.append((x, p))
         return sum(self.fits) / len(self.fits)
 

@@ -1,8 +1,10 @@
 """The tracks: their centre lines and edges, and the position of a point relative to them."""
 
+import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,9 +15,10 @@ from cloning.road.motion import right_of, wrap_angle
 FOLDER = Path(__file__).parent
 LEFT, RIGHT = -1, 1  # sides of a road, with the signs of lateral offsets
 
+Indices = TypeVar("Indices", int, np.ndarray)
 
-@dataclass(frozen=True)
-class Pose:
+
+class Pose(NamedTuple):
     """A pose on the road."""
 
     x: float  # m, east
@@ -205,22 +208,28 @@ class Track:
         """Return the indices of the points from `start` to `end` metres along the file's direction."""
         return np.arange(round(start / self.step), round(end / self.step) + 1) % len(self.points)
 
-    def wrap(self, i: np.ndarray) -> np.ndarray:
-        """Return the index of each i-th point from s = 0 on, int (n,): round the loop, or up to an open road's ends."""
+    def wrap(self, i: Indices) -> Indices:
+        """Return the index of the i-th point from s = 0 on: round the loop, or up to an open road's ends."""
         return i % len(self.points) if self.closed else np.clip(i + self.first, 0, len(self.points) - 1)
 
     def index(self, s: float) -> int:
         """Return the index of the last point at or before s metres along the track."""
-        return int(self.wrap(np.array(math.floor(s / self.step))))
+        return int(self.wrap(math.floor(s / self.step)))
 
     def at(self, s: float, right: float = 0.0) -> Pose:
         """Return the pose at s metres along the track, `right` metres to the right of the centre line."""
-        number, part = divmod(s / self.step, 1)
-        i, j = self.wrap(int(number) + np.arange(2)).tolist()
-        x, y, z = self.points[i] * (1 - part) + self.points[j] * part
-        heading = self.heading[i] + part * wrap_angle(self.heading[j] - self.heading[i])
-        grade = self.grade[i] * (1 - part) + self.grade[j] * part
-        return Pose(x + np.sin(heading) * right, y - np.cos(heading) * right, z, heading, grade)
+        number, part = divmod(float(s) / self.step, 1)
+        i = int(number)
+        *before, before_heading = self._poses[self.wrap(i)]
+        *after, after_heading = self._poses[self.wrap(i + 1)]
+        x, y, z, grade = [here * (1 - part) + there * part for here, there in zip(before, after, strict=True)]
+        heading = before_heading + part * wrap_angle(after_heading - before_heading)
+        return Pose(x + float(np.sin(heading)) * right, y - float(np.cos(heading)) * right, z, heading, grade)
+
+    @functools.cached_property
+    def _poses(self) -> list[list[float]]:
+        """x, y, z, grade and heading at each point: floats, since `at` would take twice as long with small arrays."""
+        return np.column_stack([self.points, self.grade, self.heading]).tolist()
 
     def locate(self, x: float, y: float, near: float | None = None) -> tuple[float, float]:
         """Return s and the lateral offset, in metres, of the position (x, y).
