@@ -115,8 +115,24 @@ def test_a_missing_library_is_told_in_one_sentence(tmp_path, program, library, c
     (tmp_path / f"{library}.py").write_text(missing, encoding="utf-8")
     done = run(*command, modules=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (FAILED, 1), done.stderr
-    assert f"{library} is missing: activate the environment" in done.stderr and remedy in done.stderr
+    activate = "" if program.startswith("behavioral-cloning") else "activate the environment"  # which is a clone's
+    assert f"{library} is missing: {activate}" in done.stderr and remedy in done.stderr
     assert done.stderr.startswith(f"{program.split()[0]}")
+
+
+@pytest.mark.parametrize(
+    ("program", "command"),
+    [
+        ("model.py", ["model.py", ""]),
+        ("simulator", ["-m", "simulator", "record", ""]),
+        ("behavioral-cloning report", [*INSTALLED, "report", "run", ""]),
+    ],
+)
+def test_an_empty_argument_is_not_the_current_folder(program, command):
+    """As from a shell's variable that is not set."""
+    done = run(*command)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (FAILED, "", 1), done.stderr
+    assert done.stderr.startswith(f"{program}: an argument is empty")
 
 
 @pytest.mark.parametrize(

@@ -97,9 +97,11 @@ def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType 
     if library is None or library in OWN_PACKAGES:
         sys.__excepthook__(kind, error, trace)
         return
-    activate = f"activate the environment, in the project's folder (`{ACTIVATE}`)"
-    install = f"where that does not help, `pip install {PACKAGES.get(library, library)}`"
-    print(f"{name}: the library {library} is missing: {activate}; {install}", file=sys.stderr, flush=True)
+    remedy = f"`pip install {PACKAGES.get(library, library)}`"
+    if not installed:
+        activate = f"activate the environment, in the project's folder (`{ACTIVATE}`)"
+        remedy = f"{activate}; where that does not help, {remedy}"
+    print(f"{name}: the library {library} is missing: {remedy}", file=sys.stderr, flush=True)
     os._exit(FAILED)
 
 
@@ -149,10 +151,14 @@ def run(main: Callable[[], int | None]) -> NoReturn:
     if callable(stop):
         signal.signal(signal.SIGINT, _interrupt)
     try:
+        if "" in sys.argv[1:]:  # as a file's name it would be the current folder
+            from cloning.base.errors import UserError  # not at the top: see the docstring above
+
+            raise UserError("an argument is empty, as from a shell's variable that is not set; name it or leave it out")
         status = main()
     except BaseException as error:
         signal.signal(signal.SIGINT, stop)
-        from cloning.base.errors import UserError  # not at the top: see the docstring above
+        from cloning.base.errors import UserError
 
         if interrupted or isinstance(error, KeyboardInterrupt):  # a library may have raised an error of its own for it
             with suppress(OSError):  # Ctrl-C has ended the reader of a pipe, too
