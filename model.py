@@ -394,7 +394,7 @@ class TrainingRun:
 def prepare(command: Command) -> Prepared:
     """Read the data of the run that a command is about. Raises UserError, OSError."""
     run, begin = resumed(command)
-    folders = find_folders(list(run.recordings))
+    folders = find_folders(run.recordings, exact=isinstance(begin, SavedRun))
     run = replace(run, recordings=tuple(str(folder.absolute()) for folder in folders))
     observations = read_observations(run.recipe, folders, command.process.strict)
     train, validation = split(observations, run.recipe, run.seed)

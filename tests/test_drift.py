@@ -51,6 +51,8 @@ def test_pieces_are_those_of_the_held_out_stretches_with_the_rows_in_between():
     assert len(every) == MOST_PIECES
     assert rows_of(every)[0] == (0, ROWS)
     assert rows_of(every)[-1][1] > 9_900, "from the first to the last"
+    twice = driven([moving(60).take(np.repeat(np.arange(60), 2))], np.zeros(60, int), np.arange(20, 80))
+    assert rows_of(twice) == [(10, 40)], "a copy of a row is no break"
     assert driven([without_files(400)], np.zeros(400, int), np.arange(400)) == [], "the car stands still"
     assert driven([moving(400)], np.array([], int), np.array([], int)) == []
 

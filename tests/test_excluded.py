@@ -3,6 +3,7 @@
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import warm
 from commands import ROOT, SHORT, run_here
 
 from cloning.base.errors import RecordingError
+from cloning.browse.library import Library
 from cloning.recordings.excluded import MAX_REASON, Cut, add_cuts, delete_cuts, one_line, read_cuts
 from cloning.recordings.log import print_findings, read_recording, read_uncut
 from cloning.replay.replay import load_recording
@@ -102,6 +104,12 @@ def test_a_wrong_line_is_named_with_the_remedy(linked, text, words):
         with pytest.raises(RecordingError):
             add_cuts(linked, Cut(names["a"], names["b"], "more"))
     assert (linked / "excluded.csv").read_bytes() == before
+
+
+def test_a_tag_of_rows_that_are_gone_is_named_in_its_own_file(linked):
+    (linked / "tags.csv").write_text("first image,last image,tag\nnone.jpg,none.jpg,bend\n", encoding="utf-8")
+    with closing(Library([linked], [])) as shown, pytest.raises(RecordingError, match=r"tags\.csv: line 2: none\.jpg"):
+        shown[next(iter(shown.recordings))].details()
 
 
 def test_a_file_that_is_no_text_and_one_that_leaves_nothing(linked):

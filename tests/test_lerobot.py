@@ -147,6 +147,13 @@ def test_another_cars_data_set_becomes_a_recording_and_what_does_not_fit_is_told
     command = [data_set, "--output", output]
     assert refused(*command).endswith(f"--camera: {CENTER}, observation.images.right")
     command += ["--camera", CENTER]
+    for names, shown in (
+        ({"x": 2, "wheel": 0, "gas": 1}, "wheel, action:gas, action:x"),
+        (None, "0, action:1, action:2"),
+    ):
+        edit(data_set, features=kept | {"action": kept["action"] | {"names": names}})
+        assert f"--steering: action:{shown}, recorded_at:" in refused(*command)
+    edit(data_set, features=kept)
     assert "--steering: action:wheel, action:gas, action:x, recorded_at:" in refused(*command)
     command += ["--steering", "action:wheel", "--full-lock"]
     assert "where 0.2 is the full lock to the right" in refused(*command, 0.2) and not output.exists()

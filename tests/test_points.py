@@ -124,6 +124,7 @@ def test_what_is_no_road_is_refused_with_reason_and_place(arguments, reason):
         ("\x00\x01", "line 1: .* is not a point x,y or x,y,z, nor a line of these names"),
         ("s,x,y\n0,0,0\n30,30,0\n", "line 1: s,x,y is not a point x,y or x,y,z, nor a line of these names"),
         ("x,y\n0,0,0\n30,30,0\n", "line 2: 0,0,0 is not a point"),
+        ("0" * 200_000, "not CSV: field larger than"),
     ],
 )
 def test_what_is_no_file_of_points_is_refused(text, reason, tmp_path):

@@ -375,14 +375,20 @@ def test_the_sample_recording_is_whole(tmp_path):
 def test_folders_are_found_below_links_and_each_once(tmp_path):
     for name in ("disk/lake", "disk/more/jungle", "data/own"):
         render_recording(tmp_path / name, rows=1)
-    data = tmp_path / "data"
+    data, own = tmp_path / "data", render_recording(tmp_path / "data" / "own" / "below", rows=1)
+    assert find_folders([own.parent]) == [own.parent, own] and find_folders([own.parent], exact=True) == [own.parent]
     try:
         (data / "disk").symlink_to(tmp_path / "disk")
         (data / "own" / "up").symlink_to(data)
     except OSError:
         pytest.skip("Windows lets only privileged users make symbolic links")
     found = find_folders([str(data), str(tmp_path / "disk" / "lake")])
-    assert [folder.relative_to(data).as_posix() for folder in found] == ["disk/lake", "disk/more/jungle", "own"]
+    assert [folder.relative_to(data).as_posix() for folder in found] == [
+        "disk/lake",
+        "disk/more/jungle",
+        "own",
+        "own/below",
+    ]
     with pytest.raises(RecordingError, match="no such folder"):
         find_folders([str(tmp_path / "nowhere")])
     with pytest.raises(RecordingError, match="no such file; name the folder of a recording"):

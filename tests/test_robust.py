@@ -12,6 +12,7 @@ from rendered import render_recording, without_files
 
 import model
 from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.browse import analyse
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
 from cloning.network.network import CROP, SEEN_SHAPE, Network, load_model
@@ -366,11 +367,43 @@ def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monk
 def test_the_label_is_the_recovery_steering_and_not_the_drivers(monkeypatch):
     """Rows whose lane is 1 m to the left of a car that a human drives straight on."""
     lanes(monkeypatch, offset=1.0)
-    checked = CheckedRecording(**vars(recording(0.0)), digests=np.zeros(1, np.uint64))
-    selected = select_known_lane(checked, ROBUST)
+    selected = select_known_lane(checked(recording(0.0)), ROBUST)
     assert (selected.steering < -0.1).all()
     assert selected.steering == pytest.approx(selected.lanes.steering(1.0, 0.0), abs=1e-4)
     assert 0.5 * N < len(selected) < N
+
+
+def checked(recording):
+    return CheckedRecording(**vars(recording), digests=np.arange(N, dtype=np.uint64))
+
+
+def test_copies_of_rows_end_no_stretch(monkeypatch):
+    """As in a log in which somebody has repeated the bends."""
+
+    def centred(found, _):
+        zeros = np.zeros(len(found))
+        return LanePosition.read(zeros, zeros, zeros == 0)
+
+    monkeypatch.setattr(lanes_module, "lane_position", centred)
+    driven = recording(0.2)
+    repeated = driven.take(np.repeat(np.arange(N), 1 + np.arange(N) % 3))
+    plain, copied = (select_known_lane(checked(each), ROBUST) for each in (driven, repeated))
+    assert len(plain) > 0.5 * N
+    assert np.array_equal(plain.frame, copied.frame) and np.array_equal(plain.steering, copied.steering)
+
+
+def test_the_page_of_a_recording_shows_the_labels_that_are_learned(monkeypatch):
+    """Also beside a mishap, in which no row has one."""
+    reading = LanePosition.read(np.full(N, 0.8), np.zeros(N), np.arange(N) // 120 != 1)
+    reading.piece[120:240] = recovery.MISHAP
+    monkeypatch.setattr(lanes_module, "lane_position", lambda *_: reading)
+    monkeypatch.setattr(analyse, "known_position", lambda _: None)
+    monkeypatch.setattr(analyse, "localise_recording", lambda *_: (reading, []))
+    driven = recording(0.1)
+    learned = Lanes.of(driven)
+    expected = np.where(learned.known, learned.steering(learned.offset, learned.yaw), np.nan)
+    assert np.isfinite(expected[20:100]).all() and np.isnan(expected[120:240]).all()
+    np.testing.assert_array_equal(analyse.lane(driven).columns["label"], expected.astype(np.float32))
 
 
 def test_a_recipe_of_shifts_neither_turns_the_car_nor_changes_the_light():

@@ -11,6 +11,7 @@ if __name__ == "__main__":
     program.end_on_interrupt("analyse")
 
 import argparse
+import itertools
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -96,7 +97,7 @@ def lane(recording: Recording) -> Result:
         x[rows], y[rows] = np.array([(pose.x, pose.y) for pose in poses]).T
     offset = np.where(position.trusted, position.lateral_offset, np.nan).astype(np.float32)
     label = np.full(len(recording), np.nan, np.float32)
-    for stretch in driven:
+    for stretch in itertools.chain.from_iterable(position.pieces(recording, each) for each in driven):
         rows = stretch.rows
         ahead = LaneAhead.of_stretch(stretch, position.lateral_offset[rows], position.trusted[rows])
         label[rows] = np.where(ahead.known, ahead.steering(ahead.offset, ahead.yaw), np.nan)

@@ -147,8 +147,8 @@ class ShownRecording:
         shown = self._without_map()
         if "message" in shown:  # a file has changed since
             raise RecordingError(shown["message"])
-        for kind, some in (("cuts", cuts), ("tags", read_cuts(self.folder, TAGS))):
-            covered = _rows_cut(self.folder, tuple(some), recording)
+        for kind, some, file in (("cuts", cuts, EXCLUDED), ("tags", read_cuts(self.folder, TAGS), TAGS)):
+            covered = _rows_cut(self.folder, tuple(some), recording, file)
             shown[kind] = [
                 {**each.__dict__, "frames": int(rows.sum()), "stretches": stretches_of(rows)}
                 for each, rows in zip(some, covered, strict=True)
@@ -292,7 +292,7 @@ class ShownRecording:
     def cut(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
         """Cut or tag stretches, and return the cuts as they are written. Raises RecordingError, OSError."""
         cuts = [Cut(cut.first, cut.last, one_line(cut.reason)) for cut in cuts]
-        _rows_cut(self.folder, tuple(cuts), self.read())  # refuses what is no stretch
+        _rows_cut(self.folder, tuple(cuts), self.read(), file)  # refuses what is no stretch
         add_cuts(self.folder, *cuts, file=file)
         return cuts
 
@@ -341,9 +341,9 @@ class ShownRecording:
             return path.read_bytes()
 
 
-def _rows_cut(folder: Path, cuts: tuple[Cut, ...], recording: Recording) -> np.ndarray:
-    """Return the rows of each cut: bool (cuts, n). Raises RecordingError."""
-    rows = list(cut_rows(folder, cuts, recording.names, recording.images[:, 0]))
+def _rows_cut(folder: Path, cuts: tuple[Cut, ...], recording: Recording, file: str = EXCLUDED) -> np.ndarray:
+    """Return the rows of each cut, or with TAGS each tag: bool (cuts, n). Raises RecordingError."""
+    rows = list(cut_rows(folder, cuts, recording.names, recording.images[:, 0], file))
     return np.array(rows, bool).reshape(len(cuts), len(recording))
 
 

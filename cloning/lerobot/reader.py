@@ -52,10 +52,12 @@ def _columns(info: dict[str, Any], steering: str | None) -> dict[str, tuple[str,
     """Return the feature of each number of a recording that is found, and the number's place in it."""
     found, places = {}, {}
     for key, each in info["features"].items():
-        names = each.get("names") or ([key.rpartition(".")[2]] if list(each["shape"]) == [1] else [])
-        while isinstance(names, dict):
-            names = next(iter(names.values()))
-        for at, name in enumerate(names if len(each["shape"]) == 1 else []):
+        count = each["shape"][0] if len(each["shape"]) == 1 else 0
+        names = each.get("names") or ([key.rpartition(".")[2]] if count == 1 else [str(at) for at in range(count)])
+        while isinstance(names, dict):  # {"motors": [...]}, or each name with its place
+            first = next(iter(names.values()))
+            names = sorted(names, key=names.__getitem__) if isinstance(first, int) else first
+        for at, name in enumerate(names if count else []):
             places[f"{key}:{name}"] = key, at
             meaning, is_mph = column_of(str(name)), each.get("units", [""])[0] == "mph"
             if meaning in NUMBERS and (meaning not in found or key == ACTION) and (meaning != "speed" or is_mph):

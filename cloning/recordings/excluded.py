@@ -52,15 +52,17 @@ def read_cuts(folder: Path, file: str = EXCLUDED) -> list[Cut]:
     return _parse(folder / file, _lines(folder / file))
 
 
-def cut_rows(folder: Path, cuts: Iterable[Cut], names: np.ndarray, centres: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield which rows each cut leaves out: bool (n,).
+def cut_rows(
+    folder: Path, cuts: Iterable[Cut], names: np.ndarray, centres: np.ndarray, file: str = EXCLUDED
+) -> Iterator[np.ndarray]:
+    """Yield which rows each cut leaves out, or with TAGS each tag is of: bool (n,).
 
     A stretch begins at the first row with its first image, and ends at the next one with its last image. Copies of its
     rows elsewhere in the recording are left out with it.
     names, centres: as `Recording` has them: bytes (m,), sorted; int32 (n,), an index into names for each row.
     Raises RecordingError for an image that no row has, and for a stretch whose end comes before its beginning.
     """
-    path = folder / EXCLUDED
+    path = folder / file
     for cut in cuts:
         where = f"{path}: line {cut.line}" if cut.line else str(path)
         found = []

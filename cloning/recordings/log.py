@@ -52,9 +52,13 @@ class Recording(Table):
     # Keeps decoded frames in memory for `road`; none unless `check_images` is given a larger one.
     frames: FrameCache = field(default_factory=FrameCache)
 
+    def originals(self) -> np.ndarray:
+        """Return the first of successive rows with the same centre image: int (m,); oversampling makes such copies."""
+        return np.flatnonzero(np.diff(self.images[:, 0], prepend=-1))
+
     def without_copies(self) -> Self:
-        """Return the first of successive rows with the same centre image: oversampling makes such copies."""
-        return self.take(np.diff(self.images[:, 0], prepend=-1) != 0)
+        """Return the rows of `originals`: in the others no time passes."""
+        return self.take(self.originals())
 
     def name(self, row: int, camera: int = 0) -> str:
         """Return the file name of a row's image; camera: 0 centre, 1 left, 2 right."""
@@ -80,9 +84,10 @@ class CheckedRecording(Recording):
     digests: np.ndarray  # uint64 (m,): of the image files' contents
 
 
-def find_folders(given: Iterable[str | Path]) -> list[Path]:
+def find_folders(given: Iterable[str | Path], exact: bool = False) -> list[Path]:
     """Return the recordings (folders with a driving_log.csv) among and below the given folders, without duplicates.
 
+    exact: below a recording there may be others, which are not meant.
     Raises RecordingError if a name is of no folder, or if neither the folder nor one below it is a recording.
     """
     folders: dict[Path, Path] = {}
@@ -92,16 +97,16 @@ def find_folders(given: Iterable[str | Path]) -> list[Path]:
             raise RecordingError(f"{path}: no such folder. {WHERE_TO_GET_RECORDINGS}")
         if path.is_file():
             raise RecordingError(f"{path}: a file; name the folder of a recording, with {DRIVING_LOG} and IMG/")
-        logs = [path / DRIVING_LOG] if (path / DRIVING_LOG).is_file() else sorted(logs_below(path))
-        if not logs:
+        found = [path] if exact and (path / DRIVING_LOG).is_file() else sorted(folders_below(path))
+        if not found:
             raise RecordingError(f"{path}: no {DRIVING_LOG} in or below it. {WHERE_TO_GET_RECORDINGS}")
-        for log in logs:
-            folders.setdefault(log.parent.resolve(), log.parent)
+        for folder in found:
+            folders.setdefault(folder.resolve(), folder)
     return list(folders.values())
 
 
-def logs_below(path: Path) -> Iterator[Path]:
-    """Yield each driving_log.csv below a folder, through symbolic links too: recordings are often on another disk.
+def folders_below(path: Path) -> Iterator[Path]:
+    """Yield each recording in and below a folder, through symbolic links too: recordings are often on another disk.
 
     A folder that cannot be read is named on stderr.
     """
@@ -118,7 +123,7 @@ def logs_below(path: Path) -> Iterator[Path]:
         visited.add(real)
         if DRIVING_LOG in files:
             below[:] = [name for name in below if name != IMAGE_FOLDER]  # which takes long to list
-            yield Path(folder) / DRIVING_LOG
+            yield Path(folder)
 
 
 def print_findings(recording: Recording) -> None:

@@ -44,8 +44,10 @@ def held_out(recordings: Sequence[Recording], recording: np.ndarray, row: np.nda
     rows are too few, or the car stands still.
     """
     found = []
-    for index, whole in enumerate(recordings):
-        rows, first = np.unique(row[recording == index], return_index=True)
+    for index, each in enumerate(recordings):
+        originals, whole = each.originals(), each.without_copies()
+        rows = np.searchsorted(originals, row[recording == index], "right") - 1
+        rows, first = np.unique(rows, return_index=True)
         aims = aim[recording == index][first]
         drives = stretch_rows(whole)
         for group in np.split(rows, np.flatnonzero(np.abs(np.diff(whole.time[rows])) > SECONDS) + 1):

@@ -109,7 +109,7 @@ class Report:
         self.looked_at: Recording | None = None  # the recording whose frames are shown
         for name in self.run["recordings"]:
             with self._noting_what_is_missing():
-                for found in find_folders([name]):
+                for found in find_folders([name], exact=True):
                     with self._noting_what_is_missing():
                         self._read(found)
         for each, short in zip(self.recordings, short_names(each["folder"] for each in self.recordings), strict=True):

@@ -206,7 +206,11 @@ def parse_road(text: str) -> tuple[list[list[float]], dict[str, Any]]:
         return points, {key: own[key] for key in ("closed", "width", "marking", "land") if key in own}
     if "@" in text:
         return parse_track_string(text), {}
-    rows = [(number, row) for number, row in enumerate(csv.reader(text.splitlines()), 1) if any(map(str.strip, row))]
+    try:
+        lines = list(csv.reader(text.splitlines()))
+    except csv.Error as error:  # a line that is no point
+        raise TrackError(f"not CSV: {error}") from None
+    rows = [(number, row) for number, row in enumerate(lines, 1) if any(map(str.strip, row))]
     names = [name.strip().lower() for name in rows[0][1]] if rows else []
     if sorted(names) in (["x", "y"], ["x", "y", "z"]):
         rows = rows[1:]

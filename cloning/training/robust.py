@@ -81,6 +81,7 @@ def select_known_lane(recording: CheckedRecording, recipe: Recipe) -> Observatio
     """Keep the rows whose lane ahead is known, labelled with the recovery steering from the recorded pose."""
     is_known = (recording.folder / LANE_FILE).exists()
     print(f"{'reading' if is_known else 'estimating'} the lane in {recording.folder}", flush=True)
+    recording = recording.without_copies()  # each would end a stretch
     all_lanes = Lanes.of(recording)
     rows = np.flatnonzero(all_lanes.known)
     lanes = all_lanes.take(rows)
