@@ -258,8 +258,7 @@ class StatusLine:
         if session and session.driven and not session.ended:
             line = self.text(session, now)
             self.stderr.write(f"\r{line}\033[K" if self.stderr.is_terminal else f"{line}\n")
-            self.frames = session.driven
-        self.session, self.time = session, now
+        self.session, self.time, self.frames = session, now, session.driven if session else 0
 
     def text(self, session: Session, now: float) -> str:
         """Return the line: means since the last line or the session's start, and the last frame's figures.

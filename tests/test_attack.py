@@ -63,6 +63,14 @@ def test_the_attacks_find_a_fault(server, jpegs, expected):
     assert report.faults(timely=False) == ["lost", "memory", "new car", "left open"]
 
 
+def test_an_attack_that_fails_is_not_withstood(server, jpegs, expected):
+    def broken(port: int, until: float) -> None:
+        raise ValueError
+
+    with pytest.raises(RuntimeError, match="the attack itself has failed"):
+        attack.run(broken, server, jpegs, expected, SECONDS)
+
+
 INTERRUPTED = """
 import os, signal, time
 from types import SimpleNamespace

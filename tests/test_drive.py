@@ -269,6 +269,13 @@ def test_the_rate_counts_from_the_sessions_start_or_the_last_line(session, jpeg)
     session.driven += 6000
     status.update()
     assert float(shown(stderr).split()[0]) == pytest.approx(10, rel=0.05)
+    later = drive.Session(session.server)
+    session.server.sessions["sid"], later.heard = later, time.monotonic()  # of which no frame is driven at first
+    for driven in (0, 6000):
+        status.time, later.driven = time.perf_counter() - 600, driven
+        later.history.extend(session.history)
+        status.update()
+    assert float(shown(stderr).split()[0]) == pytest.approx(10, rel=0.05)
 
 
 def test_escape_sequences_are_for_terminals_only(session, jpeg):

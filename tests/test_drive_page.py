@@ -1,6 +1,7 @@
 """The page of drive.py: what it says goes on, the set speed that it changes, and its looks in a real Chromium."""
 
 import json
+import mimetypes
 import threading
 import time
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from drive_process import ask, live, serving
 
 import drive
 from cloning.base import program
+from cloning.road.track import centre_line
 from cloning.server import page as drive_page
 from tools import bench_driving
 from tools.simulator_client import Simulator, telemetry
@@ -53,6 +55,25 @@ def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_i
         measured: Any = SimpleNamespace(port=server.port, latencies=[])
         bench_driving.Server.read_latencies(measured, 2)
     assert len(measured.latencies) == 2 and all(0 < seconds < 60 for seconds in measured.latencies)
+
+
+def test_any_road_that_the_stand_in_names_is_drawn(server, jpegs):
+    with Simulator(server.port).open() as simulator:
+        for track in ("mountain-7", "nowhere", "lake"):
+            simulator.drive({**telemetry(jpegs[0]), "stand_in": {**PLACE, "track": track}})
+            status, body, _ = ask(server.port, "/road")
+            expected: Any = [] if track == "nowhere" else centre_line(track)[:, :2]
+            assert status == 200 and len(json.loads(body)) == len(expected)
+            assert np.abs(np.array(json.loads(body)) - expected).max(initial=0) < 0.051
+
+
+def test_scripts_are_scripts_whatever_the_machine_calls_them(network, monkeypatch):
+    """Windows' registry may say text/plain, which no browser runs."""
+    monkeypatch.setattr(mimetypes, "_db", mimetypes.MimeTypes())
+    mimetypes.add_type("text/plain", ".js")
+    app = drive_page.create_app(drive.DriveServer(network), time.sleep)
+    for name, kind in (("drive.js", "text/javascript"), ("style.css", "text/css")):
+        assert app.test_client().get(f"/site/{name}").content_type.startswith(kind)
 
 
 def test_the_benchmark_answers_a_ping_and_waits_for_the_answer():
@@ -255,7 +276,8 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             page.press(" ")
             page.shows("#saving", "frames saved in run 1-2")
             page.shows("#film", "python video.py 'run 1-2'")
-            page.shows("#browse", "python -m cloning.lerobot 'run 1-2' --output 'run 1-2-recording' && python -m ")
+            page.shows("#convert", "python -m cloning.lerobot 'run 1-2' --output 'run 1-2-recording'")
+            page.shows("#browse", "python -m cloning.browse 'run 1-2-recording'")
             for key in ("Tab", " "):
                 page.press(key)
             page.wait("document.querySelector('#attention').checked")
@@ -271,8 +293,10 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             page.wait("document.querySelector('#map .road').getAttribute('d')?.length > 1000")
             feeder.message = {**usual, "stand_in": {**PLACE, "offset": -2.6, "track": "nowhere"}}
             page.shows("#now-distance", "2.60 m left of")
-            page.wait("document.querySelector('#map .road').getAttribute('d') == ''")
+            page.wait("document.querySelector('#map').hidden")
             assert page.run("document.querySelector('#now-distance').className") == "far"
+            page.drag("#speed", 0.3, 0.8)  # while the page is told of the speed before
+            page.shows("#answer", "drives at 2")
             feeder.message = {**usual, "speed": "fast"}
             page.shows("#state", "No frame can be used")
             page.shows("#unusable", "speed is not a number")

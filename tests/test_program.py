@@ -11,6 +11,7 @@ import warm
 from commands import HERE, ROOT, run_model
 
 from cloning.base import progress
+from cloning.base.outputs import as_typed
 from cloning.base.program import FAILED
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there SIGINT goes to a whole console")
@@ -133,6 +134,13 @@ def test_an_empty_argument_is_not_the_current_folder(program, command):
     done = run(*command)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (FAILED, "", 1), done.stderr
     assert done.stderr.startswith(f"{program}: an argument is empty")
+
+
+def test_words_are_typed_as_the_machines_shell_reads_them(monkeypatch):
+    words = "python", "video.py", r"runs\a b"
+    assert as_typed(*words) == r"python video.py 'runs\a b'"
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert as_typed(*words) == r'python video.py "runs\a b"'
 
 
 @pytest.mark.parametrize(

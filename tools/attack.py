@@ -156,6 +156,8 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     finally:
         attacker.kill()
         attacker.join()
+    if (attacker.exitcode or 0) > 0:  # otherwise it was killed, or has ended
+        raise RuntimeError("the attack itself has failed, with the error above")
     if server.process.poll() is not None:
         return Report(drive, 0.0, 0.0, PATIENCE, 0)
     ended = time.monotonic()

@@ -4,6 +4,7 @@ import itertools
 import socket
 import struct
 import time
+import urllib.request
 import zlib
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -12,7 +13,7 @@ import numpy as np
 
 from cloning.base.frame import FRAME
 from cloning.recordings.images import encode
-from tools.simulator_client import fragments, telemetry_message
+from tools.simulator_client import Simulator, fragments, telemetry, telemetry_message
 
 Attack = Callable[[int, float], None]  # takes the server's port and the time.monotonic() at which to stop
 T = TypeVar("T")
@@ -146,6 +147,17 @@ def bad_frames(port: int, until: float) -> None:
         flood(port, min(until, time.monotonic() + 0.02), WEBSOCKET % b"", then=each)
 
 
+def roads(port: int, until: float) -> None:
+    """Name another generated road with each telemetry, and ask for its centre line: to generate one takes seconds."""
+    place = {"x": 0.0, "y": 0.0, "offset": 0.0, "departures": 0, "time": 1.0}
+    with Simulator(port).open() as simulator:
+        for number in itertools.count(1):
+            simulator.drive(telemetry(frames(1)[0]) | {"stand_in": place | {"track": f"mountain-{number}"}})
+            urllib.request.urlopen(f"http://127.0.0.1:{port}/road").read()
+            if time.monotonic() > until:
+                break
+
+
 def frames(count: int = 8) -> list[bytes]:
     """Return JPEGs about as large as the simulator's, 12 kB: a sky, and a field of grains."""
     rng = np.random.default_rng(0)
@@ -181,6 +193,7 @@ def all_attacks() -> dict[str, Attack]:
         "endless_frame": websockets(bytes(1 << 20), then=frame(b"4", length=1 << 40), connections=8),
         "bad_frames": bad_frames,
         # HTTP
+        "roads": roads,
         "polling_sessions": flooding(b"", GET % POLLING, connections=50, read=True),
         "ended_sessions": websockets(frame(b"", 0x89) * 1000, then=frame(b"1"), connections=50, read=True),
         "half_upgrades": flooding(

@@ -3,6 +3,9 @@
 import contextlib
 import json
 import os
+import shlex
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -25,6 +28,8 @@ def check_folders(*paths: str | None, model: str | Path | None = None) -> None:
             raise OutputError(f"{path}: no such folder to write it in; make the folder first")
         if path and names_folder(path):
             raise OutputError(f"{path}: is a folder; name a file in it")
+        if path and Path(path).exists() and not Path(path).is_file():
+            raise OutputError(f"{path}: is a device or a pipe; name a file")
 
 
 def write_output(path: str | Path, data: bytes) -> None:
@@ -38,6 +43,12 @@ def write_output(path: str | Path, data: bytes) -> None:
 def write_json(path: str | Path, value: Mapping | Sequence) -> None:
     """Write a report as JSON. Raises OutputError."""
     write_output(path, json.dumps(value, indent=1).encode() + b"\n")
+
+
+def as_typed(*words: object) -> str:
+    """Return the words of a command as they are typed in a shell of this machine."""
+    texts = [*map(str, words)]
+    return subprocess.list2cmdline(texts) if sys.platform == "win32" else shlex.join(texts)
 
 
 def plural(count: int, noun: str, several: str = "") -> str:

@@ -97,13 +97,13 @@ class Protocol(eventlet.wsgi.HttpProtocol):
             self.rfile.close()  # without: 270 sockets stay open after 3 s of reconnections
 
 
-def whole_requests(app: WSGIApplication, listener: Listener) -> WSGIApplication:
-    """Return a WSGI application that gives `app` a request when all of it has been read, unless it is too long."""
+def whole_requests(app: WSGIApplication, listener: Listener, most: int = MAX_BODY) -> WSGIApplication:
+    """Return a WSGI application that gives `app` a request when all of it has been read; most: bytes of its body."""
 
     def read(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         length = int(environ.get("CONTENT_LENGTH", 0))
-        if "HTTP_TRANSFER_ENCODING" in environ or length > MAX_BODY:
-            text = f"A request's body has a Content-Length, of {MAX_BODY} bytes at most."
+        if "HTTP_TRANSFER_ENCODING" in environ or length > most:
+            text = f"A request's body has a Content-Length, of {most} bytes at most."
             return refuse(start_response, "413 Content Too Large", text)
         # Without: 192 connections that send slow bodies keep every new car out.
         environ["wsgi.input"] = io.BytesIO(environ["wsgi.input"].read(length))
@@ -148,10 +148,10 @@ def refuse_other_sites(app: WSGIApplication) -> WSGIApplication:
 
 
 def _is_address(host: str) -> bool:
-    """Return whether a Host header names an IP address, localhost, or nothing."""
+    """Return whether a Host header names an IP address of a machine, localhost, or nothing."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
-        return name in ("localhost", "") or bool(ipaddress.ip_address(name))
+        return name in ("localhost", "") or not ipaddress.ip_address(name).is_unspecified
     except ValueError:
         return False
 
@@ -186,14 +186,20 @@ def noted_signals() -> list[int]:
     return noted
 
 
-def serve(listener: socket.socket, app: WSGIApplication, stopped: list[int], *updates: Callable[[], None]) -> None:
-    """Serve the application until `stopped` has a signal; updates: called ten times a second."""
+def serve(
+    listener: socket.socket,
+    app: WSGIApplication,
+    stopped: list[int],
+    *updates: Callable[[], None],
+    most: int = MAX_BODY,
+) -> None:
+    """Serve the application until `stopped` has a signal; updates: called ten times a second; most: bytes of a body."""
     pool = eventlet.GreenPool(MAX_CONNECTIONS + 1)  # one more, which takes the place of one that has been hung up
     patient = Listener(listener, pool)
     serving = eventlet.spawn(
         eventlet.wsgi.server,
         patient,
-        whole_requests(refuse_other_sites(app), patient),
+        whole_requests(refuse_other_sites(app), patient, most),
         protocol=Protocol,
         custom_pool=pool,
         keepalive=False,  # so that an answered connection is not kept from others

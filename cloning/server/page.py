@@ -6,10 +6,14 @@ import functools
 import itertools
 import json
 import math
-import shlex
+import os
+import subprocess
+import sys
+import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import flask
@@ -17,7 +21,8 @@ import numpy as np
 
 from cloning.base import program
 from cloning.base.arguments import number
-from cloning.base.errors import TrackError, UserError
+from cloning.base.errors import UserError
+from cloning.base.outputs import as_typed
 from cloning.network.attention import visual_backprop
 from cloning.network.network import Network
 from cloning.recordings.images import encode
@@ -25,7 +30,6 @@ from cloning.recordings.saved_frames import SessionFolder
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import TOP_SPEED_MPH
 from cloning.road.overlay import overlay
-from cloning.road.track import centre_line
 from cloning.server import site
 from cloning.wire.protocol import PORT, Place
 
@@ -40,6 +44,7 @@ SILENCE = 2.0  # s without a telemetry, or without a usable one, after which the
 MAX_PAGES = 64  # open at once
 MAX_BODY = 200  # bytes of a request; more could be JSON that is nested too deeply to read
 JPEG_QUALITY = 80  # of the pictures
+ROAD_SECONDS = 20.0  # after which a road is not drawn
 BROWSE_SECONDS = 0.5  # in which the browser of recordings must answer
 speed_argument = number(float, 0, TOP_SPEED_MPH)  # mph: a set speed; 0 stops the car
 Pause = Callable[[float], None]  # waits for so many seconds, while others work
@@ -102,9 +107,17 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     saves frames or does no longer: {"recording": true or false}; the answer is the same. Both answer {"message"} with
     400 to what can't be done.
     """
+    from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
+
+    @functools.lru_cache(maxsize=4)
+    def outline(track: str) -> list[list[float]]:
+        with one_road:
+            return road_on_map(track, pause)
+
     app = flask.Flask(__name__, static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     site.prepare(app, "img-src data:")
+    one_road = eventlet.semaphore.Semaphore()  # is generated at a time
     pages = {with_attention: Pages(server, with_attention, pause) for with_attention in (False, True)}
 
     @app.get("/")
@@ -127,12 +140,10 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     @app.get("/road")
     def road() -> list[list[float]]:
         session = server.watched_session()
-        return road_on_map(session.place.track) if session and session.place else []
+        return outline(session.place.track) if session and session.place else []
 
     @app.get("/browse")
     def browse() -> Any:
-        from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
-
         where = f"http://{site.BROWSE_HOST}:{site.BROWSE_PORT}/"
         try:
             with eventlet.Timeout(BROWSE_SECONDS):
@@ -178,13 +189,24 @@ def posted(name: str, kind: type) -> Any:
     return body[name]
 
 
-@functools.lru_cache(maxsize=4)
-def road_on_map(track: str) -> list[list[float]]:
-    """Return the points of a road's centre line, m to the east and the north; none for an unknown name."""
-    try:
-        return [[round(x, 1), round(y, 1)] for x, y in centre_line(track)[:, :2].tolist()]
-    except TrackError:
-        return []
+def road_on_map(track: str, pause: Pause) -> list[list[float]]:
+    """Return the points of a road's centre line, m to the east and the north; none for an unknown name.
+
+    In a process of its own, since generating a road may take seconds, in which this one could answer no car. pause: the
+    server's.
+    """
+    code = "import sys; from cloning.road.track import centre_line; print(centre_line(sys.argv[1])[:, :2].tolist())"
+    paths = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])}
+    command, until = [sys.executable, "-c", code, track], time.monotonic() + ROAD_SECONDS
+    with tempfile.TemporaryFile() as file:
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.DEVNULL, env={**os.environ, **paths})
+        while process.poll() is None:
+            if time.monotonic() > until:
+                process.kill()
+            pause(0.02)
+        file.seek(0)
+        found = file.read() if process.returncode == 0 else b"[]"
+    return [[round(x, 1), round(y, 1)] for x, y in json.loads(found)]
 
 
 class Pages:
@@ -272,10 +294,11 @@ def figures(server: Server, session: Session | None, now: float) -> dict[str, An
     """Return what the page tells besides the state and the graphs, for JSON; now: time.monotonic()."""
     shown: dict[str, Any] = {"set_speed": server.set_speed, "recording": server.recording}
     if session and session.folder:
-        saved, copy = (shlex.quote(f"{session.folder.path}{ending}") for ending in ("", "-recording"))
-        browse = f"python -m cloning.lerobot {saved} --output {copy} && python -m cloning.browse {copy}"
-        shown |= {"saving": session.folder.progress(), "film": program.in_commands(f"python video.py {saved}")}
-        shown |= {"browse": program.in_commands(browse)}
+        saved, copy = (as_typed(f"{session.folder.path}{ending}") for ending in ("", "-recording"))
+        convert, browse = f"python -m cloning.lerobot {saved} --output {copy}", f"python -m cloning.browse {copy}"
+        commands = {"film": f"python video.py {saved}", "convert": convert, "browse": browse}
+        shown |= {"saving": session.folder.progress()}
+        shown |= {name: program.in_commands(command) for name, command in commands.items()}
     if session:
         recent = frames_since(session.history, now - RATE_SECONDS)
         rate = (len(recent) - 1) / max(now - recent[0].time, 1e-3) if recent else 0.0

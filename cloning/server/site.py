@@ -1,5 +1,7 @@
 """What every page has in common: its style, the library that draws its curves, and what a browser may do with it."""
 
+import mimetypes
+
 import flask
 
 BROWSE_HOST, BROWSE_PORT = "127.0.0.1", 4568  # of the browser of recordings: next to the port of drive.py
@@ -10,6 +12,8 @@ def prepare(app: flask.Flask, *sources: str) -> None:
 
     sources: of the Content-Security-Policy, besides scripts, styles and answers of the same address.
     """
+    for kind, ending in (("text/javascript", ".js"), ("text/css", ".css")):  # which Windows may call text/plain
+        mimetypes.add_type(kind, ending)
     app.register_blueprint(flask.Blueprint("site", __name__, static_folder="static", static_url_path="/site"))
     policy = [
         "default-src 'none'",

@@ -34,7 +34,7 @@ const GRAPHS = [
   {column: THROTTLE, title: "Throttle", unit: "", digits: 2, least: 0.1},
   {column: LATENCY, title: "Time in drive.py", unit: " ms", digits: 1, least: 10},
 ];
-let live = {}, rows = [], road = "", heard = false, drawn = 0, events, again;
+let live = {}, rows = [], road = "", unknown = "" /* a road that is not drawn */, heard = false, drawn = 0, events, again;
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Words and figures
@@ -69,7 +69,7 @@ function showNow() {
 // Whether drive.py holds the car, so that Go lets it drive.
 const isStopped = () => live.set_speed == 0 || live.state == "doubtful";
 
-function showFigures({rate, frames, unusable, reason, saving, film, browse, recording, set_speed, state}) {
+function showFigures({rate, frames, unusable, reason, saving, film, convert, browse, recording, set_speed, state}) {
   write("rate", ["driving", "doubtful"].includes(state) ? rate.toFixed(1) : "–");
   write("frames", frames ?? "–");
   write("unusable", unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–", unusable ? "bad" : "");
@@ -78,11 +78,13 @@ function showFigures({rate, frames, unusable, reason, saving, film, browse, reco
   write("record", recording ? "Stop recording" : "Record");
   for (const each of document.querySelectorAll(".saved")) each.hidden = !film;
   write("film", film ?? "");
+  write("convert", convert ?? "");
   write("browse", browse ?? "");
   element("plots").hidden = !rows.length;
   element("start").hidden = !["waiting", "gone"].includes(state);
   const stopped = isStopped();
   write("stop", stopped ? "Go" : "Stop", stopped ? "go" : "");
+  if (element("speed").matches(":active")) return; // it is being dragged
   if (!stopped) element("speed").value = set_speed;
   write("set-speed", stopped ? `${element("speed").value} mph, stopped` : `${set_speed} mph`);
 }
@@ -90,7 +92,7 @@ function showFigures({rate, frames, unusable, reason, saving, film, browse, reco
 // The road from above, where it is known, with the last minute's path.
 async function showMap() {
   const here = rows.at(-1);
-  element("map").hidden = !live.track || here?.[X] == null;
+  element("map").hidden = !live.track || live.track == unknown || here?.[X] == null;
   if (element("map").hidden) return;
   const svg = element("map").querySelector("svg"), [lane, path] = svg.querySelectorAll("path"), car = svg.querySelector("circle");
   if (road != live.track) {
@@ -102,7 +104,11 @@ async function showMap() {
       return [];
     });
     const across = [0, 1].map(axis => points.map(point => point[axis] * (axis ? -1 : 1)));
-    if (!points.length) return;
+    if (!points.length) {
+      unknown = road;
+      element("map").hidden = true;
+      return;
+    }
     const least = across.map(values => Math.min(...values) - 15), most = across.map(values => Math.max(...values) + 15);
     svg.setAttribute("viewBox", [...least, most[0] - least[0], most[1] - least[1]].join(" "));
     lane.setAttribute("d", smooth(across[0].map((x, at) => [x, across[1][at]])));
