@@ -37,6 +37,21 @@ def test_a_file_appears_only_when_it_is_complete(tmp_path):
     assert os.listdir(tmp_path) == ["film.mp4"]
 
 
+def test_a_link_stays_and_a_pipe_is_not_replaced(tmp_path):
+    disk, link, pipe = tmp_path / "disk", tmp_path / "report.json", tmp_path / "pipe"
+    disk.mkdir()
+    link.symlink_to(disk / "report.json")
+    for data in (b"old", b"new"):
+        write(link, data)
+        assert link.is_symlink() and (disk / "report.json").read_bytes() == data
+    os.mkfifo(pipe)
+    with pytest.raises(OSError, match="is a device or a pipe") as caught:
+        write(pipe, b"new")
+    assert caught.value.filename == str(pipe) and pipe.is_fifo()
+    with pytest.raises(OutputError, match="pipe: is a device or a pipe; name a file"):
+        check_folders(str(pipe))
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, RuntimeError, ValueError])
 def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path, error):
     path = tmp_path / "film.mp4"

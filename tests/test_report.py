@@ -16,6 +16,7 @@ import warm
 from browser import LOOKS, needs_chromium
 from commands import ROOT, log
 from matplotlib.figure import Figure
+from PIL import Image
 
 from cloning.base.errors import UserError
 from cloning.base.files import csv_bytes
@@ -23,7 +24,7 @@ from cloning.base.film import FilmWriter
 from cloning.recordings.format import BINS
 from cloning.replay.score import YARDSTICKS
 from cloning.report.content import Report, bend
-from cloning.report.pictures import film_uri, steering_chart
+from cloning.report.pictures import film_uri, picture_uri, steering_chart
 
 
 def report(*arguments) -> subprocess.CompletedProcess:
@@ -141,6 +142,13 @@ def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):
     (copy / "report.html").unlink()
     done = report(copy, "--lap", copy / "training_log.csv")
     whole = "not a whole picture, such as a PNG or a JPEG; make it again"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (200, 200, 3), np.uint8)).save(tmp_path / "damaged.png")
+    data = bytearray((tmp_path / "damaged.png").read_bytes())
+    second = data.index(b"IDAT", data.index(b"IDAT") + 1)
+    data[second : second + 4] = b"\0\0\0\0"  # for which Pillow raises SyntaxError
+    (tmp_path / "damaged.png").write_bytes(data)
+    with pytest.raises(UserError, match=whole):
+        picture_uri(tmp_path / "damaged.png")
     assert done.returncode == 2 and done.stderr == f"report: {copy}/training_log.csv: {whole}\n"
     (copy / "The lake.json").write_text("{}", encoding="utf-8")
     done = report(copy, "--lap", copy / "The lake.png")

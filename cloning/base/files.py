@@ -29,19 +29,22 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     is deleted and the old file stays. The block writes and closes the temporary file; if it does not create it, an
     existing `path` stays as it is. The temporary file (`.NAME.RANDOM.part`) is no other process's, so several may write
     `path` at the same time, and the last one to finish wins. The first use in a folder deletes those that are a day
-    old, which killed processes left.
+    old, which killed processes left. Through a symbolic link the file is written to which it leads.
 
     Raises OSError with the name `path`, not the temporary one, for example when the disk is full, and at once when
-    `path` is a folder.
+    `path` is a folder or a device, which would be replaced.
     """
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    temporary = _temporary(path)
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "is a device or a pipe, not a file", str(path))
+    target = path.resolve()
+    temporary = _temporary(target)
     try:
         yield temporary
         if temporary.exists():
-            os.replace(temporary, path)
+            os.replace(temporary, target)
     except BaseException as error:
         with suppress(OSError):  # the first error matters more
             temporary.unlink(missing_ok=True)

@@ -26,6 +26,8 @@ from cloning.network import FORMAT
 from cloning.server import terminal
 from cloning.server.site import BROWSE_HOST, BROWSE_PORT
 
+MAX_BODY = 1 << 22  # bytes of a request: 30,000 cuts
+
 
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Parse the command line; arguments: those of this process if None."""
@@ -67,7 +69,7 @@ def main() -> int:
     shown = plural(count, "recording") if count else plural(len(arguments.run), "training run")
     print(f"{shown}. Open http://{BROWSE_HOST}:{listener.getsockname()[1]}/ in a browser. Ctrl-C ends.", flush=True)
     try:
-        connections.serve(listener, create_app(library, runs), stopped)
+        connections.serve(listener, create_app(library, runs), stopped, most=MAX_BODY)
     finally:
         library.close()
         stderr.finish()

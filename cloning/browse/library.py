@@ -290,11 +290,10 @@ class ShownRecording:
         return recording
 
     def cut(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
-        """Cut or tag stretches, and return the cuts as they are written. Raises RecordingError, OSError."""
+        """Cut or tag stretches, and return the cuts that were not there. Raises RecordingError, OSError."""
         cuts = [Cut(cut.first, cut.last, one_line(cut.reason)) for cut in cuts]
         _rows_cut(self.folder, tuple(cuts), self.read(), file)  # refuses what is no stretch
-        add_cuts(self.folder, *cuts, file=file)
-        return cuts
+        return add_cuts(self.folder, *cuts, file=file)
 
     def restore(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
         """Undo cuts or tags, and return those that were there. Raises GoneError, RecordingError, OSError."""

@@ -8,6 +8,7 @@ from typing import Any
 import flask
 import numpy as np
 
+from cloning.base import program
 from cloning.base.errors import UserError, message_of
 from cloning.browse.analyses import UnknownError
 from cloning.browse.library import Library, ShownRecording
@@ -29,7 +30,8 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     little-endian float32 (n,); POST tries one's analysis again, which failed. `cuts` and `tags` take [{"first", "last",
     "reason"}, …] to add or, by DELETE, to delete; they answer with the details and the "changed" ones, or with 410 if
     none to be deleted is there any more. POST begins what replays, comparisons and analyses need, DELETE ends or pauses
-    it. `export` takes {"rows", "name", "others"}, "first-end,…" and "ID,…", and answers what did not fit as "notes".
+    it. `film.mp4` takes {"rows"}, "first-end,…"; `export` {"rows", "name", "others"}, the last one "ID,…", and answers
+    what did not fit as "notes".
     """
     from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
 
@@ -50,7 +52,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     @app.errorhandler(OSError)
     def explain(error: UserError | OSError) -> tuple[dict[str, str], int]:
         status = 404 if isinstance(error, UnknownError) else 410 if isinstance(error, GoneError) else 409
-        return {"message": message_of(error)}, status
+        return {"message": program.in_commands(message_of(error))}, status
 
     @app.after_request
     def keep(response: flask.Response) -> flask.Response:
@@ -131,9 +133,11 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
         folder, notes = shown(identifier).export(stretches(rows), version() or "", name, together)
         return {"id": library.add(folder)[0], "folder": str(folder), "notes": notes}
 
-    @app.get("/recordings/<identifier>/film.mp4")
+    @app.post("/recordings/<identifier>/film.mp4")  # a request for thousands of stretches is too long for GET
     def film(identifier: str) -> flask.Response:
-        mp4 = shown(identifier).film(stretches(flask.request.args.get("rows", "")), version() or "")
+        body = flask.request.get_json()
+        rows = str(body.get("rows", "")) if isinstance(body, dict) else ""
+        mp4 = shown(identifier).film(stretches(rows), version() or "")
         return flask.Response(mp4, mimetype="video/mp4", headers={"Content-Disposition": "attachment"})
 
     @app.route("/analyses", methods=["POST", "DELETE"])
@@ -194,6 +198,6 @@ def cuts() -> list[Cut]:
 
 def stretches(text: str) -> list[list[int]]:
     """Return the stretches in a text such as "0-15,30-45". Ends the request with 400 if it has none."""
-    if not re.fullmatch(r"(\d{1,9}-\d{1,9},?)+", text):
+    if not re.fullmatch(r"\d{1,9}-\d{1,9}(,\d{1,9}-\d{1,9})*", text):
         flask.abort(400, "Rows are stretches such as 0-15,30-45.")
-    return [[int(row) for row in stretch.split("-")] for stretch in text.strip(",").split(",")]
+    return [[int(row) for row in stretch.split("-")] for stretch in text.split(",")]

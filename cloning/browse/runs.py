@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from cloning.base import program
 from cloning.base.errors import UserError, message_of
 from cloning.base.outputs import short_names
 from cloning.browse.analyses import UnknownError
@@ -42,7 +43,7 @@ class Runs:
                     known = overview(files)
                     known = {key: known[key] for key in known.keys() - {"pictures", "trail", "options"}}
                 except (UserError, OSError) as error:
-                    known = {"message": message_of(error)}
+                    known = {"message": program.in_commands(message_of(error))}
                 shown.append(self._place(index) | known)
         return shown
 

@@ -87,16 +87,18 @@ class GoneError(RecordingError):
     """A cut or tag that is to be deleted and is not there any more."""
 
 
-def add_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> None:
-    """Append cuts or tags to a recording's, unless the same ones are there; the other lines stay as they are.
+def add_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> list[Cut]:
+    """Append cuts or tags to a recording's, and return those that were not there; the other lines stay as they are.
 
     Raises RecordingError if the file is not readable as such, and OSError if it cannot be written; then it stays.
     """
     with _changing(folder / file) as (lines, there):
         present = {each.row() for each in there}
-        if added := [_line(row) for row in dict.fromkeys(cut.row() for cut in cuts) if row not in present]:
+        added = {cut.row(): cut for cut in cuts if cut.row() not in present}
+        if added:
             ended = [line if line.endswith(("\n", "\r")) else f"{line}\n" for line in lines]
-            lines[:] = [*(ended or [_line(HEADERS[file])]), *added]
+            lines[:] = [*(ended or [_line(HEADERS[file])]), *map(_line, added)]
+    return list(added.values())
 
 
 def delete_cuts(folder: Path, *cuts: Cut, file: str = EXCLUDED) -> list[Cut]:

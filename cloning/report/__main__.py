@@ -16,6 +16,7 @@ if __name__ == "__main__":
 import base64
 import re
 from pathlib import Path
+from typing import Any
 
 from cloning.base.arguments import command_line
 from cloning.base.errors import UserError
@@ -39,6 +40,8 @@ def main() -> int:
     add("--lap", nargs="+", type=Path, default=[], metavar="FILE.png", help=lap)
     add("--markdown", action="store_true", help="also write report.md, with its pictures in report/")
     arguments = parser.parse_args()
+    if arguments.markdown:
+        markdown_library()  # before all is replayed
     output = RunFiles(str(arguments.run / "model.pt")).report
     report = Report(arguments.run, arguments.lap)
     check_folders(str(output))
@@ -51,15 +54,20 @@ def main() -> int:
     return program.DONE
 
 
+def markdown_library() -> Any:
+    """Return the optional library that converts to Markdown. Raises UserError if it is not installed."""
+    try:
+        import markdownify
+    except ImportError as error:
+        raise UserError(f"{error}; pip install markdownify") from None
+    return markdownify
+
+
 def write_markdown(page: str, path: Path) -> None:
     """Write a page's text as Markdown; the pictures are files in the folder of its name, films are left out.
 
-    Raises UserError if the library that converts it is not installed, OSError.
+    Raises the error of `markdown_library`, OSError.
     """
-    try:
-        import markdownify  # an optional library
-    except ImportError as error:
-        raise UserError(f"{error}; pip install markdownify") from None
     folder = path.with_suffix("")
     folder.mkdir(exist_ok=True)
     pictures = list[str]()
@@ -72,7 +80,7 @@ def write_markdown(page: str, path: Path) -> None:
     content = page[page.index("<main>") : page.index("</main>")]
     content = re.sub(r"<source[^>]*>|<video.*?</video>", "", content, flags=re.DOTALL)  # dark twins, films
     content = re.sub(r'data:image/([\w+]+);base64,([^"]+)', saved, content)
-    write(path, markdownify.markdownify(content, heading_style="ATX", bullets="*").encode(errors="replace"))
+    write(path, markdown_library().markdownify(content, heading_style="ATX", bullets="*").encode(errors="replace"))
 
 
 if __name__ == "__main__":

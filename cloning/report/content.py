@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +11,7 @@ import numpy as np
 
 from cloning.base import program
 from cloning.base.errors import ModelError, RecordingError, UserError, message_of
-from cloning.base.outputs import short_names
+from cloning.base.outputs import as_typed, short_names
 from cloning.browse import summary
 from cloning.browse.runs import overview
 from cloning.network.attention import visual_backprop
@@ -205,7 +204,7 @@ class Report:
                 why = f"Watch the interventions on {Path(each['recording']).name}, and record more of such places"
                 steps.append((why, ("python", "-m", "cloning.browse", each["recording"], "--model", self.model)))
         steps.append(("Let it drive the simulator, or the stand-in for it", ("python", "drive.py", self.model)))
-        return [(why, program.in_commands(shlex.join(map(str, command)))) for why, command in steps]
+        return [(why, program.in_commands(as_typed(*command))) for why, command in steps]
 
     def page(self) -> str:
         """Return the page, which needs no other file. Raises UserError."""

@@ -48,8 +48,8 @@ def picture_uri(source: Path | Image.Image) -> str:
     """Return a data URI of a picture, at most WIDEST wide. Raises UserError if it is no whole picture, OSError."""
     try:
         picture = (Image.open(source) if isinstance(source, Path) else source).convert("RGB")
-    except OSError as error:
-        if error.filename:  # cannot be read
+    except (OSError, SyntaxError) as error:  # the second for some damaged PNGs
+        if isinstance(error, OSError) and error.filename:  # cannot be read
             raise
         raise UserError(f"{source}: not a whole picture, such as a PNG or a JPEG; make it again") from None
     picture.thumbnail((WIDEST, WIDEST))

@@ -112,12 +112,13 @@ async function act(now, kind, method, cuts, what, from = "") {
     const changed = details.changed.map(({first, last, reason}) => ({first, last, reason}));
     if (from) now[from].pop();
     else now.undone = [];
-    now[from == "done" ? "undone" : "done"].push({kind, method: OPPOSITE[method], cuts: changed});
+    if (changed.length) now[from == "done" ? "undone" : "done"].push({kind, method: OPPOSITE[method], cuts: changed});
     keep(now);
     if (page.open != now) return;
     if (method == "POST") now.marks = {};
     notice();
-    say(`${what}: ${many(changed.length, "stretch", "stretches")}.${from ? "" : " Undo takes it back."}`);
+    const back = from || !changed.length ? "" : " Undo takes it back.";
+    say(`${what}: ${changed.length ? many(changed.length, "stretch", "stretches") : "nothing that was not so before"}.${back}`);
     await now.update(details);
     find();
   } catch (error) {

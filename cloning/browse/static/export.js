@@ -22,8 +22,7 @@ element("export").onclose = async () => {
   tell(kind == "film" ? "Making the film …" : "Writing the recording …");
   try {
     if (kind == "film") {
-      const query = new URLSearchParams({rows, version});
-      const film = await request(`/recordings/${id}/film.mp4?${query}`, {binary: true});
+      const film = await request(`/recordings/${id}/film.mp4?version=${version}`, {...sending("POST", {rows}), binary: true});
       const address = URL.createObjectURL(new Blob([film], {type: "video/mp4"}));
       make("a", "", {href: address, download: `${name}.mp4`}).click();
       setTimeout(() => URL.revokeObjectURL(address), 60000);

@@ -89,7 +89,8 @@ function arrange() {
   const state = new URLSearchParams({
     ...query && {find: query}, ...by != "name" && {sort: by}, ...selected.size && {select: [...selected]}});
   element("home").href = state.size ? `#?${state}` : "#"; // from a recording back to the same
-  history.replaceState(null, "", element("home").href);
+  const {href} = element("home"); // Safari throws after 100 changes of the address in 30 s; a click has changed it already
+  if (location.href != href && !location.hash.startsWith("#/")) history.replaceState(null, "", href);
   const states = [...known.values()].map(({lane}) => lane?.state), isPaused = states.includes("paused");
   const left = states.filter(state => PENDING.includes(state)).length;
   renew(element("analysing"), [left, isPaused], () => {
