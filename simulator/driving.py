@@ -8,6 +8,7 @@ that the file's input has.
 """
 
 import functools
+import hashlib
 import json
 import math
 import re
@@ -193,7 +194,8 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
         size = (columns, rows) if type(rows) is type(columns) is int else None
         unknown = set(said) - set(PREPROCESSING)
         whole_cut = not (0 <= top < FRAME[0] - bottom <= FRAME[0] and 0 <= left < FRAME[1] - right <= FRAME[1])
-        if unknown or whole_cut or len(shape) != 4 or 3 not in (shape[1], shape[3]):
+        scaled = whole and [low, high] != PREPROCESSING["range"]  # which bytes can't be
+        if unknown or whole_cut or scaled or len(shape) != 4 or 3 not in (shape[1], shape[3]):
             raise ValueError(f"shape {shape}, {said}")
     except (ValueError, TypeError, LookupError, OSError) as error:
         wanted = f"it may have {json.dumps(PREPROCESSING)} with other values, and colours {', '.join(COLOURS)}"
@@ -207,6 +209,12 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
         return np.ascontiguousarray(image if whole else (image * scale + low).astype(np.float32))[None]
 
     return prepare
+
+
+def digest_of(file: Path) -> str:
+    """Return a digest of a driver's file, and of the one beside an ONNX file that tells how frames become its input."""
+    beside = [file.with_suffix(".json")] if file.suffix == ".onnx" else []
+    return hashlib.sha256(b"".join(each.read_bytes() for each in (file, *beside) if each.exists())).hexdigest()
 
 
 def server_address(driver: str) -> tuple[str, int] | None:

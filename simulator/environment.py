@@ -217,10 +217,10 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         steering, throttle = np.clip(commands, -1, 1).tolist()
         before = self.run.travelled
         stayed = self.run.advance(steering, throttle)
-        while stayed and not self.clock.due(self.run.time):
+        while stayed and not (self.run.at_end or self.clock.due(self.run.time)):
             stayed = self.run.advance(steering, throttle)
         reward = float(self.run.travelled - before) - (0 if stayed else DEPARTURE_PENALTY)
-        finished = bool(self.run.travelled >= self.laps * self.track.length)
+        finished = bool(self.run.travelled >= self.laps * self.track.length or self.run.laps >= self.laps)
         self.state = "ended" if finished or not stayed else "driving"
         return self._frame(), reward, not stayed, finished, self._info()
 

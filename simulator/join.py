@@ -53,6 +53,7 @@ class Joined(ClientSession):
         self._thinking = 0.02  # s that the driver takes
         self._apart: bool | None = None if dialect.apart else False  # whether it is in another thread; None: unknown
         self._vain = self._constant = 0  # attempts to find it there; answers in a row that did not change
+        self._is_puzzled = False  # whether the user knows that no answer can be used
         self._origin = 0.0  # simulated s at time.perf_counter() 0, with a pace
 
     def run(self) -> None:
@@ -67,7 +68,7 @@ class Joined(ClientSession):
                 finally:
                     self.close()
             except SimulatorError:
-                if not self.frames:
+                if not self.time:  # nothing was driven
                     raise
                 return
 
@@ -78,6 +79,7 @@ class Joined(ClientSession):
 
     def _exchange(self) -> None:
         """Send and receive until the program wants no more, or the connection is lost. Raises ConnectionLost."""
+        self._origin = self.time - self.pace * time.perf_counter()
         self._listen(SETTLE)
         self._origin = self.time - self.pace * time.perf_counter()
         while not self.dialect.over:
@@ -88,6 +90,9 @@ class Joined(ClientSession):
                 if not self.pace:
                     self._await_driver(telemetry)
                 self._drive()
+            elif not (self.time or self._is_puzzled):
+                self._is_puzzled = True
+                print(f"no usable answer in {ASK_AGAIN:g} s; if none comes, it may speak another --dialect", flush=True)
 
     def _ask(self, telemetry: str) -> bool:
         """Send a telemetry; return whether it was answered."""

@@ -130,7 +130,7 @@ class Run:
         length = self.track.length
         self.travelled += (self.s - before + length / 2) % length - length / 2
         self.distance += self.car.speed * STEP
-        if self.travelled >= (self.laps + 1) * length:
+        if self.travelled >= (self.laps + 1) * length if self.track.closed else self.s >= length:
             self.lap_times.append(self.time)
             self.at_end = not self.track.closed
         trajectory = self.trajectory

@@ -113,6 +113,14 @@ def test_a_drive_goes_on_after_a_departure_until_it_can_score_nothing():
     assert not drive("expert", task).departures
 
 
+def test_the_film_of_a_drive_that_went_otherwise_before_says_so():
+    """A server need not answer twice alike: here it left the road long before the moment that is to be filmed."""
+    until = drive("straight", TINY[2]).departures[0].time
+    same, other = (report.film("straight", (TINY[2], at)) for at in (round(until, 2), 30.0))
+    assert (same.again, other.again) == (True, False)
+    assert all(clip.film.startswith("data:video/mp4;base64,") for clip in (same, other))
+
+
 def test_a_server_is_told_no_place_and_its_speed_is_held_for_it():
     told = []
 
@@ -179,11 +187,13 @@ def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape,
     frame[60:135, 20:300] = (255, 0, 0)
     assert driving.load_driver(file)(frame) == pytest.approx(2 * 0.299 - 1, abs=0.005)
     driving.load_driver.cache_clear()
+    digest = driving.digest_of(tmp_path / "keras.onnx")
     crops = (f'{{"crop": {crop}}}' for crop in ([100, 60], [0, 0, 320, 0], [1, 2, 3], [1.5, 0]))
     for wrong in (*crops, '{"colour": "CMYK"}', '{"scale": 2}', "[]", "{"):
         (tmp_path / "keras.json").write_text(wrong, encoding="utf-8")
         with pytest.raises(UserError, match=r"keras\.json: does not tell"):
             driving.load_driver(file)
+        assert driving.digest_of(tmp_path / "keras.onnx") != digest, "earlier results are another entry's"
 
 
 @pytest.mark.parametrize(
@@ -204,6 +214,9 @@ def test_an_onnx_network_of_other_inputs_is_refused_before_it_drives(tmp_path, s
 def test_without_that_file_frames_are_as_the_simulator_sends_them(tmp_path):
     file = onnx_file(tmp_path / "own.onnx", (None, 160, 320, 3), [1, 2], kind=2)
     assert driving.load_driver(file)(np.full((160, 320, 3), (0, 200, 200), np.uint8)) == 0
+    (tmp_path / "own.json").write_text('{"range": [-1, 1]}', encoding="utf-8")
+    with pytest.raises(UserError, match="does not tell"):  # bytes can't be so
+        driving.preprocessing(tmp_path / "own.json", [1, 160, 320, 3], whole=True)
     prepare = driving.preprocessing(tmp_path / "none.json", [1, 160, 320, 3], whole=True)
     frame = np.random.default_rng(0).integers(0, 256, (160, 320, 3), np.uint8)
     assert np.array_equal(prepare(frame)[0], frame)

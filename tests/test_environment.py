@@ -231,6 +231,17 @@ def test_reset_chooses_the_road_the_look_and_the_start(lake):
     assert np.array_equal(lake_frame, lake.reset()[0])
 
 
+@pytest.mark.parametrize("begin", [0, 90])
+def test_an_episode_on_an_open_road_ends_where_the_road_ends_wherever_it_began(begin):
+    env = environment.Drive(make_road([(0, 0), (50, 0), (100, 0)]))
+    env.reset(options={"s": begin})
+    ended = False
+    while not ended:
+        _, _, left, ended, info = env.step(np.asarray([0, 1]))
+        assert not left
+    assert info["s"] == pytest.approx(100, abs=0.4)
+
+
 def test_info_has_the_names_that_users_of_gym_donkeycar_know():
     env = environment.Drive(make_road([(0, 0, 3), (0, 30, 3)]), laps=2)
     info = env.reset(options={"offset": 0.5})[1]

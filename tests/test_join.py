@@ -224,6 +224,21 @@ def test_a_server_may_open_the_session_late(monkeypatch):
     assert len(program.data) == 4
 
 
+def test_a_program_whose_answers_cannot_be_used_is_told_of_and_is_no_success(monkeypatch, capsys):
+    monkeypatch.setattr("simulator.join.ASK_AGAIN", 0.2)
+    with Program(lambda data, n: [["steer", {"steering_angle": 0, "throttle": 1}]] if n < 3 else None) as program:
+        assert join("measures", program) == 2
+    printed = capsys.readouterr()
+    assert printed.out.count("no usable answer in 0.2 s; if none comes, it may speak another --dialect") == 1
+    assert "0 simulated seconds" in printed.out
+
+
+def test_with_a_pace_the_car_stands_still_until_the_first_telemetry():
+    with Program(lambda data, n: [steer(0, 1)] if n < 5 else None) as program:
+        assert join("measures", program, "--pace", "1") == 0
+    assert number(program.data[0], "distance") == 0
+
+
 def test_a_lost_answer_stops_nothing(monkeypatch):
     monkeypatch.setattr("simulator.join.ASK_AGAIN", 0.2)
     with Program(lambda data, n: [] if n % 7 == 3 else [steer(0, 1)] if n < 30 else None) as program:

@@ -13,7 +13,6 @@ same options give the same results, on any number of processes. The folder gets 
 """
 
 import functools
-import hashlib
 import itertools
 import json
 import statistics
@@ -230,7 +229,7 @@ def main(argv: list[str] | None = None) -> int:
         driving.load_driver(file)  # before processes start
         stem = Path(file).stem
         unique = [Path(other).stem for other in options.models].count(stem) == 1
-        models.append((file, stem if unique else file, hashlib.sha256(Path(file).read_bytes()).hexdigest()))
+        models.append((file, stem if unique else file, driving.digest_of(Path(file))))
     courses: list[tuple[str, float, Conditions]] = []
     for track in options.tracks:
         at, metres = TRACKS.index(track), options.laps * Track(track).length

@@ -2,7 +2,6 @@
 
 import argparse
 import functools
-import hashlib
 import json
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -51,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
     about = {
         "version": tasks.VERSION,
         "entry": file.stem if file.is_file() else entry,
-        "sha256": hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else None,
+        "sha256": driving.digest_of(file) if file.is_file() else None,
     }
     workers = driving.workers_for(entry, options.processes, options.scheduler)
     recordings = replays.folders(options.recordings) if options.recordings else []

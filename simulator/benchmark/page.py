@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from cloning.recordings.writer import SampleClock
 from cloning.server.template import whole_page
 from simulator import driving
 from simulator.benchmark import scores
@@ -44,6 +45,8 @@ def film(driver: str, failure: tuple[Task, float]) -> Clip:
 
         def watch(run: Run, cameras: Cameras | None) -> None:
             shown.cameras = cameras
+            if run.departures and not shown.writer.frames:  # earlier than before: its last moment alone
+                shown.clock = SampleClock()
             shown.watch(run)
 
         drive = driving.drive(task.conditions(driver)._replace(set_back=False), task.source, watch)
