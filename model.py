@@ -167,8 +167,8 @@ REPORT = Recipe(
     augmentations=(
         Augmentation("unaltered"),
         Augmentation("flipped", mirrors=True, share="flip"),
-        Augmentation("brightened", brighten, choose_brightness, caption="brightness x {:.2f}"),
-        Augmentation("shadowed", shade, choose_shadow, share="shadow", caption="shadow x {:.2f}"),
+        Augmentation("brightened", brighten, choose_brightness, caption="brightness x {:.2f}", gpu=True),
+        Augmentation("shadowed", shade, choose_shadow, share="shadow", caption="shadow x {:.2f}", gpu=True),
     ),
     flip=0.9,
     brightness=(0.4, 1.2),
@@ -278,7 +278,7 @@ class TrainingRun:
         one_thread()
         self.pool = ThreadPoolExecutor(threads(), initializer=one_thread)
         self.training, self.validation = training, validation
-        if self.device.type == "cuda" and not recipe.disturbed:  # disturbances are made by the CPU
+        if self.device.type == "cuda" and recipe.on_gpu():
             self.training, self.validation = (part.on_gpu(self.device, self.pool) for part in (training, validation))
         self.errors: nn.Module = SquaredErrors(self.network, self.precision, self.pool, recipe.huber)
         if ranks.world > 1:

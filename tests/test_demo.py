@@ -106,6 +106,10 @@ def test_recordings_of_ones_own_are_trained_on_and_driven(commands, linked, caps
     assert [words[words.index("--direction") - 1] for words in driven] == ["jungle", "jungle"]
     assert commands[-1][:3] == ["-m", "cloning.report", own]
     assert "python drive.py demo/own/model.pt" in capsys.readouterr().out
-    (demo.OWN / "training_arguments.json").write_text(json.dumps({"recordings": ["/gone"]}), encoding="utf-8")
+    arguments, link = demo.OWN / "training_arguments.json", linked.with_name("link")
+    link.symlink_to(linked)
+    arguments.write_text(json.dumps({"recordings": [str(link)]}), encoding="utf-8")
+    assert demo.main([str(link)]) == program.DONE, "it goes on"
+    arguments.write_text(json.dumps({"recordings": ["/gone"]}), encoding="utf-8")
     with pytest.raises(UserError, match="a demo with other recordings, /gone: delete the folder first"):
         demo.main([str(linked)])

@@ -7,7 +7,7 @@ from rendered import render_frame
 from scipy.spatial.distance import mahalanobis
 
 import drive
-from cloning.base.errors import ModelError
+from cloning.base.errors import ModelError, UserError
 from cloning.lane import foretell
 from cloning.lane.foretell import ALARM, Blindness, Foreteller, Limits, Normal, Observation, Observer, Ordinary, Signs
 from cloning.network.network import Network, steer
@@ -112,6 +112,9 @@ def driven(rng: np.random.Generator, number: int, kind: str, strange: bool) -> t
     return course, tool.Drive(seen, 0 * time, time, away, np.array([29.95] if strange else []))
 
 
+CLEAR = (tool.ORDINARY, False), (tool.HARD, True)
+
+
 def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
     rng = np.random.default_rng(5)
     kinds = [(tool.ORDINARY, False)] * 6 + [(tool.HARD, False)] * 4 + [(tool.HARD, True), (tool.DISTURBED, True)] * 3
@@ -123,6 +126,15 @@ def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
     hard, every = (line.strip("| ").split(" | ") for line in (lines[3], lines[-1]))
     assert hard[1:3] == ["3", "100 %"] and every[1] == "6" and every[4] == "55", "5 whole windows, 11 drives"
     assert float(every[5].removesuffix(" %")) < 15 and int(every[3].removesuffix(" %")) < 25
+
+
+def test_a_network_that_leaves_every_mountain_road_has_limits_and_one_that_leaves_all_is_refused():
+    rng = np.random.default_rng(5)
+    fair, hard = ([driven(rng, 2001 + i, kind, strange) for i in range(6)] for kind, strange in CLEAR)
+    limits = tool.fit(fair + hard, [])
+    assert ALARM < limits.stop < 1 and tool.table(limits, hard).splitlines()[3].endswith("| 100 % | 100 % | 0 |  |")
+    with pytest.raises(UserError, match="leaves the road in every clear drive"):
+        tool.fit(hard, [])
 
 
 def test_an_alarm_counts_from_6_to_1_s_before_a_departure():

@@ -13,6 +13,7 @@ from cloning.recordings.check import check_images
 from cloning.recordings.log import read_recording
 from cloning.training.gpu import GpuFrames
 from cloning.training.pieces import Batch, SquaredErrors
+from cloning.training.recipe import Augmentation
 from model import REPORT, ROBUST, Generator
 
 
@@ -53,6 +54,15 @@ def test_images_that_fill_a_batch_up_do_not_count(pool, huber):
     for gradient, parameter in zip(gradients, network.parameters(), strict=True):
         assert parameter.grad is not None
         torch.testing.assert_close(gradient, parameter.grad, rtol=1e-3, atol=1e-4 * float(parameter.grad.abs().max()))
+
+
+def test_only_frames_that_are_used_are_loaded_and_only_for_what_a_gpu_can_change(sample_recording, pool):
+    found = REPORT.select(check_images(read_recording(sample_recording)), REPORT)
+    frames = found.take(np.arange(20, 30)).on_gpu(torch.device("cpu"), pool).gpu
+    assert frames and frames.count == 3 * 10
+    own = Augmentation("own", lambda images, *_: images)
+    assert REPORT.on_gpu() and ROBUST.on_gpu() and not replace(ROBUST, disturbed=0.4).on_gpu()
+    assert not replace(REPORT, augmentations=(own,)).on_gpu()
 
 
 def test_frames_that_do_not_fit_are_left_to_the_cpu(sample_recording, pool, monkeypatch, capsys):

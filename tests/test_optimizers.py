@@ -2,10 +2,39 @@
 
 from typing import Any
 
+import pytest
 import torch
+from torch import nn
 
+from cloning.base.errors import ModelError
 from cloning.network.network import Network
+from cloning.training.checkpoint import Checkpoint
 from cloning.training.optimizers import Adam, Muon, orthogonal
+from cloning.training.options import Process, Run
+from model import REPORT
+
+
+class LargeNetwork(Network):
+    """Of 2.7 million parameters."""
+
+    def layers(self):
+        convolutions, _ = super().layers()
+        return convolutions, [nn.Linear(self.units, 600), nn.Linear(600, 1)]
+
+
+class NormalizedNetwork(Network):
+    """With batch normalization, of which a copy of the network would learn the averages."""
+
+    def layers(self):
+        (first, *others), dense = super().layers()
+        return [nn.Sequential(first, nn.BatchNorm2d(24)), *others], dense
+
+
+@pytest.mark.parametrize(("kind", "words"), [(LargeNetwork, "too many for a file"), (NormalizedNetwork, "batch norm")])
+def test_a_network_that_cannot_be_saved_whole_is_refused_before_it_is_trained(kind, words):
+    network, process = kind(), Process("model.pt")
+    with pytest.raises(ModelError, match=words):
+        Checkpoint(Run(REPORT, ()), process, network, Adam(network.parameters()), "")
 
 
 def networks():

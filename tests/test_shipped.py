@@ -128,6 +128,16 @@ def rendered(monkeypatch) -> list[str]:
     return names
 
 
+def test_what_is_trained_on_is_not_written_over(linked, model_file, tmp_path, capsys):
+    """Another start, after an interruption, would take the mean of the mean."""
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copyfile(model_file, out / "model.pt")
+    with pytest.raises(SystemExit):
+        shipped.main([str(linked), "--from", str(out / "model.pt"), "--folder", str(out)])
+    assert "the mean is written there; copy the file first" in capsys.readouterr().err
+
+
 def test_training_reads_only_what_this_run_asked_for(sample_recording, tmp_path, rendered, commands):
     """The folder may hold laps and recordings of an earlier run with other options."""
     out, commands.status = tmp_path / "out", INCOMPLETE

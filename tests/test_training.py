@@ -22,7 +22,8 @@ from rendered import render_recording
 from steer_server import unused_port
 
 import model
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, UserError
+from cloning.network.compute import choose_device
 from cloning.training import options, pictures, summary
 from cloning.training.checkpoint import Progress
 from cloning.training.distributed import FirstRankFailed, Ranks
@@ -225,6 +226,16 @@ def test_wrong_arguments_are_refused_before_anything_is_written(linked, tmp_path
     assert done.returncode == 2
     assert "model.py: " in done.stderr and words in done.stderr and "Traceback" not in done.stderr
     assert {path for path in tmp_path.rglob("*") if linked not in path.parents} == {linked.parent, linked}
+
+
+def test_several_processes_leave_apples_gpu_alone(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    assert choose_device("auto").type == "mps"
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert choose_device("auto").type == "cpu"
+    with pytest.raises(UserError, match="--device mps: several processes"):
+        choose_device("mps")
 
 
 def test_without_recordings_the_user_is_told_where_to_get_some(tmp_path):

@@ -83,7 +83,7 @@ def check(folder: Path, recordings: list[Path]) -> None:
     """Raise UserError if a demo in the folder was begun with other recordings."""
     arguments = folder / "training_arguments.json"
     trained_on = json.loads(arguments.read_bytes())["recordings"] if arguments.exists() else []
-    if trained_on and [*map(Path, trained_on)] != [each.resolve() for each in recordings]:
+    if trained_on and [Path(each).resolve() for each in trained_on] != [each.resolve() for each in recordings]:
         raise UserError(f"{folder} has a demo with other recordings, {', '.join(trained_on)}: delete the folder first")
 
 

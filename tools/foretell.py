@@ -24,6 +24,7 @@ import numpy as np
 
 from cloning.base import program
 from cloning.base.arguments import command_line, number
+from cloning.base.errors import UserError
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane.foretell import (
@@ -240,8 +241,10 @@ def regress(signs: np.ndarray, away: np.ndarray, share: np.ndarray) -> np.ndarra
 
 
 def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation]) -> Limits:
-    """Return the limits; driven: what tunes them."""
+    """Return the limits; driven: what tunes them. Raises UserError for a network that drives nowhere."""
     fair = [(course, each) for course, each in driven if not course.disturbance and not len(each.departures)]
+    if not fair:
+        raise UserError("the network leaves the road in every clear drive, so nothing is ordinary; train it longer")
     # Every second one says what is ordinary: in these the networks' activations are nearer to it than in any others.
     known = {course for course, _ in fair[::2]}
     seen = [each.seen for course, each in fair if course in known] + list(recordings)
@@ -255,7 +258,7 @@ def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation
     weights = STEEPNESS * regress(signs, *(np.concatenate(each)[rows] for each in (coming, share)))
     odds = {kind: risks(tuned, kind, lambda part: part.signs @ weights)[1] for kind in CONDITIONS}
     alarm = np.quantile(np.concatenate(list(odds.values())), 1 - FALSE_ALARMS)
-    clear = max(odds[kind].max() for kind in (HARD, ORDINARY))
+    clear = max((odds[kind].max() for kind in (HARD, ORDINARY) if len(odds[kind])), default=alarm)
     stop = 1 / (1 + np.exp(min(0, alarm - clear) - MARGIN))
     return Limits(ordinary, weights, -float(alarm), float(stop))
 
@@ -277,8 +280,11 @@ def table(limits: Limits, driven: Sequence[tuple[Course, Drive]]) -> str:
 
     def add(name: str, before: np.ndarray, without: np.ndarray) -> None:
         alarms = np.concatenate([before, without]) >= ALARM
-        figures = [f"{100 * values.mean():.0f} %" if len(values) else "" for values in (before >= ALARM, alarms)]
-        rows.append(row(name, len(before), *figures, len(without), f"{100 * (without >= ALARM).mean():.1f} %"))
+        foretold, at_random, false = (
+            f"{100 * values.mean():.{digits}f} %" if len(values) else ""
+            for values, digits in ((before >= ALARM, 0), (alarms, 0), (without >= ALARM, 1))
+        )
+        rows.append(row(name, len(before), foretold, at_random, len(without), false))
 
     for kind in CONDITIONS:
         total.append(risks(found, kind, lambda part: limits.risk(part.signs, part.blind)))

@@ -188,6 +188,8 @@ def main(argv: list[str] | None = None) -> int:
     model, points = options.folder / "model.pt", [read_road(file) for file in options.road]
     trained, epochs, rate, begin = model, EPOCHS, LEARNING_RATE, tuple[str | Path, ...]()
     if start := options.start:
+        if start.resolve() == model.resolve():
+            parser.error(f"--from {start}: the mean is written there; copy the file first, or name another --folder")
         load_model(start)  # before all is rendered
         trained, epochs, rate = options.folder / "trained-on" / "model.pt", EPOCHS_ON, LEARNING_RATE_ON
         begin = ("--from", start)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from cloning.base.cores import threads as threads  # re-exported
+from cloning.base.errors import UserError
 
 DEVICES = ("auto", "cpu", "cuda", "mps")  # cuda: an NVIDIA GPU; mps: Apple's
 
@@ -26,10 +27,13 @@ def is_available(name: str) -> bool:
 def choose_device(name: str) -> torch.device:
     """Return the device of this name, one of the DEVICES; with several NVIDIA GPUs, the one of this rank.
 
-    auto: a GPU if there is one, else the CPU.
+    auto: a GPU if there is one, else the CPU. Several processes can't share Apple's. Raises UserError if they are to.
     """
+    together = int(os.environ.get("WORLD_SIZE", 1)) > 1
     if name == "auto":
-        name = next((gpu for gpu in ("cuda", "mps") if is_available(gpu)), "cpu")
+        name = next((gpu for gpu in ("cuda", *["mps"] * (not together)) if is_available(gpu)), "cpu")
+    if name == "mps" and together:
+        raise UserError("--device mps: several processes can't share Apple's GPU; start one, without torchrun")
     if name == "cuda":
         name = f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
     return torch.device(name)

@@ -37,7 +37,7 @@ from cloning.network.network import (
     save_model,
     versions,
 )
-from cloning.network.tensors import matching, shown
+from cloning.network.tensors import MAX_SIZE, MAX_STRUCTURE, matching, shown
 from cloning.recordings.format import BINS
 from cloning.training.observations import Observations
 from cloning.training.optimizers import Adam
@@ -257,7 +257,16 @@ class Checkpoint:
     """Writes the model files of a run, and restores the run from them."""
 
     def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data_fingerprint: str):
-        """network, optimizer: whose state is saved and restored; data_fingerprint: of `fingerprint`."""
+        """network, optimizer: whose state is saved and restored; data_fingerprint: of `fingerprint`.
+
+        Raises ModelError for a network that can't be saved whole.
+        """
+        averages = [optimizer.zeros(index).values() for index in range(len(optimizer.parameters))]
+        size = sum(tensor.nbytes for tensor in itertools.chain(network.state_dict().values(), *averages))
+        if size > MAX_SIZE - MAX_STRUCTURE:
+            raise ModelError(f"the network's weights and their averages take {size:,} bytes, too many for a file")
+        if next(network.buffers(), None) is not None:  # the copies that compute the gradients have their own
+            raise ModelError("a network with batch normalization, or other buffers, can't be trained here")
         self.run, self.process, self.network, self.optimizer = run, process, network, optimizer
         self.files, self.fingerprint = RunFiles(process.output), data_fingerprint
         self.resumed = False  # whether `restore` found a state of this run

@@ -155,7 +155,7 @@ class Observations(Table):
         used, read = list[np.ndarray](), list[Callable[[], np.ndarray]]()
         for index, recording in enumerate(self.recordings):
             mine = self.recording == index
-            rows = np.unique(np.concatenate([self.row[mine], self.lanes.earlier[mine]]))
+            rows = np.unique(np.concatenate([self.row[mine], self.lanes.earlier[mine & self.lanes.known]]))
             images, first = np.unique(recording.images[rows], return_index=True)
             used.append(np.isin(np.arange(len(recording.names)), images))
             for row, camera in zip(rows[first // len(CAMERAS)], first % len(CAMERAS), strict=True):

@@ -38,6 +38,7 @@ class Augmentation(NamedTuple):
     share: float | str = 1.0  # of the observations that have it, 0..1, or the name of the recipe's field that says it
     mirrors: bool = False  # whether it begins with the mirrored image, and the negative label
     caption: str = ""  # of the diagnostic picture: a format for the choices, such as "brightness x {:.2f}"
+    gpu: bool = False  # whether `change` also changes tensors, which are in a GPU's memory
 
 
 class Words(NamedTuple):
@@ -145,6 +146,10 @@ class Recipe:
             elif type(found) is not type(own):
                 raise ValueError(f"its {option_name(name)} is of type {type(found).__name__}")
         return replace(self, **figures)
+
+    def on_gpu(self) -> bool:
+        """Return whether a GPU can make the images; foul weather, and changes that take arrays alone, need the CPU."""
+        return not self.disturbed and all(each.gpu or each.change is unchanged for each in self.augmentations)
 
     def shares(self) -> list[float]:
         """Return the share of the observations that have an image of each augmentation, 0..1."""
