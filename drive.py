@@ -336,7 +336,7 @@ def main() -> int:
     if arguments.stop_when_lost and not limits:
         raise UserError(
             f"{limits_file(model)}: no such file for this network, so nothing tells when it is lost; "
-            f"`python -m tools.foretell {model}` makes it, or leave out --stop-when-lost"
+            f"`python -m tools.foretell {model}`, in a clone of the project, makes it, or leave out --stop-when-lost"
         )
     if arguments.folder:
         saved_frames.check_folder(arguments.folder)

@@ -153,11 +153,13 @@ def _add_replay(commands: "Subparsers") -> None:
     add("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
     text = (
         "distance in m from the lane centre at which a human would take over; each limit is a drive of its own "
-        "(default 1, as in NVIDIA's evaluation, and 2.5, where the side of the car is on the edge line)"
+        "(default 1, as in NVIDIA's evaluation, and 2.5, where on the lake the side of the car is on the edge line)"
     )
     metres = number(float, 0.01, 1000)
     add("--limit", type=metres, nargs="+", default=LIMITS, dest="limits", metavar="LIMIT", help=text)
-    text = "measure offsets from the lane centre, estimated from the frames (default), or from the human driver's path"
+    text = (
+        "measure offsets from the lane centre (default), which lane.csv tells or the frames, or from the human's path"
+    )
     add("--reference", choices=("lane", "human"), default="lane", help=text)
     add("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
     text = "plot lateral offset and steering over time; of several recordings, FILE-RECORDING.png each"

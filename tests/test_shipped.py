@@ -22,7 +22,7 @@ from tools.shipped import FIRST_LOOK, Lap, drive_lap, laps, render, repeat
 
 
 def test_what_is_left_to_measure_with_is_not_trained_on():
-    chosen, taught = laps(101, 100, {"road": 1000, "mountain": 1000}), scenes(101, {"road": 101, "mountain": 101}, 10)
+    chosen, taught = laps(101, 100, {"road": 1000, "mountain": 1000}), scenes(101, {"road": 210, "mountain": 300}, 10)
     for rendered in (chosen, taught):
         assert all(int(str(lap.track).partition("-")[2] or FIRST_ROAD) >= FIRST_ROAD for lap in rendered)
     assert {lap.look % SHADOWED for lap in chosen}.isdisjoint(range(1, FIRST_LOOK))

@@ -1,4 +1,4 @@
-"""Record, train and drive in the stand-in simulator, and show the result in a report: five minutes on two cores.
+"""Record, train and drive in the stand-in simulator, and show the result in a report: 4 to 8 minutes on 2 cores.
 
     make demo                                          # installs what is needed first
     python -m tools.demo                               # the same in an environment that has it

@@ -38,16 +38,17 @@ from simulator.car import STEP
 from simulator.record import record
 from tools.lane_frames import RenderedScene, render_all, shadowed
 
-UNSEEN_LOOKS = (1000, 1001, 1002)  # the network was not trained on them, nor on these roads
+UNSEEN_LOOKS = (998, 999, 1000)  # no network was trained on looks from 101 to 1000, nor on these roads
 UNSEEN_ROADS = tuple(f"road-{k}" for k in range(1, 9))
 FIRST_EDGES, EDGES_SECONDS, EDGES_SPEEDS = 201, 27, (15, 25)  # number of the first road, length of a drive, mph
+EDGES_LOOK = 700  # more than the road's number
 NEAR = 0.3  # m: a reading no further from the truth is good
 
 
 def unseen_courses() -> dict[str, list[tuple[str, int]]]:
     """Return courses by name, each with its tracks and looks."""
     courses = {name: [(name, look) for look in UNSEEN_LOOKS] for name in ROADS}
-    courses["roads"] = [(road, 1000 + k) for k, road in enumerate(UNSEEN_ROADS)]
+    courses["roads"] = [(road, 990 + k) for k, road in enumerate(UNSEEN_ROADS)]
     shadows = {f"{name}, shadows": [(road, shadowed(look)) for road, look in some] for name, some in courses.items()}
     return courses | shadows
 
@@ -98,7 +99,8 @@ def measure_edges(network: LaneNetwork, roads: int) -> None:
     found = defaultdict(list)
     courses = [(course, k) for course in COURSES for k in range(FIRST_EDGES, FIRST_EDGES + roads)]
     for (course, k), speed in itertools.product(courses, EDGES_SPEEDS):
-        road, look, direction = generate(f"{course}-{k}"), k if k % 2 else shadowed(k), ("ccw", "cw")[k // 2 % 2]
+        road, look, direction = generate(f"{course}-{k}"), EDGES_LOOK + k, ("ccw", "cw")[k // 2 % 2]
+        look = look if k % 2 else shadowed(look)
         assert road  # of a name that generates one
         track = Track(road, direction)
         laps = EDGES_SECONDS * speed * MPH / track.length

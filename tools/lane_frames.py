@@ -25,6 +25,7 @@ from simulator.world import Scene
 
 FRAME_SHARES = {"lake": 1, "jungle": 2}  # relative: hills and narrow bends are harder
 FIRST_ROAD = 1001  # the first generated road that networks are trained on
+LOOKS = 101  # in which generated roads are rendered, from 0 on
 MAX_OFFSET, MAX_YAW = 3.5, 15.0  # m and degrees: lateral offset and heading error
 
 
@@ -50,8 +51,8 @@ def scenes(looks: int, number_of: dict[str, int], frames: int) -> list[RenderedS
     """Return what the lane network is trained on: both tracks in so many looks, and generated roads.
 
     Each look of a track comes without and with shadows; every second road has shadows. number_of: generated roads of
-    each kind; frames: of a scene, times the track's share. Look 0, which resembles the real simulator, gets three times
-    as many.
+    each kind, in LOOKS looks; frames: of a scene, times the track's share. Look 0, which resembles the real simulator,
+    gets three times as many.
     """
     tracks = [
         RenderedScene(track, twin, frames * share * (1 if look else 3))
@@ -60,7 +61,7 @@ def scenes(looks: int, number_of: dict[str, int], frames: int) -> list[RenderedS
         for twin in (look, shadowed(look))
     ]
     return tracks + [
-        RenderedScene(f"{kind}-{FIRST_ROAD + k}", every_second_shadowed(k), frames)
+        RenderedScene(f"{kind}-{FIRST_ROAD + k}", every_second_shadowed(k % LOOKS), frames)
         for kind, roads in number_of.items()
         for k in range(roads)
     ]

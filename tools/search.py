@@ -8,7 +8,8 @@
 A road has 7 or 8 nodes, 10 to 25 m apart, with a turn at each, through which a Catmull-Rom spline goes. A driver
 fails if a wheel leaves the road, or the car does not arrive at its end in time. Evolution keeps the roads on which the
 car came farthest from the lane's centre, and changes the turns and distances of some of their nodes. The same options
-find the same roads, on any number of processes. Each failure is driven again, and must be the same to the last digit.
+find the same roads, on any number of processes; another kind of processor rounds otherwise. Each failure is driven
+again, and must be the same to the last digit.
 
 The folder gets a file for each failure, which `--road` of `python -m simulator` takes; search.json, with what was
 printed; and failures.png: the roads from above, and where the car left them.

@@ -67,8 +67,11 @@ FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
     "batch_size": (number(int, 1, MAX_BATCH), "observations in a batch; each gives 3.7 images on average"),
     "learning_rate": (number(float, 1e-9, 10), "learning rate of Adam or, with --robust, of Muon"),
     "samples_per_epoch": (count, "smallest number of images in an epoch; a fifth as many observations validate it"),
-    "throttle_threshold": (any_number, "drop rows with less throttle, 0 to 1"),
-    "side_correction": (any_number, "steering added to the label of left images, subtracted from that of right ones"),
+    "throttle_threshold": (any_number, "without --robust: drop rows with less throttle, 0 to 1"),
+    "side_correction": (
+        any_number,
+        "without --robust: steering added to the label of left images, subtracted from right ones'",
+    ),
     "repeats": (number(int, 1, MAX_REPEATS), COPIES),
     "disturbed": (number(float, 0, 1), "with --robust: share of the images in foul weather, or of a faulty camera"),
 }

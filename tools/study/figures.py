@@ -40,6 +40,13 @@ DRIVING = {
     "departures_per_km": "departures per km",
     "offset_mean": "mean distance from the lane's centre",
 }
+INTRODUCTION = """Made by `python -m tools.study`. How, and what follows from it, is in [the
+report](../../writeup_report.md#does-the-loss-tell-how-it-drives). Each network's errors are those against the human
+driver on the recording of its track that it did not see, its replays are of that recording, and its laps are driven in
+the stand-in simulator. *mse*: mean squared error; *whiteness*: root mean square of the steering's change per second;
+*drift*: how far from the driver's path the car is after 2 s. A network is named by its recipe, or by what differs from
+the report's: *centre camera*, no images of the side cameras; *shifts* and *rotations*, images seen from beside the
+lane's centre, or turned."""
 EQUALS = 0.01  # departures per km that a metre of mean distance counts: less than one departure in a lap
 COLOURS = dict.fromkeys(LOSSES, "tab:orange") | dict.fromkeys(REPLAYS, "tab:blue")
 
@@ -98,7 +105,7 @@ def correlations(rows: Sequence[Row], driving: str) -> dict[str, tuple[float, fl
 
 def report(rows: Sequence[Row]) -> str:
     """Return study.md: the correlations on each track, the recovery, and all networks."""
-    lines = ["# Does the loss tell how a network drives?", "", "Made by `python -m tools.study`."]
+    lines = ["# Does the loss tell how a network drives?", "", INTRODUCTION]
     compared = {title: part for title, part in groups(rows).items() if len(part) > 2}
     for name, words in DRIVING.items():
         found = [correlations(part, name) for part in compared.values()]
