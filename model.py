@@ -52,7 +52,7 @@ from cloning.training.light import brighten, choose_brightness, choose_shadow, s
 from cloning.training.observations import CameraViews, Choices, Observations, centre_images
 from cloning.training.optimizers import OPTIMIZERS
 from cloning.training.options import Command, Process, Run
-from cloning.training.pictures import batch_pictures, loss_picture
+from cloning.training.pictures import batch_pictures, write_losses
 from cloning.training.pieces import Batch, SquaredErrors, predict, start_batch
 from cloning.training.recipe import Augmentation, Recipe, Words
 from cloning.training.robust import robust
@@ -81,6 +81,7 @@ def read_observations(recipe: Recipe, folders: list[Path], strict: bool) -> Obse
     print(summary.recordings_table(counts, recipe.words.dropped.format(recipe=recipe)))
     if strict:
         summary.refuse_rejected(observations.recordings)
+    summary.tell_of_twins(observations)
     if len(observations) < recipe.folds:
         raise RecordingError(rows.too_few(recipe.folds, recipe.words.too_few))
     return observations
@@ -305,8 +306,7 @@ class TrainingRun:
             progress.seconds += time.monotonic() - started
             is_best = progress.finish_epoch(*figures, self.recipe.best_by)
             if self.ranks.first:  # first: a run killed before `save` repeats this
-                write(self.files.log, summary.history_csv(history))
-                write(self.files.losses, loss_picture(history, self.recipe.dropout))
+                write_losses(self.files, history, self.recipe.dropout)
             self.save(self.files.last, *[self.files.best] * is_best)
             if self.ranks.first:
                 print(summary.epoch_line(history[-1]), flush=True)
@@ -394,7 +394,7 @@ class TrainingRun:
 def prepare(command: Command) -> Prepared:
     """Read the data of the run that a command is about. Raises UserError, OSError."""
     run, begin = resumed(command)
-    folders = find_folders(run.recordings, exact=isinstance(begin, SavedRun))
+    folders = find_folders(run.recordings, exact=isinstance(begin, SavedRun) and "recordings" not in command.given)
     run = replace(run, recordings=tuple(str(folder.absolute()) for folder in folders))
     observations = read_observations(run.recipe, folders, command.process.strict)
     train, validation = split(observations, run.recipe, run.seed)

@@ -348,6 +348,8 @@ def run_window(arguments: argparse.Namespace) -> int:
         opened.run()
     finally:
         opened.finish()
+    if opened.failed:
+        raise opened.failed
     raise KeyboardInterrupt  # panda3d has caught it: every other end is a SystemExit
 
 

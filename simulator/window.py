@@ -13,7 +13,7 @@ from direct.showbase.ShowBase import ShowBase
 from direct.task.Task import Task
 from panda3d import core
 
-from cloning.base.errors import SimulatorError
+from cloning.base.errors import SimulatorError, UserError
 from cloning.base.frame import FRAME
 from cloning.recordings.writer import RecordingWriter, SampleClock, check_name_of_corrections
 from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
@@ -113,6 +113,7 @@ class Window(ShowBase):
         self.cameras = Cameras(self.scene, disturbance=disturbance)
         self.controls, self.gamepad = Controls(), Gamepad()
         self.remote: RemoteDriver | None = None
+        self.failed: UserError | None = None  # what has ended the window
         self.by_hand = not server  # whether the person drove before the last frame
         self.started = bool(server)  # until somebody drives, the car stands still, also on a slope
         if server:
@@ -201,7 +202,16 @@ class Window(ShowBase):
         return None
 
     def tick(self, task: Task) -> int:
-        """Simulate the time since the last frame and show the result; panda3d calls this before each frame."""
+        """Call `advance` before each frame; panda3d calls this, and would print the traceback of an error."""
+        try:
+            self.advance()
+        except UserError as error:
+            self.failed = error
+            self.task_mgr.stop()
+        return int(task.done if self.failed else task.cont)
+
+    def advance(self) -> None:
+        """Simulate the time since the last frame and show the result. Raises UserError."""
         now = time.monotonic()
         held, mouse, pad = self.held(), self.mouse(), self.gamepad.read()
         by_hand = not self.remote or balance(held, "up", "down") != 0
@@ -236,7 +246,6 @@ class Window(ShowBase):
             )
         self.departures = len(self.simulation.departures)
         self.show(by_hand)
-        return int(task.cont)
 
     def begin_drive(self) -> None:
         """Let what is recorded from now on be a drive of its own."""
@@ -257,8 +266,11 @@ class Window(ShowBase):
 
     def do_jump(self) -> None:
         """Set the car back to the saved position."""
-        self.simulation.s = self.saved[0]
-        self.simulation.set_back(self.saved[1])
+        run, length = self.simulation, self.simulation.track.length
+        begin = run.s - run.travelled  # of the laps
+        run.s, run.at_end = self.saved[0], False
+        run.travelled = run.laps * length + (run.s - begin) % length
+        run.set_back(self.saved[1])
 
     def do_view(self) -> None:
         """Switch between the chase view and the bonnet view."""

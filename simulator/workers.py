@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from multiprocessing.context import BaseContext
 from typing import TypeVar
@@ -22,6 +22,7 @@ from cloning.base.errors import SimulatorError, UserError
 from cloning.base.processes import interrupt_deferred
 from cloning.base.progress import progress_bar
 
+MOST_ON_WINDOWS = 61  # processes for whose ends it can wait
 WAIT = 30.0  # s for a worker of Dask's to come; its scheduler is waited for as long
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -48,6 +49,8 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
         if scheduler:
             yield _dask(scheduler, stack)
             return
+        if sys.platform == "win32":
+            processes = min(processes, MOST_ON_WINDOWS)
         others = multiprocessing.active_children()
         with interrupt_deferred():
             pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
@@ -73,8 +76,15 @@ def results(pool: Executor, work: Callable[[Item], Result], items: Iterable[Item
     As `pool.map`, but for Ctrl-C: that would cancel what runs, and Python 3.11 fails on it when its processes end.
     """
     coming = [pool.submit(work, item) for item in items]
-    done = (each.result() for each in coming)
+    done = map(_result, coming)
     return progress_bar(len(coming), unit, iterable=done) if unit else done
+
+
+def _result(future: Future[Result]) -> Result:
+    """Return a result once it is there; on Windows, Ctrl-C has its effect only between two short waits."""
+    while not wait([future], 0.2).done:
+        pass
+    return future.result()
 
 
 def _context() -> BaseContext:

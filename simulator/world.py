@@ -2,6 +2,7 @@
 
 import functools
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -33,13 +34,15 @@ def configure_engine() -> None:
     """Set up panda3d for this process, before it makes anything; simulated cars and rendered scenes call this.
 
     The transform cache is off, because it replaces transforms by nearly equal earlier ones: a frame would depend on the
-    frames before it. Bounds are boxes, because spheres around flat cells reach into views that do not show them.
+    frames before it. Bounds are boxes, because spheres around flat cells reach into views that do not show them. On
+    macOS the software renderer, which the cameras use, has no window.
     """
+    window = "pandagl" if sys.platform == "darwin" else "p3tinydisplay"
     core.load_prc_file_data(
         "",
         "window-type none\naudio-library-name null\nsync-video false\nprint-pipe-types false\n"
         "notify-level-display error\nnotify-level-device fatal\n"
-        "load-display p3tinydisplay\nuniquify-transforms false\ntransform-cache false\nbounds-type box\n",
+        f"load-display {window}\nuniquify-transforms false\ntransform-cache false\nbounds-type box\n",
     )
 
 

@@ -183,6 +183,12 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
     best = load_checkpoint(finished[1] / "model-best.pt")["history"]
     least = {"epoch": len(best), "by": "val_loss", "value": best[-1]["val_loss"]}
     assert found["best"] == least, "too few rows to drift"
+    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    begun = (folder / "training_arguments.json").stat().st_mtime
+    (folder / "report.html").write_text("", encoding="utf-8")
+    for later, has_report in ((-1, False), (1, True)):  # the first one is of an earlier run
+        os.utime(folder / "report.html", (begun + later, begun + later))
+        assert runs.overview(RunFiles(str(folder / "model.pt")))["has_report"] is has_report
     files = written_run(tmp_path / "old", finished=4, images=0, losses=(0.5, float("nan"), 0.3))
     files.progress.unlink()
     found = runs.overview(files)

@@ -52,6 +52,24 @@ def test_a_link_stays_and_a_pipe_is_not_replaced(tmp_path):
         check_folders(str(pipe))
 
 
+def test_on_windows_a_program_that_has_the_file_open_for_a_moment_is_waited_for(tmp_path, monkeypatch):
+    replace, tries = os.replace, list[str]()
+
+    def held_at_first(old, new):
+        tries.append(str(new))
+        if len(tries) < 3:
+            raise PermissionError(errno.EACCES, "Access is denied", str(old))
+        replace(old, new)
+
+    monkeypatch.setattr(os, "replace", held_at_first)
+    with pytest.raises(PermissionError):
+        write(tmp_path / "file", b"new")
+    monkeypatch.setattr("sys.platform", "win32")
+    tries.clear()
+    write(tmp_path / "file", b"new")
+    assert (tmp_path / "file").read_bytes() == b"new" and len(tries) == 3
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, RuntimeError, ValueError])
 def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path, error):
     path = tmp_path / "film.mp4"

@@ -17,6 +17,7 @@ from browser import LOOKS, needs_chromium
 from commands import ROOT, log
 from matplotlib.figure import Figure
 from PIL import Image
+from rendered import render_recording
 
 from cloning.base.errors import UserError
 from cloning.base.files import csv_bytes
@@ -194,7 +195,8 @@ def test_what_cannot_be_shown_of_the_recordings_is_named_and_those_with_the_same
 def test_a_recording_is_said_to_be_held_out_only_if_all_that_the_network_learned_from_is_known(
     written, sample_recording, tmp_path
 ):
-    copy, other = (shutil.copytree(each, tmp_path / each.name) for each in (written, sample_recording))
+    copy, same = (shutil.copytree(each, tmp_path / each.name) for each in (written, sample_recording))
+    other = render_recording(tmp_path / "other", rows=60, seed=1)
     arguments = json.loads((copy / "training_arguments.json").read_bytes())
     unsure = "it may have been trained on"
     for run, words in ({}, "was held out"), ({"from_model": "a.pt"}, unsure), ({"recordings": ["moved"]}, unsure):
@@ -202,6 +204,21 @@ def test_a_recording_is_said_to_be_held_out_only_if_all_that_the_network_learned
         found = Report(copy)
         found.replay([other])
         assert [each["which"] for each in found.replays] == [words]
+    found = Report(written)
+    found.replay([same])
+    assert [each["which"] for each in found.replays] == ["it was trained on"], "as a copy of it was"
+
+
+def test_the_report_is_of_the_network_whose_figures_it_has(written, tmp_path):
+    """The last run of the folder, which may have written another file than model.pt."""
+    copy = shutil.copytree(written, tmp_path / "run")
+    for name in ("model", "model-best"):
+        (copy / f"{name}.pt").rename(copy / f"{name.replace('model', 'robust')}.pt")
+    arguments = json.loads((copy / "training_arguments.json").read_bytes())
+    (copy / "training_arguments.json").write_text(json.dumps(arguments | {"output": str(copy / "robust.pt")}))
+    found = Report(copy)
+    assert found.model == copy / "robust-best.pt"
+    assert not any(str(copy / "model.pt") in command for _, command in found.next_steps())
 
 
 @needs_chromium

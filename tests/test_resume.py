@@ -203,6 +203,30 @@ def test_a_finished_run_that_is_resumed_says_how_to_train_on(begun):
     assert same(weights(begun / "model.pt"), before)
 
 
+def test_a_run_that_is_resumed_has_its_own_losses_again(begun):
+    """A run in the same folder may have replaced them before its models were moved back."""
+    before = (begun / "training_log.csv").read_bytes()
+    (begun / "training_log.csv").write_bytes(before.replace(b"\n1,", b"\n9,"))
+    (begun / "training_loss.png").unlink()
+    assert run_here("--output", begun / "model.pt", "--resume").returncode == 0
+    assert (begun / "training_log.csv").read_bytes() == before and (begun / "training_loss.png").exists()
+
+
+def test_a_recording_and_one_below_it_are_found_again(sample_recording, tmp_path):
+    data, below = shutil.copytree(sample_recording, tmp_path / "data"), tmp_path / "data" / "lake"
+    for folder, seed in ((below, 1), (data / "later", 2)):
+        render_recording(folder, rows=20, seed=seed)
+        command = (data, *TINY, "--epochs", seed, "--output", tmp_path / "model.pt", "--resume")
+        done = run_here(*command)
+        if folder == below:
+            assert done.returncode == 0 and "data/lake" in done.stdout, "both"
+            assert run_here("--output", tmp_path / "model.pt", "--resume", "--epochs", 1).returncode == 0
+            assert run_here(*command).returncode == 0
+        else:
+            assert done.returncode == 2 and "the run began with other recordings" in done.stderr
+            assert run_here("--output", tmp_path / "model.pt", "--resume").returncode == 0, "those of the run"
+
+
 @pytest.mark.parametrize("missing", [False, True])
 def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording, missing):
     """All files of a run get the same ending, also if one of them was missing."""
@@ -313,7 +337,7 @@ def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkey
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device", "disk")])
-@pytest.mark.parametrize("function, advice", [("fingerprint", "start the run again"), ("loss_picture", "--resume")])
+@pytest.mark.parametrize("function, advice", [("fingerprint", "start the run again"), ("write_losses", "--resume")])
 def test_resume_is_recommended_only_once_the_new_run_has_a_state(
     begun, sample_recording, monkeypatch, error, function, advice
 ):

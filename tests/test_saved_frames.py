@@ -33,6 +33,7 @@ def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
     folder.mkdir()
     (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
     (folder / frames.DRIVEN).write_bytes(b"old")
+    (folder / ".DS_Store").write_bytes(b"macOS's")  # of somebody who has looked into it
     frames.empty_folder(folder)
     assert list(folder.iterdir()) == []
     for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "center_2018_07_16_17_11_43_382.jpg"):

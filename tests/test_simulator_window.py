@@ -10,17 +10,19 @@ import sys
 import time
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from commands import ROOT
 from drive_process import awaited
 from panda3d.core import GamepadButton, InputDevice
 
+from cloning.base.errors import RecordingError
 from cloning.road.motion import FULL_LOCK, MPH, WHEELBASE
 from cloning.road.track import Track
 from simulator.controls import Controls, Sticks
 from simulator.run import Run
-from simulator.window import STRAIGHT, Gamepad
+from simulator.window import STRAIGHT, Gamepad, Window
 
 
 def test_at_rest_keys_steer_a_twentieth_a_step_and_let_go_as_fast():
@@ -283,6 +285,27 @@ def test_the_window_is_driven_and_records(screen, tmp_path, drives, status):
         assert folder.exists() == drives
     finally:
         window.kill()
+
+
+def test_an_error_ends_the_window_without_panda3ds_traceback():
+    error, stopped = RecordingError("driven: exists already"), list[bool]()
+    window: Any = SimpleNamespace(failed=None, advance=Mock(side_effect=error))
+    window.task_mgr = SimpleNamespace(stop=lambda: stopped.append(True))
+    task: Any = SimpleNamespace(done=0, cont=1)
+    assert Window.tick(window, task) == task.done
+    assert window.failed is error and stopped == [True]
+
+
+def test_a_jump_back_does_not_count_as_driven():
+    """Nor does one to a place before the lap's start count as a lap."""
+    window: Any = SimpleNamespace(simulation=Run(Track("lake")), saved=(5.0, 0.0))
+    run, length = window.simulation, window.simulation.track.length
+    run.s = run.travelled = 0.95 * length
+    Window.do_jump(window)
+    assert (run.laps, run.s, run.travelled) == (0, 5, 5)
+    window.saved = (0.5 * length, 0.0)
+    Window.do_jump(window)
+    assert run.travelled == pytest.approx(0.5 * length)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux names its screen in $DISPLAY")

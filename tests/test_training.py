@@ -228,6 +228,15 @@ def test_wrong_arguments_are_refused_before_anything_is_written(linked, tmp_path
     assert {path for path in tmp_path.rglob("*") if linked not in path.parents} == {linked.parent, linked}
 
 
+def test_frames_that_are_in_two_recordings_are_told(sample_recording, tmp_path, capsys):
+    """As those of a part that was exported: what is cut from one stays in the other."""
+    part = shutil.copytree(sample_recording, tmp_path / "part")
+    model.read_observations(REPORT, [sample_recording, part], False)
+    assert "54 frames are in more than one of these recordings" in capsys.readouterr().out
+    model.read_observations(REPORT, [sample_recording], False)
+    assert "more than one" not in capsys.readouterr().out
+
+
 def test_several_processes_leave_apples_gpu_alone(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """Run a command of the Python interpreter in a process of its own; options: of `subprocess.run`."""
-    return subprocess.run([sys.executable, *map(str, words)], encoding="utf-8", **options)
+    return subprocess.run([sys.executable, *map(str, words)], encoding="utf-8", errors="replace", **options)
 
 
 def row(*cells: object) -> str:
@@ -34,7 +34,7 @@ class ServerProcess:
     def __init__(self, *command: str | Path):
         """Run Python with these arguments until it listens; what it prints later is lost. Raises UserError."""
         self.process = subprocess.Popen(
-            [sys.executable, *map(str, command)], stderr=subprocess.PIPE, text=True, encoding="utf-8"
+            [sys.executable, *map(str, command)], stderr=subprocess.PIPE, encoding="utf-8", errors="replace"
         )
         assert self.process.stderr
         printed = []

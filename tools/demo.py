@@ -115,7 +115,7 @@ def drive(lap: Drive) -> None:
                 raise SimulatorError(f"{lap.title}: {done.stderr.strip()}; start the demo again to continue")
             lap.picture.parent.mkdir(exist_ok=True)
             for kind, file in files.items():
-                file.rename(lap.picture.with_suffix(f".{kind}"))
+                file.replace(lap.picture.with_suffix(f".{kind}"))
     print(f"{lap.title}: {lap_in_words(lap.report())}", flush=True)
 
 

@@ -12,12 +12,14 @@ import os
 import re
 import secrets
 import shutil
+import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 TEMPORARY_NAME = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part")
+HELD_OPEN = 3.0  # s for which another program may have a file open
 LEFT_BEHIND = 86_400.0  # s: the temporary file of a process that still writes is not so old
 
 
@@ -44,7 +46,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         if temporary.exists():
-            os.replace(temporary, target)
+            _rename(temporary, target, os.replace)
     except BaseException as error:
         with suppress(OSError):  # the first error matters more
             temporary.unlink(missing_ok=True)
@@ -52,6 +54,18 @@ def written_whole(path: str | Path) -> Iterator[Path]:
             reason = error.strerror or str(error)  # NumPy's OSError has a message but no errno
             raise OSError(error.errno or errno.EIO, reason, str(path)) from error
         raise
+
+
+def _rename(old: Path, new: Path, rename: Callable[[Path, Path], None]) -> None:
+    """Rename a file or folder; on Windows, wait for programs that have it open for a moment, as virus scanners do."""
+    until = time.monotonic() + (HELD_OPEN if sys.platform == "win32" else 0.0)
+    while True:
+        try:
+            return rename(old, new)
+        except PermissionError:
+            if time.monotonic() >= until:
+                raise
+        time.sleep(0.05)
 
 
 def _temporary(path: Path) -> Path:
@@ -85,7 +99,7 @@ def folder_written_whole(path: str | Path) -> Iterator[Path]:
     try:
         temporary.mkdir()
         yield temporary
-        os.rename(temporary, path)
+        _rename(temporary, path, os.rename)
     except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
         if isinstance(error, OSError) and error.filename and str(error.filename).startswith(str(temporary)):

@@ -47,6 +47,6 @@ class Attention:
             pickle.dump((jpeg, model), self.process.stdin)
             self.process.stdin.flush()
             return pickle.load(self.process.stdout)
-        except (BrokenPipeError, EOFError, pickle.UnpicklingError):
+        except (OSError, EOFError, pickle.UnpicklingError):  # Windows has other errors than BrokenPipeError
             self.process.wait()
             return None

@@ -119,7 +119,7 @@ def overview(files: RunFiles) -> dict[str, Any]:
         "trail": _trail(progress, finished + min(1.0, images / samples)),
         "best": _best(history, options.get("best_by") or ("val_loss" if robust else "val_drift")),
         "options": _flat(options),
-        "has_report": files.report.is_file(),
+        "has_report": files.report.is_file() and files.report.stat().st_mtime >= files.arguments.stat().st_mtime,
         "pictures": _pictures(files, progress["batches"] * options["batch_size"] if progress else math.inf),
     }
 

@@ -22,6 +22,7 @@ from cloning.recordings.format import parse_time_stamp, time_stamp
 # The prefix is that of a recording's centre frames, which video.py films, too.
 FRAME_NAME = re.compile(r"(?:center_)?(\d{4}(?:_\d\d){5}_\d{3})\.jpg")
 DRIVEN = "driven.csv"
+LEFT_BY_FILE_MANAGERS = (".DS_Store", "Thumbs.db", "desktop.ini")  # when somebody looks into a folder
 DRIVEN_COLUMNS = ("frame", "steering", "throttle", "speed (mph)")
 MAX_QUEUED = 2000  # frames, about 30 MB; with more waiting in memory, driving waits for the disk
 Jobs = queue.Queue[Callable[[], None] | None]  # what the saving thread does next; None ends it
@@ -44,7 +45,7 @@ def check_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise UserError(f"{folder}: not a folder; name a folder for the frames")
     for entry in folder.iterdir():
-        if entry.name == DRIVEN:
+        if entry.name in (DRIVEN, *LEFT_BY_FILE_MANAGERS):
             continue
         temporary = TEMPORARY_NAME.fullmatch(entry.name)  # of a frame that a killed process was writing
         name = temporary[1] if temporary else entry.name

@@ -1,5 +1,7 @@
 """The driver of a replay that is a model in this process."""
 
+import copy
+
 from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
 from cloning.network.network import Network, load_model, steer
@@ -12,6 +14,8 @@ class ModelDriver:
     def __init__(self, model: str | Network):
         """Load the model; model: its file, or the network itself. Raises ModelError."""
         self.network = load_model(model) if isinstance(model, str) else model
+        if next(self.network.parameters()).device.type == "mps":  # which threads can't share: torch ends the process
+            self.network = copy.deepcopy(self.network).cpu()
         top, bottom = self.network.crop
         self.rows = slice(top, FRAME[0] - bottom)  # of a frame, which the network sees
 

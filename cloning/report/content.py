@@ -88,14 +88,15 @@ class Report:
         """Read a run; laps: pictures to show. Raises UserError, OSError."""
         files = RunFiles(str(folder / "model.pt"))
         self.run, self.name = overview(files), folder.resolve().name
+        arguments = json.loads(files.arguments.read_bytes())
+        files = RunFiles(str(folder / Path(str(arguments.get("output", files.last))).name))  # the last run's here
         self.model = files.best if files.best.exists() else files.last
         if not self.run["best"] or not self.model.exists():
             why = "no epoch is finished with a loss that is a number"
             raise UserError(f"{folder}: {why}, so there is nothing to report; let model.py go on, or train again")
         one_thread()  # as drive.py does; replays run at the same time
         self.network = load_model(self.model)
-        self.arguments = files.arguments
-        arguments = json.loads(self.arguments.read_bytes())
+        self.output, self.arguments = files.last, files.arguments
         self.recipe, self.labels = arguments.get("recipe"), arguments.get("training", {}).get("labels")
         self.laps = [Lap.of(picture, FILMS // len(laps)) for picture in laps]
         numbers = self.run["pictures"]
@@ -105,6 +106,7 @@ class Report:
         ]
         self.recordings: list[dict[str, Any]] = []
         self.missing: list[str] = []  # why recordings are not shown
+        self.trained_on = set[int]()  # digests of the centre images that the network was given
         self.looked_at: Recording | None = None  # the recording whose frames are shown
         for name in self.run["recordings"]:
             with self._noting_what_is_missing():
@@ -130,6 +132,7 @@ class Report:
             raise RecordingError(f"{folder}: no usable row is left")
         figures = summary.figures(recording, np.zeros(len(recording), bool))
         cut = sum(rows for _, rows in recording.cuts)
+        self.trained_on.update(recording.digests[recording.images[:, 0]].tolist())
         self.recordings.append({**figures, "folder": folder, "cut_frames": cut})
         self.looked_at = self.looked_at or recording
 
@@ -159,7 +162,7 @@ class Report:
                 (caption, frame_uri(captioned(frame.view, steering, caption)))
                 for caption, (frame, steering) in zip(captions, shots.taken, strict=False)
             ]
-            is_given = folder.resolve() in [each["folder"].resolve() for each in self.recordings]
+            is_given = not self.trained_on.isdisjoint(recording.digests[recording.images[:, 0]].tolist())
             other = "was held out" if self.knows_all else "it may have been trained on"
             which, curves = "it was trained on" if is_given else other, uri(plot(recording, drives), "image/png")
             shown = {"which": which, "table": rows, "plot": curves, "interventions": len(where), "pictures": pictures}
@@ -188,14 +191,14 @@ class Report:
     def next_steps(self) -> list[tuple[str, str]]:
         """Return what to do next: why, and a command."""
         folder, steps = self.model.parent, list[tuple[str, tuple[object, ...]]]()
-        output, train = folder / "model.pt", ("python", "model.py")
+        train = "python", "model.py"
         if not self.run["robust"]:
             why = "Train with recovery steering from other positions, which drives best"
             robust = ("--robust", "--output", folder / "robust" / "model.pt")
             steps.append((why, (*train, *self.run["recordings"], *robust)))
         if self.run["best"]["epoch"] == (epochs := self.run["epochs"]):
             why = "The last epoch is the best one: train longer"
-            steps.append((why, (*train, "--resume", "--epochs", 2 * epochs, "--output", output)))
+            steps.append((why, (*train, "--resume", "--epochs", 2 * epochs, "--output", self.output)))
         if not self.replays:
             why = "Let it drive recordings that it was not trained on, and write this report again"
             steps.append((why, ("python", "-m", "cloning.report", folder, "--held-out", "FOLDER")))

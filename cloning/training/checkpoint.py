@@ -42,6 +42,7 @@ from cloning.recordings.format import BINS
 from cloning.training.observations import Observations
 from cloning.training.optimizers import Adam
 from cloning.training.options import Command, Process, Run
+from cloning.training.pictures import write_losses
 from cloning.training.recipe import Recipe, option_name
 from cloning.training.run_files import EpochMetrics, RunFiles, best_epoch
 
@@ -285,6 +286,8 @@ class Checkpoint:
         settings["training"] = {"labels": counts.tolist()}
         write(self.files.arguments, json.dumps(settings, indent=2).encode())
         if self.resumed:
+            if progress.history:  # in the place of its losses there may be another run's
+                write_losses(self.files, progress.history, self.run.recipe.dropout)
             if progress.history and not progress.images and not self.files.last.exists():  # it was moved away
                 self.save(progress, self.files.last)
             self._write_progress(progress)  # a killed run may not have come so far

@@ -1,16 +1,18 @@
 """Make the pictures of a training run: frames with their steering, and the losses by epoch."""
 
 import io
+import math
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from cloning.base.figure import png
+from cloning.base.files import csv_bytes, write
 from cloning.recordings.format import CAMERAS
 from cloning.road.motion import FULL_LOCK
 from cloning.training.observations import Choices
 from cloning.training.recipe import Recipe
-from cloning.training.run_files import EpochMetrics
+from cloning.training.run_files import EpochMetrics, RunFiles
 
 SCALE = 3  # of a frame's pixels: three frames in a row are 25 cm wide at 300 dpi
 FONT, MARGIN = 44, 12  # pixels: of the captions, which stay legible at a third of the size; between panels
@@ -69,6 +71,13 @@ def batch_pictures(choices: Choices, recipe: Recipe) -> dict[str, bytes]:
         "training_generator_LRC_{}.png": grid([left, center, right], columns=3),
         "training_generator_augmented-{}.png": grid(panels, columns=2),
     }
+
+
+def write_losses(files: RunFiles, history: list[EpochMetrics], dropout: bool) -> None:
+    """Write training_log.csv, a line for each finished epoch, and `loss_picture`; an unknown figure is empty."""
+    rows = (["" if math.isnan(figure) else figure for figure in row.values()] for row in history)
+    write(files.log, csv_bytes([history[0], *rows]))
+    write(files.losses, loss_picture(history, dropout))
 
 
 def loss_picture(history: list[EpochMetrics], dropout: bool) -> bytes:

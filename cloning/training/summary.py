@@ -21,6 +21,7 @@ from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
 from cloning.training.checkpoint import Progress
 from cloning.training.distributed import Ranks
+from cloning.training.observations import Observations
 from cloning.training.recipe import Recipe
 from cloning.training.run_files import EpochMetrics, RunFiles, best_epoch
 
@@ -105,9 +106,12 @@ def _rejected(recordings: Iterable[Recording]) -> list[tuple[Any, ...]]:
     return [(recording.folder / DRIVING_LOG, *row) for recording in recordings for row in recording.rejected]
 
 
-def history_csv(history: list[EpochMetrics]) -> bytes:
-    """Return the contents of training_log.csv: a line for each finished epoch; a figure that is unknown is empty."""
-    return csv_bytes([history[0], *(["" if math.isnan(x) else x for x in row.values()] for row in history)])
+def tell_of_twins(observations: Observations) -> None:
+    """Print how many frames are in several recordings, such as in one and in a part of it that was exported."""
+    pairs = np.unique(np.stack([observations.frame, observations.recording.astype(np.uint64)]), axis=1)
+    if twins := pairs.shape[1] - len(np.unique(observations.frame)):
+        are = "frame is" if twins == 1 else "frames are"
+        print(f"{twins:,} {are} in more than one of these recordings: there they count again, also if one cuts them")
 
 
 def run_header(network: Network, device: torch.device, precision: torch.dtype, ranks: Ranks, layers: bool) -> str:
