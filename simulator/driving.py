@@ -26,7 +26,7 @@ import numpy as np
 
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.frame import FRAME
-from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, load_limits
+from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
 from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
 from cloning.recordings.format import SAMPLE_RATE
@@ -133,9 +133,13 @@ class Drive:
 # Drivers
 
 
-@functools.cache
 def load_driver(driver: str) -> Steering:
     """Return what computes the steering, -1..1, from a frame, uint8 (160, 320, 3). Raises UserError."""
+    return _load_driver(driver, digest_of(Path(driver)))
+
+
+@functools.cache
+def _load_driver(driver: str, digest: str) -> Steering:  # by its digest, since a file may be trained anew meanwhile
     if not driver.endswith(".onnx"):
         one_thread()
         network = load_model(driver)
@@ -168,11 +172,15 @@ def load_driver(driver: str) -> Steering:
     return steering
 
 
-@functools.cache
 def load_limits_of(driver: str) -> tuple[Observer, Limits] | None:
     """Return what foretells that a model leaves the road, None if its limits are not known. Raises UserError."""
     if driver.endswith(".onnx"):
         return None
+    return _load_limits_of(driver, digest_of(Path(driver)), digest_of(limits_file(Path(driver))))
+
+
+@functools.cache
+def _load_limits_of(driver: str, *digests: str) -> tuple[Observer, Limits] | None:
     network = load_model(driver)
     limits = load_limits(Path(driver), network)
     return (Observer(network), limits) if limits else None
@@ -214,7 +222,7 @@ def preprocessing(file: Path, shape: list, whole: bool) -> Callable[[np.ndarray]
 def digest_of(file: Path) -> str:
     """Return a digest of a driver's file, and of the one beside an ONNX file that tells how frames become its input."""
     beside = [file.with_suffix(".json")] if file.suffix == ".onnx" else []
-    return hashlib.sha256(b"".join(each.read_bytes() for each in (file, *beside) if each.exists())).hexdigest()
+    return hashlib.sha256(b"".join(each.read_bytes() for each in (file, *beside) if each.is_file())).hexdigest()
 
 
 def server_address(driver: str) -> tuple[str, int] | None:
@@ -341,7 +349,7 @@ def _drive(
                     run.set_back()
                 else:
                     ended = run.departures[-1].side
-            elif run.travelled >= length:
+            elif run.travelled >= length or (run.at_end and conditions.metres is None):
                 ended = "arrived"
             elif run.time > late:
                 ended = "late"

@@ -48,6 +48,8 @@ MAX_STEPS = 10 * 60 * SAMPLE_RATE  # ten simulated minutes, so that the episode 
 OPTIONS = ("s", "offset", "turn", "track", "direction", "look", "disturb")  # of reset
 DEPARTURE_PENALTY = 100.0  # m of progress; Gymnasium's CarRacing gives the same for leaving its playfield
 
+DRIVES = 32  # with the same disturbance that differ: what lasts for a drive is kept in memory
+
 
 def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> None:
     """Raise SimulatorError if a value is not valid, or of a type that cannot be compared; allowed: what is valid."""
@@ -135,6 +137,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         self.cameras = Cameras(scene, ("center",))
         self.render_mode, self.view = render_mode, ChaseView(scene) if render_mode else None
         self.state: Literal["new", "driving", "ended", "closed"] = "new"
+        self.finished = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -149,7 +152,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         """
         self._check_open()
         super().reset(seed=seed)
-        self.state = "ended"  # until the car stands on the road
+        self.state, self.finished = "new", False  # until the car stands on the road; whether the laps are driven
         options = {} if options is None else options
         if not isinstance(options, dict) or options.keys() - set(OPTIONS):
             raise SimulatorError(f"options {options!r}: the options of reset are {', '.join(OPTIONS)}, in a dict")
@@ -162,7 +165,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         self._set_on_road(options)
         self.clock = SampleClock(1 / SAMPLE_RATE)
         self.disturbance = disturbance
-        self.cameras.disturb(disturbance, int(self.np_random.integers(2**31)) if disturbance else 0)
+        self.cameras.disturb(disturbance, int(self.np_random.integers(DRIVES)) if disturbance else 0)
         self.state = "driving"
         return self._frame(), self._info()
 
@@ -215,14 +218,15 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         if commands.shape != (2,) or not np.isfinite(commands).all():
             raise InvalidAction(f"{action!r}: an action is two finite numbers, steering and throttle")
         steering, throttle = np.clip(commands, -1, 1).tolist()
-        before = self.run.travelled
+        run = self.run
+        before = run.laps * self.track.length if run.at_end else run.travelled  # another lap begins at rest
         stayed = self.run.advance(steering, throttle)
         while stayed and not (self.run.at_end or self.clock.due(self.run.time)):
             stayed = self.run.advance(steering, throttle)
         reward = float(self.run.travelled - before) - (0 if stayed else DEPARTURE_PENALTY)
-        finished = bool(self.run.travelled >= self.laps * self.track.length or self.run.laps >= self.laps)
-        self.state = "ended" if finished or not stayed else "driving"
-        return self._frame(), reward, not stayed, finished, self._info()
+        self.finished = bool(run.travelled >= self.laps * self.track.length or run.laps >= self.laps)
+        self.state = "ended" if self.finished or not stayed else "driving"
+        return self._frame(), reward, not stayed, self.finished, self._info()
 
     def _frame(self) -> np.ndarray:
         """Render the centre camera's present frame: uint8 (160, 320, 3), RGB."""

@@ -44,7 +44,7 @@ class LeRobotDrive(gymnasium.Wrapper):
 
     def _described(self, frame: np.ndarray, info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
         observation = {"pixels": {"center": frame}, "agent_pos": np.array([1, MPH], np.float32) * info["speed"]}
-        return observation, {**info, "is_success": info["laps"] >= self.get_wrapper_attr("laps")}
+        return observation, {**info, "is_success": self.get_wrapper_attr("finished")}
 
 
 def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: Any = None) -> dict[str, dict[int, VectorEnv]]:

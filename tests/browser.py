@@ -7,7 +7,6 @@ import re
 import select
 import shutil
 import subprocess
-import time
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from drive_process import awaited
 
 AXE = Path(__file__).with_name("axe.min.js")  # axe-core 4.14.1 by Deque Systems, MPL-2.0: see axe.LICENSE
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome") or ""
@@ -28,6 +28,8 @@ OPTIONS = (
 
 class Page:
     """A page in Chromium: one tab."""
+
+    until = staticmethod(awaited)
 
     def __init__(self, profile: Path):
         inward, self.outgoing = os.pipe()
@@ -51,14 +53,6 @@ class Page:
             self.send(f"{domain}.enable")
         sooner = "const later = setTimeout; setTimeout = (action, ms, ...more) => later(action, ms / 10, ...more)"
         self.send("Page.addScriptToEvaluateOnNewDocument", source=sooner)  # what a page waits for comes sooner
-
-    def until(self, condition, seconds: float = 60.0):
-        """Wait until a condition is true; return its value."""
-        end = time.monotonic() + seconds
-        while not (value := condition()):
-            assert time.monotonic() < end, "the browser never got there"
-            time.sleep(0.02)
-        return value
 
     def send(self, method: str, **parameters) -> dict:
         self.number += 1

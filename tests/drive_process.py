@@ -13,6 +13,7 @@ import urllib.request
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import warm
 from commands import HERE, ROOT
@@ -28,12 +29,13 @@ def found(pattern: str, text: str) -> str:
     return match[1]
 
 
-def awaited(condition: Callable[[], object], seconds: float = 60.0) -> None:
-    """Wait until a condition is true."""
+def awaited(condition: Callable[[], Any], seconds: float = 60.0) -> Any:
+    """Wait until a condition is true; return its value."""
     end = time.monotonic() + seconds
-    while not condition():
+    while not (value := condition()):
         assert time.monotonic() < end, "it never came"
         time.sleep(0.02)
+    return value
 
 
 def ask(port: int, path: str, method: str = "GET", body: object = None, **headers: str) -> tuple[int, bytes, dict]:

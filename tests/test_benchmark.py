@@ -186,7 +186,6 @@ def test_an_onnx_network_gets_frames_as_the_file_beside_it_says(tmp_path, shape,
     frame = np.full((160, 320, 3), 255, np.uint8)  # white where it is cut off
     frame[60:135, 20:300] = (255, 0, 0)
     assert driving.load_driver(file)(frame) == pytest.approx(2 * 0.299 - 1, abs=0.005)
-    driving.load_driver.cache_clear()
     digest = driving.digest_of(tmp_path / "keras.onnx")
     crops = (f'{{"crop": {crop}}}' for crop in ([100, 60], [0, 0, 320, 0], [1, 2, 3], [1.5, 0]))
     for wrong in (*crops, '{"colour": "CMYK"}', '{"scale": 2}', "[]", "{"):

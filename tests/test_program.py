@@ -8,7 +8,7 @@ import time
 
 import pytest
 import warm
-from commands import HERE, ROOT, run_model
+from commands import HERE, ROOT
 
 from cloning.base import progress
 from cloning.base.outputs import as_typed
@@ -186,23 +186,6 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
     lines = capsys.readouterr().err.splitlines()
     assert 3 <= len(lines) <= 20, "not every update"
     assert re.fullmatch(r"training +\d+ %, \d+/100 images, 00:00 since the start, 00:\d\d left, loss \d+", lines[0])
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["model.py", "nowhere"],
-        ["drive.py", "nowhere.pt"],
-        ["video.py", "nowhere"],
-        ["-m", "simulator", "replay", "nowhere"],
-        ["-m", "tools.speedrun", "nowhere"],
-    ],
-)
-def test_an_error_of_the_user_is_a_line_and_status_2(tmp_path, command):
-    words = [ROOT / word if word.endswith(".py") else word for word in command]
-    done = run_model(command=[sys.executable, *words], cwd=tmp_path, env=HERE)
-    assert done.returncode == FAILED == 2
-    assert "nowhere" in done.stderr.splitlines()[-1] and "Traceback" not in done.stderr
 
 
 ENDING_MAIN = """

@@ -4,12 +4,10 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from scenes import Here
 from steer_server import STEER, Server
 
 from cloning.base.program import DONE
-from cloning.network.network import Network, save_model
 from cloning.road.points import make_road, read_road
 from simulator import driving
 from tools import search
@@ -17,21 +15,10 @@ from tools import search
 KIND = search.Kind(sharpest=35, steepest=0.2, marking="white", land="meadow")
 
 
-@pytest.fixture(scope="module")
-def straight(tmp_path_factory):
-    """A model file that always steers straight ahead."""
-    network = Network()
-    for parameter in network.dense[-1].parameters():
-        torch.nn.init.zeros_(parameter)
-    path = tmp_path_factory.mktemp("model") / "straight.pt"
-    save_model(path, network)
-    return str(path)
-
-
-def test_a_search_finds_failures_that_repeat_and_writes_roads_for_others(straight, tmp_path, capsys, monkeypatch):
+def test_a_search_finds_failures_that_repeat_and_writes_roads_for_others(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(driving, "started_workers", Here)
     folder = tmp_path / "found"
-    words = [str(folder), "--driver", straight, "--roads", "2", "--searches", "random"]
+    words = [str(folder), "--driver", "straight", "--roads", "2", "--searches", "random"]
     assert search.main(words) == DONE
     printed, told = capsys.readouterr().out, json.loads((folder / "search.json").read_text(encoding="utf-8"))
     assert "2 of 2 failures were the same" in printed
@@ -39,7 +26,7 @@ def test_a_search_finds_failures_that_repeat_and_writes_roads_for_others(straigh
     assert (folder / "failures.png").read_bytes().startswith(b"\x89PNG")
     for file in folder.glob("random-1-*.json"):
         failure, road = json.loads(file.read_text(encoding="utf-8")), read_road(file)
-        again = driving.drive(driving.Conditions(straight, 20, 0), road)
+        again = driving.drive(driving.Conditions("straight", 20, 0), road)
         assert again.figures().items() <= failure.items()
         # By geometry: the car's middle stays on the tangent at the start, and a wheel is 0.8 m beside it.
         along, beside = (np.array(again.path[-1]) - road.points[0, :2]) @ rotation(road.points)

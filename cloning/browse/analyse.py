@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.cores import threads
-from cloning.base.errors import ModelError, UserError
+from cloning.base.errors import ModelError
 from cloning.browse.analyses import PROGRESS, Analysis, Result, stamp, write_result
 from cloning.lane.known import known_position
 from cloning.lane.localise import localise_recording, shipped_networks
@@ -44,7 +44,7 @@ NOTHING = np.empty(0, np.float32)
 
 
 def main() -> int:
-    """Analyse a recording and write the result; return the exit status."""
+    """Analyse a recording and write the result; return the exit status. Raises UserError or OSError."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", type=Path, help="folder with a driving_log.csv")
     parser.add_argument("kind", choices=("lane", "steering", "replay"))
@@ -53,17 +53,14 @@ def main() -> int:
     arguments = parser.parse_args()
     if hasattr(os, "nice"):
         os.nice(10)  # the page, and whatever else the user does, goes first
-    try:
-        folder, analysis = arguments.recording, Analysis(arguments.kind, arguments.model, arguments.limit)
-        before = stamp(folder, analysis)
-        if analysis.kind == "replay":
-            result = replayed(load_recording(folder), analysis)
-        else:
-            recording = check_images(read_uncut(folder), threads(), show_progress=False).without_copies()
-            result = lane(recording) if analysis.kind == "lane" else steering(recording, analysis.model)
-        write_result(folder, analysis, before, result)
-    except (UserError, OSError) as error:
-        return program.failed(error)
+    folder, analysis = arguments.recording, Analysis(arguments.kind, arguments.model, arguments.limit)
+    before = stamp(folder, analysis)
+    if analysis.kind == "replay":
+        result = replayed(load_recording(folder), analysis)
+    else:
+        recording = check_images(read_uncut(folder), threads(), show_progress=False).without_copies()
+        result = lane(recording) if analysis.kind == "lane" else steering(recording, analysis.model)
+    write_result(folder, analysis, before, result)
     return program.DONE
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from cloning.base.arguments import number
-from cloning.base.errors import ModelError
+from cloning.base.errors import ModelError, UserError
 from cloning.base.outputs import names_folder
 from cloning.network.compute import DEVICES, is_available
 from cloning.network.network import load_checkpoint
@@ -45,6 +45,13 @@ class Process:
     strict: bool = False
     resume: bool = False
     save_seconds: float = SAVE_SECONDS  # between two saved states
+
+    def check(self) -> None:
+        """Raise UserError for an output or a device that can't be used."""
+        if names_folder(self.output):
+            raise UserError(f"--output {self.output}: is a folder; name the model file in it, such as model.pt")
+        if self.device not in DEVICES or not is_available(self.device):
+            raise UserError(f"--device {self.device}: torch finds no such GPU on this machine; leave the option out")
 
 
 EVERY_NAME = frozenset(item.name for kind in (Run, Recipe) for item in fields(kind)) - {"recordings"}
@@ -92,10 +99,10 @@ def parse(argv: list[str] | None, report: Recipe, robust: Recipe) -> Command:
     process = Process(**{name: values.pop(name) for name in ("output", "device", "strict", "resume") if name in values})
     if "recordings" in values:
         values["recordings"] = tuple(values["recordings"])
-    if names_folder(process.output):
-        parser.error(f"--output {process.output}: is a folder; name the model file in it, such as model.pt")
-    if not is_available(process.device):
-        parser.error(f"--device {process.device}: torch finds no such GPU on this machine; leave the option out")
+    try:
+        process.check()
+    except UserError as error:
+        parser.error(str(error))
     return Command(Run(recipe, **values), process, given, {report.name: report, robust.name: robust})
 
 

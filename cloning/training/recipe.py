@@ -116,6 +116,12 @@ class Recipe:
     shaded: float = 0.0  # share of the images with shadows
     disturbed: float = 0.0  # share of the images in foul weather, or of a dirty or faulty camera
 
+    def __post_init__(self) -> None:
+        """Take NumPy's numbers, of which a sweep may be made, for Python's, which a checkpoint can contain."""
+        for item in fields(self):
+            if isinstance(value := getattr(self, item.name), np.generic):
+                object.__setattr__(self, item.name, value.item())
+
     def saved(self) -> dict[str, Any]:
         """Return the recipe as plain values for a checkpoint: functions and augmentations by their names."""
         return {item.name: _plain(getattr(self, item.name)) for item in fields(self) if item.name != "words"}

@@ -77,6 +77,7 @@ def status_of(work: Callable[[], None], process: Process, ranks: Ranks) -> int:
     files, resume = RunFiles(process.output), process.resume
     status, message, before = 0, "", files.state()
     try:
+        process.check()
         with files.claimed(ranks):
             work()
     except UserError as error:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, SimulatorError
 from cloning.base.frame import FRAME
 from cloning.network.compute import one_thread
 from cloning.recordings.format import DRIVING_LOG
@@ -55,4 +55,11 @@ def driver_of(driver: str) -> Driver:
     if address := server_address(driver):
         return ServerDriver(*address, WAIT)
     steering, rows = load_driver(driver), slice(0, FRAME[0])
-    return lambda frame: steering(frame.received(rows))
+
+    def steer(frame: ReplayFrame) -> float:
+        try:
+            return steering(frame.received(rows))
+        except ArithmeticError as error:
+            raise SimulatorError(f"{driver}: {error}; train the model again") from None
+
+    return steer
