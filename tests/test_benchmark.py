@@ -1,5 +1,6 @@
 """The benchmark: its tasks, its score, its entries, and the same figures wherever its drives run."""
 
+import copy
 import json
 import os
 import socket
@@ -7,15 +8,18 @@ import subprocess
 import sys
 import time
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from commands import HERE, ROOT
 from steer_server import STEER, Server
 
-from cloning.base.errors import UserError
+from cloning.base.errors import SimulatorError, UserError
 from cloning.base.program import DONE, FAILED
-from cloning.network.network import SHIPPED_MODEL
+from cloning.network.network import SHIPPED_MODEL, save_model
 from cloning.road.autonomy import INTERVENTION_TIME
 from cloning.road.disturbances import KINDS, Disturbance
 from cloning.road.motion import MPH
@@ -23,7 +27,7 @@ from cloning.road.track import Track
 from cloning.wire.client import parse_event
 from simulator import __main__, driving, workers
 from simulator.benchmark import page as report
-from simulator.benchmark import scores, tasks
+from simulator.benchmark import replays, scores, tasks
 from simulator.benchmark.command import drive, run
 from simulator.benchmark.tasks import Task
 from simulator.run import Departure
@@ -75,8 +79,8 @@ def test_the_score_is_the_rules_formula():
     assert driven(TINY[0], 9, 30)["score"] == 0
     assert driven(TINY[0], 0, 30, "late")["score"] == 0
     drives = [driven(task, n, 60) for n, task in enumerate(TINY)]  # 100, 90, 80, 70, 60
-    replays = driven(TINY[0]._replace(group="replays"), 10, 60)
-    groups = scores.by_group([*drives, driven(TINY[0], 5, 60), replays])
+    replayed = driven(TINY[0]._replace(group="replays"), 10, 60)
+    groups = scores.by_group([*drives, driven(TINY[0], 5, 60), replayed])
     assert groups["tracks"]["score"] == 75 and groups["tracks"]["departures"] == 5
     assert scores.score(groups) == (75 + 90 + 80 + 70 + 60) / 5
     row = scores.line("mine", {"groups": groups, "score": scores.score(groups)})
@@ -208,6 +212,26 @@ def test_an_onnx_network_of_other_inputs_is_refused_before_it_drives(tmp_path, s
     with pytest.raises(UserError, match=r"other\.") as caught:
         driving.load_driver(file)
     assert reason in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_model_that_is_trained_anew_drives_with_its_new_weights(network, tmp_path):
+    file, frame, steered = tmp_path / "model.pt", np.full((160, 320, 3), 90, np.uint8), list[float]()
+    changed = copy.deepcopy(network)
+    for bias in (0.0, 0.25):
+        torch.nn.init.constant_(changed.dense[-1].bias, bias)
+        save_model(file, changed)
+        steered.append(driving.load_driver(str(file))(frame))
+    assert steered[1] - steered[0] == pytest.approx(0.25, abs=1e-3)
+
+
+def test_a_steering_that_is_no_number_is_told_in_replays_too(monkeypatch):
+    def steering(frame):
+        raise ArithmeticError("the network's steering is not finite")
+
+    monkeypatch.setattr(replays, "load_driver", lambda _: steering)
+    seen: Any = SimpleNamespace(received=lambda rows: None)
+    with pytest.raises(SimulatorError, match=r"own\.onnx: the network's steering is not finite; train the model again"):
+        replays.driver_of("own.onnx")(seen)
 
 
 def test_without_that_file_frames_are_as_the_simulator_sends_them(tmp_path):

@@ -203,6 +203,8 @@ def test_wrong_options_are_reported_and_begin_no_episode(lake, options, message)
         lake.reset(options=options)
     with pytest.raises(ResetNeeded):
         lake.step(np.asarray([0, 1]))
+    with pytest.raises(ResetNeeded):
+        lake.render()
 
 
 @pytest.mark.parametrize("action", [[math.nan, 1], [0, math.inf], [0], 0.5, "left", None, [[0, 1], [0]]])
@@ -240,6 +242,16 @@ def test_an_episode_on_an_open_road_ends_where_the_road_ends_wherever_it_began(b
         _, _, left, ended, info = env.step(np.asarray([0, 1]))
         assert not left
     assert info["s"] == pytest.approx(100, abs=0.4)
+
+
+def test_a_reward_is_progress_also_where_a_second_lap_of_an_open_road_begins():
+    env = environment.Drive(make_road([(0, 0), (50, 0), (100, 0)]), laps=2)
+    env.reset(options={"s": 80})
+    rewards, ended = list[float](), False
+    while not ended:
+        _, reward, _, ended, _ = env.step(np.asarray([0, 1]))
+        rewards.append(reward)
+    assert max(rewards) < 1.5 and sum(rewards) == pytest.approx(20 + 100, abs=1)
 
 
 def test_info_has_the_names_that_users_of_gym_donkeycar_know():

@@ -237,6 +237,22 @@ def test_frames_that_are_in_two_recordings_are_told(sample_recording, tmp_path, 
     assert "more than one" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("process", "words"), [({"output": "runs/a/"}, "is a folder"), ({"device": "gpu"}, "finds no such GPU")]
+)
+def test_a_programs_arguments_are_checked_as_the_commands(linked, tmp_path, monkeypatch, capsys, process, words):
+    monkeypatch.chdir(tmp_path)
+    assert model.train(REPORT, [linked], **{"output": "model.pt", "device": "cpu"} | process) == 2
+    assert words in capsys.readouterr().err and not (tmp_path / "runs").exists()
+
+
+def test_numpys_numbers_make_a_recipe_that_can_be_saved():
+    epochs: Any = np.int64(3)
+    recipe = replace(REPORT, learning_rate=np.logspace(-4, -3, 2)[0], epochs=epochs)
+    assert type(recipe.learning_rate) is float and type(recipe.epochs) is int
+    assert recipe == replace(REPORT, epochs=3) and REPORT.restored(recipe.saved()) == recipe
+
+
 def test_several_processes_leave_apples_gpu_alone(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
