@@ -79,6 +79,8 @@ def corner_texture(frame: np.ndarray) -> core.Texture:
 class Window(ShowBase):
     """The window; its run is `simulation`, because ShowBase has a method `run`."""
 
+    failed: UserError | None = None  # what has ended it
+
     def __init__(
         self,
         track: Track,
@@ -113,7 +115,6 @@ class Window(ShowBase):
         self.cameras = Cameras(self.scene, disturbance=disturbance)
         self.controls, self.gamepad = Controls(), Gamepad()
         self.remote: RemoteDriver | None = None
-        self.failed: UserError | None = None  # what has ended the window
         self.by_hand = not server  # whether the person drove before the last frame
         self.started = bool(server)  # until somebody drives, the car stands still, also on a slope
         if server:
