@@ -47,8 +47,9 @@ ID = "behavioral-cloning/Drive-v0"
 MAX_STEPS = 10 * 60 * SAMPLE_RATE  # ten simulated minutes, so that the episode of a car that stands still ends, too
 OPTIONS = ("s", "offset", "turn", "track", "direction", "look", "disturb")  # of reset
 DEPARTURE_PENALTY = 100.0  # m of progress; Gymnasium's CarRacing gives the same for leaving its playfield
-
-DRIVES = 32  # with the same disturbance that differ: what lasts for a drive is kept in memory
+DISTURBANCE_SEEDS = (
+    32  # as in a training: what a seed gives to a whole drive, such as drops on the lens, stays in memory
+)
 
 
 def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> None:
@@ -120,7 +121,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         speed in mph, 1 to 30, which the car never exceeds; laps: after which an episode is truncated, such as 0.5;
         random_start: begin each episode anywhere on the centre line instead of where the autonomous mode does;
         render_mode: "rgb_array" (a view from behind the car) or None; disturb: foul weather or a fault of the camera,
-        such as "fog:3" (see cloning.road.disturbances), in each episode another one, or None.
+        such as "fog:3" (see cloning.road.disturbances), in each episode by one of 32 seeds, or None.
         """
         EzPickle.__init__(self, track, direction, look, speed, laps, random_start, render_mode, disturb)
         self.track = make_track(track, direction)
@@ -137,7 +138,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         self.cameras = Cameras(scene, ("center",))
         self.render_mode, self.view = render_mode, ChaseView(scene) if render_mode else None
         self.state: Literal["new", "driving", "ended", "closed"] = "new"
-        self.finished = False
+        self.finished = False  # whether the episode's laps are driven
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -152,7 +153,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         """
         self._check_open()
         super().reset(seed=seed)
-        self.state, self.finished = "new", False  # until the car stands on the road; whether the laps are driven
+        self.state, self.finished = "new", False  # until the car stands on the road
         options = {} if options is None else options
         if not isinstance(options, dict) or options.keys() - set(OPTIONS):
             raise SimulatorError(f"options {options!r}: the options of reset are {', '.join(OPTIONS)}, in a dict")
@@ -165,7 +166,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         self._set_on_road(options)
         self.clock = SampleClock(1 / SAMPLE_RATE)
         self.disturbance = disturbance
-        self.cameras.disturb(disturbance, int(self.np_random.integers(DRIVES)) if disturbance else 0)
+        self.cameras.disturb(disturbance, int(self.np_random.integers(DISTURBANCE_SEEDS)) if disturbance else 0)
         self.state = "driving"
         return self._frame(), self._info()
 
@@ -220,10 +221,10 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         steering, throttle = np.clip(commands, -1, 1).tolist()
         run = self.run
         before = run.laps * self.track.length if run.at_end else run.travelled  # another lap begins at rest
-        stayed = self.run.advance(steering, throttle)
-        while stayed and not (self.run.at_end or self.clock.due(self.run.time)):
-            stayed = self.run.advance(steering, throttle)
-        reward = float(self.run.travelled - before) - (0 if stayed else DEPARTURE_PENALTY)
+        stayed = run.advance(steering, throttle)
+        while stayed and not (run.at_end or self.clock.due(run.time)):
+            stayed = run.advance(steering, throttle)
+        reward = float(run.travelled - before) - (0 if stayed else DEPARTURE_PENALTY)
         self.finished = bool(run.travelled >= self.laps * self.track.length or run.laps >= self.laps)
         self.state = "ended" if self.finished or not stayed else "driving"
         return self._frame(), reward, not stayed, self.finished, self._info()

@@ -79,9 +79,9 @@ class Joined(ClientSession):
 
     def _exchange(self) -> None:
         """Send and receive until the program wants no more, or the connection is lost. Raises ConnectionLost."""
-        self._origin = self.time - self.pace * time.perf_counter()
+        self._start_clock()
         self._listen(SETTLE)
-        self._origin = self.time - self.pace * time.perf_counter()
+        self._start_clock()
         while not self.dialect.over:
             while not self.dialect.ready:
                 self._listen(ASK_AGAIN)
@@ -92,7 +92,10 @@ class Joined(ClientSession):
                 self._drive()
             elif not (self.time or self._is_puzzled):
                 self._is_puzzled = True
-                print(f"no usable answer in {ASK_AGAIN:g} s; if none comes, it may speak another --dialect", flush=True)
+                print(
+                    f"no usable answer in {ASK_AGAIN:g} s; if none comes, the program may speak another --dialect",
+                    flush=True,
+                )
 
     def _ask(self, telemetry: str) -> bool:
         """Send a telemetry; return whether it was answered."""
@@ -164,7 +167,7 @@ class Joined(ClientSession):
         """Drive until the next telemetry is due."""
         if self.dialect.still:
             self._listen(STILL)
-            self._origin = self.time - self.pace * time.perf_counter()
+            self._start_clock()
             self.due = self.time
             return
         self.due += self.period
@@ -181,6 +184,10 @@ class Joined(ClientSession):
         self.dialect.step()
         self.time += STEP
 
+    def _start_clock(self) -> None:
+        """Let simulated time, with a pace, go on from here."""
+        self._origin = self.time - self.pace * time.perf_counter()
+
     def _now(self) -> float:
         """Return the simulated time that it should be by the wall clock."""
         return self._origin + self.pace * time.perf_counter()
@@ -192,7 +199,7 @@ class Joined(ClientSession):
             if not self.dialect.still:
                 self._step()
         if behind > MAX_CATCH_UP or self.dialect.still:
-            self._origin = self.time - self.pace * time.perf_counter()
+            self._start_clock()
 
 
 def join(arguments: argparse.Namespace, track: Track, own: dict[str, Any]) -> int:

@@ -22,7 +22,7 @@ from cloning.base.errors import SimulatorError, UserError
 from cloning.base.processes import interrupt_deferred
 from cloning.base.progress import progress_bar
 
-MOST_ON_WINDOWS = 61  # processes for whose ends it can wait
+MOST_ON_WINDOWS = 61  # processes, whose ends it can wait for at the same time
 WAIT = 30.0  # s for a worker of Dask's to come; its scheduler is waited for as long
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -229,7 +229,7 @@ def test_a_program_whose_answers_cannot_be_used_is_told_of_and_is_no_success(mon
     with Program(lambda data, n: [["steer", {"steering_angle": 0, "throttle": 1}]] if n < 3 else None) as program:
         assert join("measures", program) == 2
     printed = capsys.readouterr()
-    assert printed.out.count("no usable answer in 0.2 s; if none comes, it may speak another --dialect") == 1
+    assert printed.out.count("no usable answer in 0.2 s; if none comes, the program may speak another --dialect") == 1
     assert "0 simulated seconds" in printed.out
 
 

@@ -149,10 +149,10 @@ def bad_frames(port: int, until: float) -> None:
 
 def roads(port: int, until: float) -> None:
     """Name another generated road with each telemetry, and ask for its centre line: to generate one takes seconds."""
-    place = {"x": 0.0, "y": 0.0, "offset": 0.0, "departures": 0, "time": 1.0}
+    place, seen = {"x": 0.0, "y": 0.0, "offset": 0.0, "departures": 0, "time": 1.0}, telemetry(frames(1)[0])
     with Simulator(port).open() as simulator:
         for number in itertools.count(1):
-            simulator.drive(telemetry(frames(1)[0]) | {"stand_in": place | {"track": f"mountain-{number}"}})
+            simulator.drive(seen | {"stand_in": place | {"track": f"mountain-{number}"}})
             urllib.request.urlopen(f"http://127.0.0.1:{port}/road").read()
             if time.monotonic() > until:
                 break

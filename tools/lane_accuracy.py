@@ -41,7 +41,7 @@ from tools.lane_frames import RenderedScene, render_all, shadowed
 UNSEEN_LOOKS = (998, 999, 1000)  # no network was trained on looks from 101 to 1000, nor on these roads
 UNSEEN_ROADS = tuple(f"road-{k}" for k in range(1, 9))
 FIRST_EDGES, EDGES_SECONDS, EDGES_SPEEDS = 201, 27, (15, 25)  # number of the first road, length of a drive, mph
-EDGES_LOOK = 700  # more than the road's number
+EDGES_LOOK = 700  # plus a road's number: its look
 NEAR = 0.3  # m: a reading no further from the truth is good
 
 

@@ -157,7 +157,7 @@ def run(main: Callable[[], int | None]) -> NoReturn:
             raise UserError("an argument is empty, as from a shell's variable that is not set; name it or leave it out")
         status = main()
     except BaseException as error:
-        kept = error  # noqa: F841 - what it has, such as a window half made, is not taken apart while the process ends
+        kept = error  # noqa: F841 - so that what it holds, such as a window half made, is not taken apart at the end
         signal.signal(signal.SIGINT, stop)
         from cloning.base.errors import UserError
 

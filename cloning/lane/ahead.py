@@ -47,8 +47,8 @@ def _points_ahead(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the centre line's points near s: float64 (n,) each, m to the camera's right, ahead of it, and z."""
     x, y, z = track.points[(round(s / track.step) + VISIBLE_POINTS) % len(track.points)].T
-    x, y, along, across = x - camera[0], y - camera[1], np.cos(heading), np.sin(heading)
-    return x * across - y * along, x * along + y * across, z
+    x, y, cos, sin = x - camera[0], y - camera[1], np.cos(heading), np.sin(heading)
+    return x * sin - y * cos, x * cos + y * sin, z  # as `components`, which also copies: this is called for each row
 
 
 def _until_it_turns_back(distances: np.ndarray, forward: np.ndarray, *values: np.ndarray) -> np.ndarray:

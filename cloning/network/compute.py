@@ -31,7 +31,8 @@ def choose_device(name: str) -> torch.device:
     """
     together = int(os.environ.get("WORLD_SIZE", 1)) > 1
     if name == "auto":
-        name = next((gpu for gpu in ("cuda", *["mps"] * (not together)) if is_available(gpu)), "cpu")
+        gpus = ("cuda",) if together else ("cuda", "mps")
+        name = next((gpu for gpu in gpus if is_available(gpu)), "cpu")
     if name == "mps" and together:
         raise UserError("--device mps: several processes can't share Apple's GPU; start one, without torchrun")
     if name == "cuda":

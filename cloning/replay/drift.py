@@ -45,9 +45,9 @@ def held_out(recordings: Sequence[Recording], recording: np.ndarray, row: np.nda
     """
     found = []
     for index, each in enumerate(recordings):
-        originals, whole = each.originals(), each.without_copies()
-        rows = np.searchsorted(originals, row[recording == index], "right") - 1
-        rows, first = np.unique(rows, return_index=True)
+        originals = each.originals()
+        whole, numbers = each.take(originals), np.searchsorted(originals, row[recording == index], "right") - 1
+        rows, first = np.unique(numbers, return_index=True)
         aims = aim[recording == index][first]
         drives = stretch_rows(whole)
         for group in np.split(rows, np.flatnonzero(np.abs(np.diff(whole.time[rows])) > SECONDS) + 1):

@@ -109,15 +109,11 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     """
     from cloning.server.libraries import eventlet  # here, because it needs the socket libraries
 
-    @functools.lru_cache(maxsize=4)
-    def outline(track: str) -> list[list[float]]:
-        with one_road:
-            return road_on_map(track, pause)
-
     app = flask.Flask(__name__, static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     site.prepare(app, "img-src data:")
-    one_road = eventlet.semaphore.Semaphore()  # is generated at a time
+    outline = functools.lru_cache(maxsize=4)(functools.partial(road_on_map, pause))
+    one_road = eventlet.semaphore.Semaphore()  # is generated at a time, and once for all pages that ask meanwhile
     pages = {with_attention: Pages(server, with_attention, pause) for with_attention in (False, True)}
 
     @app.get("/")
@@ -140,7 +136,10 @@ def create_app(server: Server, pause: Pause) -> flask.Flask:
     @app.get("/road")
     def road() -> list[list[float]]:
         session = server.watched_session()
-        return outline(session.place.track) if session and session.place else []
+        if not (session and session.place):
+            return []
+        with one_road:
+            return outline(session.place.track)
 
     @app.get("/browse")
     def browse() -> Any:
@@ -189,10 +188,10 @@ def posted(name: str, kind: type) -> Any:
     return body[name]
 
 
-def road_on_map(track: str, pause: Pause) -> list[list[float]]:
+def road_on_map(pause: Pause, track: str) -> list[list[float]]:
     """Return the points of a road's centre line, m to the east and the north; none for an unknown name.
 
-    In a process of its own, since generating a road may take seconds, in which this one could answer no car. pause: the
+    Another process generates them, for ROAD_SECONDS at most: this one could answer no car meanwhile. pause: the
     server's.
     """
     code = "import sys; from cloning.road.track import centre_line; print(centre_line(sys.argv[1])[:, :2].tolist())"

@@ -107,9 +107,13 @@ def _rejected(recordings: Iterable[Recording]) -> list[tuple[Any, ...]]:
 
 
 def tell_of_twins(observations: Observations) -> None:
-    """Print how many frames are in several recordings, such as in one and in a part of it that was exported."""
-    pairs = np.unique(np.stack([observations.frame, observations.recording.astype(np.uint64)]), axis=1)
-    if twins := pairs.shape[1] - len(np.unique(observations.frame)):
+    """Print how many frames are in several recordings, such as in one and in a part of it that was exported.
+
+    observations: in the order of the recordings.
+    """
+    order = np.argsort(observations.frame, kind="stable")  # np.unique takes ten times as long
+    frame, recording = observations.frame[order], observations.recording[order]
+    if twins := np.count_nonzero((frame[1:] == frame[:-1]) & (recording[1:] != recording[:-1])):
         are = "frame is" if twins == 1 else "frames are"
         print(f"{twins:,} {are} in more than one of these recordings: there they count again, also if one cuts them")
 
