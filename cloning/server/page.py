@@ -191,10 +191,13 @@ def posted(name: str, kind: type) -> Any:
 def road_on_map(pause: Pause, track: str) -> list[list[float]]:
     """Return the points of a road's centre line, m to the east and the north; none for an unknown name.
 
-    Another process generates them, for ROAD_SECONDS at most: this one could answer no car meanwhile. pause: the
-    server's.
+    Another process generates them, for ROAD_SECONDS at most: this one could answer no car meanwhile. Where it can, it
+    lets cars go first. pause: the server's.
     """
-    code = "import sys; from cloning.road.track import centre_line; print(centre_line(sys.argv[1])[:, :2].tolist())"
+    code = (
+        "import os, sys; getattr(os, 'nice', int)(10); from cloning.road.track import centre_line; "
+        "print(centre_line(sys.argv[1])[:, :2].tolist())"
+    )
     paths = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])}
     command, until = [sys.executable, "-c", code, track], time.monotonic() + ROAD_SECONDS
     with tempfile.TemporaryFile() as file:
