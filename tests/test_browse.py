@@ -214,17 +214,14 @@ def recording(linked):
         yield recording
 
 
-def ended(analyses: Analyses, folder: Path) -> list[dict]:
-    """The states of an analysis of the lane until it is done or has failed, without repetitions."""
-    states: list[dict] = []
+def ended(analyses: Analyses, folder: Path) -> dict:
+    """The state of an analysis of the lane once it is done or has failed."""
 
-    def is_over() -> bool:
-        if (state := analyses.state(folder, LANE)) not in states[-1:]:
-            states.append(state)
-        return state["state"] not in ("waiting", "running")
+    def is_over() -> dict | None:
+        state = analyses.state(folder, LANE)
+        return None if state["state"] in ("waiting", "running") else state
 
-    awaited(is_over)
-    return states
+    return awaited(is_over)
 
 
 def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, tmp_path, monkeypatch):
@@ -242,37 +239,49 @@ def test_the_open_recording_goes_first_and_then_the_smallest(sample_recording, t
             queue.state(folder, LANE)
         queue.urgent = folders[3]
     for folder in folders:
-        assert ended(queue, folder)[-1]["state"] == "failed"
+        assert ended(queue, folder)["state"] == "failed"
     queue.close()
     order = [Path(line).name for line in (tmp_path / "order").read_text(encoding="utf-8").splitlines()]
     assert order == ["open", "small", "middle", "large"]
 
 
+SPOILT = """
+import pathlib, sys, time
+print("progress 0.5", flush=True)
+while not pathlib.Path(sys.argv[1], "go").exists():
+    time.sleep(0.01)
+sys.exit("details\\nanalyse: spoilt")
+"""
+
+
 def test_an_analysis_tells_how_far_it_is_and_why_it_failed(recording, linked, monkeypatch):
-    code = "import sys, time; print('progress 0.5', flush=True); time.sleep(0.5); sys.exit('details\\nanalyse: spoilt')"
-    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
-    states = ended(recording.analyses, linked)
-    assert states[0] == {"state": "waiting"} and {"state": "running", "progress": 0.5} in states
-    assert states[-1] == {"state": "failed", "message": "analyse: spoilt"}
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", SPOILT))
+    queue, failed = recording.analyses, {"state": "failed", "message": "analyse: spoilt"}
+    assert queue.state(linked, LANE) == {"state": "waiting"}
+    awaited(lambda: queue.state(linked, LANE) == {"state": "running", "progress": 0.5})
+    (linked / "go").touch()
+    assert ended(queue, linked) == failed
+    (linked / "go").unlink()
     recording.retry("offset")
-    assert recording.analyses.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
-    assert ended(recording.analyses, linked)[-1] == states[-1]
+    assert queue.state(linked, LANE)["state"] in ("waiting", "running"), "tried again when asked to"
+    (linked / "go").touch()
+    assert ended(queue, linked) == failed
     with pytest.raises(UnknownError):
         recording.retry("steering")
     time.sleep(0.02)  # longer than a tick of the file system's clock
     (linked / "driving_log.csv").touch()
-    assert recording.analyses.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
-    recording.analyses.close()
-    assert recording.analyses.process is None
+    assert queue.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
+    queue.close()
+    assert queue.process is None
 
 
 def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried_again(recording, linked, monkeypatch):
     monkeypatch.setattr(analyses, "COMMAND", ("/no/python",))
     message = "its process cannot be started: /no/python: No such file or directory"
-    assert ended(recording.analyses, linked)[-1] == {"state": "failed", "message": message}
+    assert ended(recording.analyses, linked) == {"state": "failed", "message": message}
     monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", "import sys; sys.exit('started')"))
     recording.retry("offset")
-    assert ended(recording.analyses, linked)[-1] == {"state": "failed", "message": "started"}
+    assert ended(recording.analyses, linked) == {"state": "failed", "message": "started"}
 
 
 def test_analyses_pause_and_go_on(recording, linked, monkeypatch):
