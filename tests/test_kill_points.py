@@ -256,6 +256,7 @@ class Browser:
         if not (port := printed_port(running, r"http://[\d.]+:(\d+)/")):
             return
         try:
+            ask(port, "/analyses", "DELETE")  # one would outlive a killed server, and write into the folder later
             here = f"/recordings/{json.loads(ask(port, '/recordings')[1])[0]['id']}"
             version = json.loads(ask(port, f"{here}/details")[1])["version"]
             self.answer = json.loads(ask(port, f"{here}/{self.path}?version={version}", "POST", self.content)[1])
