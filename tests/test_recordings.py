@@ -130,6 +130,11 @@ def test_a_recording_without_time_stamps_keeps_the_file_order(log):
     found = log(*[f"center_{at}.jpg,left_{at}.jpg,right_{at}.jpg,0.{at},1,0,9" for at in (3, 1, 2)])
     np.testing.assert_array_equal(found.steering, np.array([0.3, 0.1, 0.2], np.float32))
     np.testing.assert_allclose(np.diff(found.time), 1 / 15)
+    many = [line.replace("43_", f"{second}_") for second in range(10, 60) for line in usual(first=100)]
+    assert log(*many).repairs == {}
+    for wrong in ("2018_13_16", "2018_02_29", "2018_07_00"):
+        found = log(*many, *usual()[:1], usual()[1].replace("2018_07_16", wrong))
+        np.testing.assert_array_equal(found.lines, np.arange(1, 203))
 
 
 def test_a_header_within_a_long_file(log):

@@ -29,6 +29,7 @@ WHERE_TO_GET_RECORDINGS = (
 )
 SHOWN_REJECTED = 5  # rows of each finding that are printed, so that a damaged recording does not fill the screen
 STAMP_SEPARATORS = [4, 7, 10, 13, 16, 19]  # where its underscores are
+STAMP_PARTS = [4, 6, 8, 10, 12, 14]  # where, without them, month, day, hour, minute, second and millisecond begin
 
 
 @dataclass(frozen=True)
@@ -208,17 +209,21 @@ def _contradicting(images: np.ndarray, steering: np.ndarray) -> np.ndarray:
 
 
 def _time_stamps(names: np.ndarray) -> np.ndarray:
-    """Return seconds since 1970 from names like center_2018_07_16_17_11_43_382.jpg, nan for others: float64 (m,)."""
+    """Return seconds since 1970 from names like center_2018_07_16_17_11_43_382.jpg, nan for others: float64 (m,).
+
+    NumPy does not parse the stamps: at the first one that is wrong in a long array, NumPy 2.4 crashes.
+    """
     ends = np.strings.rfind(names, b".")
     stamps = np.strings.slice(names, np.maximum(ends - STAMP_LENGTH, 0), ends).astype(f"S{STAMP_LENGTH}")
     characters = stamps.view(np.uint8).reshape(-1, STAMP_LENGTH)
-    digits = np.delete(characters, STAMP_SEPARATORS, axis=1)
-    is_stamp = ((digits >= ord("0")) & (digits <= ord("9"))).all(1)
-    is_stamp &= (characters[:, STAMP_SEPARATORS] == ord("_")).all(1)
-    characters[:, STAMP_SEPARATORS] = np.frombuffer(b"--T::.", np.uint8)
-    time = np.full(len(names), np.nan)
-    try:
-        time[is_stamp] = stamps[is_stamp].astype("M8[ms]").astype(np.int64) / 1000
-    except ValueError:  # such as month 13: the names are not the simulator's
-        return np.full(len(names), np.nan)
-    return time
+    digits = np.delete(characters, STAMP_SEPARATORS, axis=1).astype(int) - ord("0")
+    year, month, day, hour, minute, second, millisecond = (
+        part @ 10 ** np.arange(part.shape[1])[::-1] for part in np.split(digits, STAMP_PARTS, axis=1)
+    )
+    months = 12 * (year - 1970) + month - 1
+    days = months.astype("M8[M]").astype("M8[D]").astype(int) + day - 1
+    is_stamp = (characters[:, STAMP_SEPARATORS] == ord("_")).all(1) & ((digits >= 0) & (digits <= 9)).all(1)
+    is_stamp &= (month >= 1) & (month <= 12) & (days.astype("M8[D]").astype("M8[M]").astype(int) == months)
+    is_stamp &= (hour < 24) & (minute < 60) & (second < 60)
+    milliseconds = (((days * 24 + hour) * 60 + minute) * 60 + second) * 1000 + millisecond
+    return np.where(is_stamp, milliseconds / 1000, np.nan)
