@@ -135,6 +135,8 @@ def test_a_recording_without_time_stamps_keeps_the_file_order(log):
     for wrong in ("2018_13_16", "2018_02_29", "2018_07_00"):
         found = log(*many, *usual()[:1], usual()[1].replace("2018_07_16", wrong))
         np.testing.assert_array_equal(found.lines, np.arange(1, 203))
+        ((repair, told),) = found.repairs.items()
+        assert repair.startswith("no time in the image's name") and told == [1, 202]
 
 
 def test_a_header_within_a_long_file(log):

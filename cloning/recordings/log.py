@@ -184,7 +184,9 @@ def read_uncut(folder: str | Path) -> Recording:
     images = np.ascontiguousarray(images.reshape(image_names.T.shape).T, np.int32)
     time = _time_stamps(names)[images[:, 0]]
     steering, throttle, brake, speed = np.ascontiguousarray(numbers.astype(np.float32).T)
-    if np.isnan(time).any():
+    if (untold := np.isnan(time)).any():
+        assumed = f"no time in the image's name, so the whole file counts as one drive, {SAMPLE_RATE} rows a second"
+        reader.repairs[assumed] = [int(untold.sum()), int(lines[untold].min())]
         time = lines / float(SAMPLE_RATE)
     contradicting = _contradicting(images[:, 0], steering)
     for row in np.flatnonzero(contradicting):
