@@ -20,6 +20,7 @@ from cloning.recordings.images import RULES, decode, read_jpeg
 from cloning.recordings.log import CheckedRecording, Recording
 
 COPY_OR_DELETE = "copy it again, or delete the row"
+SAME_AS_CENTRE = f"the centre camera's picture; {COPY_OR_DELETE}"
 IMAGES_AT_ONCE = 32  # for each thread: Ctrl-C waits for them, and a future takes memory, of perhaps millions of images
 
 
@@ -27,6 +28,9 @@ def check_images(
     recording: Recording, threads: int = 2, frames: FrameCache | None = None, show_progress: bool = True
 ) -> CheckedRecording:
     """Decode every image of a recording, and return its rows without those that have an unusable image.
+
+    A side camera's image that is a copy of the centre one's is unusable, too: a network would take it for a view from
+    the side.
 
     Usable images are remembered in the user's cache folder: one whose file has not changed since (same size and time of
     change) is not decoded again. threads: that decode at the same time; frames: becomes the recording's, and keeps what
@@ -63,12 +67,13 @@ def check_images(
     is_usable[list(reasons)] = False
     if is_usable[todo].any():
         _write_cache(cache, names[is_usable], states[is_usable], digests[is_usable])
-    unusable = ~is_usable[recording.images]
+    unusable, content = ~is_usable[recording.images], digests[recording.images]
+    unusable[:, 1:] |= (content[:, 1:] == content[:, :1]) & ~unusable.any(1, keepdims=True)
     rejected = list(recording.rejected)
     for row in np.flatnonzero(unusable.any(1)):
         image = int(recording.images[row][unusable[row]][0])
         finding = Finding.IMAGE_MISSING if is_missing[image] else Finding.IMAGE_UNUSABLE
-        detail = f"{IMAGE_FOLDER}/{os.fsdecode(names[image])}: {reasons[image]}"
+        detail = f"{IMAGE_FOLDER}/{os.fsdecode(names[image])}: {reasons.get(image, SAME_AS_CENTRE)}"
         rejected.append(Rejected(int(recording.lines[row]), finding, detail))
     checked = CheckedRecording(**{**vars(recording), "frames": frames, "rejected": rejected}, digests=digests)
     return checked.take(~unusable.any(1))
