@@ -360,8 +360,10 @@ def test_numbers_that_show_other_columns_or_units(log, rows, why):
             log(HEADER.replace("throttle,brake", "0,0"), *usual(numbers=rows))
 
 
-def test_a_speed_that_the_simulator_never_writes_is_left_out(log):
+def test_a_speed_that_the_simulator_never_writes_is_left_out_or_told(log):
     assert findings(log(*usual(), f"{images(9)},0,1,0,48.58")) == [(5, Finding.OUT_OF_RANGE)]
+    told = "speed above 32, which the simulator's car never reaches, is taken for mph"  # or are they km/h?
+    assert log(HEADER, *usual(), f"{images(9)},0,1,0,48.58").repairs == {told: [1, 6]}
 
 
 def test_a_header_in_other_words_within_the_file_is_refused(log):

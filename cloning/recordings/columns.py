@@ -8,7 +8,7 @@ Some things leave no evidence. Without a header that names all columns, or below
 numbers in another order, with another sign or in another unit that stay within the ranges, such as the km/h of a car
 that hardly exceeds 20 mph. Below a header: values that are not what their column's name says, such as steering in
 radians. That the car drives at most 30 mph is certain of the simulator's own logs, which have no header; below one, a
-faster car is believed.
+faster car is believed, and told.
 """
 
 import itertools

@@ -10,6 +10,7 @@ import numpy as np
 
 from cloning.base.errors import RecordingError
 from cloning.recordings.columns import (
+    FASTEST,
     NUMBER,
     REMEDY,
     WHOLE_NUMBER,
@@ -136,6 +137,9 @@ class RowReader:
             lost = " (has its decimal point been lost, or is it in another unit?)" if name == "speed" else ""
             detail = f"{name} {numbers[row, column]:g} is not in {least}..{greatest}{lost}; correct or delete the row"
             self._reject(int(lines[row]), Finding.OUT_OF_RANGE, detail)
+        if (fast := usable & (numbers[:, -1] > FASTEST)).any():
+            told = f"speed above {FASTEST}, which the simulator's car never reaches, is taken for mph"
+            self.repairs[told] = [int(fast.sum()), int(lines[fast].min())]
         if open_line in lines[usable]:
             self._repair("the file ends within this line: its last number may be cut short", open_line)
         names = np.array([[name.encode(errors="surrogateescape") for name in column] for column in images], bytes).T
