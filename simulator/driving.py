@@ -291,6 +291,7 @@ def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | No
     with closing(ClientSession(*address, WAIT)) as session:
 
         def request(image: bytes, run: Run) -> Answer:
+            session.receive_unasked()  # a server may answer twice
             answer = session.request_answer(telemetry_packet(run.steering, run.throttle, run.speed_mph, image))
             return answer if conditions.own_throttle else Answer(answer.steering)
 

@@ -126,15 +126,17 @@ def test_the_film_of_a_drive_that_went_otherwise_before_says_so():
 
 
 def test_a_server_is_told_no_place_and_its_speed_is_held_for_it():
-    told = []
+    told, steered = [], [0.0]
 
     def answer(packet, n):
         told.append(packet)
-        return [STEER % ("0", "0")]
+        return [STEER % (n / 1000, "0")] * 2
 
     with Server(answer) as server:
-        done = drive(f"127.0.0.1:{server.port}", TINY[1])
+        conditions = TINY[1].conditions(f"127.0.0.1:{server.port}")
+        done = driving.drive(conditions, TINY[1].source, lambda run, _: steered.append(run.steering))
     assert done.ended == "arrived" and 2 < done.seconds < 8  # 15 m, at first at rest
+    assert 1000 * steered[-1] > len(told) - 4, "the second answer to a frame is none to the next one"
     fields = {"steering_angle", "throttle", "speed", "image"}
     assert {key for packet in told for key in (parse_event(packet) or ("", {}))[1]} == fields
 
