@@ -32,6 +32,7 @@ def test_a_circle_is_measured_as_a_circle():
     assert track.curvature == pytest.approx(np.full(len(track.points), -1 / 50), rel=0.02)  # to the left
     assert track.locate(53, 0) == (pytest.approx(0, abs=0.1), pytest.approx(3, abs=0.01))
     assert np.all(track.edges == 3.5)
+    assert make_road(CIRCLE, width=np.int64(7)) == make_road(CIRCLE, width=np.float32(7)) == track.source
     assert Track(make_road(CIRCLE[::-1])).direction == "cw"
     assert Track(make_road(CIRCLE[:-1], closed=True)).length == pytest.approx(track.length)
 

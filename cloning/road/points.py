@@ -44,7 +44,7 @@ def make_road(
     points: Iterable[Sequence[float]],
     *,
     closed: bool | None = None,
-    width: float = WIDTH,
+    width: float | np.integer | np.floating = WIDTH,
     marking: str = MARKING,
     land: str = LAND,
     name: str = "road",
@@ -67,7 +67,7 @@ def make_road(
     closed = ends_meet if closed is None else bool(closed)
     if len(numbers) < (3 if closed else 2):
         raise TrackError(f"{len(numbers)} different points; a road needs 2, and a closed one 3")
-    if not isinstance(width, int | float) or not MIN_WIDTH <= width <= MAX_WIDTH:
+    if not isinstance(width, int | float | np.integer | np.floating) or not MIN_WIDTH <= width <= MAX_WIDTH:
         raise TrackError(f"width {width!r}: it must be {MIN_WIDTH:g} to {MAX_WIDTH:g} (m)")
     for kind, value, known in (("marking", marking, MARKINGS), ("land", land, LANDS)):
         if value not in known:
