@@ -163,7 +163,7 @@ def _load_driver(driver: str, digest: str) -> Steering:  # by its digest, since 
                 raise ArithmeticError("the network's steering is not finite")
             return float(np.clip(found, -1, 1))
 
-        steering(np.zeros(FRAME, np.uint8))
+        steering(np.resize(np.arange(256, dtype=np.uint8), FRAME))  # some divide by the deviation of a frame
     except UserError:
         raise
     except Exception as error:  # onnxruntime has its own, without a common class

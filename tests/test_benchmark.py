@@ -141,13 +141,13 @@ def test_a_server_is_told_no_place_and_its_speed_is_held_for_it():
     assert {key for packet in told for key in (parse_event(packet) or ("", {}))[1]} == fields
 
 
-def onnx_file(path, shape, axes, kind):
+def onnx_file(path, shape, axes, kind, reduced="ReduceMean"):
     """A network that steers by the mean over these axes of its input, of which it returns the first number."""
     from onnx import TensorProto, helper, save
 
     nodes = [
         helper.make_node("Cast", ["frames"], ["numbers"], to=TensorProto.FLOAT),
-        helper.make_node("ReduceMean", ["numbers"], ["steering"], axes=axes, keepdims=0),
+        helper.make_node(reduced, ["numbers"], ["steering"], axes=axes, keepdims=0),
     ]
     taken = helper.make_tensor_value_info("frames", kind, shape)
     given = helper.make_tensor_value_info("steering", TensorProto.FLOAT, None)
@@ -240,6 +240,8 @@ def test_a_steering_that_is_no_number_is_told_in_replays_too(monkeypatch):
 def test_without_that_file_frames_are_as_the_simulator_sends_them(tmp_path):
     file = onnx_file(tmp_path / "own.onnx", (None, 160, 320, 3), [1, 2], kind=2)
     assert driving.load_driver(file)(np.full((160, 320, 3), (0, 200, 200), np.uint8)) == 0
+    bright = onnx_file(tmp_path / "bright.onnx", (1, 160, 320, 3), [1, 2], 2, reduced="ReduceLogSum")
+    assert driving.load_driver(bright)(np.full((160, 320, 3), 200, np.uint8)) == 1  # but no number for a black frame
     (tmp_path / "own.json").write_text('{"range": [-1, 1]}', encoding="utf-8")
     with pytest.raises(UserError, match="does not tell"):  # bytes can't be so
         driving.preprocessing(tmp_path / "own.json", [1, 160, 320, 3], whole=True)
