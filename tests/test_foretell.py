@@ -83,6 +83,15 @@ def test_the_observer_sees_what_the_network_steers_by_and_both_sides_alike(netwo
     assert float(x) == pytest.approx(float(seen.steering), abs=1e-5)
 
 
+def test_a_network_without_a_narrow_layer_is_watched_at_its_last_one():
+    class Wide(Network):
+        def layers(self):
+            return super().layers()[0], [torch.nn.Linear(self.units, 512), torch.nn.Linear(512, 1)]
+
+    seen = Observer(Wide().eval())(render_frame(0.4, 0.0, np.random.default_rng(4)))
+    assert seen.activations.shape == (512,)
+
+
 def test_a_camera_that_shows_nothing_new_while_the_car_drives_makes_it_blind(limits, network):
     """A standing car's frames are all alike; after a pause, of the simulator or of drive.py, one frame is no alarm."""
     blindness = Blindness()

@@ -38,7 +38,7 @@ class Observation(NamedTuple):
     """What the networks make of a frame; in the tool each array has one more dimension, for the frames of a drive.
 
     steering     float32 (): -1..1
-    activations  float32 (u,): inputs of the driving network's first dense layer that has MOST_UNITS or fewer
+    activations  float32 (u,): inputs of the driving network's first dense layer of MOST_UNITS or fewer, or its last one
     hidden       float32 (96,): of the lane network
     centres      float32 (5,): m to the lane's centre at DISTANCES_AHEAD, right positive
     mirrored     float32 (5,): the same in the mirror image
@@ -59,7 +59,7 @@ class Observer:
         self.network, self.lane = network, fold_norms(load_network(ANY_ROAD_WEIGHTS))
         self.activations = torch.empty(0)
         dense = [layer for layer in network.dense if isinstance(layer, nn.Linear)]
-        watched = next(layer for layer in dense if layer.in_features <= MOST_UNITS)
+        watched = next((layer for layer in dense if layer.in_features <= MOST_UNITS), dense[-1])
         watched.register_forward_pre_hook(self._keep)
 
     def _keep(self, layer: nn.Module, inputs: tuple[torch.Tensor, ...]) -> None:
