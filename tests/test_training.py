@@ -248,9 +248,14 @@ def test_a_programs_arguments_are_checked_as_the_commands(linked, tmp_path, monk
 
 def test_numpys_numbers_make_a_recipe_that_can_be_saved():
     epochs: Any = np.int64(3)
-    recipe = replace(REPORT, learning_rate=np.logspace(-4, -3, 2)[0], epochs=epochs)
-    assert type(recipe.learning_rate) is float and type(recipe.epochs) is int
+    turn, brightness = (np.float64(0.2), 0.5), np.array([0.4, 1.2])
+    ranges: dict[str, Any] = {"turn": turn, "brightness": brightness}
+    recipe = replace(REPORT, learning_rate=np.logspace(-4, -3, 2)[0], epochs=epochs, **ranges)
+    assert {type(figure) for figure in (recipe.learning_rate, *recipe.turn, *recipe.brightness)} == {float}
+    assert type(recipe.epochs) is int
     assert recipe == replace(REPORT, epochs=3) and REPORT.restored(recipe.saved()) == recipe
+    whole = replace(REPORT, huber=1)
+    assert whole.restored(whole.saved()) == whole
 
 
 def test_several_processes_leave_apples_gpu_alone(monkeypatch):

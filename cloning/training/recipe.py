@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cloning.network.network import NETWORKS, Exposure
-from cloning.network.tensors import shown
+from cloning.network.tensors import is_number, shown
 from cloning.training.optimizers import OPTIMIZERS
 
 
@@ -119,8 +119,7 @@ class Recipe:
     def __post_init__(self) -> None:
         """Take NumPy's numbers, of which a sweep may be made, for Python's, which a checkpoint can contain."""
         for item in fields(self):
-            if isinstance(value := getattr(self, item.name), np.generic):
-                object.__setattr__(self, item.name, value.item())
+            object.__setattr__(self, item.name, _python(getattr(self, item.name)))
 
     def saved(self) -> dict[str, Any]:
         """Return the recipe as plain values for a checkpoint: functions and augmentations by their names."""
@@ -143,7 +142,7 @@ class Recipe:
                     raise ValueError(f"its {name} is {shown(found)}, not {_plain(own)}")
                 figures[name] = own
             elif name == "huber":
-                if not (found is None or type(found) is float):
+                if not (found is None or is_number(found)):
                     raise ValueError(f"its huber is of type {type(found).__name__}")
             elif isinstance(own, tuple):
                 if not isinstance(found, (list, tuple)) or [*map(type, found)] != [*map(type, own)]:
@@ -170,6 +169,13 @@ class Recipe:
 def option_name(name: str) -> str:
     """Return the option that sets a field: batch_size -> --batch-size; from_model -> --from."""
     return f"--{name.removesuffix('_model').replace('_', '-')}"
+
+
+def _python(value: Any) -> Any:
+    """Return NumPy's numbers as Python's, also those of a range, and anything else as it is."""
+    if type(value) is tuple or isinstance(value, np.ndarray):
+        return tuple(map(_python, value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _plain(value: Any) -> Any:
