@@ -16,6 +16,7 @@ import torch
 from browser import decoded
 from PIL import Image
 from rendered import render_frame
+from torch import nn
 
 import drive
 from cloning.network import attention
@@ -294,9 +295,19 @@ def test_escape_sequences_are_for_terminals_only(session, jpeg):
 # What the network looks at
 
 
-def looking_at_what_is_bright() -> Network:
+class OfOtherLayers(Network):
+    """A network with padding and pooling, which NVIDIA's does not have."""
+
+    units = 24 * 10 * 40
+
+    def layers(self) -> Any:
+        block = nn.Sequential(nn.Conv2d(3, 8, 5, padding="same"), nn.MaxPool2d(2))
+        return [nn.AvgPool2d(2, ceil_mode=True), block, nn.Conv2d(8, 24, 3, 2, padding=1)], [nn.Linear(self.units, 1)]
+
+
+def looking_at_what_is_bright(kind: type[Network] = Network) -> Network:
     """A network whose every layer passes on where the image is bright."""
-    network = Network().eval()
+    network = kind().eval()
     for name, parameter in network.named_parameters():
         average = 1 / parameter[0].numel() if name.startswith("convolutions") and name.endswith("weight") else 0
         # Black is -1: it falls below 0 and out of the positive part.
@@ -312,11 +323,12 @@ def test_attention_to_an_even_image_has_no_grid():
     assert np.count_nonzero(np.diff(rising)) == 1, "from top to bottom it rises to one maximum, and falls"
 
 
-def test_attention_is_where_the_network_can_see_anything():
+@pytest.mark.parametrize("kind", [Network, OfOtherLayers])
+def test_attention_is_where_the_network_can_see_anything(kind):
     """A network that looks at what is bright looks at the bright spot, and nowhere else."""
     frame = np.zeros((160, 320, 3), np.uint8)
     frame[90:106, 200:216] = 255
-    steering, mask = attention.visual_backprop(looking_at_what_is_bright(), frame)
+    steering, mask = attention.visual_backprop(looking_at_what_is_bright(kind), frame)
     assert steering == 0
     assert mask.shape == (160, 320) and mask.dtype == np.float32 and mask.max() == pytest.approx(1)
     assert not mask[:60].any() and not mask[135:].any(), "the rows that are cropped off"

@@ -19,13 +19,14 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
     the kernels are binomial coefficients, whose sum is the same everywhere at a stride of 1 or 2. Raises
     ArithmeticError if the network's output is not finite.
     """
-    maps: list[torch.Tensor] = []
+    maps, sizes = list[torch.Tensor](), list[tuple[int, ...]]()  # of outputs; of inputs: rows, columns
 
-    def keep_average(_: nn.Module, __: object, output: torch.Tensor) -> None:
+    def keep_average(_: nn.Module, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
         # Only the positive part: the method is made for ReLU, which passes no other.
         maps.append(output.relu().mean(1, keepdim=True))
+        sizes.append(tuple(inputs[0].shape[2:]))
 
-    layers = [layer for layer in network.convolutions if isinstance(layer, nn.Conv2d)]
+    layers = [layer for layer in network.convolutions.modules() if isinstance(layer, nn.Conv2d)]
     hooks = [layer.register_forward_hook(keep_average) for layer in layers]
     try:
         steering = float(steer(network, frame))
@@ -34,15 +35,20 @@ def visual_backprop(network: Network, frame: np.ndarray) -> tuple[float, np.ndar
             hook.remove()
     top, bottom = network.crop
     cropped = (FRAME[0] - top - bottom, FRAME[1])
-    sizes = [cropped, *(tuple(average.shape[2:]) for average in maps[:-1])]  # rows, columns of each layer's input
+    below = [cropped, *(tuple(average.shape[2:]) for average in maps[:-1])]
     with torch.inference_mode():
         mask = torch.ones_like(maps[-1])
-        for layer, average, size in reversed(list(zip(layers, maps, sizes, strict=True))):
+        for layer, average, size, wanted in reversed(list(zip(layers, maps, sizes, below, strict=True))):
             mask = mask * average
             covered = [(n - 1) * s + k for n, s, k in zip(mask.shape[2:], layer.stride, layer.kernel_size, strict=True)]
-            padding = [whole - part for whole, part in zip(size, covered, strict=True)]
+            # What the layer left over at its input's end, and what it padded it with at the start.
+            missing = [max(0, whole - part) for whole, part in zip(size, covered, strict=True)]
+            padded = [max(0, part - whole + 1) // 2 for whole, part in zip(size, covered, strict=True)]
             kernel = torch.outer(*map(_binomial, layer.kernel_size))[None, None].to(mask.device)
-            mask = nn.functional.conv_transpose2d(mask, kernel, stride=layer.stride, output_padding=padding)
+            mask = nn.functional.conv_transpose2d(mask, kernel, stride=layer.stride, output_padding=missing)
+            mask = mask[..., padded[0] :, padded[1] :][..., : size[0], : size[1]]
+            if size != wanted:  # another network has layers in between, such as pooling
+                mask = nn.functional.interpolate(mask, wanted, mode="bilinear")
             mask = mask / mask.max().clamp(min=1e-12)
     whole_frame = np.zeros(FRAME[:2], np.float32)
     whole_frame[top : FRAME[0] - bottom] = mask[0, 0].cpu().numpy()
