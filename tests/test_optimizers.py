@@ -30,8 +30,16 @@ class NormalizedNetwork(Network):
         return [nn.Sequential(first, nn.BatchNorm2d(24)), *others], dense
 
 
-@pytest.mark.parametrize(("kind", "words"), [(LargeNetwork, "too many for a file"), (NormalizedNetwork, "batch norm")])
-def test_a_network_that_cannot_be_saved_whole_is_refused_before_it_is_trained(kind, words):
+def cropped_otherwise():
+    """A network that would learn from rows 60 to 135 of a frame, and drive by rows 40 to 115."""
+    return Network(crop=(40, 45))
+
+
+REFUSED = [(LargeNetwork, "too many"), (NormalizedNetwork, "batch norm"), (cropped_otherwise, r"by \(40, 45")]
+
+
+@pytest.mark.parametrize(("kind", "words"), REFUSED)
+def test_a_network_that_cannot_be_trained_or_saved_whole_is_refused_before(kind, words):
     network, process = kind(), Process("model.pt")
     with pytest.raises(ModelError, match=words):
         Checkpoint(Run(REPORT, ()), process, network, Adam(network.parameters()), "")

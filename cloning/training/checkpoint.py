@@ -27,6 +27,7 @@ from cloning.base.errors import ModelError
 from cloning.base.files import write
 from cloning.base.outputs import plural
 from cloning.network.network import (
+    CROP,
     NETWORKS,
     PREPROCESSING,
     Network,
@@ -260,7 +261,7 @@ class Checkpoint:
     def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data_fingerprint: str):
         """network, optimizer: whose state is saved and restored; data_fingerprint: of `fingerprint`.
 
-        Raises ModelError for a network that can't be saved whole.
+        Raises ModelError for a network that can't be saved whole, or sees other rows of a frame.
         """
         averages = [optimizer.zeros(index).values() for index in range(len(optimizer.parameters))]
         size = sum(tensor.nbytes for tensor in itertools.chain(network.state_dict().values(), *averages))
@@ -268,6 +269,8 @@ class Checkpoint:
             raise ModelError(f"the network's weights and their averages take {size:,} bytes, too many for a file")
         if next(network.buffers(), None) is not None:  # the copies that compute the gradients have their own
             raise ModelError("a network with batch normalization, or other buffers, can't be trained here")
+        if network.crop != CROP:  # it would drive by other rows than those that it learns from
+            raise ModelError(f"a network that crops frames by {network.crop}, not {CROP}, can't be trained here")
         self.run, self.process, self.network, self.optimizer = run, process, network, optimizer
         self.files, self.fingerprint = RunFiles(process.output), data_fingerprint
         self.resumed = False  # whether `restore` found a state of this run
