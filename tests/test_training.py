@@ -256,6 +256,8 @@ def test_numpys_numbers_make_a_recipe_that_can_be_saved():
     assert recipe == replace(REPORT, epochs=3) and REPORT.restored(recipe.saved()) == recipe
     whole = replace(REPORT, huber=1)
     assert whole.restored(whole.saved()) == whole
+    with pytest.raises(ValueError, match="best_by is 'drift'"):
+        replace(REPORT, best_by="drift")
 
 
 def test_several_processes_leave_apples_gpu_alone(monkeypatch):

@@ -117,9 +117,14 @@ class Recipe:
     disturbed: float = 0.0  # share of the images in foul weather, or of a dirty or faulty camera
 
     def __post_init__(self) -> None:
-        """Take NumPy's numbers, of which a sweep may be made, for Python's, which a checkpoint can contain."""
+        """Take NumPy's numbers, of which a sweep may be made, for Python's, which a checkpoint can contain.
+
+        Raises ValueError for another `best_by`, which would be asked for only after an epoch.
+        """
         for item in fields(self):
             object.__setattr__(self, item.name, _python(getattr(self, item.name)))
+        if self.best_by not in ("val_loss", "val_drift"):
+            raise ValueError(f"best_by is {self.best_by!r}, not 'val_loss' or 'val_drift'")
 
     def saved(self) -> dict[str, Any]:
         """Return the recipe as plain values for a checkpoint: functions and augmentations by their names."""
