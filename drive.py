@@ -153,6 +153,7 @@ class DriveServer:
         from cloning.server import server  # here, because it needs the socket libraries
 
         self.network, self.model, self.set_speed = network, model, set_speed
+        self.go_speed = set_speed or SET_SPEED_MPH
         self.limits, self.stop_when_lost = limits, stop_when_lost
         self.observer = Observer(network) if limits else None
         self.saver: saved_frames.FrameSaver | None = None  # saves the frames
@@ -213,7 +214,7 @@ class DriveServer:
 
     def change_set_speed(self, set_speed: float) -> None:
         """Drive all simulators at another set speed, in mph, from the next frame on; 0 stops them."""
-        self.set_speed = set_speed
+        self.set_speed, self.go_speed = set_speed, set_speed or self.go_speed
         for session in self.sessions.values():
             session.drive_at(set_speed)
 

@@ -171,7 +171,7 @@ def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monk
 
     monkeypatch.setattr(drive_page, "UPDATE_INTERVAL", 2**-10)
     events = drive_page.Pages(server, with_attention=False, pause=pause).events()
-    quiet = {"state": "waiting", "set_speed": 9.0, "recording": False}
+    quiet = {"state": "waiting", "set_speed": 9.0, "go_speed": 9.0, "recording": False}
     assert json.loads(next(events)[6:]) == quiet
     next(events)
     assert len(naps) == 1 + drive_page.QUIET_INTERVALS
@@ -318,6 +318,30 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
         page.shows("#state", "Waiting for a simulator")
         page.wait("document.querySelector('#speed').value == 12")
         assert page.text("#answer") == ""
+
+
+@needs_chromium
+def test_each_key_on_the_slider_counts_and_a_stopped_car_stays_until_go(model_file, jpegs, page, tmp_path):
+    """Over a slow connection, while the server tells of the speed before; and after the page was loaded again."""
+    with serving(model_file, cwd=tmp_path) as server, feeding(server.port, telemetry(jpegs[0], speed="9.0000")):
+        page.open(own := f"http://127.0.0.1:{server.port}/")
+        page.shows("#set-speed", "9 mph")
+        wait = "await new Promise(go => setTimeout(go, 3000))"  # 0.3 s
+        page.run(f"own = fetch; fetch = async (...what) => {{ {wait}; return own(...what); }}; speed.focus()")
+        for _ in range(4):
+            page.press("ArrowRight")
+            page.run("new Promise(go => setTimeout(go, 2000))")
+        page.shows("#answer", "drives at 11 mph")
+        page.click("#stop")
+        page.shows("#set-speed", "11 mph, stopped")
+        page.open(own)
+        page.shows("#set-speed", "11 mph, stopped")
+        page.run("speed.focus()")
+        page.press("ArrowLeft")
+        page.shows("#answer", "Go drives at 10.5 mph")
+        assert shown(server)["set_speed"] == 0
+        page.click("#stop")
+        page.shows("#answer", "drives at 10.5 mph")
 
 
 @needs_chromium

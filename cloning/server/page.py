@@ -86,6 +86,7 @@ class Server(Protocol):
     network: Network
     model: str  # the network's name, for people
     set_speed: float  # mph
+    go_speed: float  # mph, of the car that is stopped once it drives on, else the set speed
     recording: bool  # whether frames are saved
 
     def watched_session(self) -> Session | None:
@@ -294,7 +295,7 @@ def state_of(session: Session | None, now: float) -> str:
 
 def figures(server: Server, session: Session | None, now: float) -> dict[str, Any]:
     """Return what the page tells besides the state and the graphs, for JSON; now: time.monotonic()."""
-    shown: dict[str, Any] = {"set_speed": server.set_speed, "recording": server.recording}
+    shown: dict[str, Any] = {"set_speed": server.set_speed, "go_speed": server.go_speed, "recording": server.recording}
     if session and session.folder:
         saved, copy = (as_typed(f"{session.folder.path}{ending}") for ending in ("", "-recording"))
         convert, browse = f"python -m cloning.lerobot {saved} --output {copy}", f"python -m cloning.browse {copy}"

@@ -9,6 +9,7 @@ const STILL = 0.5; // mph: a car that is slower stands
 const GAP = 1; // s without a frame that interrupt a curve
 const LEFT = 64, RIGHT = 16; // px of a plot; drive.css has them for the captions
 const LEAST = 84, MOST = 260, ABOVE = 125, CAPTION = 24; // px of a plot's height, of what stands above all, of a caption
+const HOLD = 2000; // ms after its last move in which the slider does not follow the server, which may not know of it yet
 const SPIKES = 3; // frames at least that a scale may leave out
 const LIMIT = 1e6; // beyond which nothing is drawn to scale
 const WORDS = {
@@ -35,6 +36,7 @@ const GRAPHS = [
   {column: LATENCY, title: "Time in drive.py", unit: " ms", digits: 1, least: 10},
 ];
 let live = {}, rows = [], road = "", unknown = "" /* a road that is not drawn */, heard = false, drawn = 0, events, again;
+let moved = -HOLD, offered; // ms, when the slider was moved last; mph that the server gave it last
 
 // ---------------------------------------------------------------------------------------------------------------------
 // Words and figures
@@ -69,7 +71,9 @@ function showNow() {
 // Whether drive.py holds the car, so that Go lets it drive.
 const isStopped = () => live.set_speed == 0 || live.state == "doubtful";
 
-function showFigures({rate, frames, unusable, reason, saving, film, convert, browse, recording, set_speed, state}) {
+const showSpeed = speed => write("set-speed", `${speed} mph${isStopped() ? ", stopped" : ""}`);
+
+function showFigures({rate, frames, unusable, reason, saving, film, convert, browse, recording, set_speed, go_speed, state}) {
   write("rate", ["driving", "doubtful"].includes(state) ? rate.toFixed(1) : "–");
   write("frames", frames ?? "–");
   write("unusable", unusable ? `${unusable}; the last one: ${reason}` : unusable ?? "–", unusable ? "bad" : "");
@@ -84,9 +88,9 @@ function showFigures({rate, frames, unusable, reason, saving, film, convert, bro
   element("start").hidden = !["waiting", "gone"].includes(state);
   const stopped = isStopped();
   write("stop", stopped ? "Go" : "Stop", stopped ? "go" : "");
-  if (element("speed").matches(":active")) return; // it is being dragged
-  if (!stopped) element("speed").value = set_speed;
-  write("set-speed", stopped ? `${element("speed").value} mph, stopped` : `${set_speed} mph`);
+  const isHeld = element("speed").matches(":active") || performance.now() - moved < HOLD;
+  if (!isHeld && (!stopped || go_speed != offered)) element("speed").value = offered = go_speed;
+  showSpeed(isHeld || stopped ? element("speed").value : set_speed);
 }
 
 // The road from above, where it is known, with the last minute's path.
@@ -326,8 +330,15 @@ async function post(path, body, words) {
 }
 
 const setSpeed = speed => post("/set-speed", {set_speed: String(speed)}, speed ? `drives at ${speed} mph` : "stops the car");
-element("speed").onchange = () => setSpeed(Number(element("speed").value));
-element("speed").oninput = () => element("set-speed").textContent = `${element("speed").value} mph`;
+element("speed").onchange = () => {
+  const {value} = element("speed");
+  if (isStopped()) answer(`Go drives at ${value} mph`);
+  else setSpeed(Number(value));
+};
+element("speed").oninput = () => {
+  moved = performance.now();
+  showSpeed(element("speed").value);
+};
 element("stop").onclick = () => setSpeed(isStopped() ? Number(element("speed").value) : 0);
 element("record").onclick = () => post("/record", {recording: !live.recording}, live.recording ? "recording has ended" : "recording");
 element("controls").onsubmit = event => event.preventDefault();
