@@ -231,12 +231,14 @@ def test_a_run_that_was_killed_before_it_told_of_its_end_tells_when_it_is_resume
 
 @needs_chromium
 def test_a_training_run_refreshes_itself(tmp_path, page):
-    files = written_run(tmp_path / "a", finished=1, images=500, drifts=(0.9, 0.8, 0.6, 0.7))
+    files = written_run(tmp_path / "a b" / "a", finished=1, images=500, drifts=(0.9, 0.8, 0.6, 0.7))
+    options = json.loads(files.arguments.read_bytes()) | {"output": "a b/a/net.pt"}  # not model.pt
+    files.arguments.write_text(json.dumps(options), encoding="utf-8")
     written_run(tmp_path / "b", finished=4, images=0, epochs=5)
     (tmp_path / "none").mkdir()
     for path in files.pictures.iterdir():
         cv2.imwrite(str(path), np.zeros((1, 1), np.uint8))
-    with browsing("--run", *(tmp_path / name for name in ("a", "b", "none"))) as server:
+    with browsing("--run", *(tmp_path / name for name in ("a b/a", "b", "none"))) as server:
         page.open(f"{server.base}#/run/2")
         page.shows("#notice", "none: no training run in this folder yet; `python model.py --output")
         assert page.barriers() == []
@@ -246,7 +248,8 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.wait("document.querySelectorAll('#losses .uplot').length == 2")
         assert page.run("document.title").startswith("stopped: ")
         assert "Drift" in page.text("#losses section") and "within the epoch" in page.text("#losses")
-        page.shows("#run-figures", f"not written yet: python -m cloning.report {tmp_path / 'a'}")
+        page.shows("#run-figures", f"not written yet: python -m cloning.report '{files.report.parent}'")
+        page.shows("#run-figures", f"python model.py --resume --output '{files.last.with_name('net.pt')}'")
         files.report.write_text("<p>What it learned", encoding="utf-8")
         page.shows("#run-figures a", "report.html")
         assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<p>What it learned"
@@ -279,7 +282,7 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         progress = files.progress.read_text(encoding="utf-8")
         files.progress.write_text(progress.replace('"finished": 1', '"finished": 4'), encoding="utf-8")
         page.shows("#run-figures", "finished: 4 epochs")
-        page.shows("#run-figures", "epoch 4, in model-best.pt: it has the least validation loss, 0.2000")
+        page.shows("#run-figures", "epoch 4, in net-best.pt: it has the least validation loss, 0.2000")
         page.shows("#run-figures", "the least drift, 0.60 m, is that of epoch 3")
         assert page.run("document.querySelector('#run-bar').value") == 1
         assert page.run("document.querySelector('#run-read').open"), "after it has refreshed itself"

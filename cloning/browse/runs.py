@@ -9,7 +9,7 @@ from typing import Any
 
 from cloning.base import program
 from cloning.base.errors import UserError, message_of
-from cloning.base.outputs import short_names
+from cloning.base.outputs import as_typed, short_names
 from cloning.browse.analyses import UnknownError
 from cloning.training.run_files import RunFiles, best_epoch, judged_by
 
@@ -83,9 +83,10 @@ class Runs:
 def overview(files: RunFiles) -> dict[str, Any]:
     """Return what the page shows of a run. Raises UserError, OSError."""
     if not files.arguments.exists():
-        command = f"`python model.py --output {files.last}`"
-        raise UserError(f"{files.last.parent}: no training run in this folder yet; {command} begins one")
+        command = as_typed("python", "model.py", "--output", files.last)
+        raise UserError(f"{files.last.parent}: no training run in this folder yet; `{command}` begins one")
     options, progress = _json(files.arguments, OPTIONS, 1, "recipe"), {}
+    output = RunFiles(str(files.last.with_name(Path(str(options.get("output", files.last))).name)))  # the last run's
     history = _history(files.log)
     if files.progress.exists():
         progress = _json(files.progress, PROGRESS, 0)
@@ -104,6 +105,11 @@ def overview(files: RunFiles) -> dict[str, Any]:
     recordings, robust = options.get("recordings"), options.get("robust") is True or options.get("name") == "robust"
     return {
         "run": progress.get("run"),  # its identifier, or None
+        "models": [output.last.name, output.best.name],  # the names of its files
+        "commands": {
+            "resume": _command("python", "model.py", "--resume", "--output", output.last.resolve()),
+            "report": _command("python", "-m", "cloning.report", files.last.parent.resolve()),
+        },
         "state": state,
         "robust": robust,
         "recordings": [str(each) for each in recordings] if isinstance(recordings, list) else [],
@@ -122,6 +128,10 @@ def overview(files: RunFiles) -> dict[str, Any]:
         "has_report": files.report.is_file() and files.report.stat().st_mtime >= files.arguments.stat().st_mtime,
         "pictures": _pictures(files, progress["batches"] * options["batch_size"] if progress else math.inf),
     }
+
+
+def _command(*words: object) -> str:
+    return program.in_commands(as_typed(*words))
 
 
 def _trail(progress: dict[str, Any], done: float) -> list[list[float]]:

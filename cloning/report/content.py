@@ -89,14 +89,14 @@ class Report:
         files = RunFiles(str(folder / "model.pt"))
         self.run, self.name = overview(files), folder.resolve().name
         arguments = json.loads(files.arguments.read_bytes())
-        files = RunFiles(str(folder / Path(str(arguments.get("output", files.last))).name))  # the last run's here
-        self.model = files.best if files.best.exists() else files.last
+        self.output, best = (folder / name for name in self.run["models"])
+        self.model = best if best.exists() else self.output
         if not self.run["best"] or not self.model.exists():
             why = "no epoch is finished with a loss that is a number"
             raise UserError(f"{folder}: {why}, so there is nothing to report; let model.py go on, or train again")
         one_thread()  # as drive.py does; replays run at the same time
         self.network = load_model(self.model)
-        self.output, self.arguments = files.last, files.arguments
+        self.arguments = files.arguments
         self.recipe, self.labels = arguments.get("recipe"), arguments.get("training", {}).get("labels")
         self.laps = [Lap.of(picture, FILMS // len(laps)) for picture in laps]
         numbers = self.run["pictures"]

@@ -50,21 +50,21 @@ async function load(now) {
 
 const UNITS = {val_loss: "validation loss", val_drift: "drift"};
 // Which epoch is the best, why, and whether its drift says the same.
-function best({best, history}) {
+function best({best, history, models}) {
   if (!best) return "none yet";
   const steadiest = history.filter(row => row.val_drift != null).sort((a, b) => a.val_drift - b.val_drift)[0];
   const value = (best.by == "val_drift" ? metres : loss)(best.value);
-  const why = `epoch ${best.epoch}, in model-best.pt: it has the least ${UNITS[best.by]}, ${value}`;
+  const why = `epoch ${best.epoch}, in ${models[1]}: it has the least ${UNITS[best.by]}, ${value}`;
   if (!steadiest || steadiest.epoch == best.epoch) return why;
   return `${why}; the least drift, ${metres(steadiest.val_drift)}, is that of epoch ${steadiest.epoch}`;
 }
 
 const metres = value => value == null ? "–" : `${value.toFixed(2)} m`;
 
-export const stateOf = ({state, history, epochs, samples_per_epoch: samples, images, left}) => {
+export const stateOf = ({state, commands, history, epochs, samples_per_epoch: samples, images, left}) => {
   if (state == "finished") return `finished: ${many(epochs, "epoch")}`;
   const where = `epoch ${Math.min(history.length + 1, epochs)} of ${epochs}`;
-  if (state == "stopped") return `stopped or killed in ${where}; continue with --resume`;
+  if (state == "stopped") return `stopped or killed in ${where}; continue with ${commands.resume}`;
   if (history.length == epochs) return "running: another run reads its recordings, or this one sums up";
   const share = (100 * Math.min(1, images / samples)).toFixed(0);
   return `running: ${where}, ${share} % of it` + (left == null ? "" : `, ${duration(left)} left`);
@@ -107,7 +107,7 @@ function update({all, runs}) {
       `validation loss ${loss(last.val_loss)}, training loss ${loss(last.loss)}`,
     trained: `${run.robust ? "with --robust" : "as in the report"}, in ${run.folder}`,
     report: run.has_report ? make("a", "report.html", {href: `/runs/${run.id}/report.html`, target: "_blank"})
-      : `not written yet: python -m cloning.report ${run.folder}`,
+      : `not written yet: ${run.commands.report}`,
   });
   element("run-figures").replaceChildren(...lines.flatMap(([term, value]) => [make("dt", term), make("dd", "", {}, value)]));
   element("run-read").hidden = !run.recordings.length;
