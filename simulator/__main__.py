@@ -197,7 +197,7 @@ def _add_join(commands: "Subparsers") -> None:
     add("--dialect", choices=("measures", "roads", "episodes"), required=True, help=text)
     text = (
         "let simulated time follow the wall clock: 1 in real time, 0.5 half as fast; by default it waits for the "
-        "answer to each telemetry, and in the dialect roads for the program's driver"
+        "answer to each telemetry, and in the dialects roads and episodes for the program's driver"
     )
     add("--pace", type=number(float, 0, 100), default=0.0, metavar="FACTOR", help=text)
     text = "telemetries a simulated second, of which there are at most 50 (default %(default)s)"

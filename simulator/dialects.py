@@ -256,9 +256,10 @@ class Episodes(Dialect):
     """
 
     more = 0.003  # after its action, the program sends whether to go on, and perhaps another episode
+    apart = True
 
     def __init__(self, stage: Stage):
-        self.day = True
+        self.day, self._last = True, None  # data of the last action
         self.tone: np.ndarray | None = None  # of the camera by day
         super().__init__(stage)
         self.ready = False
@@ -277,6 +278,7 @@ class Episodes(Dialect):
     def handle(self, event: str, data: Any) -> bool:
         """Steer, start or end an episode, pause or go on. Raises UserError for an unknown track or weather."""
         if event == "action":
+            self.same, self._last = data == self._last, data
             return self.obey(data)
         if event in ("pause_sim", "resume_sim"):
             self.still = event == "pause_sim"

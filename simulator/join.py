@@ -20,6 +20,7 @@ from cloning.wire.session import MAX_UNASKED, ClientSession
 from simulator.car import STEP
 from simulator.client import MAX_CATCH_UP
 from simulator.dialects import DIALECTS, Dialect, Stage
+from simulator.run import Run
 
 ASK_AGAIN = 5.0  # s without an answer, after which the telemetry is sent again: programs drop some
 SETTLE = 0.2  # s without a word from the server, after which its greeting is over, and the start of an episode
@@ -85,10 +86,10 @@ class Joined(ClientSession):
         while not self.dialect.over:
             while not self.dialect.ready:
                 self._listen(ASK_AGAIN)
-            telemetry = self.dialect.telemetry()
+            run, telemetry = self.dialect.run, self.dialect.telemetry()
             if self._ask(telemetry):
                 if not self.pace:
-                    self._await_driver(telemetry)
+                    self._await_driver(run, telemetry)
                 self._drive()
             elif not (self.time or self._is_puzzled):
                 self._is_puzzled = True
@@ -103,8 +104,8 @@ class Joined(ClientSession):
         self.frames += 1
         return self._await_answer()
 
-    def _await_driver(self, telemetry: str) -> None:
-        """Send the telemetry again until the answer changes, if the program's driver may be in another thread."""
+    def _await_driver(self, run: Run, telemetry: str) -> None:
+        """Send a run's telemetry again until the answer changes, if the program's driver may be in another thread."""
         is_new = not self.dialect.same
         if is_new:
             self._constant = 0
@@ -113,6 +114,8 @@ class Joined(ClientSession):
         begin, pause = time.monotonic(), self._thinking
         while time.monotonic() < begin + (PATIENTLY if self._apart else BRIEFLY):
             self._listen(pause)
+            if self.dialect.run is not run:  # another episode has begun
+                return
             if self._ask(telemetry) and not self.dialect.same:
                 self._apart = True
                 self._thinking += 0.1 * (min(time.monotonic() - begin, 0.2) - self._thinking)
