@@ -289,7 +289,8 @@ class Episodes(Dialect):
             self.tell("episode_events", {"events": self.events})
             self.tell("episode_ended", {})
         elif event == "start_episode" and isinstance(data, dict):
-            self.start(*(str(data.get(key)) for key in ("track_name", "weather_name", "daytime_name")))
+            wanted = {"weather_name": "sunny", "daytime_name": "day"} | data  # some programs name only the track
+            self.start(*(str(wanted.get(key)) for key in ("track_name", "weather_name", "daytime_name")))
             self.tell("episode_started", {})
         return False
 
