@@ -62,9 +62,12 @@ class Joined(ClientSession):
         while not self.dialect.over:
             try:
                 self.connect()
+                begin = time.monotonic()
                 try:
                     self._exchange()
                 except ConnectionLost as error:
+                    if self._waiting_until:  # a server that has not answered yet is there all the same
+                        self._waiting_until += time.monotonic() - begin
                     self.count_reconnection(error)
                 finally:
                     self.close()

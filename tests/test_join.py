@@ -28,9 +28,9 @@ LAKE = Stage("lake", None, 0, {})
 class Program(Server):
     """A server whose `answer(data, n)` returns the events for a telemetry's data, or None to hang up."""
 
-    def __init__(self, answer):
+    def __init__(self, answer, sessions=1):
         self.answer, self.data = answer, []
-        super().__init__(self.reply_to)
+        super().__init__(self.reply_to, sessions=sessions)
 
     def reply_to(self, packet, n):
         event, data = json.loads(packet[2:])
@@ -242,6 +242,20 @@ def test_a_program_whose_answers_cannot_be_used_is_told_of_and_is_no_success(mon
     printed = capsys.readouterr()
     assert printed.out.count("no usable answer in 0.2 s; if none comes, the program may speak another --dialect") == 1
     assert "0 simulated seconds" in printed.out
+
+
+def test_a_program_that_thinks_long_and_hangs_up_before_its_first_answer_is_joined_again(monkeypatch):
+    monkeypatch.undo()  # what `at_once` has changed
+
+    def answer(data, n):
+        if len(program.data) > 1:
+            return [steer(0, 1)] if n < 3 else None
+        time.sleep(1.3)  # more than --wait
+        return None
+
+    with Program(answer, sessions=2) as program:
+        assert join("measures", program, "--wait", "1") == 0
+    assert len(program.data) == 5
 
 
 def test_with_a_pace_the_car_stands_still_until_the_first_telemetry():
