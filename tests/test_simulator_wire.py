@@ -194,8 +194,10 @@ OTHER_SERVERS = {
 def test_drives_with_other_peoples_servers(name, tmp_path, capsys, monkeypatch):
     program, packages, asks = OTHER_SERVERS[name]
     if packages:
-        command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path), *packages]
-        if subprocess.run(command, timeout=60).returncode:
+        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path)]
+        try:
+            subprocess.run([*pip, *packages], check=True, timeout=60)
+        except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
             pytest.skip(f"pip can't install {packages} here")
     monkeypatch.setattr("cloning.wire.client.PING_INTERVAL", 0.5)
     monkeypatch.setattr("cloning.wire.client.PONG_TIMEOUT", 0.5)
