@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from commands import ROOT, SHORT, TINY, edited, finished_run, log, run_here, run_model, same, started_run, weights
+from commands import HERE, ROOT, SHORT, TINY, edited, finished_run, log, run_here, run_model, same, weights
 from killed import ALL
 from rendered import render_recording
 
@@ -40,20 +40,36 @@ def begun(one_epoch, tmp_path):
     return shutil.copytree(one_epoch, tmp_path / "begun")
 
 
+# A run that gets a signal when its first epoch begins; SIGHUP twice, as a closed terminal may send it.
+SIGNALLED = """
+import os, signal, sys, model
+from cloning.base import program
+
+number = int(sys.argv.pop(1))
+
+def told(*words, **more):
+    print(*words, **more)
+    for _ in range(1 + (number == signal.SIGHUP)):
+        if words[0].startswith("Epoch"):
+            os.kill(os.getpid(), number)
+
+model.print = told
+program.name = "model.py"
+program.run(model.main)
+"""
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows sends a process no signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_interrupted(
     finished, sample_recording, tmp_path, name
 ):
     output, number = tmp_path / "model.pt", getattr(signal, name)
-    run = started_run(sample_recording, *SHORT, "--output", output, until="Epoch")
-    run.send_signal(number)
-    if number == signal.SIGHUP:
-        run.send_signal(number)  # as a closed terminal may do
-    _, errors = run.communicate(timeout=120)
+    command = [sys.executable, "-c", SIGNALLED, str(int(number))]
+    run = run_model(sample_recording, *SHORT, "--output", output, command=command, env=HERE)
     assert run.returncode == 128 + number
-    assert errors.startswith("model.py: ") and "--resume" in errors
-    assert "Traceback" not in errors
+    assert run.stderr.startswith("model.py: ") and "--resume" in run.stderr
+    assert "Traceback" not in run.stderr
     state = torch.load(tmp_path / "model-resume.pt", weights_only=True)["training"]
     assert 0 < state["images"] < 150  # in the middle of an epoch
     assert run_here(sample_recording, "--output", output, "--resume").returncode == 0
@@ -95,7 +111,8 @@ def test_a_run_whose_terminal_is_closed_saves_its_state(sample_recording, tmp_pa
     import termios
 
     ours, its = os.openpty()
-    command = [sys.executable, str(ROOT / "model.py"), str(sample_recording), *map(str, SHORT), "--output", "model.pt"]
+    long = [*map(str, SHORT), "--epochs", "100"]  # so that it still runs when its terminal is closed
+    command = [sys.executable, str(ROOT / "model.py"), str(sample_recording), *long, "--output", "model.pt"]
     run = subprocess.Popen(
         command,
         cwd=tmp_path,
