@@ -197,6 +197,7 @@ def test_plain_rows_are_read_as_all_others(log, monkeypatch):
         (f"{images(9, cameras=('center', 'left', 'left'))},0,1,0,9", Finding.CAMERAS, "an image of the right camera"),
         (f"{images(9, cameras=('left', 'center', 'right'))},0,1,0,9", Finding.CAMERAS, "an image of the center camera"),
         (images(9).replace("left_2018", "left_2019") + ",0,1,0,9", Finding.CAMERAS, "are of different times"),
+        (images(9).replace("jpg", "PNG") + ",0,1,0,9", Finding.CAMERAS, "PNG: not a JPEG; convert the images"),
         (images(9).replace("_", "_" + "1" * 300) + ",0,1,0,9", Finding.CAMERAS, "not understood as an image of the"),
         (f"{images(9)},0.5,1,0,9,0.5", Finding.COLUMNS, "5 numbers where 4 are expected"),  # 13
         (f"{images(9)},0.5,1,0,9,Lake v1.2", Finding.COLUMNS, "name the columns in a header line above the rows"),

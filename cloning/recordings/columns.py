@@ -89,14 +89,17 @@ def base_name(path: str) -> str:
 
 
 def is_image(path: str) -> bool:
-    """Return whether a path is that of a JPEG."""
-    return path.lower().endswith((".jpg", ".jpeg"))
+    """Return whether a path is that of an image; `check_names` refuses all but JPEGs."""
+    return path.lower().endswith((".jpg", ".jpeg", ".png", ".bmp"))
 
 
 def check_names(names: Sequence[str]) -> None:
     """Raise UnclearRowError unless three file names are one moment's images of the centre, left and right camera."""
     moments = set()
     for name, camera in zip(names, CAMERAS, strict=True):
+        if name.lower().endswith((".png", ".bmp")):
+            remedy = f"convert the images, and name them .jpg, here and in {IMAGE_FOLDER}/"
+            raise UnclearRowError(Finding.CAMERAS, f"{name[:MAX_NAME]}: not a JPEG; {remedy}")
         match = IMAGE.fullmatch(name)
         if not match or match[1].lower().replace("centre", "center") != camera or len(os.fsencode(name)) > MAX_NAME:
             raise UnclearRowError(

@@ -113,7 +113,8 @@ def reference_lines(recording: Recording, by_lane: bool = True) -> list[Referenc
     else:
         lines = [ReferenceLine.human_path(stretch) for stretch in driven]
     if not lines:
-        raise NothingToReplay(f"{recording.folder}: no two seconds of driving without a break to replay; record more")
+        nothing = "no two seconds of driving without a break to replay, all faster than 2 mph; record more"
+        raise NothingToReplay(f"{recording.folder}: {nothing}")
     return lines
 
 

@@ -29,7 +29,7 @@ def robust(report: Recipe) -> Recipe:
         name="robust",
         words=Words(
             dropped="lane ahead unknown",
-            too_few="the drives are too short",
+            too_few="the drives are too short, or not faster than 2 mph",
             label_source="recovery steering",
             aimed_at="the lane's centre",
             remedy="train longer, or record more",
