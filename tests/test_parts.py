@@ -7,7 +7,7 @@ from rendered import without_files
 from cloning.lane.ahead import centre_ahead
 from cloning.lane.cuts import find_cuts
 from cloning.lane.follow import Candidate, TrackFilter, short_of_bend
-from cloning.lane.localise import localise_all
+from cloning.lane.localise import localise_all, steers_against_bends
 from cloning.lane.parts import EXPECTED, Placing, certain_parts, unrivalled
 from cloning.lane.reader import DISTANCES_AHEAD, MOUNT_OFFSETS, fuse_detections
 from cloning.lane.recovery import MISHAP, LanePosition
@@ -234,6 +234,13 @@ def test_a_turn_that_the_steering_does_not_explain_ends_a_part(lake):
     undamaged = np.r_[np.ones(400, bool), np.zeros(40, bool), np.ones(460, bool)]
     check(offset, undamaged)
     assert np.isnan(offset[410:430]).all()
+
+
+@pytest.mark.parametrize(("rows", "told"), [(700, True), (590, False)])
+def test_steering_of_the_other_sign_is_told_from_what_the_cameras_see(rows, told):
+    recording, centres = driven("jungle", rows)
+    assert not steers_against_bends(recording, centres)
+    assert steers_against_bends(recording.take(slice(None), steering=-recording.steering), centres) == told
 
 
 def test_a_short_drive_that_turns_otherwise_than_it_steers_is_not_certain(lake):

@@ -208,10 +208,10 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
     centres: float32 (n, 3, 5), m to the right of the cameras.
     """
     near = centres[..., :2]  # further ahead a metre is few pixels
-    scale = _smooth((near[:, 1] - near[:, 2]).mean(1), SCALE_ROWS) / (MOUNT_OFFSETS[2] - MOUNT_OFFSETS[1])
+    scale = smooth((near[:, 1] - near[:, 2]).mean(1), SCALE_ROWS) / (MOUNT_OFFSETS[2] - MOUNT_OFFSETS[1])
     scale = np.clip(scale, MIN_SCALE, 1)
     near = near / scale[:, None, None] + MOUNT_OFFSETS[:, None]
-    camera_error = _smooth(near[:, 1:] - near[:, :1])
+    camera_error = smooth(near[:, 1:] - near[:, :1])
     heading = stretch.heading
     # The path of the rear axle, which slides outwards in bends.
     path, step = heading[:-1] + np.diff(heading) / 2 + stretch.slip, np.diff(stretch.driven)
@@ -242,11 +242,11 @@ def _fit_centre(stretch: Stretch, centres: np.ndarray) -> LanePosition:
         a, b, _ = curve
         yaw[row] = -np.arctan(b)
         offset[row] = -a * np.cos(yaw[row])
-    trusted = (np.abs(camera_error) < MAX_CAMERA_ERROR).all((1, 2)) & (_smooth(residual) < MAX_RESIDUAL)
+    trusted = (np.abs(camera_error) < MAX_CAMERA_ERROR).all((1, 2)) & (smooth(residual) < MAX_RESIDUAL)
     return LanePosition.read(offset / np.sqrt(scale), yaw, trusted)
 
 
-def _smooth(values: np.ndarray, rows: int = SMOOTHING_ROWS) -> np.ndarray:
+def smooth(values: np.ndarray, rows: int = SMOOTHING_ROWS) -> np.ndarray:
     """Average values (n, …) over an odd number of rows with a Hann window, at the ends over the rows that there are."""
     weights = np.hanning(rows + 2)[1:-1].astype(np.float32)
     half, others = rows // 2, values.ndim - 1
