@@ -317,6 +317,7 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
         page.shows("#where", "frame 1 of 60")
         page.press("Escape")
         page.wait(f"location.hash == '#?find=refused%3E0' && {shown} == 'gone'")
+        page.wait("document.activeElement.textContent == 'gone'")
         page.run("document.querySelector('#query').value = ''; document.querySelector('#query').oninput()")
         page.open(f"{server.base}#?select={server.hash('spoilt')[2:]}")  # which cannot be exported
         page.shows("#total", "4 recordings, 121 frames")

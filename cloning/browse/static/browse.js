@@ -7,11 +7,12 @@ import {showRecording, leaveRecording, pressed, KEYS} from "./recording.js";
 
 const VIEWS = ["list", "comparison", "recording", "run"];
 const AGAIN = 5000; // ms until a view that could not be shown is tried again
-let routed = 0, again; // number of the last view, what an earlier one says is dropped; timer of the next try
+let routed = 0, again, before; // number of the last view, what an earlier one says is dropped; timer of the next try; its id
 
 async function route(isAgain) {
   const [path, query = ""] = location.hash.split("?"), [, id, row] = path.split("/");
-  const shown = new URLSearchParams(query), number = ++routed;
+  const shown = new URLSearchParams(query), number = ++routed, from = before;
+  before = id;
   clearTimeout(again);
   leaveList();
   leaveComparison();
@@ -23,7 +24,7 @@ async function route(isAgain) {
   document.title = "Recordings";
   try {
     await (id == "run" ? showRun(row, shown) : id == "compare" ? showComparison(shown)
-      : id ? showRecording(id, row, shown) : showList(shown));
+      : id ? showRecording(id, row, shown) : showList(shown, from));
     if (isAgain && number == routed) notice();
   } catch (error) {
     if (number != routed) return;

@@ -25,7 +25,8 @@ function again() {
   dispatchEvent(new HashChangeEvent("hashchange"));
 }
 
-export async function showList(state) {
+// from: the id of the recording from which it is come back to.
+export async function showList(state, from) {
   const now = shown, recordings = await ask("");
   if (now != shown) return;
   lost = false;
@@ -39,6 +40,9 @@ export async function showList(state) {
   element("cards").replaceChildren(...cards);
   element("finding").hidden = !cards.length;
   await Promise.all(recordings.map((recording, at) => fill(recording.id, cards[at], now)));
+  if (now == shown && document.activeElement == document.body) {
+    element("cards").querySelector(`h2 a[href="#/${from}"]`)?.focus(); // which scrolls there
+  }
 }
 
 // ---------------------------------------------------------------------------------------------------------------------
