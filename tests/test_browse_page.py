@@ -347,6 +347,8 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
     page.open(f"{served.base}#/compare?limit=1")
     page.wait("document.querySelectorAll('#table td').length > 5")
     difference = 0.1 - read_recording(sample_recording).steering
+    page.run("document.querySelector('#table a').textContent = 'lake_'.repeat(40)")
+    assert page.box("#table td")[0] < 600, "the figures are beside a long name, not below it"
     for words in ("one.pt", "two.pt", "90.0 %", "0.25 m", f"{np.sqrt(np.mean(difference**2)):.3f}", "lake"):
         assert words in page.text("#table")
     assert page.barriers() == []
