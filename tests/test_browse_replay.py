@@ -253,6 +253,8 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         files.report.write_text("<p>What it learned", encoding="utf-8")
         page.shows("#run-figures a", "report.html")
         assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<p>What it learned"
+        page.run("document.querySelector('#run-figures a').focus(); new Promise(go => setTimeout(go, 15000))")
+        assert page.run("document.activeElement.textContent") == "report.html", "though the page has asked again"
         page.click("#run-others button")
         page.shows("#losses", "b drift")
         assert page.run("location.hash") == "#/run/0?with=1"

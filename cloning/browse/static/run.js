@@ -109,7 +109,8 @@ function update({all, runs}) {
     report: run.has_report ? make("a", "report.html", {href: `/runs/${run.id}/report.html`, target: "_blank"})
       : `not written yet: ${run.commands.report}`,
   });
-  element("run-figures").replaceChildren(...lines.flatMap(([term, value]) => [make("dt", term), make("dd", "", {}, value)]));
+  renew(element("run-figures"), lines, () =>
+    lines.flatMap(([term, value]) => [make("dt", term), make("dd", "", {}, value)]));
   element("run-read").hidden = !run.recordings.length;
   element("run-count").textContent = many(run.recordings.length, "recording");
   renew(element("run-recordings"), run.recordings, () => run.recordings.map(folder => make("li", folder)));
