@@ -222,10 +222,10 @@ class Generator:
         passes = at // len(self.observations)  # over all observations, each in another order
         parts = [self.order(int(p))[at[passes == p] % len(self.observations)] for p in np.unique(passes)]
         chosen, camera = np.concatenate(parts), rng.integers(len(CAMERAS), size=n) * recipe.side_cameras
-        made = [rng.random(n) < share if share < 1 else np.ones(n, bool) for share in recipe.shares()]
-        total_images = int(np.sum(made))
-        slots = np.full((n, len(made)), -1)
-        slots[np.stack(made, axis=1)] = rng.permutation(total_images)  # the batch is shuffled
+        made = np.stack([rng.random(n) < share if share < 1 else np.ones(n, bool) for share in recipe.shares()], axis=1)
+        made[0, 0] |= not made.any()  # a small batch of rare augmentations has one image, too
+        total_images, slots = int(made.sum()), np.full(made.shape, -1)
+        slots[made] = rng.permutation(total_images)  # the batch is shuffled
         units = NETWORKS[recipe.network].units
         bits = np.unpackbits(np.frombuffer(rng.bytes(-(-total_images * units // 8)), np.uint8))
         keep = bits[: total_images * units].view(bool).reshape(total_images, units) if recipe.dropout else None

@@ -218,3 +218,9 @@ def test_an_augmentation_of_no_share_is_not_made(generator):
     for left_out, recipe in ((1, replace(REPORT, flip=0.0)), (3, replace(REPORT, shadow=0.0))):
         without = Generator(generator.observations, recipe, 0, generator.pool)
         assert (without.sample(0).slots >= 0).any(axis=0).tolist() == [other != left_out for other in range(4)]
+
+
+def test_a_batch_of_rare_augmentations_has_an_image(generator):
+    rare = replace(REPORT, batch_size=2, augmentations=(REPORT.augmentations[0]._replace(share=0.5),))
+    few = Generator(generator.observations, rare, 0, generator.pool)
+    assert {few.start_batch(number)().total for number in range(20)} == {1, 2}
