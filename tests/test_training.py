@@ -90,6 +90,9 @@ def test_an_error_above_that_of_constant_steering_is_explained():
     assert "net.pt has a larger error than steer 0, because on straights" in larger and "nan" not in larger
     assert larger.endswith(f"replay RECORDING --model {Path('runs', 'net.pt')}")
     assert "larger error" not in text(labels) and "hardly follows" not in text(labels)
+    long = summary.error_table(labels, 0.05, {Path("jungle-shadows.pt"): labels, Path("a.pt"): labels}, REPORT)
+    title, *figures = [line for line in long.splitlines() if "  steer 0  " in line or line.startswith("steering of")]
+    assert title.split()[-2:] == ["jungle-shadows.pt", "a.pt"] and {len(line) for line in figures} == {len(title)}
     assert "net.pt hardly follows the driver" in text(np.zeros_like(labels))
     with warnings.catch_warnings(action="error"):
         assert math.isnan(summary.correlation(labels[:1], labels[:1])), "of a single row"

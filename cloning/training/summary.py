@@ -177,15 +177,17 @@ def error_table(labels: np.ndarray, mean: float, models: Mapping[Path, np.ndarra
     edges, label_source = (0, recipe.straight, *recipe.turn, 1), recipe.words.label_source
     predictions = {"steer 0": np.zeros_like(labels), "steer mean": np.full_like(labels, mean)}
     predictions |= {path.name: guess for path, guess in models.items()}
-    lines = [f"\n{'validation: mean squared error':32} {'rows':>6}" + "".join(f"{name:>15}" for name in predictions)]
+    width = max(13, *map(len, predictions)) + 2
+    titles = "".join(f"{name:>{width}}" for name in predictions)
+    lines = [f"\n{'validation: mean squared error':32} {'rows':>6}{titles}"]
     size = np.abs(labels)
     for low, high in [*itertools.pairwise(edges), (edges[0], edges[-1])]:
         rows = (size >= low) & ((size < high) | (high == edges[-1]))
         if rows.any():
-            errors = "".join(f"{np.mean((guess - labels)[rows] ** 2):15.4f}" for guess in predictions.values())
+            errors = "".join(f"{np.mean((guess - labels)[rows] ** 2):{width}.4f}" for guess in predictions.values())
             lines.append(f"{f'steering of {low:g} to {high:g}':32} {rows.sum():6,}{errors}")
     correlations = {name: correlation(guess, labels) for name, guess in predictions.items()}
-    values = "".join(f"{'-' if np.isnan(value) else f'{value:.2f}':>15}" for value in correlations.values())
+    values = "".join(f"{'-' if np.isnan(value) else f'{value:.2f}':>{width}}" for value in correlations.values())
     lines.append(f"{f'correlation with the {label_source}':39}{values}")
     lines.append("\nsteer 0 and steer mean, constant steering, are for comparison; they have no correlation (-).")
     lines[-1] += recipe.words.val_loss
