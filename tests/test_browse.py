@@ -284,19 +284,6 @@ def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried
     assert ended(recording.analyses, linked) == {"state": "failed", "message": "started"}
 
 
-def test_analyses_pause_and_go_on(recording, linked, monkeypatch):
-    code = "import time; print('progress 0.5', flush=True); time.sleep(600)"
-    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
-    queue = recording.analyses
-    awaited(lambda: queue.state(linked, LANE) == {"state": "running", "progress": 0.5})
-    process = queue.process
-    queue.pause()
-    awaited(lambda: queue.state(linked, LANE) == {"state": "paused"})
-    assert process and process.poll() is not None, "it takes no more time"
-    queue.resume()
-    awaited(lambda: queue.state(linked, LANE) == {"state": "running", "progress": 0.5})
-
-
 def test_a_recording_without_an_image_has_no_lane(linked):
     shutil.rmtree(linked / "IMG")
     (linked / "IMG").mkdir()
