@@ -61,7 +61,7 @@ def test_roads_are_closed_loops_of_600_to_1500_metres(roads, mountains):
 
 def test_roads_keep_away_from_themselves(roads, mountains):
     """Parts 50 m or more apart along the road leave room for two roads, and 2 m between them; none cross."""
-    for road in roads[:40] + mountains:
+    for road in roads[:20] + mountains[:15]:
         points, n = road.points[:, :2], len(road.points)
         apart = np.abs(np.arange(n)[:, None] - np.arange(n))
         apart = np.minimum(apart, n - apart)

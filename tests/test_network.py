@@ -198,19 +198,17 @@ def test_dark_images_and_those_without_contrast_are_lifted_when_it_drives(tmp_pa
         assert torch.equal(lifting.train()(dark), plain.train()(dark)), "in training all are as they are"
 
 
-@pytest.mark.parametrize(("track", "wrong"), [("lake", 0), ("jungle", 10)])
+@pytest.mark.parametrize(("track", "wrong"), [("lake", 0), ("jungle", 4)])
 def test_the_shipped_network_steers_back_to_the_centre(track, wrong, tmp_path):
     """The side cameras see the road as a car does that is 0.8 m off: further right from the left, and vice versa."""
     recorded(tmp_path / track, Track(track), 0.1, 30, seed=0)
     network = load_model(SHIPPED_MODEL)
-    centre, left, right = (
-        np.array([steer(network, decode(path.read_bytes())) for path in sorted(tmp_path.glob(f"*/IMG/{camera}_*.jpg"))])
-        for camera in ("center", "left", "right")
-    )
+    images = (sorted(tmp_path.glob(f"*/IMG/{camera}_*.jpg"))[::2] for camera in ("center", "left", "right"))
+    centre, left, right = (np.array([steer(network, decode(path.read_bytes())) for path in each]) for each in images)
     assert len(centre) == len(left) == len(right) > 50
     assert (left > centre).all()
-    # Measured in the jungle: 8 of 247, in a row before a crest that hides the road. There the right camera is about 2 m
-    # off the centre, as far as any pose that was trained on.
+    # Measured in the jungle: 2 of 124, before a crest that hides the road. There the right camera is about 2 m off the
+    # centre, as far as any pose that was trained on.
     assert np.sum(right >= centre) <= wrong
     # Measured: 0.20 to 0.28. At 0.2 the car is back in the centre after about 7 m.
     assert 0.17 < np.mean(left - centre) < 0.3
