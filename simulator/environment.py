@@ -83,6 +83,22 @@ def make_track(track: Any, direction: Any) -> Track:
     return Track(track, direction)
 
 
+def set_on_road(run: Run, options: dict[str, Any]) -> None:
+    """Set the car on its road; options: see `Drive.reset`. Raises SimulatorError."""
+    turn = options.get("turn", 0.0)
+    check("turn", turn, lambda radians: -math.pi <= radians <= math.pi, "-π to π (radians)")
+    s, offset = options.get("s", run.s), options.get("offset", 0.0)
+    length = run.track.length
+    check("s", s, lambda metres: 0 <= metres < length, f"at least 0 and less than {length:.1f} (m)")
+    left, right = run.track.edges[run.track.index(s)]
+    edges = f"at {s:.1f} m the edges are at {-left:.2f} and {right:.2f} m"
+    check("offset", offset, lambda metres: -left <= metres <= right, f"a number on the road (m); {edges}")
+    run.s = float(s)
+    run.set_back(float(offset), turn=float(turn))
+    if side := run.off_road():
+        raise SimulatorError(f"offset {offset!r}: a wheel would be beyond the road's {side} edge; {edges}")
+
+
 class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
     """Drive the simulator's car by its centre camera; a step lasts one frame, 1/15 s of simulated time.
 
@@ -158,12 +174,18 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         if not isinstance(options, dict) or options.keys() - set(OPTIONS):
             raise SimulatorError(f"options {options!r}: the options of reset are {', '.join(OPTIONS)}, in a dict")
         disturbance = parse_disturbance(options["disturb"]) if "disturb" in options else self.disturbance
-        self._choose_road(options)
-        self.run = Run(self.track, "autonomous")
-        self.run.car.speed_limit = self.speed * MPH
+        track, look = self._chosen_road(options)
+        run = Run(track, "autonomous")
+        run.car.speed_limit = self.speed * MPH
         if self.random_start:
-            self.run.s = self.np_random.uniform(0, self.track.length)
-        self._set_on_road(options)
+            run.s = self.np_random.uniform(0, track.length)
+        set_on_road(run, options)
+        if (track.source, look) != (self.track.source, self.look):
+            scene = Scene(scenery.build(track.source, look))
+            self.cameras.move(scene)
+            if self.view:
+                self.view.move(scene)
+        self.run, self.track, self.look = run, track, look
         self.clock = SampleClock(1 / SAMPLE_RATE)
         self.disturbance = disturbance
         self.cameras.disturb(disturbance, int(self.np_random.integers(DISTURBANCE_SEEDS)) if disturbance else 0)
@@ -174,34 +196,14 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         if self.state == "closed":
             raise ClosedEnvironmentError("the environment is closed: make another one")
 
-    def _choose_road(self, options: dict[str, Any]) -> None:
-        """Build the road that the options name, if it is another one. Raises SimulatorError, TrackError."""
+    def _chosen_road(self, options: dict[str, Any]) -> tuple[Track, int]:
+        """Return the road and look that the options name, or the present ones. Raises SimulatorError, TrackError."""
         if not options.keys() & {"track", "direction", "look"}:
-            return
+            return self.track, self.look
         source, look = options.get("track", self.track.source), options.get("look", self.look)
         track = make_track(source, options.get("direction", None if "track" in options else self.track.direction))
         check_look(look)
-        if (source, look) != (self.track.source, self.look):
-            scene = Scene(scenery.build(source, look))
-            self.cameras.move(scene)
-            if self.view:
-                self.view.move(scene)
-        self.track, self.look = track, look
-
-    def _set_on_road(self, options: dict[str, Any]) -> None:
-        """Set the car on the road; options: see `reset`. Raises SimulatorError."""
-        turn = options.get("turn", 0.0)
-        check("turn", turn, lambda radians: -math.pi <= radians <= math.pi, "-π to π (radians)")
-        s, offset = options.get("s", self.run.s), options.get("offset", 0.0)
-        length = self.track.length
-        check("s", s, lambda metres: 0 <= metres < length, f"at least 0 and less than {length:.1f} (m)")
-        left, right = self.track.edges[self.track.index(s)]
-        edges = f"at {s:.1f} m the edges are at {-left:.2f} and {right:.2f} m"
-        check("offset", offset, lambda metres: -left <= metres <= right, f"a number on the road (m); {edges}")
-        self.run.s = float(s)
-        self.run.set_back(float(offset), turn=float(turn))
-        if side := self.run.off_road():
-            raise SimulatorError(f"offset {offset!r}: a wheel would be beyond the road's {side} edge; {edges}")
+        return track, look
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Drive until the next frame is due, or the car leaves the road; return what the class describes.

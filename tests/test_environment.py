@@ -229,6 +229,9 @@ def test_reset_chooses_the_road_the_look_and_the_start(lake):
     assert backwards == pytest.approx((60, 0, 9), abs=0.1)
     with pytest.raises(TrackError, match="moon"):
         env.reset(options={"track": "moon"})
+    with pytest.raises(SimulatorError, match="less than"):
+        env.reset(options={"track": "jungle", "s": 2000})
+    assert env.reset()[1]["pos"] == backwards, "what is refused changes nothing"
     lake_frame, _ = env.reset(options={"track": "lake", "look": 0})
     assert np.array_equal(lake_frame, lake.reset()[0])
 
