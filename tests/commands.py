@@ -46,8 +46,9 @@ def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
     command = list(map(str, arguments))
     out, err = io.StringIO(), io.StringIO()
     named = unittest.mock.patch.object(program, "name", "model.py")
+    called = unittest.mock.patch.object(sys, "argv", ["model.py"])  # for argparse
     small = unittest.mock.patch.multiple(pictures, SCALE=1, png=lambda figure, dpi: PICTURE)
-    with named, small, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
+    with named, called, small, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
         try:
             status: Any = model.main(command)
         except SystemExit as error:  # argparse's

@@ -75,7 +75,7 @@ def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
     commands = re.findall(r"^  (\w+)", run(command, "--help").stdout, re.MULTILINE)
     assert commands == ["train", "drive", "video", "simulator", "replay", "browse", "report", "export", "lerobot"]
     done = run(folder / "python", "-c", IN_PYTHON)
-    assert done.returncode == 0 and done.stdout.count("usage:") == len(commands), done.stderr
+    assert done.returncode == 0 and done.stdout.count("usage: behavioral-cloning ") == len(commands), done.stderr
     assert done.stdout.endswith("\n(160, 320, 3)\n")
     missing = run(command, "train", "nowhere")
     assert missing.returncode == 2 and missing.stderr.startswith("behavioral-cloning train: nowhere: no such folder")

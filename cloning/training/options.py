@@ -120,7 +120,6 @@ def recipe_name(model: str) -> str | None:
 def build_parser(report: Recipe, robust: Recipe) -> argparse.ArgumentParser:
     """Return the parser; it sets no defaults, which are the recipe's."""
     parser = argparse.ArgumentParser(
-        prog="model.py",
         description="Train NVIDIA's network to predict steering from recordings of the Udacity simulator.",
         epilog="The defaults are those of the report of Udacity's Behavioral Cloning project. "
         "Stop a run with Ctrl-C at any time; --resume continues it.",
