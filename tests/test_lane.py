@@ -13,12 +13,12 @@ import pytest
 import real_recordings
 import torch
 from scenes import Here, lake_drive, recorded
+from test_parts import localised
 
 from cloning.base.errors import ModelError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import parts, reader
 from cloning.lane.ahead import centre_ahead
-from cloning.lane.follow import TrackFilter
 from cloning.lane.localise import estimate_lane_position, localise_recording
 from cloning.lane.reader import (
     DISTANCES_AHEAD,
@@ -34,13 +34,13 @@ from cloning.lane.reader import (
     read_strips,
 )
 from cloning.lane.recovery import LanePosition
-from cloning.lane.search import MIN_LOG_LIKELIHOOD, Localisation, followed, known_tracks, search
+from cloning.lane.search import MIN_LOG_LIKELIHOOD, Localisation
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.log import read_recording
-from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, camera_position
-from cloning.road.motion import REAR_AXLE, Stretch, stretches
-from cloning.road.track import ROADS, Track
+from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
+from cloning.road.motion import REAR_AXLE, stretches
+from cloning.road.track import Track
 from simulator import __main__ as simulator
 from tools import lane_accuracy, lane_frames, likeness, train_lane
 from tools.lane_frames import RenderedScene, render_strips
@@ -79,12 +79,6 @@ def test_where_the_centre_lies_ahead(direction):
     assert found == pytest.approx(-1 / np.cos(yaw) - DISTANCES_AHEAD * np.tan(yaw), abs=0.04)
 
 
-def localise(stretch, centres):
-    """Localise a whole stretch on the track and direction that it fits best."""
-    found = search([TrackFilter(stretch, centres, track) for track in known_tracks()], 0, len(stretch))
-    return followed(found[0], len(stretch))
-
-
 def test_a_drive_is_localised_on_its_road(drive):
     """By what the network sees, a quarter of it made nonsense."""
     recording, true = drive
@@ -94,32 +88,12 @@ def test_a_drive_is_localised_on_its_road(drive):
     rng = np.random.default_rng(0)
     nonsense = rng.random(len(centres)) < 0.25
     centres[nonsense] = rng.uniform(-4, 4, centres[nonsense].shape)
-    found = localise(stretch, centres)
+    found = localised(stretch, centres)
     assert (found.track.name, found.track.direction) == ("lake", "ccw")
     assert found.is_certain()
     error = found.states[:, 1] + REAR_AXLE * np.sin(found.states[:, 2]) - true[rows]
     assert np.abs(error).mean() < 0.15  # measured: 0.131
-    assert localise(stretch, -centres).log_likelihood < MIN_LOG_LIKELIHOOD  # a road that it is not
-
-
-@pytest.mark.parametrize("name", ["lake", "jungle", "road-1", "road-4", "road-16", "road-20"])
-def test_no_road_is_taken_for_a_known_one(name):
-    """315 m along a road's centre, detected to 0.15 m: the lake fits these roads' detections nearly as well."""
-    track, n = Track(name), 700
-    driven = 30 + 0.45 * np.arange(n)
-    poses = [track.at(s) for s in driven]
-    heading = -np.unwrap([at.heading for at in poses])
-    stretch = Stretch(slice(0, n), np.zeros(n), np.zeros(n), heading - heading[0], driven, np.zeros(n - 1))
-    centres = []
-    for s, at in zip(driven, poses, strict=True):
-        camera = camera_position(np.array([at.x, at.y]), np.array([np.cos(at.heading), np.sin(at.heading)]))
-        centres.append(centre_ahead(track, s, camera, at.heading))
-    noise = np.random.default_rng(0).normal(0, 0.15, (n, len(DISTANCES_AHEAD)))
-    found = localise(stretch, (np.nan_to_num(centres) + noise)[:, None] - MOUNT_OFFSETS[:, None])
-    assert found.log_likelihood > MIN_LOG_LIKELIHOOD
-    assert found.is_certain() == (name in ROADS)
-    if name in ROADS:
-        assert found.track.name == name and np.abs(found.states[:, 1]).mean() < 0.05  # measured: 0.017 and 0.034
+    assert localised(stretch, -centres).log_likelihood < MIN_LOG_LIKELIHOOD  # a road that it is not
 
 
 @pytest.mark.parametrize("pose", [(0.8, 0, 0), (0.3, 4, 0.05), (-1.2, 1, -0.1)])
