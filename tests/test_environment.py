@@ -110,15 +110,6 @@ def test_the_episode_ends_where_the_car_leaves_the_road(lake):
     assert not np.array_equal(frame, again)
 
 
-def test_an_episode_on_an_open_road_ends_with_success_at_its_end():
-    env = environment.Drive(make_road([(0, 0), (30, 0)], width=6), speed=15)
-    env.reset()
-    frame, _, terminated, truncated, info = end_of_episode(env, 0, 1)[1]
-    assert (terminated, truncated, info["laps"]) == (False, True, 1)
-    assert frame[100:].std() > 5
-    env.close()
-
-
 def test_the_car_never_exceeds_the_set_speed_and_a_lap_is_counted():
     env = environment.Drive(speed=10, laps=2)
     env.reset()
@@ -158,8 +149,6 @@ def test_environments_in_processes_of_their_own_see_the_same(lake):
     ("arguments", "message"),
     [
         ({"direction": "left"}, "'ccw', 'cw' or None"),
-        ({"look": 0.5}, "a whole number"),
-        ({"look": math.inf}, "a whole number"),
         ({"look": 1.0}, "a whole number from 0, as an int"),
         ({"speed": 31}, r"1 to 30 \(mph\)"),
         ({"laps": math.nan}, "a number above 0"),
@@ -183,13 +172,9 @@ def test_wrong_arguments_are_reported(arguments, message):
         ({"s": 2000}, "less than 1137.9"),
         ({"s": math.nan}, "less than 1137.9"),
         ({"offset": -3.5, "s": 300}, "the road's left edge; at 300.0 m the edges are at -3.95 and 3.95 m"),
-        ({"offset": math.inf}, "it must be a number"),
-        ({"offset": 1e300}, "it must be a number on the road"),
         ({"offset": 10**400}, "it must be a number on the road"),
         ({"speed": 3}, "the options of reset are s, offset, turn, track"),
-        ({"s": "300"}, "less than 1137.9"),
         ({"offset": None}, "it must be a number"),
-        ({"turn": "left"}, "it must be -π to π"),
         ({"turn": 4}, "it must be -π to π"),
         ({"look": -1}, "a whole number"),
         ({"track": 7}, "a name, such as 'lake'"),
@@ -238,13 +223,11 @@ def test_reset_chooses_the_road_the_look_and_the_start(lake):
 
 @pytest.mark.parametrize("begin", [0, 90])
 def test_an_episode_on_an_open_road_ends_where_the_road_ends_wherever_it_began(begin):
-    env = environment.Drive(make_road([(0, 0), (50, 0), (100, 0)]))
+    env = environment.Drive(make_road([(0, 0), (50, 0), (100, 0)], width=6))
     env.reset(options={"s": begin})
-    ended = False
-    while not ended:
-        _, _, left, ended, info = env.step(np.asarray([0, 1]))
-        assert not left
-    assert info["s"] == pytest.approx(100, abs=0.4)
+    frame, _, terminated, truncated, info = end_of_episode(env, 0, 1)[1]
+    assert (terminated, truncated, info["laps"]) == (False, True, 1)
+    assert info["s"] == pytest.approx(100, abs=0.4) and frame[100:].std() > 5
 
 
 def test_a_reward_is_progress_also_where_a_second_lap_of_an_open_road_begins():
