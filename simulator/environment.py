@@ -55,7 +55,7 @@ DISTURBANCE_SEEDS = (
 def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> None:
     """Raise SimulatorError if a value is not valid, or of a type that cannot be compared; allowed: what is valid."""
     try:
-        accepted = valid(value)
+        accepted = np.ndim(value) == 0 and valid(value)
     except (TypeError, ValueError, ArithmeticError):
         accepted = False
     if not accepted:

@@ -174,6 +174,7 @@ def test_wrong_arguments_are_reported(arguments, message):
         ({"offset": -3.5, "s": 300}, "the road's left edge; at 300.0 m the edges are at -3.95 and 3.95 m"),
         ({"offset": 10**400}, "it must be a number on the road"),
         ({"speed": 3}, "the options of reset are s, offset, turn, track"),
+        ({"s": np.array([300.0])}, "less than 1137.9"),
         ({"offset": None}, "it must be a number"),
         ({"turn": 4}, "it must be -π to π"),
         ({"look": -1}, "a whole number"),
