@@ -1,7 +1,6 @@
 """The command of an installed project: `behavioral-cloning train`, `drive` and so on, like the scripts of a clone.
 
-`behavioral-cloning train --help` shows the options of `python model.py`, and so on. `cloning.scripts` is where a wheel
-has the scripts.
+`behavioral-cloning train --help` shows the options of `python model.py`, and so on. `cloning.scripts` has the scripts.
 """
 
 import sys

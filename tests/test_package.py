@@ -45,14 +45,14 @@ def wheel(tmp_path) -> Path:
     return next(tmp_path.glob("*.whl"))
 
 
-def install(wheel: Path, folder: Path) -> Path:
-    """Make an environment with the wheel, and with the libraries of this one; return the folder of its commands."""
+def install(folder: Path, *project: str | Path) -> Path:
+    """Make an environment with the project, and the libraries of this one; return the folder of its commands."""
     venv.create(folder)
     [packages] = folder.glob("Lib/site-packages" if os.name == "nt" else "lib/python*/site-packages")
     libraries = importlib.metadata.distribution("numpy").locate_file("")
     (packages / "libraries.pth").write_text(f"{libraries}\n", encoding="utf-8")
-    command = ["pip", "--python", str(folder), "install", "--quiet", "--no-deps", "--ignore-installed", str(wheel)]
-    subprocess.run([sys.executable, "-m", *command], check=True, timeout=120)
+    command = ["pip", "--python", str(folder), "install", "--quiet", "--no-deps", "--ignore-installed"]
+    subprocess.run([sys.executable, "-m", *command, *project], check=True, timeout=120)
     return folder / ("Scripts" if os.name == "nt" else "bin")
 
 
@@ -64,8 +64,9 @@ def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
     assert names == wanted | {f"cloning/scripts/{name}.py" for name in ("model", "drive", "video")}
     assert {"cloning/py.typed", "simulator/py.typed", "cloning/network/shipped.pt"} <= names
 
-    folder, elsewhere = install(wheel, tmp_path / "environment"), tmp_path / "elsewhere"
+    folder, elsewhere = install(tmp_path / "environment", wheel), tmp_path / "elsewhere"
     elsewhere.mkdir()
+    editable = install(tmp_path / "editable", "--no-build-isolation", "--editable", tmp_path / "source")
     command = str(folder / "behavioral-cloning")
 
     def run(*words: str | Path) -> subprocess.CompletedProcess:
@@ -77,6 +78,7 @@ def test_the_wheel_in_a_fresh_environment(wheel, tmp_path):
     done = run(folder / "python", "-c", IN_PYTHON)
     assert done.returncode == 0 and done.stdout.count("usage: behavioral-cloning ") == len(commands), done.stderr
     assert done.stdout.endswith("\n(160, 320, 3)\n")
+    assert run(editable / "behavioral-cloning", "video", "--help").returncode == 0, "it finds the scripts in the clone"
     missing = run(command, "train", "nowhere")
     assert missing.returncode == 2 and missing.stderr.startswith("behavioral-cloning train: nowhere: no such folder")
     assert "`behavioral-cloning simulator record data/lake-ccw`" in missing.stderr and not list(elsewhere.iterdir())
