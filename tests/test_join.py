@@ -169,8 +169,10 @@ def test_each_road_has_the_weather_sent_before_it():
     assert (sun == moon).all()
 
 
-def test_a_driver_in_another_thread_is_waited_for_and_gets_the_same_drive_however_slow_it_is():
+def test_a_driver_in_another_thread_is_waited_for_and_gets_the_same_drive_however_slow_it_is(monkeypatch):
     """The program answers at once, with the last command of a driver that has seen another frame meanwhile."""
+    for name in ("BRIEFLY", "PATIENTLY"):
+        monkeypatch.setattr(f"simulator.join.{name}", 10.0)
 
     def drive(pause):
         tests, lock = RoadTests([0.0]), threading.Condition()
