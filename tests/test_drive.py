@@ -247,14 +247,16 @@ def test_a_terminal_that_nobody_reads_costs_lines_and_no_time():
 
 
 def test_the_latency_is_the_time_in_the_server_however_many_frames_are_in_flight(session, jpeg):
-    """Three telemetries circulate, and the simulator takes half a second to send the next one."""
+    """Three telemetries circulate, which arrived 0.04 s ago."""
+    begin = time.perf_counter()
     for _ in range(3):
         session.answer(telemetry(jpeg), time.perf_counter() - 0.04)
+    longest = 1000 * (time.perf_counter() - begin + 0.04)
     status = drive.StatusLine(session.server, printed())
     shown = [float(part.split()[0]) for part in status.text(session, time.perf_counter()).split(", ") if "ms" in part]
     on_the_page = [frame.latency for frame in session.history]
     assert shown == [pytest.approx(np.mean(on_the_page), abs=0.06)]
-    assert all(40 <= latency < 540 for latency in on_the_page)
+    assert all(40 <= latency < longest for latency in on_the_page)
 
 
 def test_the_rate_counts_from_the_sessions_start_or_the_last_line(session, jpeg):
