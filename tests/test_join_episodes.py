@@ -25,7 +25,7 @@ class EpisodeProgram:
     """A test program of the dialect of episodes: `plan` yields what to send in answer to a telemetry."""
 
     def __init__(self, plan):
-        self.sio = socketio.Server(async_mode="threading", transports=["websocket"])
+        self.sio = socketio.Server(async_mode="threading", transports=["websocket"], async_handlers=False)
         self.heard: list[tuple[str, Any]] = []
         self.plan = plan(self)
         events = "episode_metrics", "episode_events", "episode_event", "episode_started", "episode_ended"
