@@ -215,8 +215,10 @@ def test_the_report_is_of_the_network_whose_figures_it_has(written, tmp_path):
     for name in ("model", "model-best"):
         (copy / f"{name}.pt").rename(copy / f"{name.replace('model', 'robust')}.pt")
     arguments = json.loads((copy / "training_arguments.json").read_bytes())
+    arguments["recipe"]["epochs"] += 1  # as if it had been stopped
     (copy / "training_arguments.json").write_text(json.dumps(arguments | {"output": str(copy / "robust.pt")}))
     found = Report(copy)
+    assert f"python model.py --resume --output {copy / 'robust.pt'}" in dict(found.next_steps()).values()
     assert found.model == copy / "robust-best.pt"
     assert not any(str(copy / "model.pt") in command for _, command in found.next_steps())
 

@@ -196,9 +196,12 @@ class Report:
             why = "Train with recovery steering from other positions, which drives best"
             robust = ("--robust", "--output", folder / "robust" / "model.pt")
             steps.append((why, (*train, *self.run["recordings"], *robust)))
-        if self.run["best"]["epoch"] == (epochs := self.run["epochs"]):
+        epochs, go_on = self.run["epochs"], (*train, "--resume", "--output", self.output)
+        if self.run["state"] == "stopped":
+            steps.append((f"It stopped before the end of its {epochs} epochs: let it go on", go_on))
+        if self.run["best"]["epoch"] == epochs:
             why = "The last epoch is the best one: train longer"
-            steps.append((why, (*train, "--resume", "--epochs", 2 * epochs, "--output", self.output)))
+            steps.append((why, (*go_on, "--epochs", 2 * epochs)))
         if not self.replays:
             why = "Let it drive recordings that it was not trained on, and write this report again"
             steps.append((why, ("python", "-m", "cloning.report", folder, "--held-out", "FOLDER")))
