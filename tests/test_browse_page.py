@@ -376,6 +376,9 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
         text = "map(each => `${each.tagName} ${each.id} ${each.textContent}`)"
         assert page.run(f"{CONTROLS}.filter(each => !each.title && !each.matches('a')).{text}") == []
         assert width > 600 or page.run(f"{CONTROLS}.filter(each => each.offsetHeight < 44).{text}") == []
+    models = "document.querySelectorAll('#attention button, #plots figcaption > span')"
+    page.run(f"{models}.forEach(each => each.textContent = 'a_long_name_'.repeat(9))")
+    assert page.fits(), "whatever models are called"
 
 
 def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(served, page, sample_recording):
