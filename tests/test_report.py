@@ -25,7 +25,7 @@ from cloning.base.film import FilmWriter
 from cloning.recordings.format import BINS
 from cloning.replay.score import YARDSTICKS
 from cloning.report.content import Report, bend
-from cloning.report.pictures import film_uri, picture_uri, steering_chart
+from cloning.report.pictures import epochs_chart, film_uri, picture_uri, steering_chart
 
 
 def report(*arguments) -> subprocess.CompletedProcess:
@@ -76,6 +76,7 @@ def test_the_report_contains_the_run(written, finished):
     assert " ".join(layers) in text, "the table of layers that the run printed"
     assert "The best epoch is 1 : it has the least drift, 0.50 m." in text
     assert "Networks like this one stay on the road" in text
+    assert "tells best" in text and "tells best" not in Report(finished[1]).page(), "which knows no drift"
     assert "lake sample 60 0 0 0.1 30.2" in text, "the recording's rows, cuts, unusable rows, minutes and mph"
     assert "leaves out 20 % of the rows with less than 0.02" in text and "throttle below 0.25" in text
     assert "lake sample , which it was trained on, it drives with" in text
@@ -105,6 +106,12 @@ def test_the_titles_of_the_histograms_stay_in_their_places(monkeypatch):
     steering_chart(dict.fromkeys(("of {:,} rows, as driven", "of {:,} for training, resampled"), np.full(BINS, 2500)))
     left, right = (axes.title.get_window_extent() for axes in figures[0].axes)
     assert left.x0 > 0 and left.x1 < right.x0 and right.x1 < figures[0].bbox.x1
+
+
+def test_the_only_epoch_is_a_whole_number():
+    run = {"history": [{"epoch": 1, "val_drift": 0.5}], "best": {"epoch": 1}, "trail": []}
+    chart = base64.b64decode(epochs_chart(run, {"val_drift": "drift"}, "m").light.partition(",")[2]).decode()
+    assert ">1</text>" in chart and ">0.98</text>" not in chart
 
 
 def test_a_long_film_is_made_small(tmp_path):

@@ -131,7 +131,7 @@ def epochs_chart(run: dict[str, Any], names: dict[str, str], ylabel: str) -> Cha
         axes.axvline(best, linestyle=":", color="tab:green", label=f"best epoch: {best}")
         if "loss" in names and run["trail"]:
             axes.plot(*zip(*run["trail"], strict=True), color="tab:gray", linewidth=0.8, label="within the epochs")
-        axes.set(xlabel="epoch", ylabel=ylabel, ylim=(0, None))
+        axes.set(xlabel="epoch", ylabel=ylabel, xlim=(0, epochs[-1] + 0.5), ylim=(0, None))
         axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True))
         axes.legend()
 
