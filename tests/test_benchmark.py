@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from browser import needs_chromium
 from commands import HERE, ROOT
 from steer_server import STEER, Server
 
@@ -263,6 +264,19 @@ def test_the_command_scores_in_another_process_what_is_driven_here(model_file, t
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count("data:video/mp4") == 1 and "drove differently" not in page
     assert all(task.name in page for task in TINY)
+
+
+@needs_chromium
+def test_its_page_is_read_on_a_phone(page, tmp_path):
+    figures = {"drives": 1, "score": 100.0, "departures": 0, "mean_m": 0.1}
+    found = {"entry": "/a_long_name" * 9, "score": 100.0, "quick": True, "version": 1, "foretelling": "", "drives": []}
+    html = report.page(found | {"groups": dict.fromkeys(tasks.GROUPS, figures)}, [])
+    (tmp_path / "report.html").write_text(html, encoding="utf-8")
+    page.look(390, 900)
+    page.open((tmp_path / "report.html").as_uri())
+    page.wait("document.readyState == 'complete'")
+    page.check_look(390, False)
+    assert page.box("tbody th")[2] > 100, "not one letter below the other"
 
 
 def test_real_recordings_that_are_missing_are_told_before_anything_is_driven(tmp_path):

@@ -236,6 +236,7 @@ def test_the_page_fits_every_screen_bars_nobody_and_asks_for_nothing(written, pa
         page.look(width, 900, dark)
         page.open((written / "report.html").as_uri())
         page.wait("document.readyState == 'complete'")
+        page.run("document.querySelector('main b').textContent = '/a_long_name'.repeat(20)")
         page.check_look(width, dark)
         assert page.complaints() == []
         assert page.run("[...document.images].every(image => image.naturalWidth > 100)")
