@@ -41,11 +41,15 @@ lint: .venv/installed
 	@[ "$$(uname)" != Linux ] || PATH="$$PATH:/sbin" ldconfig -p | grep -q libX11.so.6 || $(APT) libx11-6
 	touch $@
 
+# With the oldest Python, for which not all libraries' newest versions are. NVIDIA's are not for macOS and Windows.
 lock:
+	@$(PYTHON) -c "import sys; sys.exit('lock with the oldest Python: make lock PYTHON=python3.11' \
+		if sys.version_info[:2] > (3, 11) else 0)"
 	$(PYTHON) -m venv .venv-lock
 	.venv-lock/bin/python -m pip install --quiet '.[simulator,gymnasium,lerobot,export,markdown,dev]'
 	(head -n 2 requirements.txt; .venv-lock/bin/python -m pip list --format=freeze --exclude behavioral-cloning \
-		--exclude pip --exclude setuptools | sed 's/+cpu$$//') > .venv-lock/requirements.txt
+		--exclude pip --exclude setuptools \
+		| sed -e 's/+.*//' -e '/^nvidia-/d' -e '/^cuda-/d' -e '/^triton=/d') > .venv-lock/requirements.txt
 	mv .venv-lock/requirements.txt requirements.txt
 	rm -r .venv-lock
 

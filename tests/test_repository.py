@@ -90,6 +90,18 @@ def test_every_requirement_is_listed_with_its_purpose_and_pinned():
             assert re.search(rf"\b{name}\b", section) and (name in pinned or name in NOT_INSTALLED), name
 
 
+@pytest.mark.skipif(os.name == "nt", reason="needs make and sh")
+def test_make_lock_leaves_out_what_only_linux_has(tmp_path):
+    python = tmp_path / "python"  # stands for Python and for that of the new environment, with PyPI's PyTorch on Linux
+    listed = "cuda-toolkit==13.0\\nnvidia-nvtx==13.0\\ntorch==2.13.0+cu130\\ntriton==3.7.1\\n"
+    makes = 'mkdir -p .venv-lock/bin; cp "$0" .venv-lock/bin/python'
+    python.write_text(f"#!/bin/sh\ncase $* in *venv*) {makes};; *list*) printf '{listed}';; esac\n", encoding="utf-8")
+    python.chmod(0o755)
+    shutil.copy(ROOT / "requirements.txt", tmp_path)
+    subprocess.run(["make", "-f", ROOT / "Makefile", "lock", "PYTHON=./python"], cwd=tmp_path, check=True)
+    assert (tmp_path / "requirements.txt").read_text(encoding="utf-8").splitlines()[2:] == ["torch==2.13.0"]
+
+
 def anchors(document: Path) -> set[str]:
     """The names by which a web page of the document links to its headings, as GitHub forms them."""
     headings = re.findall(r"^#+ (.*)$", document.read_text(encoding="utf-8"), re.MULTILINE)
