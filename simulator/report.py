@@ -155,12 +155,11 @@ def write_picture(path: str | Path, run: Run) -> None:
         along.axvline(driven, color="tab:red", linewidth=1)
         along.annotate(f"{departure.time:.0f} s", (driven, -scale), (3, 3), **name)
     words = lap_in_words(lap_report(run)).replace("; ", "\n")
-    figure.suptitle(f"{track.name} {track.direction}: {words}", fontsize=11)
     above.set(xlabel="east, m", ylabel="north, m")
     along.set(xlabel="distance driven, m", ylabel="m right of the\ncentre line", ylim=(-1.05 * scale, 1.05 * scale))
     along.set_xlim(0, max(1.0, run.distance))
     along.grid(alpha=0.3)
-    write_output(path, png(figure, 130))
+    write_output(path, png(figure, 130, f"{track.name} {track.direction}: {words}"))
 
 
 def mark_start(axes: "Axes", track: Track) -> None:

@@ -47,7 +47,7 @@ def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
     out, err = io.StringIO(), io.StringIO()
     named = unittest.mock.patch.object(program, "name", "model.py")
     called = unittest.mock.patch.object(sys, "argv", ["model.py"])  # for argparse
-    small = unittest.mock.patch.multiple(pictures, SCALE=1, png=lambda figure, dpi: PICTURE)
+    small = unittest.mock.patch.multiple(pictures, SCALE=1, png=lambda *_: PICTURE)
     with named, called, small, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
         try:
             status: Any = model.main(command)

@@ -124,7 +124,7 @@ PREPARE = f"""
 import functools, multiprocessing, sys
 sys.path.append({str(ROOT)!r})
 from cloning.base import figure
-figure.png = lambda figure, dpi: {PICTURE!r}
+figure.png = lambda *_: {PICTURE!r}
 import pandas  # or else pyarrow does for its first table, in every child
 import av, matplotlib.figure, model, video, drive, simulator.client, simulator.film, simulator.record, simulator.report
 import cloning.network.attention, cloning.replay.command

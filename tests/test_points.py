@@ -149,7 +149,7 @@ def test_a_missing_file_and_options_that_do_not_go_together_are_clear_errors(tmp
 
 
 def test_every_lap_of_an_open_road_starts_at_rest_at_its_start_and_ends_at_its_end(tmp_path):
-    run = Run(Track(make_road(BEND)))
+    run = Run(Track(make_road(BEND, name="\udcfc$\\frac$")))  # a file may be called so
     expert = Expert(run.track, top_speed=15 * MPH)
     run.car.speed_limit = 15 * MPH
     begun = []

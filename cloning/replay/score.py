@@ -241,8 +241,7 @@ def plot(recording: Recording, drives: list[Drive]) -> bytes:
     axes[-1].set(xlabel="s", ylabel="steering")
     for ax in axes:
         ax.legend(loc="upper right", fontsize=8)
-    figure.suptitle(recording.folder.name)
-    return png(figure, 90)
+    return png(figure, 90, recording.folder.name)
 
 
 class ReplayFilm(DriveFilm):
