@@ -31,9 +31,12 @@ class LeRobotDrive(gymnasium.Wrapper):
         self.observation_space = spaces.Dict({"pixels": pixels, "agent_pos": spaces.Box(-100, 100, (2,), np.float32)})
         self.action_space = spaces.Box(np.array([-1, 0, 0], np.float32), np.ones(3, np.float32))
 
-    def reset(self, **options: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode; options: seed and options of the environment."""
-        return self._described(*self.env.reset(**options))
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode; seed, options: of the environment. LeRobot's own option, "lerobot_new_rollout", is none."""
+        own = {name: value for name, value in (options or {}).items() if name != "lerobot_new_rollout"}
+        return self._described(*self.env.reset(seed=seed, options=own))
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
         """Drive until the next frame."""

@@ -301,7 +301,7 @@ def test_the_environment_for_lerobot(written):
     """Its evaluation steps such environments with actions in float32, and expects these keys."""
     [(track, environments)] = runpy.run_path(str(written / "env.py"))["make_env"](n_envs=1).items()
     drive = environments[0]
-    observation, _ = drive.reset(seed=[1])
+    observation, _ = drive.reset(seed=[1], options={"lerobot_new_rollout": True})  # as LeRobot does after 0.4.4
     assert track == "lake" and observation["pixels"]["center"].shape == (1, 160, 320, 3)
     for _ in range(15):
         observation, reward, terminated, _, info = drive.step(np.array([[0, 1, 0]], np.float32))
