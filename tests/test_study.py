@@ -116,7 +116,7 @@ def test_laps_and_recovery_in_the_simulator(monkeypatch, steering, departures):
     simulator = Simulator(Network(), "lake", "ccw", 15)
     without_rendering = follow if steering is None else lambda run: steering
     monkeypatch.setattr(simulator, "steering", without_rendering)
-    run, _ = simulator.lap(0.05)
+    run = simulator.lap(0.05)
     assert (len(run.departures) > 0) == departures
     assert (np.abs(run.trajectory.offset).max() < 1) == (not departures)
     assert run.distance >= 0.05 * simulator.track.length * (not departures)

@@ -60,8 +60,8 @@ def measure(variant: Variant, recordings: Path, file: Path, epoch_images: int, s
     torch.set_num_threads(1)
     driver, held_out_recording = ModelDriver(str(folder / "model.pt")), load_recording(recordings / track.held_out)
     with open(folder / "training_log.csv", encoding="utf-8", newline="") as log:
-        losses = [float(epoch["val_loss"]) for epoch in csv.DictReader(log)]
-    found = {"own_val_loss": losses[-1], "best_val_loss": min(losses)}
+        *_, last = csv.DictReader(log)
+    found = {"own_val_loss": float(last["val_loss"])}
     found |= offline(driver.network, held_out_recording) | replayed(held_out_recording, driver)
     simulators = [Simulator(driver.network, variant.track, direction, track.speed) for direction in track.directions]
     found |= laps(simulators, share)
@@ -129,17 +129,16 @@ class Simulator:
         """Return the network's steering for what the car sees now."""
         return float(steer(self.network, self.cameras.frames(run.car.node.get_transform())[0]))
 
-    def lap(self, laps: float) -> tuple[Run, list[float]]:
-        """Drive on after departures, to the laps' end or TIME_OUT; return the run and the steering at each frame."""
+    def lap(self, laps: float) -> Run:
+        """Drive on after departures, to the laps' end or TIME_OUT, and return the run."""
         run, clock = self.start(), SampleClock(1 / SAMPLE_RATE)
         metres = laps * self.track.length
-        steering, commands = self.steering(run), list[float]()
+        steering = self.steering(run)
         while run.travelled < metres and run.time < TIME_OUT * metres / (self.speed * MPH):
             run.step(steering, 1.0)
             if clock.due(run.time):
                 steering = self.steering(run)
-                commands.append(steering)
-        return run, commands
+        return run
 
     def recovery(self, starts: int) -> float:
         """Return the share of starts next to the lane's centre, and turned, from which the car comes back in time.
@@ -175,11 +174,8 @@ class Simulator:
 
 def laps(simulators: Sequence[Simulator], share: float) -> dict[str, float]:
     """Return the measures of a network's laps, one in each simulator, together; share: of a lap, such as 1."""
-    runs, commands = zip(*(simulator.lap(share) for simulator in simulators), strict=True)
-    offsets = [np.abs(run.trajectory.offset) for run in runs]
+    runs = [simulator.lap(share) for simulator in simulators]
     return {
         "departures_per_km": sum(len(run.departures) for run in runs) / sum(run.distance for run in runs) * 1000,
-        "offset_mean": float(np.mean([offset.mean() for offset in offsets])),  # m
-        "offset_max": float(max(offset.max() for offset in offsets)),
-        "lap_whiteness": float(np.mean([np.sqrt(np.mean((np.diff(lap) * SAMPLE_RATE) ** 2)) for lap in commands])),
+        "offset_mean": float(np.mean([np.abs(run.trajectory.offset).mean() for run in runs])),  # m
     }
