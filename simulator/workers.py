@@ -53,7 +53,7 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
             processes = min(processes, MOST_ON_WINDOWS)
         others = multiprocessing.active_children()
         with interrupt_deferred():
-            pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), _begin))
+            pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), begin, (signal.SIG_IGN,)))
         try:
             with interrupt_deferred():
                 for _ in range(processes):  # each starts a process
@@ -98,9 +98,9 @@ def _context() -> BaseContext:
     return context
 
 
-def _begin() -> None:
-    """Make a process ignore Ctrl-C, and end together with the one that started it, even if that is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def begin(on_interrupt: signal.Handlers) -> None:
+    """Let a process handle Ctrl-C so, and end together with the one that started it, even if that is killed."""
+    signal.signal(signal.SIGINT, on_interrupt)
     parent = multiprocessing.parent_process()
 
     def end_with_parent() -> None:

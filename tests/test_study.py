@@ -2,16 +2,20 @@
 
 import argparse
 import csv
+import multiprocessing
 import os
 import re
+import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from drive_process import awaited
 from rendered import render_recording
 from scenes import Here
 from test_generator import loaded, observations
@@ -166,6 +170,27 @@ def test_a_killed_process_is_named(tmp_path, monkeypatch):
     options = argparse.Namespace(folder=tmp_path, recordings=tmp_path, images=1, laps=1, starts=1)
     with pytest.raises(UserError, match="lake-centre-camera-seed-0: its process was killed"):
         study.result(plan()[0], options)
+
+
+def keep_measuring(variant, recordings, file, *_):
+    file.parent.with_suffix(".pid").write_text(str(os.getpid()))
+    time.sleep(60)
+
+
+def study_one(folder):
+    study.measure = keep_measuring
+    study.result(plan()[0], argparse.Namespace(folder=folder, recordings=folder, images=1, laps=1, starts=1))
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="without /proc processes cannot be listed")
+def test_a_killed_study_leaves_no_process(tmp_path):
+    """Which would train the same network as the study that is started again."""
+    parent = multiprocessing.get_context("spawn").Process(target=study_one, args=(tmp_path,))
+    parent.start()
+    pid = awaited(lambda: [file.read_text() for file in tmp_path.glob("*.pid") if file.read_text()])[0]
+    parent.kill()
+    parent.join()
+    awaited(lambda: not Path("/proc", pid).exists(), 30)
 
 
 def test_the_report_and_the_pictures_show_all_networks(monkeypatch):

@@ -31,6 +31,7 @@ from cloning.base.outputs import write_json, write_output
 from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record
+from simulator.workers import begin
 from tools.study.figures import Row, correlation_picture, recovery_picture, report, row
 from tools.study.measures import measure
 from tools.study.networks import EPOCH_IMAGES, RENDERED, TRACKS, Variant, plan
@@ -71,8 +72,8 @@ def result(variant: Variant, options: argparse.Namespace) -> dict[str, float]:
     file = options.folder / variant.name / "result.json"
     if not file.exists():
         context = multiprocessing.get_context("spawn")
-        default = signal.signal, (signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it at once, or saves its training
-        with ProcessPoolExecutor(1, context, *default) as process:
+        default = (signal.SIG_DFL,)  # Ctrl-C ends it at once, or saves its training
+        with ProcessPoolExecutor(1, context, begin, default) as process:
             figures = options.images, options.laps, options.starts
             try:
                 process.submit(measure, variant, options.recordings, file, *figures).result()
