@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -96,6 +97,24 @@ def test_ctrl_c_ends_an_attack_too():
     assert (process.returncode, errors) == (130, "test: stopped\n")
     with pytest.raises(ProcessLookupError):
         os.kill(int(attacker), 0)
+
+
+TERMINATED = """
+import os, signal, sys, time
+sys.argv[0] = "-m"
+from tools.command import ServerProcess
+with ServerProcess("-c", "import sys, time; print('Listening on 0:1', file=sys.stderr); time.sleep(60)") as server:
+    print(server.process.pid, flush=True)
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(60)
+"""
+
+
+def test_a_tool_that_is_ended_ends_its_server():
+    ended = subprocess.run([sys.executable, "-c", TERMINATED], capture_output=True, text=True, timeout=120)
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGTERM, "")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(ended.stdout), 0)
 
 
 def test_a_client_that_reads_nothing_is_disconnected(server):

@@ -97,6 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     variants = plan()[: options.networks]
     prepare(options)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once: its networks' processes end with it
     with ThreadPoolExecutor(options.jobs) as pool:
         try:
             found = list(pool.map(partial(result, options=options), variants))
