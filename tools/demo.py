@@ -14,7 +14,6 @@ Exit status: 0 if every lap was driven without leaving the road, 1 if the car le
 import json
 import subprocess
 import time
-from argparse import Namespace
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -133,8 +132,8 @@ def report(folder: Path, laps: list[Drive]) -> None:
         raise SimulatorError("the report was not written; start the demo again to continue")
 
 
-def parse_arguments(argv: list[str] | None) -> Namespace:
-    """Parse the command line; argv: that of this process if None."""
+def main(argv: list[str] | None = None) -> int:
+    """Take the steps that are left, and print what to do next; return the exit status. Raises UserError, OSError."""
     parser = command_line("python -m tools.demo", __doc__)
     own = "recordings to train on, or folders of recordings (default: two laps that are recorded first)"
     parser.add_argument("recordings", nargs="*", metavar="FOLDER", help=own)
@@ -143,12 +142,6 @@ def parse_arguments(argv: list[str] | None) -> Namespace:
     arguments = parser.parse_args(argv)
     if arguments.track != "lake" and not arguments.recordings:
         parser.error("--track is for recordings of your own; name their folder, too")
-    return arguments
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Take the steps that are left, and print what to do next; return the exit status. Raises UserError, OSError."""
-    arguments = parse_arguments(argv)
     own, track, folder = arguments.recordings, arguments.track, OWN if arguments.recordings else FOLDER
     recordings = find_folders(own) if own else [FOLDER / "recorded"]
     if own:
