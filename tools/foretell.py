@@ -297,13 +297,8 @@ def main(argv: list[str] | None = None) -> int:
     """Drive, fit, measure; return the exit status. Raises UserError, OSError."""
     parser = command_line("python -m tools.foretell", __doc__)
     add = parser.add_argument
-    add(
-        "model",
-        nargs="?",
-        type=Path,
-        default=SHIPPED_MODEL,
-        help="model file (default: the project's own, whose limits are then replaced)",
-    )
+    model = "model file (default: the project's own, whose limits are then replaced)"
+    add("model", nargs="?", type=Path, default=SHIPPED_MODEL, help=model)
     add("--recordings", nargs="*", default=[], help="recordings of ordinary driving, or folders of recordings")
     drives = "how many drives; fewer have some of each kind, too (default %(default)s, which is all)"
     add("--drives", type=number(int, 20, len(courses())), default=len(courses()), help=drives)
