@@ -90,6 +90,7 @@ REFUSED = [
     ({"points": np.c_[4 * np.cos(TURN), 60 * np.sin(TURN)]}, r"folds within its own width, \d+ m along it \(-?0"),
     ({"points": [(0, 0), (5, 0)]}, "5.0 m long; it must be 20 to 5000 m"),
     ({"points": [(0, 0), (9000, 0)]}, "9000.0 m long"),
+    ({"points": [(i, 0, i % 2 * 9000) for i in range(401)], "checked": False}, "climbs and falls by 3600000.0 m"),
     ({"points": [(0, 0)]}, "1 different points; a road needs 2"),
     ({"points": []}, "0 different points"),
     ({"points": [(0, 0), (30, 0), (0, 0)]}, "2 different points; a road needs 2, and a closed one 3"),

@@ -73,9 +73,12 @@ def make_road(
         if value not in known:
             raise TrackError(f"{kind} {value!r}: it must be one of {', '.join(known)}")
     flat = numbers[:, :2]
-    length = float(np.linalg.norm(np.diff(np.vstack([flat, flat[:1]]) if closed else flat, axis=0), axis=1).sum())
+    changes = np.diff(np.vstack([numbers, numbers[:1]]) if closed else numbers, axis=0)
+    length, climb = float(np.linalg.norm(changes[:, :2], axis=1).sum()), float(np.abs(changes[:, 2]).sum())
     if not MIN_LENGTH <= length <= MAX_LENGTH:
         raise TrackError(f"the road is {length:.1f} m long; it must be {MIN_LENGTH:g} to {MAX_LENGTH:g} m")
+    if climb > MAX_LENGTH:  # a curve through such points takes any amount of memory
+        raise TrackError(f"the road climbs and falls by {climb:.1f} m; it must be {MAX_LENGTH:g} m at most; z is in m")
     road = PointRoad(name, numbers, float(width), marking, land, closed)
     reason = _fault(road)
     for lead in () if closed or reason else LEADS:
