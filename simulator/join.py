@@ -5,7 +5,6 @@ import contextlib
 import math
 import os
 import shlex
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from cloning.base import program
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.files import written_whole
 from cloning.base.outputs import plural
+from cloning.base.processes import PYTHON
 from cloning.road.track import Track
 from cloning.wire.client import ConnectionLost, parse_event
 from cloning.wire.session import MAX_UNASKED, ClientSession
@@ -242,7 +242,7 @@ def write_launcher(arguments: argparse.Namespace) -> None:
         value = getattr(arguments, name)
         if value is not None:
             options += [f"--{name}", os.path.abspath(value) if name == "road" else str(value)]
-    command = shlex.join([sys.executable, "-m", "simulator", *options])
+    command = shlex.join([*PYTHON, "-m", "simulator", *options])
     here = f'{LAUNCHER}{shlex.quote(str(Path(__file__).parents[1]))}"${{PYTHONPATH:+:$PYTHONPATH}}"'
     path = Path(arguments.launcher)
     try:

@@ -280,6 +280,7 @@ def test_a_lost_answer_stops_nothing(monkeypatch):
 
 def test_a_launcher_is_taken_for_the_simulator_and_writes_its_log(tmp_path):
     launcher = tmp_path / "sim.x86_64"
+    (tmp_path / "simulator.py").write_text("raise SystemExit(7)", encoding="utf-8")  # the program's own
     assert main(["join", "--dialect", "roads", "--launcher", str(launcher), "--wait", "2", "--marking", "kerb"]) == 0
     with Program(RoadTests([0.0])) as program:
         options = ["-batchmode", "-nographics", "--port", str(program.port), "-logFile", "unitylog.txt"]

@@ -1,11 +1,20 @@
 """Processes that a command starts."""
 
 import gc
+import os
 import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
+from pathlib import Path
+
+PYTHON = (sys.executable, "-P")  # loads no module from the current folder, which may be full of someone else's files
+
+
+def environment() -> dict[str, str]:
+    """Return the environment variables with which PYTHON finds this project."""
+    paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
 
 
 @contextmanager
@@ -16,6 +25,8 @@ def interrupt_deferred() -> Iterator[None]:
     """
     # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
     if sys.platform != "win32":
+        from multiprocessing import resource_tracker  # here, because it takes 40 ms
+
         resource_tracker.ensure_running()  # multiprocessing starts it with the first process, and then unblocks signals
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     received: list[int] = []  # another thread may still receive it

@@ -9,7 +9,6 @@ import hashlib
 import json
 import os
 import subprocess
-import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,13 @@ import numpy as np
 
 from cloning.base.errors import RecordingError, UserError, message_of
 from cloning.base.files import written_whole
+from cloning.base.processes import PYTHON, environment
 from cloning.recordings.check import cache_file
 from cloning.recordings.excluded import read_cuts
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, LANE_FILE
 
 RULES = 7  # of what a result contains: counted up when they change
-COMMAND = (sys.executable, "-m", "cloning.browse.analyse")
+COMMAND = (*PYTHON, "-m", "cloning.browse.analyse")
 PROGRESS = "progress "  # begins a line that a process prints, with a share of its work from 0 to 1
 
 
@@ -225,9 +225,8 @@ class Analyses:
                 return ""
             command = [*COMMAND, str(folder), analysis.kind]
             command += [analysis.model] * bool(analysis.model) + [f"{analysis.limit:g}"] * bool(analysis.limit)
-            self.process = subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
-            )
+            pipe, both, env = subprocess.PIPE, subprocess.STDOUT, environment()
+            self.process = subprocess.Popen(command, stdout=pipe, stderr=both, env=env, text=True, errors="replace")
         message = "was ended"
         with self.process as process:
             assert process.stdout

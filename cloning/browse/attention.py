@@ -2,12 +2,12 @@
 
 import pickle
 import subprocess
-import sys
 import threading
 
 from cloning.base.errors import ModelError
+from cloning.base.processes import PYTHON, environment
 
-COMMAND = (sys.executable, "-m", "cloning.browse.attend")
+COMMAND = (*PYTHON, "-m", "cloning.browse.attend")
 
 
 class Attention:
@@ -41,7 +41,8 @@ class Attention:
         if self.closed:
             return None
         if not self.process or self.process.poll() is not None:
-            self.process = subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            pipe, env = subprocess.PIPE, environment()
+            self.process = subprocess.Popen(COMMAND, stdin=pipe, stdout=pipe, env=env)
         assert self.process.stdin and self.process.stdout
         try:
             pickle.dump((jpeg, model), self.process.stdin)

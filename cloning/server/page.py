@@ -6,14 +6,11 @@ import functools
 import itertools
 import json
 import math
-import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import flask
@@ -23,6 +20,7 @@ from cloning.base import program
 from cloning.base.arguments import number
 from cloning.base.errors import UserError
 from cloning.base.outputs import as_typed
+from cloning.base.processes import PYTHON, environment
 from cloning.network.attention import visual_backprop
 from cloning.network.network import Network
 from cloning.recordings.images import encode
@@ -196,13 +194,13 @@ def road_on_map(pause: Pause, track: str) -> list[list[float]]:
     lets cars go first. pause: the server's.
     """
     code = (
-        "import os, sys; getattr(os, 'nice', int)(10); from cloning.road.track import centre_line; "
-        "print(centre_line(sys.argv[1])[:, :2].tolist())"
+        "import json, os, sys; getattr(os, 'nice', int)(10); from cloning.road.track import centre_line; "
+        "print(centre_line(json.loads(sys.argv[1]))[:, :2].tolist())"
     )
-    paths = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])}
-    command, until = [sys.executable, "-c", code, track], time.monotonic() + ROAD_SECONDS
+    # In JSON, since an argument can't be any text.
+    command, until = [*PYTHON, "-c", code, json.dumps(track)], time.monotonic() + ROAD_SECONDS
     with tempfile.TemporaryFile() as file:
-        process = subprocess.Popen(command, stdout=file, stderr=subprocess.DEVNULL, env={**os.environ, **paths})
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.DEVNULL, env=environment())
         while process.poll() is None:
             if time.monotonic() > until:
                 process.kill()
