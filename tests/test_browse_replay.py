@@ -18,7 +18,7 @@ from commands import HERE, run_here
 from drive_process import awaited
 from test_excluded import center
 
-from cloning.base.errors import ModelError
+from cloning.base.errors import ModelError, UserError
 from cloning.browse import analyse, analyses, attend, runs
 from cloning.browse.analyses import Analysis, UnknownError, stamp, write_result
 from cloning.browse.attention import Attention
@@ -189,6 +189,8 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
     for later, has_report in ((-1, False), (1, True)):  # the first one is of an earlier run
         os.utime(folder / "report.html", (begun + later, begun + later))
         assert runs.overview(RunFiles(str(folder / "model.pt")))["has_report"] is has_report
+    with pytest.raises(UserError, match="not a report"):  # it may be a link to another file
+        runs.Runs([folder]).report(0)
     files = written_run(tmp_path / "old", finished=4, images=0, losses=(0.5, float("nan"), 0.3))
     files.progress.unlink()
     found = runs.overview(files)
@@ -203,6 +205,7 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
     "name, contents, words",
     [
         ("training_arguments.json", "{", "training_arguments.json: not JSON"),
+        ("training_arguments.json", "[" * 100_000, "training_arguments.json: not JSON"),
         ("training_arguments.json", '{"epochs": "4"}', "training_arguments.json: epochs is 4"),
         ("training_arguments.json", '{"epochs": 4, "samples_per_epoch": 0}', "samples_per_epoch is 0"),
         ("training_progress.json", "[]", "training_progress.json: finished is None"),
@@ -250,9 +253,9 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         assert "Drift" in page.text("#losses section") and "within the epoch" in page.text("#losses")
         page.shows("#run-figures", f"not written yet: python -m cloning.report '{files.report.parent}'")
         page.shows("#run-figures", f"python model.py --resume --output '{files.last.with_name('net.pt')}'")
-        files.report.write_text("<p>What it learned", encoding="utf-8")
+        files.report.write_text("<!doctype html>", encoding="utf-8")
         page.shows("#run-figures a", "report.html")
-        assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<p>What it learned"
+        assert page.run("fetch(document.querySelector('#run-figures a')).then(a => a.text())") == "<!doctype html>"
         page.run("document.querySelector('#run-figures a').focus(); new Promise(go => setTimeout(go, 15000))")
         assert page.run("document.activeElement.textContent") == "report.html", "though the page has asked again"
         page.click("#run-others button")

@@ -68,7 +68,10 @@ class Runs:
         path = self._files(index).report
         if not path.is_file():
             raise UnknownError(f"{path}: not written yet; `python -m cloning.report {path.parent}` writes it")
-        return path.read_bytes()
+        page = path.read_bytes()
+        if not page.lstrip().startswith(b"<!doctype html>"):  # a link to something else
+            raise UserError(f"{path}: not a report; `python -m cloning.report {path.parent}` writes it")
+        return page
 
     def _place(self, index: int) -> dict[str, Any]:
         folder = self.files[index].last.parent
@@ -168,7 +171,7 @@ def _json(path: Path, kinds: dict[str, Any], least: int, within: str = "") -> di
     """
     try:
         found = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not JSON ({error}); `python model.py` writes it anew") from None
     if isinstance(found, dict) and isinstance(found.get(within), dict):  # an earlier version's has no such part
         found |= found[within]
