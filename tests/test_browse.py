@@ -149,6 +149,9 @@ def test_a_part_of_a_recording_is_a_recording_with_the_same_images(linked, tmp_p
     recording.path(10).unlink()
     with pytest.raises(RecordingError, match=f"{recording.name(10)}: No such file"):
         write_part([chosen], tmp_path / "other")
+    recording.path(10).symlink_to(linked / "driving_log.csv")
+    with pytest.raises(RecordingError, match=f"{recording.name(10)}: a link to another file .not a JPEG"):
+        write_part([chosen], tmp_path / "other")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "part"]
 
 

@@ -1,6 +1,7 @@
 """Write rows of recordings as a recording of its own, whose images are hard links to the same files."""
 
 import csv
+import errno
 import os
 import shutil
 from collections.abc import Sequence
@@ -26,6 +27,7 @@ from cloning.recordings.format import (
     parse_time_stamp,
     time_stamp,
 )
+from cloning.recordings.images import jpeg_size, read_jpeg
 from cloning.recordings.log import Recording
 
 DAY = timedelta(days=1)
@@ -105,10 +107,17 @@ def _renamed(recording: Recording, days: int, check: bool) -> dict[str, str]:
 
 
 def _link(source: Path, copy: Path) -> None:
-    """Make a hard link to a file, or a copy if that is not possible. Raises OSError."""
+    """Make a hard link to an image, or a copy if that is not possible. Raises OSError.
+
+    What a symbolic link leads to must be a JPEG: someone else's recording could name any file of the user's.
+    """
     try:
+        if source.is_symlink():
+            jpeg_size(read_jpeg(source))
         os.link(source.resolve(strict=True), copy)
     except FileNotFoundError:
         raise
+    except ValueError as error:
+        raise OSError(errno.EINVAL, f"a link to another file ({error})", str(source)) from None
     except OSError:
         shutil.copyfile(source, copy)
