@@ -246,12 +246,14 @@ def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
         (lambda folder: folder.joinpath("data/chunk-000/file-000.parquet").write_bytes(b"PAR1"), "copy it again"),
         (lambda folder: shutil.rmtree(folder / "videos" / CENTER), "No such file or directory"),
         (lambda folder: edit(folder, fps=5), "before its episode 0 does"),
+        (lambda folder: edit(folder, video_path="http://127.0.0.1:1/film"), "127.0.0.1:1/film: No such file"),
     ],
-    ids=["info", "table", "no film", "short film"],
+    ids=["info", "table", "no film", "short film", "no file"],
 )
-def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_path, damage, message):
+def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_path, monkeypatch, damage, message):
     damage(data_set)
-    assert message in refused(data_set, "--output", tmp_path / "recording")
+    monkeypatch.chdir(data_set)
+    assert message in refused(".", "--output", tmp_path / "recording")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lake"]
 
 

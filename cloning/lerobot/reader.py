@@ -114,7 +114,7 @@ def _images(
     where = {name.removeprefix(begin): value for name, value in episode.items() if name.startswith(begin)}
     path = folder / info["video_path"].format(video_key=key, **where, **episode)
     start, rate, row = where.get("from_timestamp", 0.0), info["fps"], 0
-    with av.open(str(path)) as film:
+    with av.open(str(path.absolute())) as film:  # else http:… in the current folder would be an address, not a file
         stream = film.streams.video[0]
         film.seek(int(start / stream.time_base), stream=stream)  # to the key frame before it
         for frame in film.decode(stream):
