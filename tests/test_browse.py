@@ -329,6 +329,10 @@ def test_without_file_handles_no_file_is_blamed():
     assert message == "Too many open files; end other programs, or raise the limit with `ulimit -n`"
 
 
+def test_names_in_a_message_do_not_change_the_terminal():
+    assert message_of(UserError("no \x1b[2J.jpg\rhere\n")) == "no \\x1b[2J.jpg\\rhere\n"
+
+
 def test_threads_that_want_the_same_recording_read_it_once(recording, monkeypatch):
     read: list[Path] = []
 

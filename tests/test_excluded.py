@@ -63,12 +63,12 @@ def test_without_time_stamps_a_stretch_ends_at_the_next_row_with_its_last_image(
 
 
 def test_every_command_honours_and_counts_cuts(copied, capsys):
-    exclude(copied, (10, 19, "off the road"), (30, 30, ""))
+    exclude(copied, (10, 19, "off the \x1b[2Jroad"), (30, 30, ""))
     print_findings(read_recording(copied))
     first, last = center(copied, 10), center(copied, 19)
     file = copied / "excluded.csv"
     printed = [
-        f"{file}: line 2: 10 rows are left out, from {first} to {last}: off the road",
+        f"{file}: line 2: 10 rows are left out, from {first} to {last}: off the \\x1b[2Jroad",
         f"{file}: line 3: 1 row is left out, from {center(copied, 30)} to {center(copied, 30)}: no reason given",
     ]
     assert capsys.readouterr().out.splitlines() == printed

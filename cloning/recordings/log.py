@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from cloning.base import program
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, printable
 from cloning.base.outputs import plural
 from cloning.base.table import Column, Table
 from cloning.recordings.columns import Finding, Rejected, UnclearLogError
@@ -136,11 +136,11 @@ def print_findings(recording: Recording) -> None:
     for finding in Finding:
         rejected = [row for row in recording.rejected if row.finding == finding]
         for row in rejected[:SHOWN_REJECTED]:
-            print(f"{path}: line {row.line}: left out: {row.detail}")
+            print(f"{path}: line {row.line}: left out: {printable(row.detail)}")
         if len(rejected) > SHOWN_REJECTED:
             print(f"{path}: … and {len(rejected) - SHOWN_REJECTED} more of this kind")
     for cut, rows in recording.cuts:
-        stretch = f"from {cut.first} to {cut.last}: {cut.reason or 'no reason given'}"
+        stretch = printable(f"from {cut.first} to {cut.last}: {cut.reason or 'no reason given'}")
         print(
             f"{recording.folder / EXCLUDED}: line {cut.line}: {plural(rows, 'row is', 'rows are')} left out, {stretch}"
         )

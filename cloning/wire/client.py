@@ -21,6 +21,7 @@ from wsproto.connection import ConnectionState
 from wsproto.events import CloseConnection, Event, Ping, RejectConnection, Request, TextMessage
 from wsproto.utilities import ProtocolError
 
+from cloning.base.errors import printable
 from cloning.road.motion import FULL_LOCK
 from cloning.wire.protocol import FRAGMENT, PING_INTERVAL, PONG_TIMEOUT, STAND_IN, Place
 
@@ -38,7 +39,10 @@ MAX_PACKET = 1 << 16  # characters; an answer has about 80
 
 
 class ConnectionLost(Exception):
-    """The server closed the connection, or was never there; the message says which."""
+    """The server closed the connection, or was never there; the message says which, perhaps in the server's words."""
+
+    def __init__(self, message: str):
+        super().__init__(printable(message))
 
 
 class NoServer(ConnectionLost):
