@@ -16,7 +16,6 @@ import gc
 import itertools
 import logging
 import statistics
-import sys
 import time
 from collections import Counter
 from contextlib import suppress
@@ -353,12 +352,10 @@ def main() -> int:
     simulator = "Now start the simulator, choose a track and AUTONOMOUS MODE,\nor"
     if port != PORT:
         simulator = f"The simulator connects to port {PORT} only.\nNow start"
-    print(
+    stderr.write(
         f"Driving with {model}{origin and f' ({origin})'}.\n"
         f"Listening on {arguments.host}:{port}. {simulator} {stand_in}.\n"
-        f"Watch at http://{f'[{watched}]' if ':' in watched else watched}:{port}/ . Ctrl-C ends.",
-        file=sys.stderr,
-        flush=True,
+        f"Watch at http://{f'[{watched}]' if ':' in watched else watched}:{port}/ . Ctrl-C ends.\n"
     )
     gc.collect()
     gc.freeze()  # else a client can make the collector look through all the libraries' objects: 0.2 s each time

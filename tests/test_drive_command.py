@@ -13,7 +13,8 @@ import pytest
 import torch
 import warm
 from commands import HERE, ROOT
-from drive_process import STOP, found, script, serving
+from drive_process import STOP, awaited, found, script, serving
+from steer_server import unused_port
 
 import drive
 from cloning.base.errors import UserError
@@ -144,3 +145,26 @@ def test_a_terminal_that_nobody_reads_and_requests_that_fill_it_stop_no_car(mode
         assert len(process.stderr.read()) < 50_000
     finally:
         process.kill()
+
+
+def test_a_terminal_that_is_gone_before_the_first_line_stops_no_car_and_no_signal(model_file, jpegs, tmp_path):
+    def simulator() -> Simulator | None:
+        try:
+            return Simulator(port).open()
+        except ConnectionRefusedError:
+            return None
+
+    reader, writer = os.pipe()
+    os.close(reader)
+    port = unused_port()
+    command = [*script("drive.py"), str(model_file), str(tmp_path / "run1"), "--port", str(port)]
+    process = warm.Popen(command, env={**os.environ, **HERE}, stderr=writer)
+    os.close(writer)
+    try:
+        with awaited(simulator) as car:
+            car.drive(telemetry(jpegs[0]))
+            process.send_signal(STOP)
+            assert process.wait(20) == 128 + STOP
+    finally:
+        process.kill()
+    assert len(list((tmp_path / "run1").glob("*.jpg"))) == 1
