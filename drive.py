@@ -62,6 +62,7 @@ class Session(page.Session):
         self.steering = np.float32(0)  # of the last answer, -1..1
         self.puzzled = False  # whether `tell_of_silence` has told of it
         self.warned: Counter[str] = Counter()  # kinds of warnings logged: see terminal.Few
+        self.folders: list[saved_frames.SessionFolder] = []  # of its saved frames; the last one may be `folder`
 
     def answer(self, message: object, arrived: float | None = None) -> dict[str, str]:
         """Return the answer to a telemetry message: steering and throttle, -1..1, as strings. Never raises.
@@ -97,7 +98,9 @@ class Session(page.Session):
             self.driven += 1
             self.place = place
             if self.server.saver and self.server.recording:
-                self.folder = self.folder or self.server.saver.start_session()
+                if not self.folder:
+                    self.folder = self.server.saver.start_session()
+                    self.folders.append(self.folder)
                 driven = float(self.steering), throttle, telemetry.speed
                 self.folder.save(telemetry.jpeg, driven, place.time if place else None)
             where = (place.offset, place.x, place.y, risk) if place else (telemetry.cte, None, None, risk)
@@ -128,8 +131,8 @@ class Session(page.Session):
         self.heeds, self.lost = self.heeds and not self.lost, False
 
     def summary(self) -> str:
-        """Return a line about the whole session: how many frames, and where they are saved."""
-        saved = f"; {self.folder.summary()}" if self.folder else ""
+        """Return a line about the whole session: how many frames, and how many are saved where."""
+        saved = "".join(f"; {folder.progress()}" for folder in self.folders)
         return f"session ended: {self.driven} frames driven, {self.unusable} unusable{saved}"
 
 
@@ -193,8 +196,8 @@ class DriveServer:
         if session and session.heard:
             session.ended, self.last_ended = True, session
         if session and session.driven + session.unusable:
-            if session.folder:
-                session.folder.when_written(lambda: log.info(session.summary()))
+            if session.folders:
+                session.folders[-1].when_written(lambda: log.info(session.summary()))
             else:
                 log.info(session.summary())
 

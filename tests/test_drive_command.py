@@ -13,7 +13,7 @@ import pytest
 import torch
 import warm
 from commands import HERE, ROOT
-from drive_process import STOP, awaited, found, script, serving
+from drive_process import STOP, ask, awaited, found, script, serving
 from steer_server import unused_port
 
 import drive
@@ -111,8 +111,12 @@ def test_nothing_is_lost_when_it_is_stopped(model_file, jpegs, tmp_path):
         for n in range(60):
             simulator.drive(telemetry(jpegs[n % 8]))
         simulator.drive({})
+        for recording in (False, True):  # after each, one more frame
+            assert ask(process.port, "/record", "POST", {"recording": recording})[0] == 200
+            simulator.drive(telemetry(jpegs[0]))
         assert process.stop() == 128 + STOP
-    assert process.lines[-1] == "drive.py: session ended: 60 frames driven, 1 unusable; driven frames saved in run1\n"
+    told = "62 frames driven, 1 unusable; 60 frames saved in run1; 1 frames saved in run1-2"
+    assert process.lines[-1] == f"drive.py: session ended: {told}\n"
     saved = sorted((tmp_path / "run1").glob("*.jpg"))
     assert [path.read_bytes() for path in saved] == [jpegs[n % 8] for n in range(60)]
     assert all(re.fullmatch(r"\d{4}(_\d\d){5}_\d{3}\.jpg", path.name) for path in saved)

@@ -54,7 +54,7 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
     saver, write, reports = frames.FrameSaver(tmp_path / "run1"), Path.write_bytes, []
 
     def tell(session: frames.SessionFolder) -> None:
-        reports.append(session.summary())
+        reports.append(session.progress())
 
     def fails_for_the_second_session(path, data):
         if data == b"lost":
@@ -72,7 +72,7 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
     with pytest.raises(UserError, match=rf"run1: 5 of 40 frames were not saved \({reason}\); free"):
         saver.close()
     assert reports == [
-        f"driven frames saved in {tmp_path / 'run1'}",
+        f"20 frames saved in {tmp_path / 'run1'}",
         f"15 frames saved in {tmp_path / 'run1-2'}, 5 LOST ({reason})",
     ]
     assert len(list((tmp_path / "run1-2").glob("*.jpg"))) == 15

@@ -152,10 +152,6 @@ class SessionFolder:
         lost = f", {self.lost} LOST ({self.error})" if self.lost else ""
         return f"{self.saved} frames saved in {self.path}{lost}"
 
-    def summary(self) -> str:
-        """Return where the frames are, and how many are lost so far."""
-        return self.progress() if self.lost else f"driven frames saved in {self.path}"
-
     def _write(self, path: Path, jpeg: bytes, driven: tuple[float, float, float]) -> None:
         try:
             path.parent.mkdir(exist_ok=True)
