@@ -56,12 +56,14 @@ class CorrectedClient(Client):
         self.expert = Expert(run.track, top_speed=speed * MPH, wander=0.0)
         self.correcting, self.corrections, self.expert_time = False, 0, 0.0
         self._away_at = 0.0  # simulated seconds when the car was last not near the centre, in a correction
+        self._recorded_at = -1.0  # simulated seconds of the last row
 
     def next_frame(self) -> str:
         """Decide who drives until the next frame, record what the expert drove, and return the telemetry packet."""
         run = self.run
-        if self.correcting:
+        if self.correcting and run.time > self._recorded_at:  # not again after a reconnection
             write_row(self.recording, self.recorded, run)
+            self._recorded_at = run.time
         offset, heading_error = run.lane
         if not self.correcting and abs(offset) > TOO_FAR:
             self.correcting = True

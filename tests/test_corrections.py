@@ -1,5 +1,6 @@
 """Corrections: where the expert takes over from a server, what is recorded of it, and the same by hand."""
 
+import itertools
 import re
 import sys
 from types import SimpleNamespace
@@ -112,9 +113,16 @@ def test_without_a_correction_or_a_server_there_is_no_recording(tmp_path, capsys
 
 
 def test_a_car_that_leaves_the_road_despite_the_expert_is_set_back(tmp_path, capsys, monkeypatch):
+    """The server hangs up once in the middle of a correction, of which each row is recorded once nevertheless."""
     monkeypatch.setattr(Expert, "drive", lambda expert, run: (1.0, 1.0))
-    with Server(to_the_right) as server:
+    manual = itertools.count()
+
+    def hangs_up(packet, n):
+        return None if packet == MANUAL_TELEMETRY and next(manual) == 2 else to_the_right(packet, n)
+
+    with Server(hangs_up, sessions=2) as server:
         assert corrected(tmp_path / "x-corrections", server, 0.02) == 1
+    assert (np.diff(read_recording(tmp_path / "x-corrections").time) > 0).all()
     printed = capsys.readouterr().out
     departures, corrections = (int(re.findall(rf"{word}: (\d+)", printed)[0]) for word in ("departures", "corrections"))
     assert departures >= 1 and corrections in (departures, departures + 1), "a departure ends a correction"
