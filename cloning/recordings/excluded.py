@@ -25,7 +25,7 @@ if os.name != "nt":
 
 EXCLUDED, TAGS = "excluded.csv", "tags.csv"
 HEADERS = {EXCLUDED: ("first image", "last image", "reason"), TAGS: ("first image", "last image", "tag")}
-MAX_REASON = 200  # characters
+MAX_REASON = 10_000  # characters: one written by hand is as before when its deletion is undone
 BYTES = {"encoding": "utf-8", "errors": "surrogateescape"}  # names of files may hold any bytes
 _one_at_a_time = threading.Lock()  # for Windows, where no other lock is taken
 
