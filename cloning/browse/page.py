@@ -16,7 +16,7 @@ from cloning.browse.runs import Runs
 from cloning.recordings.excluded import BYTES, EXCLUDED, TAGS, Cut, GoneError
 from cloning.road.autonomy import LIMITS
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
-from cloning.road.motion import FULL_LOCK, WHEELBASE
+from cloning.road.motion import AXLE_TO_CAMERA, FULL_LOCK, REAR_AXLE, WHEELBASE
 from cloning.server import site
 
 SPEEDS = ("0.25", "0.5", "1", "2", "4", "8")  # of playing
@@ -63,7 +63,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     @app.get("/")
     def index() -> str:
         camera = {"matrix": CAMERA_MATRIX.tolist(), "height": CAMERA_HEIGHT}
-        camera |= {"lock": math.radians(FULL_LOCK), "wheelbase": WHEELBASE}
+        camera |= {"lock": math.radians(FULL_LOCK), "wheelbase": WHEELBASE, "axle": AXLE_TO_CAMERA, "middle": REAR_AXLE}
         limits = [f"{each:g}" for each in LIMITS]
         return flask.render_template("browse.html", limits=limits, speeds=SPEEDS, camera=camera, scripts=scripts)
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from cloning.base.frame import FRAME
 from cloning.road.camera import project_ground
-from cloning.road.motion import curvature
+from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, curvature
 
 GREEN, MAGENTA = (60, 255, 60), (255, 0, 200)  # RGB: of the path, and of what the network looks at
 WIDTH = 1.5  # px of a frame
@@ -13,10 +13,15 @@ FRACTION_BITS = 4  # of the points' coordinates, as OpenCV takes them
 
 
 def draw_path(picture: np.ndarray, steering: float, colour: tuple[int, ...] = GREEN) -> None:
-    """Draw the path ahead at a steering, -1..1, on a picture: uint8 (160 k, 320 k) or (160 k, 320 k, channels)."""
-    scale = picture.shape[0] / FRAME[0]
-    ahead = np.linspace(2.5, 25, 40)  # m; the bonnet hides the nearer part
-    points = project_ground(curvature(steering) * ahead**2 / 2, ahead) * scale
+    """Draw the path ahead at a steering, -1..1, on a picture: uint8 (160 k, 320 k) or (160 k, 320 k, channels).
+
+    The car's middle drives it: a circle about a point beside the rear axle, drawn up to where it turns back.
+    """
+    scale, bend = picture.shape[0] / FRAME[0], curvature(steering)
+    ahead = np.linspace(2.5, 25, 91)  # m; the bonnet hides the nearer part
+    square = (ahead + AXLE_TO_CAMERA) ** 2 - REAR_AXLE**2
+    root = np.sqrt(np.maximum(1 - bend**2 * square, 0))
+    points = project_ground(bend * square / (1 + root), ahead)[root > 0] * scale
     fixed = np.round(points * 2**FRACTION_BITS).astype(np.int32)
     cv2.polylines(picture, [fixed], False, colour, round(WIDTH * scale), cv2.LINE_AA, FRACTION_BITS)
 

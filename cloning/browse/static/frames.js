@@ -8,14 +8,16 @@ const FORGOTTEN = 1000; // ms after which what is not shown any more is freed
 const PATIENCE = 100; // ms that a row's frames wait for what the models look at
 
 // Of cloning/road/camera.py and motion.py.
-const {matrix, height, lock, wheelbase} = JSON.parse(element("recording").dataset.camera);
+const {matrix, height, lock, wheelbase, axle, middle} = JSON.parse(element("recording").dataset.camera);
 
 // Draw the path ahead at a steering, -1..1, on a frame, as cloning/road/overlay.py does.
 function drawPath(context, steering, colour) {
   const bend = Math.tan(lock * steering) / wheelbase; // 1/m, right positive
   context.beginPath();
-  for (let ahead = 2.5; ahead <= 25; ahead += 0.5) { // m; the bonnet hides the nearer part
-    const point = [bend * ahead ** 2 / 2, height, ahead]; // right, down, forward
+  for (let ahead = 2.5; ahead <= 25; ahead += 0.25) { // m; the bonnet hides the nearer part
+    const square = (ahead + axle) ** 2 - middle ** 2, root = Math.sqrt(1 - bend ** 2 * square);
+    if (!root) break; // NaN or 0: the circle turns back
+    const point = [bend * square / (1 + root), height, ahead]; // right, down, forward
     const [x, y, z] = matrix.map(line => line.reduce((sum, factor, axis) => sum + factor * point[axis], 0));
     context.lineTo(x / z + 0.5, y / z + 0.5);
   }
