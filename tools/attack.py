@@ -22,9 +22,10 @@ from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.processes import garbage_kept, interrupt_deferred
 from cloning.network.network import SHIPPED_MODEL
+from cloning.wire.client import telemetry_packet
 from tools.attacks import Attack, all_attacks, frames
 from tools.command import ROOT, ServerProcess
-from tools.simulator_client import Simulator, telemetry_message
+from tools.simulator_client import Simulator
 
 OPEN_FILES = 1024  # that the server may have: Linux's usual limit
 MAX_GROWTH, MAX_P99, MIN_RATE = 60, 40, 15  # MB, ms, frames/s: beside an attack
@@ -70,7 +71,7 @@ class Car:
                 raise ConnectionError("the server refuses a new car")
             time.sleep(0.1)
         self.simulator = simulator.open()
-        self.messages = [telemetry_message(jpeg) for jpeg in jpegs]
+        self.messages = [telemetry_packet(0, 0, 9, jpeg) for jpeg in jpegs]
         self.expected = expected or [self.ask(message) for message in self.messages]
 
     def ask(self, message: str) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 
 from cloning.base.frame import FRAME
 from cloning.recordings.images import encode
-from tools.simulator_client import Simulator, fragments, telemetry, telemetry_message
+from cloning.wire.client import telemetry_packet
+from tools.simulator_client import Simulator, fragments, telemetry
 
 Attack = Callable[[int, float], None]  # takes the server's port and the time.monotonic() at which to stop
 T = TypeVar("T")
@@ -167,7 +168,7 @@ def frames(count: int = 8) -> list[bytes]:
 
 def all_attacks() -> dict[str, Attack]:
     """Return the attacks by name."""
-    driving = b"".join(fragments(telemetry_message(frames(1)[0])))
+    driving = b"".join(fragments(telemetry_packet(0, 0, 9, frames(1)[0])))
     bomb = frame(_compressed(b"4" + bytes(8_000_000)), 0xC1)
     nested = b'42["telemetry",' + b"[]," * 300_000 + b"0]"
     names = b"".join(frame(b"40/%d," % n) for n in range(50_000))

@@ -28,8 +28,9 @@ from cloning.base.arguments import command_line, number
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
 from cloning.server.page import DrivenFrame
+from cloning.wire.client import telemetry_packet
 from tools.command import ROOT, ServerProcess
-from tools.simulator_client import Simulator, fragments, telemetry_message
+from tools.simulator_client import Simulator, fragments
 
 TURN = 100  # frames that a server answers in one turn
 WARM_UP = 50  # frames that are not counted
@@ -107,7 +108,7 @@ def milliseconds(times: list[float], bound: list[float]) -> str:
 
 def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], list[Server]]:
     """Return the lower bounds in seconds, and the servers with their measurements. Raises UserError."""
-    messages = [fragments(telemetry_message(jpeg)) for jpeg in jpegs]
+    messages = [fragments(telemetry_packet(0, 0, 9, jpeg)) for jpeg in jpegs]
     network, bounds = load_model(model), []
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         drive = (ROOT / "drive.py", model, "--port", "0")

@@ -101,8 +101,3 @@ def telemetry(
         "speed": speed,
         "image": base64.b64encode(jpeg).decode(),
     }
-
-
-def telemetry_message(jpeg: bytes) -> str:
-    """Return the message of a telemetry at 9 mph, the set speed."""
-    return "42" + json.dumps(["telemetry", telemetry(jpeg, speed="9.0000")])
