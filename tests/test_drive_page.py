@@ -45,7 +45,7 @@ def shown(server, query: str = "") -> dict:
     return live(server.port, query)
 
 
-def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_in_it(server, jpegs):
+def test_a_page_is_given_what_was_driven(server, jpegs):
     with Simulator(server.port).open() as simulator:
         for _ in range(3):
             simulator.drive(telemetry(jpegs[0], speed="8.5000"))
@@ -54,9 +54,6 @@ def test_a_page_is_given_what_was_driven_and_the_benchmark_finds_the_latencies_i
             time_stamp, _, speed, throttle, latency, *_ = figures["rows"][-1]
             assert abs(time_stamp - time.monotonic()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
             assert figures["image"].startswith("/9j/")
-        measured: Any = SimpleNamespace(port=server.port, latencies=[])
-        bench_driving.Server.read_latencies(measured, 2)
-    assert len(measured.latencies) == 2 and all(0 < seconds < 60 for seconds in measured.latencies)
 
 
 def test_any_road_that_the_stand_in_names_is_drawn(server, jpegs):

@@ -10,12 +10,10 @@ time and memory are read from /proc.
 """
 
 import itertools
-import json
 import subprocess
 import sys
 import tempfile
 import time
-import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
@@ -27,14 +25,13 @@ from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.network.network import Network, load_model
 from cloning.recordings.images import decode
-from cloning.server.page import DrivenFrame
 from cloning.wire.client import telemetry_packet
 from tools.command import ROOT, ServerProcess
 from tools.simulator_client import Simulator, fragments
 
 TURN = 100  # frames that a server answers in one turn
 WARM_UP = 50  # frames that are not counted
-PAGE_OPEN, TYPICAL = "drive.py, page open", "typical server"  # names in the table
+PAGE_OPEN = "drive.py, page open"  # its name in the table
 
 
 class Server(ServerProcess):
@@ -45,8 +42,7 @@ class Server(ServerProcess):
         self.name = name
         self.client = Simulator(self.port)
         self.client.open()
-        self.round_trips: list[float] = []  # seconds, measured by the client
-        self.latencies: list[float] = []  # seconds, measured by the server
+        self.round_trips: list[float] = []  # seconds
         self.megabytes: list[float] = []  # resident, after each turn
         self.seconds = self.cpu_time = 0.0  # over all counted frames
 
@@ -69,12 +65,6 @@ class Server(ServerProcess):
             self.seconds += time.perf_counter() - started
             self.cpu_time += self.cpu_seconds() - cpu_before
             self.megabytes.append(self.memory())
-
-    def read_latencies(self, frames: int) -> None:
-        """Read the latencies of the last frames, as the server measured them, from the events for its page."""
-        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/live", timeout=10) as events:
-            rows = json.loads(next(line for line in events if line.startswith(b"data:"))[6:])["rows"]
-        self.latencies += [DrivenFrame(*row).latency / 1000 for row in rows[-frames:]]
 
 
 @contextmanager
@@ -116,7 +106,7 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
             "drive.py": drive,
             "drive.py, saving frames": (*drive, Path(folder) / "run1"),
             PAGE_OPEN: drive,
-            TYPICAL: ("-c", "from tools.classic_server import main; main()", model),
+            "typical server": ("-c", "from tools.classic_server import main; main()", model),
         }
         servers = [stack.enter_context(Server(name, *command)) for name, command in commands.items()]
         for server in servers:
@@ -128,8 +118,6 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
             for server in servers:
                 with open_page(server.port) if server.name == PAGE_OPEN else nullcontext():
                     server.drive(messages[turn])
-                if server.name != TYPICAL:
-                    server.read_latencies(TURN)
     return bounds, servers
 
 
@@ -157,8 +145,6 @@ def main(argv: list[str] | None = None) -> int:
             f"{server.name:24} {milliseconds(server.round_trips, bounds)} {count / server.seconds:9.1f} "
             f"{server.cpu_time / count * 1e3:10.2f} {server.megabytes[0]:9.0f} {server.megabytes[-1]:5.0f}"
         )
-        if server.latencies:
-            print(f"{'  in the server':24} {milliseconds(server.latencies, bounds)}")
     return program.DONE
 
 
