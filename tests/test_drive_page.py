@@ -2,6 +2,7 @@
 
 import json
 import mimetypes
+import subprocess
 import threading
 import time
 from contextlib import contextmanager
@@ -54,6 +55,19 @@ def test_a_page_is_given_what_was_driven(server, jpegs):
             time_stamp, _, speed, throttle, latency, *_ = figures["rows"][-1]
             assert abs(time_stamp - time.monotonic()) < 60 and speed == 8.5 and throttle > 0 and 0 < latency < 10_000
             assert figures["image"].startswith("/9j/")
+
+
+def test_an_interrupted_benchmark_closes_its_page(server, monkeypatch):
+    started, start = [], subprocess.Popen
+
+    def noted(*command, **options):
+        started.append(start(*command, **options))
+        return started[0]
+
+    monkeypatch.setattr(subprocess, "Popen", noted)
+    with pytest.raises(KeyboardInterrupt), bench_driving.open_page(server.port):
+        raise KeyboardInterrupt
+    assert started[0].poll() is not None
 
 
 def test_any_road_that_the_stand_in_names_is_drawn(server, jpegs):

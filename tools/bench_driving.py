@@ -72,11 +72,13 @@ def open_page(port: int) -> Iterator[None]:
     """Read the page's events with attention maps in another process, as a browser with the open page does."""
     read_events = "import sys, urllib.request\nfor line in urllib.request.urlopen(sys.argv[1]): pass"
     address = f"http://127.0.0.1:{port}/live?attention"
-    reader = subprocess.Popen([sys.executable, "-c", read_events, address])
-    time.sleep(1)
-    yield
-    reader.kill()
-    reader.wait()
+    command = [sys.executable, "-c", read_events, address]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as reader:  # Ctrl-C ends it, too, with a traceback
+        try:
+            time.sleep(1)
+            yield
+        finally:
+            reader.kill()
 
 
 def lower_bounds(network: Network, jpegs: list[bytes]) -> list[float]:
