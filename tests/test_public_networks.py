@@ -57,6 +57,11 @@ def test_a_rebuilt_network_enters_the_benchmark(sample_recording, tmp_path, monk
     monkeypatch.setitem(PUBLISHED, "ksakmann", brief)
     words = [str(sample_recording), "--networks", "ksakmann", "--folder", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["public_networks", *words])
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "onnxscript", None)
+        with pytest.raises(ModuleNotFoundError, match="onnxscript"):
+            public_networks.main()
+        assert not trained, "it is told before the training"
     assert public_networks.main() == DONE and brief.source in capsys.readouterr().out
     frame = read_frame(next((sample_recording / "IMG").glob("center*")))
     pixels = cv2.resize(frame[60:136, 20:300], (64, 64)).transpose(2, 0, 1)[None] / np.float32(127.5) - 1

@@ -66,7 +66,7 @@ class Published(NamedTuple):
     learning_rate: float
     batch: int
     samples: int
-    epochs: int
+    epochs: int = 10
     held_out: float = 0.0
     augmented: float = 1.0
     side: float = 0.0
@@ -130,7 +130,6 @@ PUBLISHED = {
         learning_rate=1e-4,
         batch=40,
         samples=20_000,
-        epochs=10,
         held_out=0.2,
         augmented=0.6,
         side=0.2,
@@ -146,7 +145,6 @@ PUBLISHED = {
         learning_rate=1e-3,
         batch=64,
         samples=10_000,
-        epochs=10,
     ),
     "ksakmann": Published(
         "ksakmann/CarND-BehavioralCloning @ 26caf5b, no licence found",
@@ -156,7 +154,6 @@ PUBLISHED = {
         learning_rate=1e-4,
         batch=200,
         samples=20_000,
-        epochs=10,
         flip=0.5,
         shift=(20, 2, 1 / 120),
         shear=(80, np.degrees(1 / 80) / 25 / 6),
@@ -171,7 +168,6 @@ PUBLISHED = {
         learning_rate=1e-3,
         batch=128,
         samples=28_000,  # nine tenths of the three images of 5,206 rows, and of their mirror images
-        epochs=10,
         side=0.3,
         flip=0.5,
     ),
@@ -273,6 +269,8 @@ def main() -> int:
     add("--networks", nargs="+", choices=PUBLISHED, default=list(PUBLISHED), help="which (default: all)")
     add("--folder", type=Path, default=Path("public"), help="for the results (default: public)")
     options = parser.parse_args()
+    import onnxscript  # noqa: F401  # an optional library, with which the networks are written: told before a training
+
     recordings = [check_images(read_recording(folder)) for folder in find_folders(options.recordings)]
     options.folder.mkdir(parents=True, exist_ok=True)
     for recording in recordings:
