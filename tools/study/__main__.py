@@ -32,7 +32,7 @@ from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record
 from simulator.workers import begin
-from tools.study.figures import Row, correlation_picture, recovery_picture, report, row
+from tools.study.figures import correlation_picture, recovery_picture, report, row
 from tools.study.measures import measure
 from tools.study.networks import EPOCH_IMAGES, RENDERED, TRACKS, Variant, plan
 
@@ -57,14 +57,6 @@ def prepare(options: argparse.Namespace) -> None:
         shutil.rmtree(unfinished, ignore_errors=True)
         record(unfinished, Track("lake"), options.laps)
         unfinished.rename(rendered)
-
-
-def write_study(rows: list[Row], folder: Path) -> None:
-    """Write the table, the report and the pictures of the networks measured so far. Raises OutputError."""
-    write_output(folder / "study.csv", csv_bytes([rows[0], *(network.values() for network in rows)]))
-    write_output(folder / "study.md", report(rows).encode())
-    for picture in (correlation_picture, recovery_picture):
-        write_output(folder / f"study_{picture.__name__.removesuffix('_picture')}.png", picture(rows))
 
 
 def result(variant: Variant, options: argparse.Namespace) -> dict[str, float]:
@@ -104,8 +96,12 @@ def main(argv: list[str] | None = None) -> int:
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    write_study([row(*pair) for pair in zip(variants, found, strict=True)], options.folder)
-    print(f"{options.folder / 'study.md'}, study.csv and pictures")
+    rows, study = [row(*pair) for pair in zip(variants, found, strict=True)], options.folder / "study.md"
+    write_output(study.with_suffix(".csv"), csv_bytes([rows[0], *(network.values() for network in rows)]))
+    write_output(study, report(rows).encode())
+    write_output(study.with_name("study_correlation.png"), correlation_picture(rows))
+    write_output(study.with_name("study_recovery.png"), recovery_picture(rows))
+    print(f"{study}, study.csv and pictures")
     return program.DONE
 
 
