@@ -15,7 +15,7 @@ import torch
 from scenes import Here, lake_drive, recorded
 from test_parts import localised
 
-from cloning.base.errors import ModelError, RecordingError
+from cloning.base.errors import ModelError, OutputError, RecordingError
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane import parts, reader
 from cloning.lane.ahead import centre_ahead
@@ -322,6 +322,11 @@ def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsy
 def test_the_tools_name_what_is_missing(main, options, tmp_path):
     with pytest.raises(RecordingError, match="nowhere"):
         main([*options, str(tmp_path / "nowhere")])
+
+
+def test_an_output_in_no_folder_is_refused_before_the_training(tmp_path):
+    with pytest.raises(OutputError, match="no such folder"):
+        train_lane.main(["--output", str(tmp_path / "nowhere" / "lane.pt")])
 
 
 def test_the_accuracy_on_a_recording_is_printed(drive, capsys):

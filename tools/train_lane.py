@@ -30,6 +30,7 @@ import torch
 
 from cloning.base import program
 from cloning.base.arguments import command_line, number
+from cloning.base.outputs import check_folders
 from cloning.lane.reader import (
     DIRECTION_TO_STRIP,
     DISTANCES_AHEAD,
@@ -315,6 +316,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--seed", type=number(int, 0), default=0, help="of all random choices (default %(default)s)")
     add("--output", type=Path, default=Path("lane.pt"), help="file of weights (default %(default)s)")
     options = parser.parse_args(argv)
+    check_folders(str(options.output))
     torch.manual_seed(options.seed)
     network = copy.deepcopy(load_network(options.start)) if options.start else LaneNetwork()
     recordings = [RealRecording(folder) for folder in find_folders(options.recordings)]
