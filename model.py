@@ -9,8 +9,8 @@
 
 "The report" is the writeup of the Behavioral Cloning project that is reproduced here; this file follows it from top to
 bottom, and REPORT has all its figures. A run writes model.pt (the last epoch's model, as in the report), model-best.pt
-(the epoch that drives best), model-resume.pt, training_loss.png, training_log.csv, training_arguments.json and pictures
-in diagnostic_images/. From a program: `train(replace(REPORT, flip=0.0), ["data"], "runs/a/model.pt")`.
+(the epoch that drives best), and other files, which README.md lists. From a program: `train(replace(REPORT, flip=0.0),
+["data"], "runs/a/model.pt")`.
 """
 
 from cloning.base import program
