@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("cloning", "simulator", "tools")
 SCRIPTS = ("model.py", "drive.py", "video.py")
-DOCUMENTS = [*ROOT.glob("*.md"), ROOT / "data" / "README.md", ROOT / "tools" / "experiments.md"]
+DOCUMENTS = [*ROOT.glob("*.md"), ROOT / "data" / "README.md", *ROOT.glob("tools/**/*.md"), *ROOT.glob("cloning/*/*.md")]
 NOT_INSTALLED = {"distributed"}  # of the extra dask, whose test is skipped without it
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 WRONG_IMPORTS = {  # contract -> the files that break it, and with what import
