@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-LIMITS = (1.0, 2.5)  # m from the lane centre: NVIDIA's; at the second one, the car's side is on the edge line
+LIMITS = (1.0, 2.5)  # m from the lane centre: NVIDIA's; at the second one, the car's side is on the lake's edge line
 INTERVENTION_TIME = 6.0  # s that NVIDIA counts for an intervention: a human takes over and brings the car back
 
 
