@@ -228,6 +228,7 @@ def test_the_log_is_short_whatever_clients_do(monkeypatch):
     assert len(logged(few, ["session ended"] * 10_000, logging.INFO)) == MAX_PER_MINUTE - 50
     now[0] = 60
     assert logged(few, ["session ended"] * 2, logging.INFO) == ["session ended"] * 2
+    assert logged(few, ["in\nno\x1b[2J" + 2000 * "!"], logging.INFO) == ["in no\\x1b[2J" + 988 * "!"]
 
 
 def test_a_terminal_that_nobody_reads_costs_lines_and_no_time():

@@ -10,9 +10,12 @@ from collections import Counter
 from contextlib import suppress
 from typing import TextIO
 
+from cloning.base.errors import printable
+
 MAX_WAITING = 100  # texts that wait to be printed; more are dropped
 MAX_KINDS = 50  # of warnings
 MAX_PER_MINUTE = 200  # lines
+MAX_LINE = 1000  # characters, but for its end
 LAST_SECONDS = 1.0  # in which what waits at the end is printed
 
 
@@ -52,8 +55,9 @@ class Unblocked:
 class Few(logging.Filter):
     """Passes warnings that differ only in numbers once, then the tenth, the hundredth and so on, with their number.
 
-    Of all lines it passes MAX_PER_MINUTE. A record may have an attribute `warned`, a Counter of kinds: a session's
-    records have its own, so that each session logs each kind.
+    Each becomes a line of MAX_LINE characters at most: libraries warn in a client's words. Of all lines it passes
+    MAX_PER_MINUTE. A record may have an attribute `warned`, a Counter of kinds: a session's records have its own, so
+    that each session logs each kind.
     """
 
     def __init__(self) -> None:
@@ -68,6 +72,7 @@ class Few(logging.Filter):
         if self.minute != (minute := int(time.monotonic() / 60)):
             self.minute, self.passed = minute, 0
         self.passed += 1
+        record.msg, record.args = printable(record.getMessage()).replace("\n", " ")[:MAX_LINE], None
         if self.passed == MAX_PER_MINUTE:
             record.msg = f"{record.msg} (this is the last line of this minute)"
         return self.passed <= MAX_PER_MINUTE
