@@ -234,9 +234,9 @@ def test_a_donkeycar_tub_becomes_a_recording(tub, tmp_path, end):
 
 def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
     for catalog in tub.glob("*.catalog"):
-        catalog.write_text(catalog.read_text(encoding="utf-8").replace('"user"}', '"local"}'), encoding="utf-8")
+        catalog.write_text(catalog.read_text(encoding="utf-8").replace('"user"}', r'"\u001b"}'), encoding="utf-8")
     printed, error = run(tub, "--output", tmp_path / "recording")
-    assert "no usable row" in error and "a row that the local drove is left out (11 times)" in printed
+    assert "no usable row" in error and "a row that the \\x1b drove is left out (10 times)" in printed
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from collections import Counter
 from pathlib import Path
 
 from cloning.base.arguments import command_line, number
-from cloning.base.errors import OutputError, RecordingError, UserError
+from cloning.base.errors import OutputError, RecordingError, UserError, printable
 from cloning.base.outputs import plural
 from cloning.lerobot.drives import MANIFEST, read_driven, read_tub
 from cloning.lerobot.source import write_recording
@@ -83,7 +83,7 @@ def main() -> int:
         raise RecordingError(f"{source}: {error}") from None
     finally:  # also why there is no usable row
         for note, times in notes.items():
-            print(f"{source}: {note} ({plural(times, 'time')})")
+            print(f"{source}: {printable(note)} ({plural(times, 'time')})")
     print(f"{output}: {plural(rows, 'row')}; look at them with `python -m cloning.browse {output}`")
     return program.DONE
 
