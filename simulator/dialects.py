@@ -165,8 +165,8 @@ class Measures(Dialect):
         """Steer, or drive on as before; remember after how many laps it is over."""
         if event != "steer" or not self.obey(data):
             return event == "manual"
-        if str(data.get("max_laps")).isdecimal():
-            self.max_laps = int(data["max_laps"])
+        if (laps := str(data.get("max_laps"))).isdecimal():
+            self.max_laps = float(laps)  # int() refuses thousands of digits
         return True
 
     def advance(self) -> None:

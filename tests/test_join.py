@@ -104,7 +104,7 @@ def test_a_departure_is_an_out_of_bound_episode_and_the_car_is_set_back():
 
 def test_the_last_lap_that_a_program_wants_ends_the_drive(tmp_path):
     (tmp_path / "road.csv").write_text("0,0\n25,0\n")
-    wanted = {"max_laps": "2", "confidence": "1", "loss": "0.01"}
+    wanted = {"max_laps": "2".zfill(5000), "confidence": "1", "loss": "0.01"}
     with Program(lambda data, n: [["steer", steer(0, 1)[1] | wanted]] if n < 200 else None) as program:
         assert join("measures", program, "--road", str(tmp_path / "road.csv")) == 0
     places = {(data["lapNumber"], data["currentWayPoint"]) for data in program.data}
