@@ -332,9 +332,14 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
         page.shows("#merged", "both. The list has it. one is put 1 day later")
         page.shows("#total", "5 recordings, 182 frames")
         assert len(read_recording(linked.with_name("both"))) == 61
+        page.run(f"location.hash = '{server.hash('lake')}/0?mark=0-0'")
+        page.wait("document.querySelector('#stretches .mark')")
+        page.press("x")
+        page.wait("document.querySelector('#reason[open]')")
         page.run(f"location.hash = '{server.hash('one')}/0?mark=0-0'")
         page.shows("#where", "frame 1 of 1")
         page.wait("document.querySelector('#stretches .mark')")
+        assert not page.run("document.querySelector('#reason').open"), "it would cut this recording"
         assert now(page, "plots.plots[3].axes[0]._splits.length") == 1, "no axis of a hundred NaN:NaN"
         (tmp_path / "data/one/driving_log.csv").write_text((log.splitlines()[0] + "\n") * 2, encoding="utf-8")
         page.shows("#notice", "press R to read it again")

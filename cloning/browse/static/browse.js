@@ -14,6 +14,7 @@ async function route(isAgain) {
   const shown = new URLSearchParams(query), number = ++routed, from = before;
   before = id;
   clearTimeout(again);
+  if (!isAgain) document.querySelector("dialog[open]")?.close(); // it asks about what is left
   leaveList();
   leaveComparison();
   leaveRecording();
