@@ -306,7 +306,7 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
         shown = "[...document.querySelectorAll('#cards article:not([hidden]) h2')].map(each => each.textContent).join()"
         assert page.run(shown) == "gone,lake,one,spoilt"
         assert " 0 rows" not in page.text("#cards").replace("\n", " "), "what is zero is not told"
-        searches = [("counter-clockwise", "name", "lake"), ("frames>50", "offset", "lake,gone")]
+        searches = [("counter-clockwise", "name", "lake"), ("frames > 50 minutes>0", "offset", "lake,gone")]
         searches += [("", "findings", "spoilt,gone,lake,one"), ("refused>0", "name", "gone")]
         for query, sort, names in searches:
             page.run(f"document.querySelector('#sort').value = '{sort}'")

@@ -69,7 +69,7 @@ function meets(overview, query) {
   const {name, folder, message, lane} = overview;
   const texts = [name, folder, message, lane && !message && road(overview), ...words(overview)];
   const text = texts.join(" ").toLowerCase();
-  return query.toLowerCase().split(/\s+/).filter(Boolean).every(word => {
+  return query.toLowerCase().replace(/\s*([<>]=?|=)\s*(?=-?[\d.])/g, "$1").split(/\s+/).filter(Boolean).every(word => {
     const [, figure, sign, number] = word.match(/^(\w+)([<>]=?|=)(-?[\d.]+)$/) ?? [];
     return FIGURES[figure] ? HOLDS[sign](FIGURES[figure](overview), Number(number)) : text.includes(word);
   });
