@@ -209,6 +209,7 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         low, high = (float(part) for part in now(page, "condition").split(" and ")[1].split(" <= steering <= "))
         found = (np.abs(recording.steering) > 0.2) & (recording.steering >= low) & (recording.steering <= high)
         page.shows("#matches", f"{found.sum()} frames in ")
+        page.run("localStorage.setItem('cuts-others', 'x'.repeat(5 * 2 ** 20 - 11))")  # which is full then
         page.click("#cut-matches")
         page.wait("document.querySelector('#reason[open]')")
         page.press("Enter")

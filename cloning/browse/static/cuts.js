@@ -130,7 +130,13 @@ async function act(now, kind, method, cuts, what, from = "") {
 }
 
 function keep({id, done, undone}) {
-  localStorage.setItem(`cuts-${id}`, JSON.stringify({done, undone}));
+  const write = () => localStorage.setItem(`cuts-${id}`, JSON.stringify({done, undone}));
+  try {
+    write();
+  } catch { // it is full: what was changed in other recordings cannot be undone any more, only deleted
+    localStorage.clear();
+    write();
+  }
 }
 
 // What was changed on this page earlier, to be undone: {done, undone}.
