@@ -148,7 +148,7 @@ class ShownRecording:
         if "message" in shown:  # a file has changed since
             raise RecordingError(shown["message"])
         for kind, some, file in (("cuts", cuts, EXCLUDED), ("tags", read_cuts(self.folder, TAGS), TAGS)):
-            covered = _rows_cut(self.folder, tuple(some), recording, file)
+            covered = cut_rows(self.folder, some, recording.names, recording.images[:, 0], file)
             shown[kind] = [
                 {**each.__dict__, "frames": int(rows.sum()), "stretches": stretches_of(rows)}
                 for each, rows in zip(some, covered, strict=True)
@@ -281,7 +281,7 @@ class ShownRecording:
 
     def _kept(self, recording: Recording) -> np.ndarray:
         """Return the rows that are not cut: bool (n,). Raises RecordingError."""
-        return ~np.logical_or.reduce(_rows_cut(self.folder, tuple(read_cuts(self.folder)), recording))
+        return ~_is_cut(self.folder, read_cuts(self.folder), recording)
 
     def _with_row(self, row: int, version: str | None) -> Recording:
         recording = self.read(version)
@@ -292,7 +292,7 @@ class ShownRecording:
     def cut(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
         """Cut or tag stretches, and return the cuts that were not there. Raises RecordingError, OSError."""
         cuts = [Cut(cut.first, cut.last, one_line(cut.reason)) for cut in cuts]
-        _rows_cut(self.folder, tuple(cuts), self.read(), file)  # refuses what is no stretch
+        _is_cut(self.folder, cuts, self.read(), file)  # refuses what is no stretch
         return add_cuts(self.folder, *cuts, file=file)
 
     def restore(self, cuts: Iterable[Cut], file: str = EXCLUDED) -> list[Cut]:
@@ -340,10 +340,12 @@ class ShownRecording:
             return path.read_bytes()
 
 
-def _rows_cut(folder: Path, cuts: tuple[Cut, ...], recording: Recording, file: str = EXCLUDED) -> np.ndarray:
-    """Return the rows of each cut, or with TAGS each tag: bool (cuts, n). Raises RecordingError."""
-    rows = list(cut_rows(folder, cuts, recording.names, recording.images[:, 0], file))
-    return np.array(rows, bool).reshape(len(cuts), len(recording))
+def _is_cut(folder: Path, cuts: Iterable[Cut], recording: Recording, file: str = EXCLUDED) -> np.ndarray:
+    """Return which rows are in a cut, or with TAGS in a tag: bool (n,). Raises RecordingError."""
+    is_cut = np.zeros(len(recording), bool)
+    for rows in cut_rows(folder, cuts, recording.names, recording.images[:, 0], file):
+        is_cut |= rows
+    return is_cut
 
 
 def _read(folder: Path, version: str) -> Recording:
@@ -373,11 +375,11 @@ def _line_views(folder: Path, version: str, replay: Analysis, now: str, line: in
 @functools.lru_cache(maxsize=1000)  # a few kB each, so that a list of recordings need not be read again
 def _figures(folder: Path, version: str, cuts: tuple[Cut, ...]) -> dict[str, Any]:
     recording = _read(folder, version)
-    return summary.figures(recording, np.logical_or.reduce(_rows_cut(folder, cuts, recording)))
+    return summary.figures(recording, _is_cut(folder, cuts, recording))
 
 
 @functools.lru_cache(maxsize=1000)
 def _road(folder: Path, version: str, cuts: tuple[Cut, ...], now: str) -> dict[str, Any]:
     recording = _read(folder, version)
-    is_cut = np.logical_or.reduce(_rows_cut(folder, cuts, recording))
+    is_cut = _is_cut(folder, cuts, recording)
     return summary.road_of(_result(folder, LANE, now), recording.images[:, 0], is_cut)
