@@ -54,7 +54,7 @@ def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: Any = None) -> 
     """Return vector environments of the lake track, or of the one that LeRobot's configuration `cfg` names as its task.
 
     n_envs: that many drive at once; use_async_envs: each in a process of its own. LeRobot calls this function from the
-    env.py beside a data set, once that is in a repository on the Hub:
+    env.py beside a data set, once that is in a model repository on the Hub; in a data set's LeRobot does not look:
     `lerobot.envs.factory.make_env("USER/REPOSITORY", n_envs=2, trust_remote_code=True)`. Raises TrackError.
     """
     track = getattr(cfg, "task", None) or "lake"

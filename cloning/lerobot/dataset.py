@@ -47,7 +47,10 @@ PATHS = {
     "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
     "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
 }
-ENVIRONMENT = '''"""The roads, for LeRobot's EnvHub; it needs the project behavioral-cloning[gymnasium]."""
+ENVIRONMENT = '''"""The roads, for LeRobot's EnvHub, which finds this file in a model repository, not in a data set's.
+
+It needs the project behavioral-cloning[gymnasium].
+"""
 
 from simulator.lerobot import make_env  # noqa: F401
 '''
