@@ -118,9 +118,11 @@ def _images(
         stream = film.streams.video[0]
         film.seek(int(start / stream.time_base), stream=stream)  # to the key frame before it
         for frame in film.decode(stream):
+            if frame.time > start + (row + 0.5) / rate:
+                break  # or all frames that follow were other rows'
             if frame.time > start + (row - 0.5) / rate:
                 yield frame.to_ndarray(format="rgb24")
                 row += 1
                 if row == len(table):
                     return
-    raise RecordingError(f"{path}: ends {len(table) - row} frames before its episode {episode['episode_index']} does")
+    raise RecordingError(f"{path}: has no frame for row {row} of episode {episode['episode_index']}; copy it again")
