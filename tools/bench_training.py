@@ -29,6 +29,7 @@ from unittest import mock
 import cv2
 import numpy as np
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 import model
 from cloning.base import program
@@ -65,19 +66,10 @@ def begin(folders: list[str], samples: int, output: Path) -> model.TrainingRun:
 
 def flops(network: Network) -> int:
     """Count the multiplications and additions per image, forward and backward."""
-    total = 0
-
-    def count(layer: torch.nn.Module, _: tuple, output: torch.Tensor) -> None:
-        nonlocal total
-        assert isinstance(layer, torch.nn.Conv2d | torch.nn.Linear)
-        passes = 2 if layer is network.convolutions[0] else 3  # no gradient for the image
-        total += passes * 2 * output.numel() * layer.weight[0].numel()
-
-    hooks = [layer.register_forward_hook(count) for layer in (*network.convolutions, *network.dense)]
-    network(torch.zeros((1, *FRAME), dtype=torch.uint8, device=next(network.parameters()).device))
-    for hook in hooks:
-        hook.remove()
-    return total
+    image = torch.zeros((1, *FRAME), dtype=torch.uint8, device=next(network.parameters()).device)
+    with FlopCounterMode(display=False) as counter:
+        network(image).sum().backward()
+    return counter.get_total_flops()
 
 
 def part_ab(run: model.TrainingRun, _: int) -> dict[str, float]:
