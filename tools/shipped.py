@@ -146,13 +146,11 @@ def repeat(folder: Path, recordings: list[Path]) -> list[Path]:
         if twin in twins:
             raise RecordingError(f"{recording} and {twins[twin]} have the same name: rename one of them")
         twins[twin] = recording
-        twin.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(recording / DRIVING_LOG, twin / DRIVING_LOG)
-        for name in (EXCLUDED, LANE_FILE):
-            (twin / name).unlink(missing_ok=True)
+        shutil.rmtree(twin, ignore_errors=True)
+        twin.mkdir(parents=True)
+        for name in (DRIVING_LOG, EXCLUDED, LANE_FILE):
             if (recording / name).exists():
                 shutil.copyfile(recording / name, twin / name)
-        (twin / IMAGE_FOLDER).unlink(missing_ok=True)
         (twin / IMAGE_FOLDER).symlink_to((recording / IMAGE_FOLDER).resolve())
     return list(twins)
 
