@@ -1,7 +1,9 @@
 """video.py as a user calls it, and its films."""
 
+import _thread
 import gc
 import os
+import signal
 import sys
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -246,3 +248,17 @@ def test_the_overlay_draws_steering_and_attention(run, tmp_path):
     printed = run("run1", "--overlay", "broken.pt")[1]
     assert "video.py: broken.pt: the network's steering is not finite; train the model again" in printed
     assert not list(tmp_path.glob(".*"))
+
+
+def test_ctrl_c_while_a_frame_is_encoded_loses_no_packet(tmp_path):
+    """A film without its first packet is black."""
+    writer: Any = FilmWriter(tmp_path / "film.mp4", 15)
+    written: list[object] = []
+    writer.discard()
+    number = SimpleNamespace(from_ndarray=lambda *_: signal.SIGINT)
+    writer.av = SimpleNamespace(VideoFrame=number, FFmpegError=OSError)
+    writer.stream = SimpleNamespace(encode=_thread.interrupt_main)
+    writer.container = SimpleNamespace(mux=written.append)
+    with pytest.raises(KeyboardInterrupt):
+        writer.add(np.zeros((160, 320, 3), np.uint8))
+    assert len(written) == 1

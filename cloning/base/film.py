@@ -78,7 +78,9 @@ class FilmWriter:
             if self.stream is None:
                 self.stream = self.container.add_stream("libx264", self.rate, options=self.options)
                 self.stream.pix_fmt, self.stream.height, self.stream.width = "yuv420p", *frame.shape[:2]
-            self.container.mux(self.stream.encode(self.av.VideoFrame.from_ndarray(frame, "rgb24")))
+            frames = [self.av.VideoFrame.from_ndarray(frame, "rgb24")]
+            # Ctrl-C between the two calls would lose what the first returns, and a film is black without its beginning.
+            any(map(self.container.mux, map(self.stream.encode, frames)))
         self.frames += 1
 
     def close(self) -> None:
