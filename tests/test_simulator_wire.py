@@ -79,7 +79,8 @@ def test_answers_are_read():
 def test_a_missing_server_is_waited_for_then_reported(capsys):
     assert main(["drive", "--wait", "0.5", "--port", str(unused_port())]) == 2
     told = capsys.readouterr().err
-    assert re.search(r"no server at 127\.0\.0\.1.*; start `python drive.py` in another terminal; trying again", told)
+    start = r"start `python drive.py --port \d+` in another terminal; trying again"
+    assert re.search(rf"no server at 127\.0\.0\.1.*; {start}", told)
     assert re.search(r"^python: no server at 127\.0\.0\.1.*no usable answer in 0\.5 s.*drive\.py", told, re.MULTILINE)
     assert main(["join", "--dialect", "roads", "--wait", "0.5", "--port", str(unused_port())]) == 2
     told = capsys.readouterr().err

@@ -19,6 +19,7 @@ from cloning.wire.client import (
     NoServer,
     parse_answer,
 )
+from cloning.wire.protocol import PORT
 
 OPENS = 2  # telemetries sent at the start: the real client's "open" event fires twice
 RETRY_INTERVAL = 0.1  # s between two attempts to connect; the real client makes thousands a second
@@ -32,7 +33,7 @@ class ClientSession:
     (`request_answer` returned it, or `progressed` was called) lets `wait` seconds begin anew.
     """
 
-    remedy = "; start `python drive.py` in another terminal"  # where there is no server
+    remedy = "; start `python drive.py{}` in another terminal"  # where there is no server; {}: its port
     connect_timeout = CONNECT_TIMEOUT
 
     def __init__(self, host: str, port: int, wait: float, real_timing: bool = False, max_packet: int = MAX_PACKET):
@@ -93,9 +94,12 @@ class ClientSession:
         if time.monotonic() > self._patience_ends():
             raise self.no_answer() from None
         if first:
-            remedy = self.remedy if isinstance(error, NoServer) else ""
-            _print(f"{error}{remedy}; trying again for {self.wait:g} s")
+            _print(f"{error}{self._remedy_for(error)}; trying again for {self.wait:g} s")
         time.sleep(RETRY_INTERVAL)
+
+    def _remedy_for(self, error: ConnectionLost | None) -> str:
+        port = self.address[1]
+        return self.remedy.format(f" --port {port}" * (port != PORT)) if isinstance(error, NoServer) else ""
 
     def progressed(self) -> None:
         """Begin `wait` anew, because an answer has driven the car."""
@@ -155,7 +159,7 @@ class ClientSession:
     def no_answer(self) -> SimulatorError:
         """Return the error for a server that is missing, breaks each connection, or sends nothing usable."""
         reason = f"{self._lost}; " if self._lost else ""
-        remedy = self.remedy if isinstance(self._lost, NoServer) else ""
+        remedy = self._remedy_for(self._lost)
         if self._connection:
             remedy = "; a server is there, but is silent: it may be busy, or have no handler for the event `telemetry`"
         if self.unusable:
