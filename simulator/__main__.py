@@ -266,7 +266,8 @@ def run_record(arguments: argparse.Namespace) -> int:
     pace = run.time / (time.perf_counter() - begin)
     for departure in run.departures:
         print(f"left the road at {departure.s:.0f} m after {departure.time:.1f} s")
-    print(f"{arguments.folder}: {rows} rows from {run.time:.0f} simulated seconds, at {pace:.1f} times real time")
+    recorded = f"{arguments.folder}: {rows} rows" if rows else "nothing was recorded"
+    print(f"{recorded} from {run.time:.0f} simulated seconds, at {pace:.1f} times real time")
     return program.INCOMPLETE if run.departures else program.DONE
 
 

@@ -22,6 +22,7 @@ from cloning.browse.library import Library, UnknownError
 from cloning.lane.search import Localisation
 from cloning.network.network import load_model, steer
 from cloning.recordings.check import check_images
+from cloning.recordings.excluded import TAGS, Cut, add_cuts
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import Recording, read_recording, read_uncut
 from cloning.recordings.part import write_part
@@ -136,7 +137,8 @@ def test_a_part_of_a_recording_is_a_recording_with_the_same_images(linked, tmp_p
     lane += [f"{recording.name(row)},{row / 100},0" for row in range(60)]
     (linked / "lane.csv").write_text("\n".join(lane) + "\n", encoding="utf-8")
     chosen = recording.take(np.arange(60) % 3 == 1)
-    assert write_part([chosen], tmp_path / "part") == []
+    add_cuts(linked, Cut(recording.name(1), recording.name(4), "bend"), file=TAGS)
+    assert write_part([chosen], tmp_path / "part") == ["tags do not go along"]
     written = read_recording(tmp_path / "part")
     for name in ("steering", "throttle", "brake", "speed", "time"):
         assert (getattr(written, name) == getattr(chosen, name)).all(), name

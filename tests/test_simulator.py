@@ -199,6 +199,8 @@ def test_recordings_are_as_the_simulators(tmp_path, capsys):
     pattern = r"a: (\d+) rows from (\d+) simulated seconds, at [\d.]+ times real time\n$"
     closing = re.search(pattern, capsys.readouterr().out)
     assert closing and int(closing[1]) == len(rows) and int(closing[2]) == pytest.approx(len(rows) / 15, abs=0.6)
+    assert main(["record", str(tmp_path / "b"), "--recovery", "--laps", "0.005"]) == 0
+    assert capsys.readouterr().out.startswith("nothing was recorded from ") and not (tmp_path / "b").exists()
 
 
 def test_recordings_are_the_same_where_processes_cannot_fork_or_there_is_only_one(tmp_path, monkeypatch):

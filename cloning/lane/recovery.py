@@ -25,7 +25,7 @@ from cloning.road.motion import (
     steering_for,
 )
 
-LOOKAHEAD = 6.0  # m along the lane's centre, to the point that the recovery steering aims at
+LOOKAHEAD = 6.0  # m that the recorded car drives until it is beside the point that the recovery steering aims at
 MAX_LABEL_OFFSET = 1.0  # m: from a larger lateral offset the car returns at the same angle as from this one
 MISHAP = -1  # a piece's number, see `LanePosition`
 HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far behind to so far ahead

@@ -59,7 +59,7 @@ def _columns(info: dict[str, Any], steering: str | None) -> dict[str, tuple[str,
             names = sorted(names, key=names.__getitem__) if isinstance(first, int) else first
         for at, name in enumerate(names if count else []):
             places[f"{key}:{name}"] = key, at
-            meaning, is_mph = column_of(str(name)), each.get("units", [""])[0] == "mph"
+            meaning, is_mph = column_of(str(name)), (each.get("units") or [""])[0] == "mph"
             if meaning in NUMBERS and (meaning not in found or key == ACTION) and (meaning != "speed" or is_mph):
                 found[meaning] = key, at
     if steering is not None:
@@ -89,7 +89,8 @@ def _episodes(folder: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
     if files := sorted((folder / "meta/episodes").rglob("*.parquet")):
         tables = [pq.read_table(file) for file in files]
         names = [name for name in tables[0].column_names if not name.startswith("stats/")]
-        return [episode for table in tables for episode in table.select(names).to_pylist()]
+        episodes = [episode for table in tables for episode in table.select(names).to_pylist()]
+        return sorted(episodes, key=lambda episode: episode["episode_index"])
     chunks = info["chunks_size"]  # v2 has a file for each episode, at a place that follows from its number
     return [{"episode_index": n, "episode_chunk": n // chunks} for n in range(info["total_episodes"])]
 

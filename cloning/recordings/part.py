@@ -14,6 +14,7 @@ import numpy as np
 from cloning.base.errors import RecordingError
 from cloning.base.files import csv_bytes, write
 from cloning.base.outputs import plural
+from cloning.recordings.excluded import TAGS, read_cuts
 from cloning.recordings.format import (
     CAMERAS,
     COLUMNS,
@@ -54,6 +55,8 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
     lanes = [(recording.folder / LANE_FILE).exists() for recording in recordings]
     if any(lanes) and not all(lanes):
         notes.append(f"{LANE_FILE} is left out: {recordings[lanes.index(False)].folder.name} has none")
+    if any(read_cuts(recording.folder, TAGS) for recording in recordings):
+        notes.append("tags do not go along")
     try:
         folder.mkdir()
     except FileExistsError:
