@@ -47,9 +47,8 @@ ID = "behavioral-cloning/Drive-v0"
 MAX_STEPS = 10 * 60 * SAMPLE_RATE  # ten simulated minutes, so that the episode of a car that stands still ends, too
 OPTIONS = ("s", "offset", "turn", "track", "direction", "look", "disturb")  # of reset
 DEPARTURE_PENALTY = 100.0  # m of progress; Gymnasium's CarRacing gives the same for leaving its playfield
-DISTURBANCE_SEEDS = (
-    32  # as in a training: what a seed gives to a whole drive, such as drops on the lens, stays in memory
-)
+# As in a training: what a seed gives to a whole drive, such as drops on the lens, stays in memory.
+DISTURBANCE_SEEDS = 32
 
 
 def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> None:
