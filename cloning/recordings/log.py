@@ -186,7 +186,7 @@ def read_uncut(folder: str | Path) -> Recording:
     steering, throttle, brake, speed = np.ascontiguousarray(numbers.astype(np.float32).T)
     if (untold := np.isnan(time)).any():
         assumed = f"no time in the image's name, so the whole file counts as one drive, {SAMPLE_RATE} rows a second"
-        reader.repairs[assumed] = [int(untold.sum()), int(lines[untold].min())]
+        reader.repair(assumed, int(lines[untold].min()), int(untold.sum()))
         time = lines / float(SAMPLE_RATE)
     contradicting = _contradicting(images[:, 0], steering)
     for row in np.flatnonzero(contradicting):

@@ -139,9 +139,9 @@ class RowReader:
             self._reject(int(lines[row]), Finding.OUT_OF_RANGE, detail)
         if (fast := usable & (numbers[:, -1] > FASTEST)).any():
             told = f"speed above {FASTEST}, which the simulator's car never reaches, is taken for mph"
-            self.repairs[told] = [int(fast.sum()), int(lines[fast].min())]
+            self.repair(told, int(lines[fast].min()), int(fast.sum()))
         if open_line in lines[usable]:
-            self._repair("the file ends within this line: its last number may be cut short", open_line)
+            self.repair("the file ends within this line: its last number may be cut short", open_line)
         names = np.array([[name.encode(errors="surrogateescape") for name in column] for column in images], bytes).T
         return names[usable], numbers[usable], lines[usable]
 
@@ -161,11 +161,11 @@ class RowReader:
             return self._read_header(line, fields)
         self.rows_read += 1
         if delimiter != ",":
-            self._repair("tab-separated" if delimiter == "\t" else "separated by semicolons", line)
+            self.repair("tab-separated" if delimiter == "\t" else "separated by semicolons", line)
         if delimiter != "," or '"' in text:  # else no field has a comma
             with_points = [DECIMAL_COMMA.sub(r"\1.\2", value) for value in fields]
             if with_points != fields:
-                self._repair("decimal commas", line)
+                self.repair("decimal commas", line)
                 fields = with_points
         has_decimal_commas = delimiter == "," and '"' not in text and fields[-1] != ""
         return self._read_row(line, fields, has_decimal_commas)
@@ -176,7 +176,7 @@ class RowReader:
         self._columns, is_filled = header_columns(line, fields)
         self._headers[line] = not is_filled
         if is_filled:
-            self._repair("header lacks names; usual columns taken", line)
+            self.repair("header lacks names; usual columns taken", line)
 
     def _read_row(self, line: int, fields: list[str], has_decimal_commas: bool) -> None:
         """Read a row; has_decimal_commas: it may have been split at them. Raises UnclearRowError."""
@@ -218,7 +218,7 @@ class RowReader:
             detail = f"{text!r} may be fewer numbers, one with a decimal comma; write decimal points, or {REMEDY}"
             raise UnclearRowError(Finding.COLUMNS, detail)
         if extra:
-            self._repair("extra columns ignored", line)
+            self.repair("extra columns ignored", line)
         self._lines.append(line)
         self._texts += [*names, *numbers]
 
@@ -242,7 +242,7 @@ class RowReader:
             doubt = ", or in each row three, all with one"
         for (line, names, tokens), found in zip(self._with_commas, readings, strict=True):
             if len(found) == 1 and not doubt:
-                self._repair("decimal commas", line)
+                self.repair("decimal commas", line)
                 self._lines.append(line)
                 self._texts += [*names, *found[0]]
             else:
@@ -253,5 +253,6 @@ class RowReader:
     def _reject(self, line: int, finding: Finding, detail: str) -> None:
         self.rejected.append(Rejected(line, finding, detail))
 
-    def _repair(self, repair: str, line: int) -> None:
-        self.repairs.setdefault(repair, [0, line])[0] += 1
+    def repair(self, repair: str, line: int, rows: int = 1) -> None:
+        """Note a repair, or what is assumed; line: of the first of so many rows."""
+        self.repairs.setdefault(repair, [0, line])[0] += rows
