@@ -15,6 +15,7 @@ from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 
 ARRIVAL = 0.002  # s within which a simulator sends the rest of a message, if it is read at once
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
+HASTE = 0.1  # s that a message has to wait longer that was sent before the answer to the one before
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 MAX_UNANSWERED = 1000  # texts of a client since it was last sent one; without: 10 s of work when `garbage` has gone
 OPENING_INTERVAL = 0.005  # s between two new clients; without: 23 ms beside reconnections
@@ -78,7 +79,7 @@ class Client(engineio.socket.Socket):
                 self.send(engineio.packet.Packet(engineio.packet.PING))
             if text:
                 self._handle(text)
-                self.served = time.perf_counter()
+                self.served = self.server.served = time.perf_counter()
             elif now > self.served + PING_INTERVAL + PONG_TIMEOUT:
                 break
 
@@ -90,15 +91,20 @@ class Client(engineio.socket.Socket):
             self.receive(engineio.packet.Packet(encoded_packet=UNREADABLE_TEXT if text[:2] in BINARY else text))
 
     def _take_turn(self) -> None:
-        """Wait while another client has sent a message, or its beginning just now, and was served longer ago.
+        """Wait while another client with an earlier turn has sent a message, or its beginning just now.
 
-        So a car that waits for its answer goes before those that send without waiting. Without: 30 ms beside three such
-        cars instead of 15.
+        So a car that waits for its answer goes before those that send without waiting. Without: 35 ms beside three such
+        cars instead of 14.
         """
-        self.waits = True
-        while any(each.served < self.served and each.has_message() for each in self.server.sockets.values()):
+        self.waits, seen, others = True, 0.0, self.server.sockets.values()
+        while seen < self.server.served or any(each.turn() < self.turn() and each.has_message() for each in others):
+            seen = self.server.served  # what arrived before it has yet to be read
             eventlet.sleep(0)
         self.waits = False
+
+    def turn(self) -> float:
+        """Return the time of the turn, in s: when it was served last, or HASTE later if it sends without waiting."""
+        return self.served + (0.0 if self.websocket and self.websocket.waited else HASTE)
 
     def hang_up(self) -> None:
         """Give the place back at once, and end the connection."""
@@ -127,6 +133,7 @@ class Engine(engineio.Server):
         super().__init__(*args, **options)
         engineio.socket.Socket = make_session  # which python-engineio calls for each session of any server
         self.opening = eventlet.semaphore.Semaphore()
+        self.served = time.perf_counter()  # when a message was handled last
 
     def handle_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
         """Serve a client until its websocket ends, or tell it why not."""

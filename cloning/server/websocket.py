@@ -32,6 +32,7 @@ class WebSocket:
         self.parts: list[str] = []  # of the message of which not all fragments have arrived
         self.length = 0  # of that message, in characters
         self.arrived = 0.0  # time.perf_counter() when the first fragment of the last message was read
+        self.waited = False  # for the first byte of this message, which was thus not sent before the last answer
         self.since = time.perf_counter()  # when others had their turn
 
     def receive(self) -> str | None:
@@ -40,6 +41,7 @@ class WebSocket:
         Of a text longer than MAX_MESSAGE it is only the beginning, which is answered like any other unreadable
         telemetry: without an answer the car would stand still.
         """
+        self.waited = False
         while True:
             for event in self.events:
                 if time.perf_counter() > self.since + SLICE:
@@ -80,6 +82,7 @@ class WebSocket:
         try:
             data = self.sock.fd.recv(65536)
         except BlockingIOError:
+            self.waited = self.waited or not self.parts
             self.sock.settimeout(PING_INTERVAL)
             data = self.sock.recv(65536)  # waits, while others work
             self.since = time.perf_counter()
