@@ -22,8 +22,8 @@ OPENING_INTERVAL = 0.005  # s between two new clients; without: 23 ms beside rec
 PACKET_TYPES = ("1", "3", "4", "5")  # of Engine.IO, besides pings, that a client may send
 # Events that announce attachments count as unreadable: python-socketio keeps any number, 88 MB in 3 s of `attachments`.
 BINARY, UNREADABLE_TEXT = ("45", "46"), '42["telemetry"'
-# The packets that open a session and refuse its connection to Socket.IO, but for the message.
-NO_SESSION = '0{"sid":"none","upgrades":[],"pingInterval":25000,"pingTimeout":60000}\x1e44'
+# The packet that opens a session, in which a message can be sent that refuses it.
+NO_SESSION = '0{"sid":"none","upgrades":[],"pingInterval":25000,"pingTimeout":60000}'
 log = logging.getLogger(__name__)
 
 
@@ -49,6 +49,7 @@ class Client(engineio.socket.Socket):
     def __init__(self, server: "Engine", sid: str):
         super().__init__(server, sid)
         self.websocket: WebSocket | None = None
+        self.is_old = False  # of Engine.IO 3, unlike the simulator
         self.served = time.perf_counter()  # when its last message was handled
         self.waits = False  # for a message to be handled
         self.last_ping = None  # without: threads that would ping; 38 MB more after 20 s of reconnections
@@ -57,7 +58,7 @@ class Client(engineio.socket.Socket):
 
     def handle_get_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
         """Open the websocket, and serve the client until it ends."""
-        environ["drive.client"] = self
+        environ["drive.client"], self.is_old = self, environ["drive.query"]["EIO"] == ["3"]
         environ.pop("HTTP_SEC_WEBSOCKET_EXTENSIONS", None)  # without: JavaScript's clients compress
         try:
             return eventlet.websocket.WebSocketWSGI(self._serve)(environ, start_response)
@@ -121,7 +122,9 @@ class Client(engineio.socket.Socket):
         """Send a packet, as soon as the websocket is open."""
         self.unanswered = 0
         if self.websocket:
-            self.websocket.send(packet.encode())
+            text = packet.encode()
+            # Without: JavaScript's clients before 2.2 take what tells the name of a session for an error.
+            self.websocket.send("40" if self.is_old and text.startswith("40") else text)
         else:
             self.queue.put(packet)
 
@@ -146,15 +149,19 @@ class Engine(engineio.Server):
             or environ.get("HTTP_SEC_WEBSOCKET_VERSION") != "13"
         ):
             reason = "Only the websocket transport is served: connect with transports=['websocket']."
-            is_first_poll = query.get("transport") == ["polling"] and "sid" not in query and query["EIO"] == ["4"]
-            if not is_first_poll:
+            if query.get("transport") != ["polling"] or query.keys() & {"sid", "j"}:  # j: as a script
                 return refuse(start_response, "400 Bad Request", reason)
             # Socket.IO's clients show a message that comes in a session, and not one that comes with an error status.
-            return refuse(start_response, "200 OK", reason, NO_SESSION + json.dumps({"message": reason}))
+            is_old = query["EIO"] == ["3"]
+            refusal = "44" + json.dumps(reason if is_old else {"message": reason})
+            both = (NO_SESSION, refusal)
+            body = "".join(f"{len(each)}:{each}" for each in both) if is_old else "\x1e".join(both)
+            return refuse(start_response, "200 OK", reason, body)
         with self.opening:
             eventlet.sleep(OPENING_INTERVAL)
         if not self._make_room():
             return refuse(start_response, "503 Service Unavailable", f"{MAX_CLIENTS} clients are connected already.")
+        environ["drive.query"] = query
         environ["QUERY_STRING"] = "EIO=4&transport=websocket"  # without: clients of Engine.IO 3 are refused
         return super().handle_request(environ, start_response)
 
@@ -204,6 +211,8 @@ class Server(socketio.Server):
     def _handle_eio_connect(self, eio_sid: str, environ: WSGIEnvironment) -> None:
         """Connect a new client at once, as the simulator expects: it never asks for it."""
         super()._handle_eio_connect(eio_sid, environ)
+        # Python's clients, which send a time, are connected before they are greeted: their handlers can't answer else.
+        self.always_connect = "t" in environ["drive.query"]
         super()._handle_connect(eio_sid, "/", None)
 
     def _handle_connect(self, eio_sid: str, namespace: str | None, data: Any) -> None:
