@@ -213,8 +213,12 @@ def test_images_are_checked_named_and_left_out(copied, monkeypatch):
     }
     for at, (jpeg, _) in damaged.items():
         images[at].write_bytes(jpeg)
-    left = images[7].with_name(images[7].name.replace("center", "left"))
-    left.write_bytes(images[7].read_bytes())
+    left, right = (
+        images[at].with_name(images[at].name.replace("center", side)) for at, side in ((7, "left"), (8, "right"))
+    )
+    copies = {left: images[7], right: Path(str(right).replace("right", "left")), images[9]: images[8]}
+    for copy, original in copies.items():
+        copy.write_bytes(original.read_bytes())
     given = read_recording(copied)
     found = check_images(given)
     assert len(given) == 60 and given.rejected == [], "not changed"
@@ -222,9 +226,11 @@ def test_images_are_checked_named_and_left_out(copied, monkeypatch):
     for at, (_, reason) in damaged.items():
         detail = f"IMG/{images[at].name}: {reason}; {COPY_OR_DELETE}"
         expected.append(Rejected(at + 1, Finding.IMAGE_UNUSABLE, detail))
-    detail = f"IMG/{left.name}: the centre camera's picture; {COPY_OR_DELETE}"
-    assert found.rejected == [*expected, Rejected(8, Finding.IMAGE_UNUSABLE, detail)]
-    assert set(found.lines) == set(range(1, 61)) - set(range(2, 9))
+    for line, (copy, original) in enumerate(copies.items(), 8):
+        detail = f"IMG/{copy.name}: the same picture as {original.name}; {COPY_OR_DELETE}"
+        expected.append(Rejected(line, Finding.IMAGE_UNUSABLE, detail))
+    assert found.rejected == expected
+    assert set(found.lines) == set(range(1, 61)) - set(range(2, 11))
     looked_at = Mock(side_effect=decode)
     monkeypatch.setattr(check, "decode", looked_at)
     again = check_images(read_recording(copied))

@@ -20,7 +20,7 @@ from cloning.recordings.images import RULES, decode, read_jpeg
 from cloning.recordings.log import CheckedRecording, Recording
 
 COPY_OR_DELETE = "copy it again, or delete the row"
-SAME_AS_CENTRE = f"the centre camera's picture; {COPY_OR_DELETE}"
+STANDING = 1.0  # mph: a slower car may see the same again
 IMAGES_AT_ONCE = 32  # for each thread: Ctrl-C waits for them, and a future takes memory, of perhaps millions of images
 
 
@@ -29,8 +29,8 @@ def check_images(
 ) -> CheckedRecording:
     """Decode every image of a recording, and return its rows without those that have an unusable image.
 
-    A side camera's image that is a copy of the centre one's is unusable, too: a network would take it for a view from
-    the side.
+    An image that is a copy of another camera's is unusable, too: a network would take it for a view from the side. So
+    is a moving car's centre image if it is a copy of an earlier row's: it shows another moment.
 
     Usable images are remembered in the user's cache folder: one whose file has not changed since (same size and time of
     change) is not decoded again. threads: that decode at the same time; frames: becomes the recording's, and keeps what
@@ -67,16 +67,34 @@ def check_images(
     is_usable[list(reasons)] = False
     if is_usable[todo].any():
         _write_cache(cache, names[is_usable], states[is_usable], digests[is_usable])
-    unusable, content = ~is_usable[recording.images], digests[recording.images]
-    unusable[:, 1:] |= (content[:, 1:] == content[:, :1]) & ~unusable.any(1, keepdims=True)
+    unusable = ~is_usable[recording.images]
+    original = _originals(recording, digests)
+    unusable |= (original != recording.images) & ~unusable.any(1, keepdims=True)
     rejected = list(recording.rejected)
     for row in np.flatnonzero(unusable.any(1)):
-        image = int(recording.images[row][unusable[row]][0])
+        camera = int(unusable[row].argmax())
+        image, copied = recording.images[row, camera].item(), os.fsdecode(names[original[row, camera]])
         finding = Finding.IMAGE_MISSING if is_missing[image] else Finding.IMAGE_UNUSABLE
-        detail = f"{IMAGE_FOLDER}/{os.fsdecode(names[image])}: {reasons.get(image, SAME_AS_CENTRE)}"
+        reason = reasons.get(image, f"the same picture as {copied}; {COPY_OR_DELETE}")
+        detail = f"{IMAGE_FOLDER}/{recording.name(int(row), camera)}: {reason}"
         rejected.append(Rejected(int(recording.lines[row]), finding, detail))
     checked = CheckedRecording(**{**vars(recording), "frames": frames, "rejected": rejected}, digests=digests)
     return checked.take(~unusable.any(1))
+
+
+def _originals(recording: Recording, digests: np.ndarray) -> np.ndarray:
+    """Return the images of which a recording's may wrongly be copies, else themselves: int32 (n, 3), as `images`.
+
+    digests: uint64 (m,), of the images. They may be those of the row's cameras before, or of an earlier row's centre.
+    """
+    content, original = digests[recording.images], recording.images.copy()
+    for camera, other in ((2, 1), (2, 0), (1, 0)):
+        same = content[:, camera] == content[:, other]
+        original[same, camera] = recording.images[same, other]
+    _, first, inverse = np.unique(content[:, 0], return_index=True, return_inverse=True)
+    moving = recording.speed > STANDING
+    original[moving, 0] = recording.images[first[inverse], 0][moving]
+    return original
 
 
 def _remedies(folder: Path) -> Callable[[str], str]:
