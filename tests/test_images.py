@@ -3,6 +3,7 @@
 import io
 import os
 import random
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -253,19 +254,29 @@ def upper_case_endings(folder: Path) -> None:
         image.rename(image.with_suffix(".JPG"))
 
 
+def nest(folder: Path) -> None:
+    """Give each camera a folder of its own."""
+    for image in list(folder.iterdir()):
+        camera = folder / image.name.split("_")[0]
+        camera.mkdir(exist_ok=True)
+        image.rename(camera / image.name)
+
+
 @pytest.mark.parametrize(
     ("change", "remedy"),
     [
-        (lambda folder: (folder / "IMG").rename(folder / "img"), "rename the folder img to IMG"),
+        (lambda folder: (folder / "IMG").rename(folder / "img"), "move the images from {0}/img to {0}/IMG"),
+        (lambda folder: nest(folder / "IMG"), "move the images from {0}/IMG/center to {0}/IMG"),
         (upper_case_endings, "rename center_2018_07_16_17_11_43_067.JPG, which differs in upper and lower case"),
-        (lambda folder: (folder / "IMG").rename(folder / "elsewhere"), "there is no folder IMG: copy it beside"),
+        (lambda folder: shutil.rmtree(folder / "IMG"), "there is no folder IMG: copy it beside driving_log.csv"),
     ],
 )
 def test_the_cause_of_missing_images_is_named(copied, tmp_path, change, remedy, capsys):
     if (copied / "img").exists():
         pytest.skip("this file system ignores case")
     change(copied)
-    first = f"{copied / 'driving_log.csv'}: line 1: left out: IMG/center_2018_07_16_17_11_43_067.jpg: missing; {remedy}"
+    first = f"{copied / 'driving_log.csv'}: line 1: left out: IMG/center_2018_07_16_17_11_43_067.jpg: missing; "
+    first += remedy.format(copied)
     for options in ((), ("--robust",)):
         done = run_here(copied, *options, "--output", tmp_path / "model.pt")
         assert done.returncode == 2 and first in done.stdout

@@ -99,27 +99,20 @@ def _originals(recording: Recording, digests: np.ndarray) -> np.ndarray:
 
 def _remedies(folder: Path) -> Callable[[str], str]:
     """Return what to do about a missing image, as a function of its name; folder: where it should be."""
-    if not folder.is_dir():
-        similar = _by_lower_case(folder.parent).get(folder.name.lower(), folder.name)
-        renaming = f"rename the folder {similar} to {folder.name}"
-        copying = f"there is no folder {folder.name}: copy it beside {DRIVING_LOG}"
-        return lambda name: copying if similar == folder.name else renaming
-    present = _by_lower_case(folder)
+    patterns = "*", "*/*", f"{folder.name}/*/*"
+    present = {path.name.lower(): path for pattern in patterns for path in folder.parent.glob(pattern)}
 
     def remedy(name: str) -> str:
-        similar = present.get(name.lower(), name)
-        if similar != name:
-            return f"rename {similar}, which differs in upper and lower case, or correct the csv"
-        if (folder / name).is_symlink():
+        similar = present.get(name.lower(), folder / name)
+        if similar.parent != folder:
+            return f"move the images from {similar.parent} to {folder}"
+        if similar.name != name:
+            return f"rename {similar.name}, which differs in upper and lower case, or correct the csv"
+        if similar.is_symlink():
             return "its link leads nowhere: copy the image instead, or delete the row"
-        return COPY_OR_DELETE
+        return COPY_OR_DELETE if folder.is_dir() else f"there is no folder {folder.name}: copy it beside {DRIVING_LOG}"
 
     return remedy
-
-
-def _by_lower_case(folder: Path) -> dict[str, str]:
-    """Return the names of a folder's entries by their form in lower case."""
-    return {entry.name.lower(): entry.name for entry in folder.iterdir()}
 
 
 def _file_states(folder: Path, names: np.ndarray) -> np.ndarray:
