@@ -7,9 +7,10 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import Executor
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from cloning.wire.client import parse_event
 from simulator import __main__, driving, workers
 from simulator.benchmark import page as report
 from simulator.benchmark import replays, scores, tasks
-from simulator.benchmark.command import drive, run
+from simulator.benchmark.command import drive, drive_all, run
 from simulator.benchmark.tasks import Task
 from simulator.run import Departure
 from simulator.workers import started_workers
@@ -183,6 +184,14 @@ def test_a_benchmark_goes_on_after_the_drives_before_its_server_ended(tmp_path, 
     assert [each["name"] for each in found["drives"]] == [task.name for task in TINY]
     assert [each["mean_m"] == 99 for each in found["drives"]] == [True, *[False] * 4]
     assert {path.name for path in tmp_path.iterdir()} == {"benchmark.json", "report.html"}
+
+
+@pytest.mark.parametrize("damaged", ['{"about": {', "[]", "{}"])
+def test_a_damaged_file_of_the_drives_that_are_done_is_told(tmp_path, damaged):
+    file, nobody = tmp_path / "unfinished.json", SimpleNamespace()
+    file.write_text(damaged, encoding="utf-8")
+    with pytest.raises(UserError, match=r"unfinished\.json: damaged \(.*\); leave out --resume"):
+        drive_all(cast(Executor, nobody), "straight", TINY, file, {"entry": "straight"}, resume=True)
 
 
 @pytest.mark.parametrize(("shape", "axes"), [((1, 66, 200, 3), [1, 2]), ((None, 3, 66, 200), [2, 3])])

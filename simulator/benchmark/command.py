@@ -31,11 +31,14 @@ def drive_all(
     """
     kept: dict[str, scores.Driven] = {}
     if resume and file.exists():
-        found = json.loads(file.read_text(encoding="utf-8"))
-        before = found["about"]
-        if others := [f"{key} {before[key]}, not {own}" for key, own in about.items() if before[key] != own]:
+        try:
+            found = json.loads(file.read_text(encoding="utf-8"))
+            before, kept = found["about"], found["drives"]
+            others = [f"{key} {before[key]}, not {own}" for key, own in about.items() if before[key] != own]
+        except (ValueError, LookupError, TypeError) as error:
+            raise UserError(f"{file}: damaged ({error!r}); leave out --resume") from None
+        if others:
             raise UserError(f"{file}: has drives of {'; '.join(others)}; leave out --resume")
-        kept = found["drives"]
     missing = [task for task in chosen if task.name not in kept]
     for task, done in zip(missing, results(pool, functools.partial(drive, driver), missing, "drive"), strict=True):
         kept[task.name] = scores.driven(task, done)
