@@ -329,6 +329,12 @@ def test_an_output_in_no_folder_is_refused_before_the_training(tmp_path):
         train_lane.main(["--output", str(tmp_path / "nowhere" / "lane.pt")])
 
 
+def test_a_training_without_any_road_is_refused(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        train_lane.main(["--looks", "0", "--roads", "0", "--mountains", "0"])
+    assert "are all 0: nothing to render" in capsys.readouterr().err
+
+
 def test_the_accuracy_on_a_recording_is_printed(drive, capsys):
     """The side cameras appear to be where they are mounted, and the car as far off the centre as it was driven."""
     recording, true = drive

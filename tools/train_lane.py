@@ -317,10 +317,12 @@ def main(argv: list[str] | None = None) -> int:
     add("--output", type=Path, default=Path("lane.pt"), help="file of weights (default %(default)s)")
     options = parser.parse_args(argv)
     check_folders(str(options.output))
+    chosen = scenes(options.looks, {"road": options.roads, "mountain": options.mountains}, options.frames)
+    if not chosen:
+        parser.error("--looks, --roads and --mountains are all 0: nothing to render; raise one of them")
     torch.manual_seed(options.seed)
     network = copy.deepcopy(load_network(options.start)) if options.start else LaneNetwork()
     recordings = [RealRecording(folder) for folder in find_folders(options.recordings)]
-    chosen = scenes(options.looks, {"road": options.roads, "mountain": options.mountains}, options.frames)
     print(f"rendering {sum(scene.frames for scene in chosen)} frames of {len(chosen)} scenes", flush=True)
     strips, centres = render_all(chosen, options.seed)
     batches = BatchSampler(strips, centres, recordings, options.seed)
