@@ -269,6 +269,14 @@ def test_a_damaged_tub_is_reported_with_its_line(tub, tmp_path, row, end, line):
     assert [path.name for path in tmp_path.iterdir()] == ["tub"]
 
 
+@pytest.mark.parametrize("end", ["{", '{"_index": 12, "user/an', "\0\0"])
+def test_a_last_row_that_a_power_failure_cut_short_is_left_out_of_a_tub(tub, tmp_path, end):
+    with (tub / "catalog_1.catalog").open("a", encoding="utf-8") as catalog:
+        catalog.write(end)
+    printed = converted(tub, "--output", tmp_path / "recording")
+    assert "tub: a row at the end that is cut short is left out (1 time)" in printed and "recording: 9 rows" in printed
+
+
 @pytest.mark.parametrize("last", ["3", "[]", '{"paths": 3}', '{"paths": ["catalog_0.catalog"], "deleted_indexes": 3}'])
 def test_a_damaged_manifest_of_a_tub_is_reported(tub, tmp_path, last):
     lines = (tub / "manifest.json").read_text(encoding="utf-8").splitlines()

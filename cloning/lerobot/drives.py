@@ -30,7 +30,7 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
     notes: is added to what does not fit, and how often. Raises RecordingError.
     """
     camera = camera or "cam/image_array"
-    lines = list(_lines(folder / MANIFEST).values())
+    lines = list(_lines(folder / MANIFEST, None).values())
     try:
         paths, deleted = [folder / name for name in lines[4]["paths"]], set(lines[4].get("deleted_indexes") or ())
     except (AttributeError, IndexError, KeyError, TypeError):
@@ -38,7 +38,7 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
         raise RecordingError(f"{folder / MANIFEST}: {remedy}") from None
     index = -1
     for path in paths:
-        for line, row in _lines(path).items():
+        for line, row in _lines(path, notes if path == paths[-1] else None).items():
             index += 1
             try:
                 if index in deleted:
@@ -59,15 +59,21 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
                 raise RecordingError(f"{path}: line {line}: {problem}; correct or delete the line") from None
 
 
-def _lines(path: Path) -> dict[int, Any]:
-    """Return the JSON in each line of a file that is not empty, by the line's number. Raises RecordingError."""
-    found, number = dict[int, Any](), 0
+def _lines(path: Path, notes: Counter[str] | None) -> dict[int, Any]:
+    """Return the JSON in each line of a file that is not empty, by the line's number. Raises RecordingError.
+
+    notes: is added to if the last line is cut short, as by a power failure; None: then that is an error, too.
+    """
+    found, number, text = dict[int, Any](), 0, ""
     try:
-        for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-            if text:  # donkeycar 4.0 ends its lines with \r\r\n on Windows
+        for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(keepends=True), 1):
+            if text.strip():  # donkeycar 4.0 ends its lines with \r\r\n on Windows
                 found[number] = json.loads(text)
         return found
     except ValueError as error:
+        if notes is not None and number and not text.endswith("\n"):
+            notes["a row at the end that is cut short is left out"] += 1
+            return found
         raise RecordingError(f"{path}: line {number}: {error}; copy the file again, or delete the line") from None
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}; copy it again") from None
