@@ -18,7 +18,7 @@ from steer_server import STEER, Blank, Server, accept_websocket, frame, lake
 
 from cloning.base.errors import SimulatorError
 from cloning.replay.server_driver import ServerDriver
-from cloning.wire.client import parse_answer
+from cloning.wire.client import Connection, ConnectionLost, parse_answer
 from simulator.client import RemoteDriver
 from simulator.run import Run
 
@@ -98,7 +98,7 @@ UPGRADE = b"HTTP/1.1 101 Switching Protocols\r\n"
 OTHER_KEY = UPGRADE + b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: 0\r\n\r\n"
 NUMBERS = frame("42[1]") + frame('42["steer",{"steering_angle":0,"throttle":1}]')
 DEEP = ("40", "42" + "[" * 60_000, '42["steer",' * 5_000)
-# In the first seven the websocket is not accepted, in the next two there is no session.
+# In the first seven the websocket is not accepted, in the next three there is no session.
 CASES = {
     "closes at once": Case(CLOSED, False),
     "never answers": Case("does not answer", False, holds=True),
@@ -110,6 +110,7 @@ CASES = {
     "accepts another key": Case(ALIEN, False, reads=True, once=OTHER_KEY),
     "sends the handshake slowly": Case("does not", False, once=UPGRADE * 100, pause=0.05),
     "chooses a subprotocol": Case(ALIEN, headers=b"Sec-WebSocket-Protocol: \x1b[2J\r\n", packets=None),
+    "opens no session": Case("does not speak Engine.IO", packets=None, holds=True),
     "speaks something else": Case(ALIEN, packets=None, once=frame("\x1b[2JHello" * 50), holds=True),
     "masks its frames": Case(ALIEN, once=b"\x81\x81\0\0\0\0x", holds=True),
     "sends broken UTF-8": Case(ALIEN, once=frame(b"42\xff\xfe"), holds=True),
@@ -132,7 +133,7 @@ CASES = {
 # The error names the last loss of the connection: an attempt that the end of the patience cut short, at times.
 LATE = "|accepts connections but does not answer"
 hostile = pytest.mark.parametrize("name", CASES)
-WAITING, SILENT = "waiting for drive.py", ("never answers", "sends the handshake slowly")
+WAITING, SILENT = "waiting for drive.py", ("never answers", "sends the handshake slowly", "opens no session")
 
 
 @pytest.fixture(autouse=True)
@@ -155,6 +156,12 @@ def test_a_drive_ends_when_its_patience_does(name, realtime, capsys):
     assert f"no usable answer in {WAIT:g} s" in text and text.isprintable() and len(text) < 300
     assert "start `python drive.py" not in text  # something listens there
     assert capsys.readouterr().err.count("trying again") <= 1
+
+
+@pytest.mark.parametrize(("name", "reason"), [("never answers", "not answer"), ("opens no session", "sent nothing")])
+def test_how_far_a_server_that_says_nothing_came_is_told(name, reason):
+    with Hostile(CASES[name]) as server, pytest.raises(ConnectionLost, match=reason):
+        Connection("127.0.0.1", server.port, real_timing=False, timeout=5 * WAIT)
 
 
 @pytest.mark.parametrize("name", ["sends a gigabyte", "fragments without end", "floods what is no answer"])

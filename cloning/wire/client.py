@@ -199,7 +199,9 @@ class Connection:
         """Wait for the server's open packet, ping at once, as the real client does, and ask a silent server."""
         while not self.packets:
             if time.monotonic() > until:
-                raise ConnectionLost(f"{address} accepts connections but does not answer")
+                opened = self.protocol.state is ConnectionState.OPEN
+                silent = "accepts connections but does not answer"
+                raise ConnectionLost(f"{address} {'does not speak Engine.IO (it sent nothing)' if opened else silent}")
             self._read_socket(max(0.0, until - time.monotonic()))
         packet = self.packets.popleft()
         if not packet.startswith(OPEN):
