@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = command_line("python -m tools.likeness", __doc__)
     add = parser.add_argument
     add("recording", type=Path, help="folder of a real recording of the lake or the jungle")
-    add("--frames", type=number(int, 1), default=120, help="poses to compare (default %(default)s)")
+    add("--frames", type=number(int, 1), default=240, help="poses to compare (default %(default)s)")
     add("--look", type=number(int, 0), default=0, help="look of the rendered frames (default %(default)s)")
     add("--picture", metavar="FILE.png", help="write real frames above rendered ones")
     options = parser.parse_args(argv)
