@@ -19,7 +19,7 @@ from typing import TypeVar
 from cloning.base.arguments import number
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError, UserError
-from cloning.base.processes import interrupt_deferred
+from cloning.base.processes import starting
 from cloning.base.progress import progress_bar
 
 MOST_ON_WINDOWS = 61  # processes, whose ends it can wait for at the same time
@@ -52,10 +52,10 @@ def started_workers(processes: int, scheduler: str | None = None) -> Iterator[Ex
         if sys.platform == "win32":
             processes = min(processes, MOST_ON_WINDOWS)
         others = multiprocessing.active_children()
-        with interrupt_deferred():
+        with starting():
             pool = stack.enter_context(ProcessPoolExecutor(processes, _context(), begin, (signal.SIG_IGN,)))
         try:
-            with interrupt_deferred():
+            with starting():
                 for _ in range(processes):  # each starts a process
                     pool.submit(int)
             yield pool

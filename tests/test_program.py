@@ -273,8 +273,8 @@ def test_a_command_whose_last_lines_cannot_be_printed_says_so():
 def test_ctrl_c_stays_deferred_when_the_first_process_starts():
     """multiprocessing starts a helper then, and unblocks signals, and Ctrl-C ended the one that starts the others."""
     code = (
-        "import multiprocessing, signal; from cloning.base.processes import interrupt_deferred\n"
-        "with interrupt_deferred():\n"
+        "import multiprocessing, signal; from cloning.base.processes import starting\n"
+        "with starting():\n"
         "    multiprocessing.get_context('forkserver').Process(target=print).start()\n"
         "    assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])"
     )

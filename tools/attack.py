@@ -20,7 +20,7 @@ import numpy as np
 from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
-from cloning.base.processes import garbage_kept, interrupt_deferred
+from cloning.base.processes import starting
 from cloning.network.network import SHIPPED_MODEL
 from cloning.wire.client import telemetry_packet
 from tools.attacks import Attack, all_attacks, frames
@@ -151,7 +151,7 @@ def run(attack: Attack | None, server: Target, jpegs: list[bytes], expected: lis
     before, until = server.open_files(), time.monotonic() + seconds
     attacker = multiprocessing.get_context("fork").Process(target=_attack, args=(attack, server.port, until))
     try:
-        with interrupt_deferred(), garbage_kept():
+        with starting():
             attacker.start()
         drive = car.drive(until)
     finally:

@@ -18,10 +18,12 @@ def environment() -> dict[str, str]:
 
 
 @contextmanager
-def interrupt_deferred() -> Iterator[None]:
+def starting() -> Iterator[None]:
     """A context in which processes are started; Ctrl-C has its effect at its end, and none in the processes.
 
-    Python would ignore an exception from its own code around a fork. Call it in the main thread.
+    Python would ignore an exception from its own code around a fork. What is garbage by then is never collected in a
+    copy of this process: to free a film, open or read, is to wait for its threads. A fork copies none, so the copy
+    would wait for ever. Call it in the main thread.
     """
     # The processes inherit this: Ctrl-C reaches them too, but only the one that started them is to act on it.
     if sys.platform != "win32":
@@ -33,25 +35,14 @@ def interrupt_deferred() -> Iterator[None]:
     handler = signal.getsignal(signal.SIGINT)
     if callable(handler):
         signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    gc.freeze()
     try:
         yield
     finally:
+        gc.unfreeze()
         if sys.platform != "win32":
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         if callable(handler):
             signal.signal(signal.SIGINT, handler)
         if received:
             signal.raise_signal(signal.SIGINT)
-
-
-@contextmanager
-def garbage_kept() -> Iterator[None]:
-    """A context in which this process is forked: what is garbage by then is never collected in the copy.
-
-    To free a film, open or read, is to wait for its threads. A fork copies none, so the copy would wait for ever.
-    """
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()

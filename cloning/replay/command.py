@@ -15,7 +15,7 @@ import cv2
 
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.outputs import check_folders, run_all, short_names, write_json, write_output
-from cloning.base.processes import garbage_kept, interrupt_deferred
+from cloning.base.processes import starting
 from cloning.base.progress import progress_bar
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.replay import (
@@ -149,7 +149,7 @@ class ForkedDrives:
         self.pending: dict[Connection, int] = {}  # where a drive's result will come from -> its index
         self.results: dict[int, Drive] = {}
         try:
-            with interrupt_deferred(), garbage_kept():
+            with starting():
                 for index, drive in enumerate(drives):
                     receiver, sender = context.Pipe(duplex=False)
                     process = context.Process(target=_send_result, args=(drive, sender), daemon=True)
