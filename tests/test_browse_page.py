@@ -200,8 +200,12 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         page.send("Input.insertText", text="(steering > 0.2) or (steering < ")
         assert page.run("document.querySelector('#cut-matches').disabled"), "those of the condition before"
         page.shows("#matches", "not complete")
-        page.send("Input.insertText", text="-0.2)")
         wanted = int((np.abs(recording.steering) > 0.2).sum())
+        page.send("Input.insertText", text="-0.2)")
+        page.run("document.activeElement.blur()")
+        page.press("e")
+        page.shows("#selection", f"what matches: {wanted} frames")
+        page.press("Escape")
         page.shows("#matches", f"{wanted} frames in ")
         page.run("document.activeElement.blur()")
         page.drag("#histogram .u-over", 0.8, 0.99)

@@ -120,7 +120,11 @@ function selected() {
   return ["the whole recording", [[0, count]]];
 }
 
-export function askToExport() {
+export async function askToExport() {
+  const now = page.open;
+  clearTimeout(typing);
+  await setCondition(element("condition").value.trim()); // which may have been typed a moment ago
+  if (page.open != now) return;
   const [what, stretches] = selected(), kept = new Uint8Array(page.open.count);
   for (const [first, end] of stretches) kept.fill(1, first, end);
   for (const [first, end] of page.open.details.cuts.flatMap(cut => cut.stretches)) kept.fill(0, first, end);
