@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import venv
 import zipfile
 from pathlib import Path
@@ -34,14 +35,19 @@ print(gymnasium.make("simulator.environment:behavioral-cloning/Drive-v0").reset(
 
 @pytest.fixture
 def wheel(tmp_path) -> Path:
-    """The wheel of a copy of the files that git keeps, so that nothing else gets into it, or into the folder."""
+    """The wheel of the sdist of a copy of the files that git keeps: nothing else gets into it, or into the folder."""
     for name in KEPT:
         copy = tmp_path / "source" / name
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, copy)
     # With this environment's setuptools, which PyTorch requires, too: pip would install another one first.
+    build = "import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", build, tmp_path], cwd=tmp_path / "source", check=True, timeout=120)
+    [sdist] = tmp_path.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        assert not any("/tests/" in name for name in archive.getnames()), "setuptools takes them without their helpers"
     command = ["pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", tmp_path]
-    subprocess.run([sys.executable, "-m", *command, tmp_path / "source"], check=True, timeout=120)
+    subprocess.run([sys.executable, "-m", *command, sdist], check=True, timeout=120)
     return next(tmp_path.glob("*.whl"))
 
 
