@@ -62,13 +62,16 @@ def cut_rows(
     names, centres: as `Recording` has them: bytes (m,), sorted; int32 (n,), an index into names for each row.
     Raises RecordingError for an image that no row has, and for a stretch whose end comes before its beginning.
     """
-    path = folder / file
+    path, order = folder / file, np.argsort(centres, kind="stable")
+    ends = np.searchsorted(centres, np.arange(len(names) + 1), sorter=order)  # of each image's rows in that order
+    has_copies = len(centres) > np.count_nonzero(np.diff(ends))
     for cut in cuts:
         where = f"{path}: line {cut.line}" if cut.line else str(path)
         found = []
         for name in (cut.first, cut.last):
             at = int(np.searchsorted(names, os.fsencode(name)))
-            found.append(np.flatnonzero((centres == at) & (names[at : at + 1] == os.fsencode(name)).any()))
+            is_there = (names[at : at + 1] == os.fsencode(name)).any()
+            found.append(order[ends[at] : ends[at + 1]] if is_there else order[:0])
             if not len(found[-1]):
                 raise RecordingError(
                     f"{where}: {name} is not the centre image of a usable row of {DRIVING_LOG}; name another one, or "
@@ -78,9 +81,9 @@ def cut_rows(
         last = last[last >= first[0]]
         if not len(last):
             raise RecordingError(f"{where}: {cut.last} comes before {cut.first} in the recording; exchange the two")
-        is_cut = np.zeros(len(names), bool)
-        is_cut[centres[first[0] : last[0] + 1]] = True
-        yield is_cut[centres]
+        is_cut = np.zeros(len(centres), bool)
+        is_cut[first[0] : last[0] + 1] = True
+        yield np.isin(centres, centres[is_cut]) if has_copies else is_cut
 
 
 class GoneError(RecordingError):
