@@ -34,17 +34,28 @@ def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
     (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
     (folder / frames.DRIVEN).write_bytes(b"old")
     (folder / ".DS_Store").write_bytes(b"macOS's")  # of somebody who has looked into it
-    frames.empty_folder(folder)
-    assert list(folder.iterdir()) == []
+    with frames.empty_folder(folder):
+        assert [(path.name, path.stat().st_size) for path in folder.iterdir()] == [(frames.DRIVEN, 0)]
     for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "center_2018_07_16_17_11_43_382.jpg"):
         (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
         (folder / foreign).write_bytes(b"mine")
         with pytest.raises(UserError, match=foreign):
             frames.empty_folder(folder)
-        assert len(list(folder.iterdir())) == 2
+        assert len(list(folder.iterdir())) == 3
         (folder / foreign).unlink()
     with pytest.raises(UserError, match="not a folder"):
         frames.empty_folder(Path(__file__))
+
+
+def test_a_folder_is_not_emptied_while_another_drive_saves_in_it(tmp_path):
+    saver = frames.FrameSaver(tmp_path / "run1")
+    saver.start_session().save(b"frame", (0, 0, 0))
+    with pytest.raises(UserError, match=r"run1: another drive\.py saves frames there; stop that"):
+        frames.FrameSaver(tmp_path / "run1")
+    saver.close()
+    assert len(list((tmp_path / "run1").glob("*.jpg"))) == 1
+    frames.FrameSaver(tmp_path / "run1").close()
+    assert not list((tmp_path / "run1").glob("*.jpg"))
 
 
 @pytest.mark.parametrize("trouble", [OSError(errno.ENOSPC, "No space left on device"), ValueError("a bug")])

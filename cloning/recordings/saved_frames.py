@@ -8,22 +8,30 @@ import logging
 import os
 import queue
 import re
+import sys
 import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 from cloning.base.errors import UserError
 from cloning.base.files import TEMPORARY_NAME, written_whole
 from cloning.recordings.format import parse_time_stamp, time_stamp
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
 
 # The prefix is that of a recording's centre frames, which video.py films, too.
 FRAME_NAME = re.compile(r"(?:center_)?(\d{4}(?:_\d\d){5}_\d{3})\.jpg")
 DRIVEN = "driven.csv"
 LEFT_BY_FILE_MANAGERS = (".DS_Store", "Thumbs.db", "desktop.ini")  # when somebody looks into a folder
 DRIVEN_COLUMNS = ("frame", "steering", "throttle", "speed (mph)")
+BEYOND = 1 << 30  # bytes: driven.csv is never so long
 MAX_QUEUED = 2000  # frames, about 30 MB; with more waiting in memory, driving waits for the disk
 Jobs = queue.Queue[Callable[[], None] | None]  # what the saving thread does next; None ends it
 log = logging.getLogger("drive")  # the log of drive.py
@@ -57,15 +65,38 @@ def check_folder(folder: Path) -> None:
             )
 
 
-def empty_folder(folder: Path) -> None:
-    """Make the folder if it does not exist, and delete the saved frames in it. Raises UserError."""
+def empty_folder(folder: Path) -> BinaryIO:
+    """Make the folder if it does not exist, and delete the saved frames in it; return its DRIVEN, empty.
+
+    Until that is closed, or this process ends, no other one can empty the folder. Raises UserError.
+    """
     check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        held = open(folder / DRIVEN, "ab", buffering=0)  # noqa: SIM115 - it is returned
+        if not _lock(held):
+            held.close()
+            raise UserError(f"{folder}: another drive.py saves frames there; stop that, or name another folder")
         for entry in folder.iterdir():
-            entry.unlink()
+            if entry.name != DRIVEN:
+                entry.unlink()
+        held.truncate(0)
     except OSError as error:
         raise UserError(f"{folder}: cannot be made or emptied ({error.strerror}); name another folder") from error
+    return held
+
+
+def _lock(file: BinaryIO) -> bool:
+    """Lock a file until it is closed; return whether no other process has; a file system may have no locks."""
+    try:
+        if sys.platform == "win32":
+            file.seek(BEYOND)  # others may write before this byte
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return not isinstance(error, BlockingIOError | PermissionError)
+    return True
 
 
 class FrameSaver:
@@ -77,7 +108,7 @@ class FrameSaver:
 
     def __init__(self, path: Path):
         """Empty the folder and start the thread. Raises UserError."""
-        empty_folder(path)
+        self._held = empty_folder(path)
         self._path = path
         named = path if path.name not in ("", "..") else path.resolve()  # "." has no name
         numbered = (named.with_name(f"{named.name}-{session}") for session in itertools.count(2))
@@ -99,6 +130,7 @@ class FrameSaver:
         """Wait until all frames are written, and end the thread. Raises UserError if frames were lost."""
         self._queue.put(None)
         self._thread.join()
+        self._held.close()
         if lost := sum(session.lost for session in self._sessions):
             frames = lost + sum(session.saved for session in self._sessions)
             reason = next(session.error for session in self._sessions if session.lost)
