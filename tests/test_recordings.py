@@ -127,9 +127,13 @@ def test_other_encodings_and_a_line_without_an_end(log, tmp_path):
 
 
 def test_a_recording_without_time_stamps_keeps_the_file_order(log):
-    found = log(*[f"center_{at}.jpg,left_{at}.jpg,right_{at}.jpg,0.{at},1,0,9" for at in (3, 1, 2)])
+    rows = [f"center_{at}.jpg,left_{at}.jpg,right_{at}.jpg,0.{at},1,0,9" for at in range(6)]
+    found = log(*[rows[at] for at in (3, 1, 2)])
     np.testing.assert_array_equal(found.steering, np.array([0.3, 0.1, 0.2], np.float32))
     np.testing.assert_allclose(np.diff(found.time), 1 / 15)
+    copied = log(*[rows[at] for at in (1, 2, 3, 4, 4, 2, 3, 5)])
+    np.testing.assert_allclose(np.diff(copied.time), np.array([0, 0, 0, 0, 2, 0, 2]) + 1 / 15)
+    assert copied.repairs["a copy of other rows begins or ends here: taken for the start of another drive"] == [2, 6]
     many = [line.replace("43_", f"{second}_") for second in range(10, 60) for line in usual(first=100)]
     assert log(*many).repairs == {}
     for wrong in ("2018_13_16", "2018_02_29", "2018_07_00"):

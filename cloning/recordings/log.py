@@ -17,7 +17,7 @@ from cloning.base.outputs import plural
 from cloning.base.table import Column, Table
 from cloning.recordings.columns import Finding, Rejected, UnclearLogError
 from cloning.recordings.excluded import EXCLUDED, Cut, cut_rows, read_cuts
-from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE, STAMP_LENGTH
+from cloning.recordings.format import DRIVE_GAP, DRIVING_LOG, IMAGE_FOLDER, SAMPLE_RATE, STAMP_LENGTH
 from cloning.recordings.frames import FrameCache
 from cloning.recordings.images import read_frame
 from cloning.recordings.rows import RowReader, read_lines
@@ -187,7 +187,11 @@ def read_uncut(folder: str | Path) -> Recording:
     if (untold := np.isnan(time)).any():
         assumed = f"no time in the image's name, so the whole file counts as one drive, {SAMPLE_RATE} rows a second"
         reader.repair(assumed, int(lines[untold].min()), int(untold.sum()))
-        time = lines / float(SAMPLE_RATE)
+        time, jumps = lines / float(SAMPLE_RATE), _jumps(lines, images[:, 0])
+        if len(jumps):
+            told = "a copy of other rows begins or ends here: taken for the start of another drive"
+            reader.repair(told, int(jumps[0]), len(jumps))
+            time += 2 * DRIVE_GAP * np.searchsorted(jumps, lines, side="right")
     contradicting = _contradicting(images[:, 0], steering)
     for row in np.flatnonzero(contradicting):
         name = os.fsdecode(image_names[row, 0])
@@ -200,6 +204,20 @@ def read_uncut(folder: str | Path) -> Recording:
     )
     order = np.lexsort((lines, time))  # sessions may have been merged in any order
     return recording.take(order[~contradicting[order]])
+
+
+def _jumps(lines: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """Return the lines where copied rows begin or end, ascending: int (k,); images: int (n,), a row's centre image.
+
+    A copy may follow the row that it follows in the original, or its own original, as oversampling makes it.
+    """
+    order = np.argsort(lines)
+    order = order[np.flatnonzero(np.diff(images[order], prepend=-1))]
+    _, first, which = np.unique(images[order], return_index=True, return_inverse=True)
+    original = first[which]  # of each row, where its image is first
+    is_copy = original < np.arange(len(order))
+    follows = original[1:] == original[:-1] + 1
+    return lines[order[1:][(is_copy[1:] | is_copy[:-1]) & ~follows]]
 
 
 def _contradicting(images: np.ndarray, steering: np.ndarray) -> np.ndarray:
