@@ -1,6 +1,7 @@
 """video.py as a user calls it, and its films."""
 
 import _thread
+import errno
 import gc
 import os
 import signal
@@ -142,6 +143,19 @@ def test_a_full_disk_is_a_clear_error_and_leaves_nothing(run, tmp_path, room, lo
     longest_file()
     assert status == 2 and error.startswith("video.py: run1.mp4: File too large")
     assert [path.name for path in tmp_path.iterdir()] == ["run1"]
+
+
+def test_on_windows_a_full_disk_is_as_clear_though_the_film_stays_open(run, tmp_path, longest_file, monkeypatch):
+    def is_open(path, **_):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    save(tmp_path / "run1", 3)
+    monkeypatch.setattr(os, "unlink", is_open)
+    longest_file(0)
+    status, error = run("run1")
+    longest_file()
+    assert status == 2 and error.startswith("video.py: run1.mp4: File too large")
+    assert not (tmp_path / "run1.mp4").exists()
 
 
 def test_ctrl_c_in_the_first_frame_leaves_no_film(tmp_path, monkeypatch):

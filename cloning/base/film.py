@@ -97,8 +97,10 @@ class FilmWriter:
         """Delete the unfinished film; a finished one stays."""
         with contextlib.suppress(OSError, self.av.FFmpegError):  # the disk may be too full for the end of the file
             self.container.close()
-        self.temporary.unlink(missing_ok=True)
-        self._renaming.close()
+        # So the first error is told: on Windows a file that is open can't be deleted, and FFmpeg leaves one open whose
+        # first bytes it could not write.
+        with contextlib.suppress(RuntimeError), self._renaming:
+            raise RuntimeError("discarded")  # deletes the temporary file, if that can be done
 
     def __enter__(self) -> Self:
         return self
