@@ -18,7 +18,7 @@ COMMANDS = {  # name: its module, the command of a clone, what it does
     "export": ("cloning.network.export", "python -m cloning.network.export", "write a network as ONNX"),
     "lerobot": ("cloning.lerobot.__main__", "python -m cloning.lerobot", "to and from data sets of LeRobot"),
 }
-USAGE = "usage: behavioral-cloning COMMAND …\n\n" + "\n".join(
+USAGE = "usage: behavioral-cloning COMMAND ...\n\n" + "\n".join(
     f"  {name:10} {does}: {clone}" for name, (_, clone, does) in COMMANDS.items()
 )
 

@@ -143,6 +143,13 @@ def test_words_are_typed_as_the_machines_shell_reads_them(monkeypatch):
     assert as_typed(*words) == r'python video.py "runs\a b"'
 
 
+@pytest.mark.parametrize("code_page", ["cp850", "ascii"])
+def test_the_usage_is_shown_whatever_the_console_can_show(monkeypatch, code_page):
+    monkeypatch.setenv("PYTHONIOENCODING", code_page)
+    done = run(*INSTALLED, "--help")
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("usage: behavioral-cloning COMMAND ...")
+
+
 @pytest.mark.parametrize(
     "command",
     [["model.py"], ["drive.py"], ["video.py", "run1"], *(["-m", name] for name in ("simulator", "cloning.browse"))],
