@@ -204,7 +204,7 @@ def _add_join(commands: "Subparsers") -> None:
     add("--fps", type=number(float, 1, 1000), default=SAMPLE_RATE, help=text)
     text = (
         "only write a program that runs this command with these options and its own; programs that start the "
-        "simulator themselves take it for the simulator"
+        "simulator themselves take it for the simulator (a shell script: not for Windows)"
     )
     add("--launcher", metavar="NAME.x86_64", help=text)
     add("-logFile", dest="log", metavar="FILE", help=argparse.SUPPRESS)

@@ -5,6 +5,7 @@ import contextlib
 import math
 import os
 import shlex
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -236,6 +237,8 @@ def join(arguments: argparse.Namespace, track: Track, own: dict[str, Any]) -> in
 
 def write_launcher(arguments: argparse.Namespace) -> None:
     """Write `arguments.launcher`, a program that runs `join` with these options and its own. Raises SimulatorError."""
+    if sys.platform == "win32":
+        raise SimulatorError("--launcher writes a shell script, which Windows can't start; use it on Linux, as in WSL")
     options = ["join", "--dialect", arguments.dialect]
     road = ("track", "road", "width", "marking", "land", "direction", "look", "disturb")
     for name in ("host", "port", "wait", *road, "pace", "fps"):

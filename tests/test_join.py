@@ -278,6 +278,10 @@ def test_a_lost_answer_stops_nothing(monkeypatch):
 # Started by a program; many episodes
 
 
+SCRIPTS = pytest.mark.skipif(sys.platform == "win32", reason="Windows starts no shell scripts")
+
+
+@SCRIPTS
 def test_a_launcher_is_taken_for_the_simulator_and_writes_its_log(tmp_path):
     launcher = tmp_path / "sim.x86_64"
     (tmp_path / "simulator.py").write_text("raise SystemExit(7)", encoding="utf-8")  # the program's own
@@ -289,6 +293,7 @@ def test_a_launcher_is_taken_for_the_simulator_and_writes_its_log(tmp_path):
     assert "1 episode, " in (tmp_path / "unitylog.txt").read_text()
 
 
+@SCRIPTS
 def test_a_launcher_replaces_none_but_an_earlier_one(tmp_path, capsys):
     launcher = tmp_path / "udacity.x86_64"
     launcher.write_bytes(b"\x7fELF the real simulator")
@@ -313,6 +318,13 @@ def test_options_that_would_do_nothing_are_refused_before_a_launcher_is_written(
     assert reason in capsys.readouterr().err and not launcher.exists()
 
 
+def test_on_windows_no_launcher_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert main(["join", "--dialect", "roads", "--launcher", str(tmp_path / "udacity.exe")]) == 2
+    assert "a shell script, which Windows can't start" in capsys.readouterr().err and not any(tmp_path.iterdir())
+
+
+@SCRIPTS
 def test_a_program_may_end_the_simulator_by_a_signal(tmp_path):
     launcher = tmp_path / "sim.x86_64"
     assert main(["join", "--dialect", "measures", "--launcher", str(launcher)]) == 0
