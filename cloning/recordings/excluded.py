@@ -8,6 +8,7 @@ import contextlib
 import csv
 import io
 import os
+import sys
 import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from cloning.base.files import csv_bytes, write
 from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.images import nonblocking
 
-if os.name != "nt":
+if sys.platform != "win32":
     import fcntl
 
 EXCLUDED, TAGS = "excluded.csv", "tags.csv"
@@ -136,7 +137,7 @@ def _changing(path: Path) -> Iterator[tuple[list[str], list[Cut]]]:
     except OSError as error:
         raise RecordingError(f"{log}: {error.strerror}; put the recording back, or forget its cuts") from None
     with _one_at_a_time, locked:
-        if os.name != "nt":
+        if sys.platform != "win32":
             with contextlib.suppress(OSError):  # a network's file system without locks
                 fcntl.flock(locked, fcntl.LOCK_EX)
         lines = _lines(path)

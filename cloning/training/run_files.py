@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 from cloning.base.errors import OutputError
 from cloning.base.outputs import check_folders
 
-if os.name != "nt":
+if sys.platform != "win32":
     import fcntl
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class RunFiles:
                 stack.callback(_remove_empty, new)
                 self.pictures.mkdir(parents=True, exist_ok=True)
                 check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
-                if os.name == "nt":
+                if sys.platform == "win32":
                     return
                 folder = os.open(self.last.parent, os.O_RDONLY)
                 stack.callback(os.close, folder)
@@ -92,7 +93,7 @@ class RunFiles:
 
         It looks for a moment as if this were a run, too: one that starts in the same microseconds is refused.
         """
-        if os.name == "nt":
+        if sys.platform == "win32":
             return None
         try:
             folder = os.open(self.last.parent, os.O_RDONLY)
