@@ -64,17 +64,16 @@ class RunFiles:
                 stack.callback(_remove_empty, new)
                 self.pictures.mkdir(parents=True, exist_ok=True)
                 check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
-                if sys.platform == "win32":
-                    return
-                folder = os.open(self.last.parent, os.O_RDONLY)
-                stack.callback(os.close, folder)
-                try:
-                    fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    remedy = "wait for its end, or give an --output in another folder"
-                    raise OutputError(f"{self.last}: another run is writing to this folder; {remedy}") from None
-                except OSError as error:  # a network's file system, for example
-                    print(f"{self.last.parent}: cannot be locked ({error.strerror}); start no other run in it")
+                if sys.platform != "win32":
+                    folder = os.open(self.last.parent, os.O_RDONLY)
+                    stack.callback(os.close, folder)
+                    try:
+                        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    except BlockingIOError:
+                        remedy = "wait for its end, or give an --output in another folder"
+                        raise OutputError(f"{self.last}: another run is writing to this folder; {remedy}") from None
+                    except OSError as error:  # a network's file system, for example
+                        print(f"{self.last.parent}: cannot be locked ({error.strerror}); start no other run in it")
 
             ranks.from_first(claim)
             yield
@@ -95,19 +94,20 @@ class RunFiles:
         """
         if sys.platform == "win32":
             return None
-        try:
-            folder = os.open(self.last.parent, os.O_RDONLY)
-        except FileNotFoundError:
+        else:  # not after it: mypy would report that as never reached
+            try:
+                folder = os.open(self.last.parent, os.O_RDONLY)
+            except FileNotFoundError:
+                return False
+            try:
+                fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+            except OSError:
+                return None
+            finally:
+                os.close(folder)
             return False
-        try:
-            fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        except OSError:
-            return None
-        finally:
-            os.close(folder)
-        return False
 
     def next_step(self, before: tuple[int, int] | None, resumed: bool) -> str:
         """Return what the user can do after an error.
