@@ -341,7 +341,7 @@ def test_all_pages_share_a_picture(network, jpegs, monkeypatch):
         return "picture"
 
     monkeypatch.setattr(page, "image", image)
-    monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[0], perf_counter=lambda: now[0]))
     monkeypatch.setattr(page, "UPDATE_INTERVAL", 2**-10)
     pages = page.Pages(server, with_attention=True, pause=time.sleep)
     readers: list[Any] = [pages.events() for _ in range(50)]

@@ -248,13 +248,13 @@ class Pages:
                     event = self._event(last)
                     shown, state, last, quiet = self.session, self.state, self.until, 0
                     yield event
-                self.pause(UPDATE_INTERVAL - (time.monotonic() - phase) % UPDATE_INTERVAL)  # so that none is missed
+                self.pause(UPDATE_INTERVAL - (time.perf_counter() - phase) % UPDATE_INTERVAL)  # so that none is missed
         finally:
             self.open -= 1
 
     def _begin_interval(self) -> None:
         """Choose what to show, if it is not chosen yet."""
-        interval = int(time.monotonic() / UPDATE_INTERVAL)
+        interval = int(time.perf_counter() / UPDATE_INTERVAL)  # on Windows monotonic() may have ticks of 15.6 ms
         if interval > self.interval:
             self.interval, self.session = interval, self.server.watched_session()
             self.now = self.session.heard if self.session and self.session.ended else time.monotonic()
