@@ -34,14 +34,14 @@ def test_a_folder_is_emptied_of_frames_and_of_nothing_else(tmp_path):
     (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
     (folder / frames.DRIVEN).write_bytes(b"old")
     (folder / ".DS_Store").write_bytes(b"macOS's")  # of somebody who has looked into it
-    with frames.empty_folder(folder):
-        assert [(path.name, path.stat().st_size) for path in folder.iterdir()] == [(frames.DRIVEN, 0)]
+    frames.empty_folder(folder)
+    assert list(folder.iterdir()) == []
     for foreign in ("notes.txt", "2018_13_40_17_11_43_382.jpg", "center_2018_07_16_17_11_43_382.jpg"):
         (folder / "2018_07_16_17_11_43_382.jpg").write_bytes(b"old")
         (folder / foreign).write_bytes(b"mine")
         with pytest.raises(UserError, match=foreign):
             frames.empty_folder(folder)
-        assert len(list(folder.iterdir())) == 3
+        assert len(list(folder.iterdir())) == 2
         (folder / foreign).unlink()
     with pytest.raises(UserError, match="not a folder"):
         frames.empty_folder(Path(__file__))

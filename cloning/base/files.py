@@ -18,6 +18,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+if sys.platform != "win32":
+    import fcntl
+
 TEMPORARY_NAME = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part")
 HELD_OPEN = 3.0  # s for which another program may have a file open
 LEFT_BEHIND = 86_400.0  # s: the temporary file of a process that still writes is not so old
@@ -54,6 +57,28 @@ def written_whole(path: str | Path) -> Iterator[Path]:
             reason = error.strerror or str(error)  # NumPy's OSError has a message but no errno
             raise OSError(error.errno or errno.EIO, reason, str(path)) from error
         raise
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[bool | None]:
+    """Lock a folder until the block ends, or this process; yield whether no other process has locked it.
+
+    None if that cannot be told: on Windows, and on a file system without locks, as some of networks are. Raises OSError
+    if there is no such folder.
+    """
+    if sys.platform == "win32":
+        yield None
+    else:  # not after it: mypy would report that as never reached
+        opened = os.open(folder, os.O_RDONLY)
+        free: bool | None = True
+        try:
+            try:
+                fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                free = False if isinstance(error, BlockingIOError) else None
+            yield free
+        finally:
+            os.close(opened)
 
 
 def _rename(old: Path, new: Path, rename: Callable[[Path, Path], None]) -> None:

@@ -8,30 +8,23 @@ import logging
 import os
 import queue
 import re
-import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
 
 from cloning.base.errors import UserError
-from cloning.base.files import TEMPORARY_NAME, written_whole
+from cloning.base.files import TEMPORARY_NAME, locked, written_whole
 from cloning.recordings.format import parse_time_stamp, time_stamp
-
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
 
 # The prefix is that of a recording's centre frames, which video.py films, too.
 FRAME_NAME = re.compile(r"(?:center_)?(\d{4}(?:_\d\d){5}_\d{3})\.jpg")
 DRIVEN = "driven.csv"
 LEFT_BY_FILE_MANAGERS = (".DS_Store", "Thumbs.db", "desktop.ini")  # when somebody looks into a folder
 DRIVEN_COLUMNS = ("frame", "steering", "throttle", "speed (mph)")
-BEYOND = 1 << 30  # bytes: driven.csv is never so long
 MAX_QUEUED = 2000  # frames, about 30 MB; with more waiting in memory, driving waits for the disk
 Jobs = queue.Queue[Callable[[], None] | None]  # what the saving thread does next; None ends it
 log = logging.getLogger("drive")  # the log of drive.py
@@ -65,38 +58,22 @@ def check_folder(folder: Path) -> None:
             )
 
 
-def empty_folder(folder: Path) -> BinaryIO:
-    """Make the folder if it does not exist, and delete the saved frames in it; return its DRIVEN, empty.
+def empty_folder(folder: Path) -> ExitStack:
+    """Make the folder if it does not exist, and delete the saved frames in it. Raises UserError.
 
-    Until that is closed, or this process ends, no other one can empty the folder. Raises UserError.
+    Until what is returned is closed, or this process ends, no other one empties it, where a system has locks.
     """
     check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        held = open(folder / DRIVEN, "ab", buffering=0)  # noqa: SIM115 - it is returned
-        if not _lock(held):
-            held.close()
-            raise UserError(f"{folder}: another drive.py saves frames there; stop that, or name another folder")
-        for entry in folder.iterdir():
-            if entry.name != DRIVEN:
+        with ExitStack() as stack:
+            if stack.enter_context(locked(folder)) is False:
+                raise UserError(f"{folder}: another drive.py saves frames there; stop that, or name another folder")
+            for entry in folder.iterdir():
                 entry.unlink()
-        held.truncate(0)
+            return stack.pop_all()
     except OSError as error:
         raise UserError(f"{folder}: cannot be made or emptied ({error.strerror}); name another folder") from error
-    return held
-
-
-def _lock(file: BinaryIO) -> bool:
-    """Lock a file until it is closed; return whether no other process has; a file system may have no locks."""
-    try:
-        if sys.platform == "win32":
-            file.seek(BEYOND)  # others may write before this byte
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        else:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return not isinstance(error, BlockingIOError | PermissionError)
-    return True
 
 
 class FrameSaver:

@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloning.base.errors import OutputError
+from cloning.base.files import locked
 from cloning.base.outputs import check_folders
-
-if sys.platform != "win32":
-    import fcntl
 
 if TYPE_CHECKING:
     from cloning.training.distributed import Ranks
@@ -64,16 +62,12 @@ class RunFiles:
                 stack.callback(_remove_empty, new)
                 self.pictures.mkdir(parents=True, exist_ok=True)
                 check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
-                if sys.platform != "win32":
-                    folder = os.open(self.last.parent, os.O_RDONLY)
-                    stack.callback(os.close, folder)
-                    try:
-                        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    except BlockingIOError:
-                        remedy = "wait for its end, or give an --output in another folder"
-                        raise OutputError(f"{self.last}: another run is writing to this folder; {remedy}") from None
-                    except OSError as error:  # a network's file system, for example
-                        print(f"{self.last.parent}: cannot be locked ({error.strerror}); start no other run in it")
+                free = stack.enter_context(locked(self.last.parent))
+                if free is False:
+                    remedy = "wait for its end, or give an --output in another folder"
+                    raise OutputError(f"{self.last}: another run is writing to this folder; {remedy}")
+                if free is None and sys.platform != "win32":
+                    print(f"{self.last.parent}: cannot be locked; start no other run in it")
 
             ranks.from_first(claim)
             yield
@@ -92,21 +86,10 @@ class RunFiles:
 
         It looks for a moment as if this were a run, too: one that starts in the same microseconds is refused.
         """
-        if sys.platform == "win32":
-            return None
-        else:  # not after it: mypy would report that as never reached
-            try:
-                folder = os.open(self.last.parent, os.O_RDONLY)
-            except FileNotFoundError:
-                return False
-            try:
-                fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
-            except OSError:
-                return None
-            finally:
-                os.close(folder)
+        try:
+            with locked(self.last.parent) as free:
+                return None if free is None else not free
+        except FileNotFoundError:
             return False
 
     def next_step(self, before: tuple[int, int] | None, resumed: bool) -> str:
