@@ -8,7 +8,7 @@ import numpy as np
 
 from cloning.base.figure import png
 from cloning.base.outputs import plural, write_output
-from cloning.road.autonomy import LIMITS, lap_in_words
+from cloning.road.autonomy import LIMITS, autonomy, lap_in_words
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, Track
 from simulator.car import STEP
@@ -31,7 +31,7 @@ def lap_report(run: Run, client: Client | None = None) -> dict[str, Any]:
     simulator itself used, which is measured in lock-step only.
     """
     offset = np.abs(run.trajectory.offset) if run.trajectory.offset else np.zeros(1)
-    lap_times = np.diff([0.0, *run.lap_times])
+    changes, lap_times = np.abs(np.diff(run.trajectory.steering)), np.diff([0.0, *run.lap_times])
     report: dict[str, Any] = {
         "track": run.track.name,
         "direction": run.track.direction,
@@ -51,10 +51,10 @@ def lap_report(run: Run, client: Client | None = None) -> dict[str, Any]:
             }
             for departure in run.departures
         ],
-        "autonomy": round(run.autonomy(), 4),
+        "autonomy": round(autonomy(len(run.departures), run.time), 4),
         "offset_mean_m": round(float(offset.mean()), 3),
         "offset_max_m": round(float(offset.max()), 3),
-        "steering_roughness_per_s": round(run.roughness(), 3),
+        "steering_roughness_per_s": round(float(changes.mean() / STEP), 3) if len(changes) else 0.0,
     }
     if client is None:
         return report

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cloning.road.autonomy import autonomy
 from cloning.road.motion import MPH, wrap_angle
 from cloning.road.track import Track
 from cloning.wire.protocol import MAX_NAME, Place
@@ -160,12 +159,3 @@ class Run:
             if offset > right:
                 return "right"
         return ""
-
-    def autonomy(self) -> float:
-        """Return NVIDIA's autonomy, with each departure as an intervention; see `cloning.road.autonomy`."""
-        return autonomy(len(self.departures), self.time)
-
-    def roughness(self) -> float:
-        """Return the mean absolute change of the steering per second."""
-        steering = self.trajectory.steering
-        return float(np.abs(np.diff(steering)).mean() / STEP) if len(steering) > 1 else 0.0

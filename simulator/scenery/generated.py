@@ -1,6 +1,5 @@
 """The scenery of roads of points, generated or one's own: one of five lands, and what the road's marking puts at it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,12 +23,7 @@ HARD_SHOULDER = 0.35  # m of asphalt beyond the lines
 KERB_WIDTH, WALL_HEIGHT, RAIL_DISTANCE = 0.7, 0.8, 0.5  # m; the last from the edge of the road
 POST_SPACING = 8.0  # m between a rail's posts
 SHADOW_ELEVATION = 24.0  # degrees: of the sun that casts the shadows of shadowed looks, as low as the lake's
-PLANT_TEXTURES: dict[str, Callable[[Generator], np.ndarray]] = {
-    "pine": textures.pine,
-    "palm": textures.palm,
-    "bush": textures.bush,
-    "reeds": textures.reeds,
-}
+PLANT_TEXTURES = {"pine": textures.pine, "palm": textures.palm, "bush": textures.bush, "reeds": textures.reeds}
 
 
 @dataclass(frozen=True)

@@ -58,11 +58,13 @@ def undergrowth(terrain: LakeTerrain, rng: Generator, palette: Palette, density:
 
 
 def pylons() -> Mesh:
-    """Return the line of pylons behind the bridge."""
+    """Return the line of pylons behind the bridge; each beam is two crossed strips."""
     beams = []
 
-    def add(foot: np.ndarray, a: ArrayLike, b: ArrayLike, half_width: float) -> None:
-        beams.append(beam(foot + np.array(a), foot + np.array(b), half_width))
+    def add(foot: np.ndarray, begin: ArrayLike, end: ArrayLike, half_width: float) -> None:
+        a, b = foot + np.array(begin), foot + np.array(end)
+        strips = [[a - side, a + side, b + side, b - side] for side in half_width * np.eye(2, 3)]
+        beams.append(quads(np.array(strips), PYLON_COLOUR, textures.plain()))
 
     for x, y in PYLONS:
         foot = np.array([x, y, 0.0])
@@ -77,15 +79,6 @@ def pylons() -> Mesh:
         for height in (19, 23):
             add(foot, (-4.5, 0, height), (4.5, 0, height), 0.12)
     return merge(beams)
-
-
-def beam(a: np.ndarray, b: np.ndarray, half_width: float) -> Mesh:
-    """Return a beam from point a to point b as two crossed strips."""
-    corners = [
-        [a - sideways, a + sideways, b + sideways, b - sideways]
-        for sideways in np.array([(half_width, 0, 0), (0, half_width, 0)])
-    ]
-    return quads(np.array(corners), PYLON_COLOUR, textures.plain())
 
 
 def boulders(terrain: LakeTerrain, rng: Generator, light: Light, palette: Palette) -> Mesh:
