@@ -99,11 +99,6 @@ class LaneNetwork(nn.Module):
         x = strips.permute(0, 3, 1, 2)  # in memory still channels last
         return self.dense(self.convolutions(x).flatten(1)).float()
 
-    def predict_symmetric(self, strips: torch.Tensor) -> torch.Tensor:
-        """Average the output for strips and for their mirror images: a road has no preferred side."""
-        both = self(torch.cat([strips, strips.flip(2)]))
-        return (both[: len(strips)] - both[len(strips) :]) / 2
-
 
 def save_network(path: str | Path, network: LaneNetwork) -> None:
     """Write the network's weights to a file, in half precision, which is enough. Raises OSError."""
@@ -155,7 +150,8 @@ def estimate_centres(strips: np.ndarray, network: LaneNetwork | None = None) -> 
         piece = flat[start : start + STRIPS_PER_PIECE]
         inputs = torch.from_numpy(np.stack([normalize(strip) for strip in piece]))
         with torch.inference_mode(), in_precision(precision, device):
-            return detector.predict_symmetric(inputs).numpy()
+            seen, mirrored = detector(torch.cat([inputs, inputs.flip(2)])).chunk(2)  # a road has no preferred side
+            return ((seen - mirrored) / 2).numpy()
 
     nothing = np.empty((0, len(DISTANCES_AHEAD)), np.float32)
     with ThreadPoolExecutor(threads(), initializer=one_thread) as pool:
