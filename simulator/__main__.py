@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 
 # What several commands have: the options' names, and the arguments with which argparse adds them
 Options = dict[str, dict[str, Any]]
-LAPS: Options = {
-    "--laps": {"type": number(float, 1e-6, 1e5), "default": 1, "help": "laps to drive, such as 0.5 (default 1)"}
-}
+LAPS: Options = {"--laps": {"type": number(float, 1e-6, 1e5), "default": 1, "help": "laps, such as 0.5 (default 1)"}}
 SERVER: Options = {
     "--host": {"type": address, "default": "127.0.0.1", "help": "address of the server (default %(default)s)"},
     "--port": {"type": number(int, 1, MAX_PORT), "default": PORT, "help": "port of the server (default %(default)s)"},
@@ -139,10 +137,7 @@ def _add_correct(commands: "Subparsers") -> None:
     parser = add_command(commands, run_correct, text, *shared, epilog="Exit status: as that of drive.")
     endings, mph = " or ".join(PROBLEM_AREAS), number(float, 1, TOP_SPEED_MPH)
     parser.add_argument("folder", help=f"folder for the new recording; its name must end in {endings}")
-    text = (
-        "the expert's set speed in mph, which the car never exceeds: give drive.py the same (default %(default)g, "
-        "as that of drive.py)"
-    )
+    text = "the expert's set speed in mph, never exceeded: give drive.py the same (default %(default)g, as drive.py's)"
     parser.add_argument("--speed", type=mph, default=SET_SPEED_MPH, help=text)
 
 
@@ -157,9 +152,7 @@ def _add_replay(commands: "Subparsers") -> None:
     )
     metres = number(float, 0.01, 1000)
     add("--limit", type=metres, nargs="+", default=LIMITS, dest="limits", metavar="LIMIT", help=text)
-    text = (
-        "measure offsets from the lane centre (default), which lane.csv tells or the frames, or from the human's path"
-    )
+    text = "measure offsets from the lane centre (default), which lane.csv or the frames tell, or the human's path"
     add("--reference", choices=("lane", "human"), default="lane", help=text)
     add("--report", metavar="FILE", help="write the metrics as JSON: a list, one entry per recording")
     text = "plot lateral offset and steering over time; of several recordings, FILE-RECORDING.png each"
@@ -170,10 +163,7 @@ def _add_replay(commands: "Subparsers") -> None:
 def _add_window(commands: "Subparsers") -> None:
     text = "drive and record by hand, or watch drive.py drive"
     add = add_command(commands, run_window, text, SERVER, ROAD, DISTURB).add_argument
-    text = (
-        "folder for the recording (default data/window-DATE-TIME, or data/window-DATE-TIME-corrections with "
-        "--autonomous)"
-    )
+    text = "folder for the recording (default data/window-DATE-TIME, with --autonomous window-DATE-TIME-corrections)"
     add("--folder", help=text)
     text = "let drive.py drive; W or S takes over, and only then is anything recorded"
     add("--autonomous", action="store_true", help=text)

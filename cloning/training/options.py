@@ -125,10 +125,7 @@ def build_parser(report: Recipe, robust: Recipe) -> argparse.ArgumentParser:
         "Stop a run with Ctrl-C at any time; --resume continues it.",
         argument_default=argparse.SUPPRESS,
     )
-    text = (
-        "recordings, or folders with recordings at any depth below them; a recording is a folder with a "
-        f"{DRIVING_LOG} (default: data)"
-    )
+    text = f"recordings, or folders with some at any depth; a recording is a folder with {DRIVING_LOG} (default: data)"
     parser.add_argument("recordings", nargs="*", help=text)
     add = parser.add_argument_group("recipe").add_argument
     differ = [name for name in FIGURES if getattr(report, name) != getattr(robust, name)]
