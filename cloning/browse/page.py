@@ -78,7 +78,7 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/recordings/<identifier>/details")
     def details(identifier: str) -> dict[str, Any]:
-        return shown(identifier).details(limit())
+        return shown(identifier).details(asked("limit"))
 
     @app.route("/recordings/<identifier>/replays/<limit>", methods=["POST", "DELETE"])
     def replay(identifier: str, limit: str) -> dict[str, Any]:
@@ -87,25 +87,25 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
 
     @app.get("/recordings/<identifier>/columns/<name>")
     def column(identifier: str, name: str) -> flask.Response:
-        values = shown(identifier).column(name, version())
+        values = shown(identifier).column(name, asked("version"))
         return flask.Response(np.ascontiguousarray(values, "<f4").tobytes(), mimetype="application/octet-stream")
 
     @app.post("/recordings/<identifier>/columns/<name>")
     def retry(identifier: str, name: str) -> dict[str, Any]:
         shown(identifier).retry(name)
-        return shown(identifier).details(limit())
+        return shown(identifier).details(asked("limit"))
 
     @app.get("/recordings/<identifier>/rows/<int:row>")
     def row(identifier: str, row: int) -> dict[str, Any]:
-        return shown(identifier).row(row, version())
+        return shown(identifier).row(row, asked("version"))
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>.jpg")
     def frame(identifier: str, row: int, picture: str) -> flask.Response:
-        return kept(shown(identifier).jpeg(row, picture, version()), "image/jpeg")
+        return kept(shown(identifier).jpeg(row, picture, asked("version")), "image/jpeg")
 
     @app.get("/recordings/<identifier>/rows/<int:row>/<picture>/<int:model>.png")
     def attention(identifier: str, row: int, picture: str, model: int) -> flask.Response:
-        jpeg = shown(identifier).jpeg(row, picture, version())
+        jpeg = shown(identifier).jpeg(row, picture, asked("version"))
         # In a thread, so that others are answered meanwhile; not kept, since the model may be trained anew.
         png = eventlet.tpool.execute(library.attention.png, jpeg, library.model(model))
         return flask.Response(png, mimetype="image/png")
@@ -114,15 +114,15 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
     def cut(identifier: str, kind: str) -> dict[str, Any]:
         change = shown(identifier).cut if flask.request.method == "POST" else shown(identifier).restore
         changed = change(cuts(), TAGS if kind == "tags" else EXCLUDED)
-        return shown(identifier).details(limit()) | {"changed": changed}
+        return shown(identifier).details(asked("limit")) | {"changed": changed}
 
     @app.get("/recordings/<identifier>/matches")
     def matches(identifier: str) -> dict[str, Any]:
-        return shown(identifier).matches(flask.request.args.get("condition", ""), limit(), version())
+        return shown(identifier).matches(flask.request.args.get("condition", ""), asked("limit"), asked("version"))
 
     @app.route("/recordings/<identifier>/compared", methods=["GET", "POST"])
     def compared(identifier: str) -> dict[str, Any]:
-        return shown(identifier).compared(limit() or f"{LIMITS[0]:g}", begin=flask.request.method == "POST")
+        return shown(identifier).compared(asked("limit") or f"{LIMITS[0]:g}", begin=flask.request.method == "POST")
 
     @app.post("/recordings/<identifier>/export")
     def export(identifier: str) -> dict[str, Any]:
@@ -130,14 +130,14 @@ def create_app(library: Library, runs: Runs) -> flask.Flask:
         body = body if isinstance(body, dict) else {}
         name, rows, others = (str(body.get(key, "")) for key in ("name", "rows", "others"))
         together = [library[other] for other in others.split(",") if other]
-        folder, notes = shown(identifier).export(stretches(rows), version() or "", name, together)
+        folder, notes = shown(identifier).export(stretches(rows), asked("version") or "", name, together)
         return {"id": library.add(folder)[0], "folder": str(folder), "notes": notes}
 
     @app.post("/recordings/<identifier>/film.mp4")  # a request for thousands of stretches is too long for GET
     def film(identifier: str) -> flask.Response:
         body = flask.request.get_json()
         rows = str(body.get("rows", "")) if isinstance(body, dict) else ""
-        mp4 = shown(identifier).film(stretches(rows), version() or "")
+        mp4 = shown(identifier).film(stretches(rows), asked("version") or "")
         return flask.Response(mp4, mimetype="video/mp4", headers={"Content-Disposition": "attachment"})
 
     @app.route("/analyses", methods=["POST", "DELETE"])
@@ -173,14 +173,9 @@ def kept(picture: bytes, mime_type: str) -> flask.Response:
     return response
 
 
-def version() -> str | None:
-    """Return the version of the log that the request is about."""
-    return flask.request.args.get("version")
-
-
-def limit() -> str | None:
-    """Return the limit of the replays that the request is about."""
-    return flask.request.args.get("limit")
+def asked(name: str) -> str | None:
+    """Return what the request is about: the `version` of the log, the `limit` of the replays; None if it has none."""
+    return flask.request.args.get(name)
 
 
 def cuts() -> list[Cut]:
