@@ -46,18 +46,13 @@ ROAD_WEATHERS = {"Rain": "rainy", "Snow": "snowy", "Fog": "foggy"}  # by perturb
 
 @dataclass(frozen=True)
 class Stage:
-    """What the sent roads look like, and the track before the first one.
+    """What the sent roads look like, and the track before the first one."""
 
-    source, direction, look  of the track that lies there at the start, see Track and `scenery.build`
-    road                     width, marking and land of the roads that a program sends, as `make_road` takes them
-    disturbance              of the camera's frames, or None for that of the weather, if there is one
-    """
-
-    source: str | PointRoad
+    source: str | PointRoad  # of the track that lies there at the start, as the next two: see Track, `scenery.build`
     direction: str | None
     look: int
-    road: dict[str, Any]
-    disturbance: Disturbance | None = None
+    road: dict[str, Any]  # width, marking and land of the roads that a program sends, as `make_road` takes them
+    disturbance: Disturbance | None = None  # of the camera's frames, or None for that of the weather, if there is one
 
 
 class Dialect(Driven):

@@ -60,58 +60,38 @@ Watch = Callable[[Run, Cameras | None], None]
 
 
 class Conditions(NamedTuple):
-    """How a road is driven.
+    """How a road is driven."""
 
-    driver       a model file, an .onnx file, HOST:PORT of a server, or one of BUILT_IN
-    speed, look  mph; see README.md
-    direction    "ccw", "cw", or None for that of the real simulator, or in which the road's points are listed
-    metres       to drive; None: the whole road
-    start        m along the track, m to the right and degrees turned to the right, at which the car starts at its set
-                 speed; None: at rest where the autonomous mode starts
-    set_back     after a departure the car is set back onto the lane's centre and goes on, until the time of so many
-                 interventions is that of the whole drive; if not, the first departure ends it
-    own_throttle a server's throttle counts; if not, the set speed is held as drive.py does it
-    disturbance  of the frames, or None; seed: the same disturbs them in the same way
-    foretell     a model whose limits are known foretells its departures
-    """
-
-    driver: str
-    speed: float
-    look: int
-    direction: str | None = None
-    metres: float | None = None
+    driver: str  # a model file, an .onnx file, HOST:PORT of a server, or one of BUILT_IN
+    speed: float  # mph
+    look: int  # see README.md
+    direction: str | None = None  # "ccw", "cw", or None for the real simulator's, or that in which points are listed
+    metres: float | None = None  # to drive; None: the whole road
+    # m along the track, m to the right and degrees turned to the right, at which the car starts at its set speed; None:
+    # at rest where the autonomous mode starts.
     start: tuple[float, float, float] | None = None
+    # After a departure the car is set back onto the lane's centre and goes on, until the time of so many interventions
+    # is that of the whole drive; if not, the first departure ends it.
     set_back: bool = False
-    own_throttle: bool = True
-    disturbance: Disturbance | None = None
-    seed: int = 0
-    foretell: bool = False
+    own_throttle: bool = True  # a server's throttle counts; if not, the set speed is held as drive.py does it
+    disturbance: Disturbance | None = None  # of the frames
+    seed: int = 0  # the same disturbs them in the same way
+    foretell: bool = False  # a model whose limits are known foretells its departures
 
 
 @dataclass(frozen=True)
 class Drive:
-    """How a road was driven.
+    """How a road was driven."""
 
-    farthest    m from the lane's centre
-    seconds     simulated, until the car arrived or failed
-    ended       "arrived", "left" or "right" for the side on which the car left the road for good, or "late"
-    along       m along the road where the drive ended
-    path        x, y of the car in m, one for each frame
-    mean        m from the lane's centre, on average
-    planned     s that it would have taken at its set speed
-    departures  from the road
-    alarms      s, of the frames at which the model foretold a departure; None if it doesn't
-    """
-
-    farthest: float
-    seconds: float
-    ended: str
-    along: float
-    path: tuple[tuple[float, float], ...]
-    mean: float = 0.0
-    planned: float = 0.0
-    departures: tuple[Departure, ...] = ()
-    alarms: tuple[float, ...] | None = None
+    farthest: float  # m from the lane's centre
+    seconds: float  # simulated, until the car arrived or failed
+    ended: str  # "arrived", "left" or "right" for the side on which the car left the road for good, or "late"
+    along: float  # m along the road where the drive ended
+    path: tuple[tuple[float, float], ...]  # x, y of the car in m, one for each frame
+    mean: float = 0.0  # m from the lane's centre, on average
+    planned: float = 0.0  # s that it would have taken at its set speed
+    departures: tuple[Departure, ...] = ()  # from the road
+    alarms: tuple[float, ...] | None = None  # s, of the frames at which the model foretold one; None if it doesn't
 
     @property
     def failed(self) -> bool:

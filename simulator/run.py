@@ -15,38 +15,25 @@ WHEEL_REACH = 1.95  # m: every wheel's hub is closer to the car's middle
 
 @dataclass(frozen=True)
 class Departure:
-    """Where and how fast the car left the road with a wheel.
+    """Where and how fast the car left the road with a wheel."""
 
-    time   simulated seconds since the start
-    s      metres along the track
-    speed  m/s
-    x, y   the car's position in metres, east and north
-    side   of the road that it left on, "left" or "right"
-    """
-
-    time: float
-    s: float
-    speed: float
-    x: float
-    y: float
-    side: str
+    time: float  # simulated seconds since the start
+    s: float  # metres along the track
+    speed: float  # m/s
+    x: float  # the car's position in metres, to the east
+    y: float  # and to the north
+    side: str  # of the road that it left on, "left" or "right"
 
 
 @dataclass
 class Trajectory:
-    """The car's motion, with one entry for each physics step.
+    """The car's motion, with one entry for each physics step."""
 
-    x, y      position in metres, east and north
-    offset    lateral offset in metres, right positive
-    speed     m/s
-    steering  -1..1, right positive
-    """
-
-    x: list[float] = field(default_factory=list)
-    y: list[float] = field(default_factory=list)
-    offset: list[float] = field(default_factory=list)
-    speed: list[float] = field(default_factory=list)
-    steering: list[float] = field(default_factory=list)
+    x: list[float] = field(default_factory=list)  # position in metres, to the east
+    y: list[float] = field(default_factory=list)  # and to the north
+    offset: list[float] = field(default_factory=list)  # lateral offset in metres, right positive
+    speed: list[float] = field(default_factory=list)  # m/s
+    steering: list[float] = field(default_factory=list)  # -1..1, right positive
 
 
 class Run:

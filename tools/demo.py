@@ -43,19 +43,13 @@ NEXT = (
 
 
 class Drive(NamedTuple):
-    """A lap that a network drives.
+    """A lap that a network drives."""
 
-    title             of its files in the report: a report (JSON), a picture (PNG) and a film (MP4)
-    model             the network's file
-    track, direction  of the road
-    folder            of the demo
-    """
-
-    title: str
-    model: Path
-    track: str
+    title: str  # of its files in the report: a report (JSON), a picture (PNG) and a film (MP4)
+    model: Path  # the network's file
+    track: str  # the road's name
     direction: str
-    folder: Path
+    folder: Path  # of the demo
 
     @property
     def picture(self) -> Path:

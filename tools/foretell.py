@@ -102,20 +102,13 @@ def courses() -> list[Course]:
 
 
 class Drive(NamedTuple):
-    """What was seen in a drive, and when the car left the road.
+    """What was seen in a drive, and when the car left the road."""
 
-    seen        observations, each array with a row for each frame
-    blind       float64 (n,): m driven since a frame showed anything new
-    time        float64 (n,): s
-    away        float64 (n,): m from the lane's centre
-    departures  float64 (k,): s
-    """
-
-    seen: Observation
-    blind: np.ndarray
-    time: np.ndarray
-    away: np.ndarray
-    departures: np.ndarray
+    seen: Observation  # each array with a row for each frame
+    blind: np.ndarray  # float64 (n,): m driven since a frame showed anything new
+    time: np.ndarray  # float64 (n,): s
+    away: np.ndarray  # float64 (n,): m from the lane's centre
+    departures: np.ndarray  # float64 (k,): s
 
 
 def joined(seen: Sequence[Observation]) -> Observation:

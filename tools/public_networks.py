@@ -42,39 +42,27 @@ Rows = Sequence[tuple[Recording, int]]
 
 
 class Published(NamedTuple):
-    """A public network, and how it is trained.
+    """A public network, and how it is trained."""
 
-    source       repository @ commit, and its licence
-    layers       makes it; it takes float32 (n, 3, *size)
-    size         rows and columns
-    about        what makes this of a frame: see `simulator/driving.py`
-    learning_rate, batch, samples, epochs   of Adam; images in a batch; images in an epoch; how many epochs
-    held_out     share of the rows whose loss chooses the epoch that is kept; 0: the last one is
-    augmented    share of the images that are changed as follows; others are centre images as they are
-    side         steering added to the label of left images, subtracted from that of right ones; 0: only centre ones
-    shift        by so many pixels to the sides, and up or down, images are moved at most; steering for a pixel sideways
-    shear        by so many pixels to the sides the middle row is moved at most, while the last one stays; steering for
-                 a pixel
-    brightness   how far the factor of the brightness is from 1 at most
-    border       OpenCV's, what comes in at the sides
-    """
-
-    source: str
-    layers: Callable[[], nn.Sequential]
-    size: tuple[int, int]
-    about: dict[str, Any]
-    learning_rate: float
-    batch: int
-    samples: int
+    source: str  # repository @ commit, and its licence
+    layers: Callable[[], nn.Sequential]  # makes it; it takes float32 (n, 3, *size)
+    size: tuple[int, int]  # rows and columns
+    about: dict[str, Any]  # what makes this of a frame: see `simulator/driving.py`
+    learning_rate: float  # of Adam
+    batch: int  # images
+    samples: int  # images in an epoch
     epochs: int = 10
-    held_out: float = 0.0
-    augmented: float = 1.0
+    held_out: float = 0.0  # share of the rows whose loss chooses the epoch that is kept; 0: the last one is
+    augmented: float = 1.0  # share of the images that are changed as follows; others are centre images as they are
+    # Steering added to the label of left images, subtracted from that of right ones; 0: only centre ones.
     side: float = 0.0
     flip: float = 0.0
+    # By so many pixels to the sides, and up or down, images are moved at most; steering for a pixel sideways.
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # By so many pixels to the sides the middle row is moved at most, while the last one stays; steering for a pixel.
     shear: tuple[float, float] = (0.0, 0.0)
-    brightness: float = 0.0
-    border: int = cv2.BORDER_CONSTANT
+    brightness: float = 0.0  # how far the factor of the brightness is from 1 at most
+    border: int = cv2.BORDER_CONSTANT  # OpenCV's, what comes in at the sides
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -54,18 +54,13 @@ TILE, GALLERY_SEED, GALLERY_QUALITY = (160, 80), 3, 60  # columns and rows
 
 
 class Drive(NamedTuple):
-    """A drive of a model in the stand-in, or a replay, which has no laps.
+    """A drive of a model in the stand-in, or a replay, which has no laps."""
 
-    name        of the model in tables; sha256: of its file
-    on          track, or folder of a recording
-    conditions  of which a replay has the driver and the disturbance only
-    """
-
-    name: str
-    sha256: str
-    on: str
+    name: str  # of the model in tables
+    sha256: str  # of its file
+    on: str  # track, or folder of a recording
     laps: float
-    conditions: Conditions
+    conditions: Conditions  # of which a replay has the driver and the disturbance only
 
     @property
     def where(self) -> str:

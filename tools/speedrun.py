@@ -33,16 +33,11 @@ IMAGES, BATCH, RATE = 4_500, 8, 8e-3  # enough for one lap of the lake; tools/ex
 
 
 class Result(NamedTuple):
-    """What one training run took, and how its model drives.
+    """What one training run took, and how its model drives."""
 
-    seconds   from the start of model.py to its end
-    autonomy  per cent of the time, over all recordings driven
-    distance  m from the lane's centre, mean
-    """
-
-    seconds: float
-    autonomy: float
-    distance: float
+    seconds: float  # from the start of model.py to its end
+    autonomy: float  # per cent of the time, over all recordings driven
+    distance: float  # m from the lane's centre, mean
 
 
 def speed_run(train: Sequence[Path], courses: Sequence[Course], options: argparse.Namespace, seed: int) -> Result:

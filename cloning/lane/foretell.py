@@ -35,20 +35,14 @@ WINDOW = EARLIEST - LATEST  # s of a drive without a departure, in which false a
 
 
 class Observation(NamedTuple):
-    """What the networks make of a frame; in the tool each array has one more dimension, for the frames of a drive.
+    """What the networks make of a frame; in the tool each array has one more dimension, for the frames of a drive."""
 
-    steering     float32 (): -1..1
-    activations  float32 (u,): inputs of the driving network's first dense layer of MOST_UNITS or fewer, or its last one
-    hidden       float32 (96,): of the lane network
-    centres      float32 (5,): m to the lane's centre at DISTANCES_AHEAD, right positive
-    mirrored     float32 (5,): the same in the mirror image
-    """
-
-    steering: np.ndarray
+    steering: np.ndarray  # float32 (): -1..1
+    # float32 (u,): inputs of the driving network's first dense layer of MOST_UNITS or fewer, or its last one.
     activations: np.ndarray
-    hidden: np.ndarray
-    centres: np.ndarray
-    mirrored: np.ndarray
+    hidden: np.ndarray  # float32 (96,): of the lane network
+    centres: np.ndarray  # float32 (5,): m to the lane's centre at DISTANCES_AHEAD, right positive
+    mirrored: np.ndarray  # float32 (5,): the same in the mirror image
 
 
 class Observer:
@@ -97,16 +91,11 @@ class Normal(NamedTuple):
 
 
 class Ordinary(NamedTuple):
-    """What is ordinary for a network.
+    """What is ordinary for a network."""
 
-    steering     float32 (5,): the steering is about this, times the lane's centre at DISTANCES_AHEAD
-    activations  those of the driving network
-    hidden       those of the lane network
-    """
-
-    steering: np.ndarray
-    activations: Normal
-    hidden: Normal
+    steering: np.ndarray  # float32 (5,): the steering is about this, times the lane's centre at DISTANCES_AHEAD
+    activations: Normal  # those of the driving network
+    hidden: Normal  # those of the lane network
 
     @classmethod
     def of(cls, observed: Observation) -> Self:
@@ -165,18 +154,12 @@ class Blindness:
 
 
 class Limits(NamedTuple):
-    """What tells when a network is out of its depth.
-
-    ordinary  what is ordinary for it
-    weights   float32 (2 k,), of the signs' means
-    bias      so that the risk is ALARM where an alarm is due
-    stop      the risk at which a car is better stopped
-    """
+    """What tells when a network is out of its depth."""
 
     ordinary: Ordinary
-    weights: np.ndarray
-    bias: float
-    stop: float
+    weights: np.ndarray  # float32 (2 k,), of the signs' means
+    bias: float  # so that the risk is ALARM where an alarm is due
+    stop: float  # the risk at which a car is better stopped
 
     def risk(self, signs: np.ndarray, blind: float | np.ndarray) -> Any:
         """Return the risk, 0..1, for signs (…, 2 k) and blindness (…), m.

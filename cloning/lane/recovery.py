@@ -33,21 +33,18 @@ HEADING_CHORD = 3.0  # m: the lane's heading is that of the chord from so far be
 
 @dataclass(frozen=True)
 class LanePosition(Table):
-    """The car's position in its lane, one value for each row of a recording.
+    """The car's position in its lane, one value for each row of a recording."""
 
-    lateral_offset  float32 (n,): m from the lane's centre to the car's middle, right positive
-    heading_error   float32 (n,): radians from the road's direction next to the car to the car's, right positive
-    trusted         bool (n,): whether these two values can be relied on: the three cameras' detections agree with each
-                    other and over time, or the row is placed
-    placed          bool (n,): whether it was localised on a known track, or the recording itself tells the position
-    piece           int32 (n,): rows of a stretch with the same number belong together; MISHAP: the car did not move as
-                    it steered, or was off the road, so that nothing can be learnt or judged by the row
-    """
-
-    lateral_offset: Column
-    heading_error: Column
+    lateral_offset: Column  # float32 (n,): m from the lane's centre to the car's middle, right positive
+    heading_error: (
+        Column  # float32 (n,): radians from the road's direction next to the car to the car's, right positive
+    )
+    # bool (n,): whether these two values can be relied on: the three cameras' detections agree with each other and over
+    # time, or the row is placed.
     trusted: Column
-    placed: Column
+    placed: Column  # bool (n,): whether it was localised on a known track, or the recording itself tells the position
+    # int32 (n,): rows of a stretch with the same number belong together; MISHAP: the car did not move as it steered, or
+    # was off the road, so that nothing can be learnt or judged by the row.
     piece: Column
 
     @staticmethod
@@ -69,17 +66,12 @@ class LanePosition(Table):
 
 @dataclass(frozen=True)
 class LaneAhead(Table):
-    """The lane ahead at each of n rows of recordings.
+    """The lane ahead at each of n rows of recordings."""
 
-    offset, yaw  float32 (n,): the recorded car's pose
-    goal         float32 (n, 2): the lane's centre LOOKAHEAD further on: m right and forward in the lane's frame
-    known        bool (n,): whether the lane ahead is known; if not, ignore the other columns
-    """
-
-    offset: Column
-    yaw: Column
-    goal: Column
-    known: Column
+    offset: Column  # float32 (n,): the recorded car's pose, as the next
+    yaw: Column  # float32 (n,)
+    goal: Column  # float32 (n, 2): the lane's centre LOOKAHEAD further on: m right and forward in the lane's frame
+    known: Column  # bool (n,): whether the lane ahead is known; if not, ignore the other columns
 
     @staticmethod
     def of_stretch(stretch: Stretch, offset: np.ndarray, trusted: np.ndarray) -> "LaneAhead":

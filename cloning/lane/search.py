@@ -22,21 +22,17 @@ ALONG, ACROSS = 0, 1  # the road: columns of `Localisation.states`
 
 @dataclass(frozen=True)
 class Localisation:
-    """The result of localising a stretch of a recording on a known track.
+    """The result of localising a stretch of a recording on a known track."""
 
-    track           in the direction driven
-    states          float64 (n, 3): the rear axle's state in each row: s, m along the track; lateral offset, m to the
-                    right of its centre line; heading error, radians to its right
-    log_likelihood  of a detection, on average, for a Cauchy distribution: 0 where detections agree with the track,
-                    -2.3 where they have nothing to do with it
-    turn_residual   root mean square of the changes of the heading error that neither steering nor the track explains,
-                    in standard deviations of the process noise: below 1 on the right track, where the car turns as it
-                    steers
-    """
-
-    track: Track
+    track: Track  # in the direction driven
+    # float64 (n, 3): the rear axle's state in each row: s, m along the track; lateral offset, m to the right of its
+    # centre line; heading error, radians to its right.
     states: np.ndarray
+    # Of a detection, on average, for a Cauchy distribution: 0 where detections agree with the track, -2.3 where they
+    # have nothing to do with it.
     log_likelihood: float
+    # Root mean square of the changes of the heading error that neither steering nor the track explains, in standard
+    # deviations of the process noise: below 1 on the right track, where the car turns as it steers.
     turn_residual: float
 
     def is_certain(self) -> bool:
@@ -47,18 +43,13 @@ class Localisation:
 
 @dataclass(frozen=True)
 class Part:
-    """Rows of a stretch that certainly are on a track.
+    """Rows of a stretch that certainly are on a track."""
 
-    stretch, track  their indices
-    start, end      rows of the stretch
-    found           in these rows
-    """
-
-    stretch: int
+    stretch: int  # its index, as the next
     track: int
-    start: int
-    end: int
-    found: Localisation
+    start: int  # the first row of the stretch
+    end: int  # the row after the last
+    found: Localisation  # in these rows
 
     def quality(self) -> float:
         """Return a measure of how many rows agree with the track, and how well."""

@@ -36,20 +36,13 @@ class UnusableTelemetry(ValueError):
 
 @dataclass(frozen=True)
 class Telemetry:
-    """The part of a telemetry message that driving and its page need.
+    """The part of a telemetry message that driving and its page need."""
 
-    jpeg   the image as received
-    image  the image decoded: uint8 (160, 320, 3), RGB
-    speed  mph
-    cte    m from the lane's centre, which some simulators tell, in their own sign; None without a usable number
-    place  that only the stand-in simulator tells, else None
-    """
-
-    jpeg: bytes
-    image: np.ndarray
-    speed: float
-    cte: float | None
-    place: Place | None
+    jpeg: bytes  # the image as received
+    image: np.ndarray  # decoded: uint8 (160, 320, 3), RGB
+    speed: float  # mph
+    cte: float | None  # m from the lane's centre, which some simulators tell, in their own sign; None if it is unusable
+    place: Place | None  # which only the stand-in simulator tells
 
 
 def parse_telemetry(message: object) -> Telemetry:

@@ -11,18 +11,11 @@ STAND_IN = "stand_in"  # the field with a `Place` that the stand-in simulator ad
 
 @dataclass(frozen=True)
 class Place:
-    """Where the stand-in simulator's car is, and how it got there.
+    """Where the stand-in simulator's car is, and how it got there."""
 
-    track       name of the road, of at most MAX_NAME characters; of a --road, one that no known road has
-    x, y        m to the east and to the north
-    offset      m to the right of the road's centre line
-    departures  how often it has left the road
-    time        simulated seconds
-    """
-
-    track: str
-    x: float
-    y: float
-    offset: float
-    departures: int
-    time: float
+    track: str  # name of the road, of at most MAX_NAME characters; of a --road, one that no known road has
+    x: float  # m to the east
+    y: float  # m to the north
+    offset: float  # m to the right of the road's centre line
+    departures: int  # how often it has left the road
+    time: float  # simulated seconds

@@ -33,15 +33,11 @@ RADIUS, TREAD, SPOKES = 0.34, 0.24, 24
 
 
 class Body(NamedTuple):
-    """The car's body in the coordinates of the bonnet: x right, y forward, z up, in metres.
-
-    wheel  one of the four, about the middle of its axle, which is the origin
-    brake  the brake lights as they shine
-    """
+    """The car's body in the coordinates of the bonnet: x right, y forward, z up, in metres."""
 
     body: Mesh
-    wheel: Mesh
-    brake: Mesh
+    wheel: Mesh  # one of the four, about the middle of its axle, which is the origin
+    brake: Mesh  # the brake lights as they shine
 
 
 def body(colour: Colour, light: Light) -> Body:

@@ -28,41 +28,27 @@ PLANT_TEXTURES = {"pine": textures.pine, "palm": textures.palm, "bush": textures
 
 @dataclass(frozen=True)
 class Plant:
-    """A species in a land.
+    """A species in a land."""
 
-    species  key of PLANT_TEXTURES
-    height   m: least and greatest
-    width    relative to the height
-    nearest  least distance from the road's centre line, m
-    """
-
-    species: str
+    species: str  # key of PLANT_TEXTURES
     colour: Colour
     count: int
-    height: tuple[float, float]
-    width: float
-    nearest: float
+    height: tuple[float, float]  # m: least and greatest
+    width: float  # relative to the height
+    nearest: float  # least distance from the road's centre line, m
 
 
 @dataclass(frozen=True)
 class Land:
-    """The land around a road.
+    """The land around a road."""
 
-    ground    colours of level ground, of patches on it, and of steep ground
-    hills     m: mean and spread of the hills' heights above the road
-    slope     m from the centre line to the hills' feet, and from there to their full height
-    terrace   m: height of the hills' steps; 0 for none
-    boulders  how many there are
-    haze      largest share of the haze
-    """
-
-    ground: tuple[Colour, Colour, Colour]
-    hills: tuple[float, float]
-    slope: tuple[float, float]
+    ground: tuple[Colour, Colour, Colour]  # colours of level ground, of patches on it, and of steep ground
+    hills: tuple[float, float]  # m: mean and spread of the hills' heights above the road
+    slope: tuple[float, float]  # m from the centre line to the hills' feet, and from there to their full height
     plants: tuple[Plant, ...]
-    terrace: float = 0.0
-    boulders: int = 0
-    haze: float = 0.6
+    terrace: float = 0.0  # m: height of the hills' steps; 0 for none
+    boulders: int = 0  # how many there are
+    haze: float = 0.6  # largest share of the haze
 
 
 MEADOW = Land(

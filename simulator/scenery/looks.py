@@ -29,31 +29,19 @@ PAINT_CONTRAST = 1.35
 
 @dataclass(frozen=True)
 class Look:
-    """The appearance of a track; the defaults resemble the real simulator.
-
-    palette  colours by name
-    grain    factor of the contrast of the asphalt's grain
-    spots    factor of the contrast of larger spots in the asphalt
-    sheen    relative gain in brightness of asphalt far ahead
-    stripes  metres of kerb for one red and one white stripe
-    relief   factor of the heights next to the road
-    shift    metres by which hills, soils and water are shifted along the road
-    plants   factor of the number of trees and bushes
-    shadows  number of shadows anywhere on the road; None: those of the real simulator
-    tone     float32 (3, 4): the camera's colour matrix, applied to (r, g, b, 1), 0..255; None: unchanged colours
-    """
+    """The appearance of a track; the defaults resemble the real simulator."""
 
     light: Light
-    palette: Palette
-    grain: float = 1.0
-    spots: float = 1.0
-    sheen: float = 0.28
-    stripes: float = 0.6
-    relief: float = 1.0
-    shift: float = 0.0
-    plants: float = 1.0
-    shadows: int | None = None
-    tone: np.ndarray | None = None
+    palette: Palette  # colours by name
+    grain: float = 1.0  # factor of the contrast of the asphalt's grain
+    spots: float = 1.0  # factor of the contrast of larger spots in the asphalt
+    sheen: float = 0.28  # relative gain in brightness of asphalt far ahead
+    stripes: float = 0.6  # metres of kerb for one red and one white stripe
+    relief: float = 1.0  # factor of the heights next to the road
+    shift: float = 0.0  # metres by which hills, soils and water are shifted along the road
+    plants: float = 1.0  # factor of the number of trees and bushes
+    shadows: int | None = None  # number of shadows anywhere on the road; None: those of the real simulator
+    tone: np.ndarray | None = None  # float32 (3, 4): the camera's colour matrix, applied to (r, g, b, 1), 0..255
 
 
 def make_look(look: int, light: Light, palette: Palette) -> Look:

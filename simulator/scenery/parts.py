@@ -14,15 +14,11 @@ from simulator.scenery.shapes import Colour, Light, Mesh, illuminate, sheet
 
 @dataclass(frozen=True)
 class Haze:
-    """Haze that grows with the distance.
-
-    range    metres from the camera at which it begins, and at which it would hide everything without `maximum`
-    maximum  largest share of the haze in a colour, 0..1
-    """
+    """Haze that grows with the distance."""
 
     colour: Colour
-    range: tuple[float, float]
-    maximum: float = 1.0
+    range: tuple[float, float]  # metres at which it begins, and at which it would hide everything without `maximum`
+    maximum: float = 1.0  # largest share of the haze in a colour, 0..1
 
 
 @dataclass(frozen=True)

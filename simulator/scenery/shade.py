@@ -29,16 +29,11 @@ THINNEST = 0.05  # m: plants' images that the sun sees narrower than this cast n
 
 @dataclass(frozen=True)
 class ShadeStyle:
-    """How dark, how soft and how long shadows are.
+    """How dark, how soft and how long shadows are."""
 
-    depth      exponent of the share of light that the sky alone gives: 1 is physical, more is darker
-    softness   standard deviation of the blur of the shadows' edges on the road, m
-    elevation  factor of the elevation of the sun that casts them; below 1 they are longer
-    """
-
-    depth: float
-    softness: float
-    elevation: float = 1.0
+    depth: float  # exponent of the share of light that the sky alone gives: 1 is physical, more is darker
+    softness: float  # standard deviation of the blur of the shadows' edges on the road, m
+    elevation: float = 1.0  # factor of the elevation of the sun that casts them; below 1 they are longer
 
 
 class ShadowMap:

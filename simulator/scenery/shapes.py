@@ -12,38 +12,25 @@ Colour = tuple[float, float, float]  # RGB, 0..1
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with colours at their corners and one texture.
+    """Triangles with colours at their corners and one texture."""
 
-    points   float (n, 3): m
-    colours  float (n, 3): 0..1, by which the texture is multiplied
-    uv       float (n, 2): texture coordinates
-    faces    int (m, 3): indices into the points
-    texture  uint8 (rows, columns, 3 RGB or 4 RGBA); with 4 channels, pixels with alpha below half are transparent
-    sheen    relative gain in brightness where the mesh is seen far ahead, at a grazing angle
-    road     float (n, 2): s along the track and lateral offset of points of a ribbon along the road, m; else None
-    """
-
-    points: np.ndarray
-    colours: np.ndarray
-    uv: np.ndarray
-    faces: np.ndarray
-    texture: np.ndarray
-    sheen: float = 0.0
+    points: np.ndarray  # float (n, 3): m
+    colours: np.ndarray  # float (n, 3): 0..1, by which the texture is multiplied
+    uv: np.ndarray  # float (n, 2): texture coordinates
+    faces: np.ndarray  # int (m, 3): indices into the points
+    texture: np.ndarray  # uint8 (rows, columns, 3 RGB or 4 RGBA); pixels with alpha below half are transparent
+    sheen: float = 0.0  # relative gain in brightness where the mesh is seen far ahead, at a grazing angle
+    # float (n, 2): s along the track and lateral offset of points of a ribbon along the road, m; else None.
     road: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class Light:
-    """The light of a scene.
+    """The light of a scene."""
 
-    sun       unit vector towards the sun
-    sunlight  colour of its light
-    fill      colour of the light that reaches shaded sides, too
-    """
-
-    sun: tuple[float, float, float]
-    sunlight: Colour
-    fill: Colour
+    sun: tuple[float, float, float]  # unit vector towards the sun
+    sunlight: Colour  # colour of its light
+    fill: Colour  # colour of the light that reaches shaded sides, too
 
     def on(self, normals: np.ndarray) -> np.ndarray:
         """Return the colours, (n, 3), of a white surface with unit normals (n, 3)."""
@@ -53,17 +40,12 @@ class Light:
 
 @dataclass(frozen=True)
 class Material:
-    """The colour and texture of a ribbon.
+    """The colour and texture of a ribbon."""
 
-    colour   (3,) or (distances, offsets, 3)
-    texture  as in Mesh
-    metres   length of road that one repetition of the texture covers
-    across   texture coordinates at the ribbon's offsets; None: the texture repeats every `metres` across the road, too
-    """
-
-    colour: ArrayLike
-    texture: np.ndarray
-    metres: float
+    colour: ArrayLike  # (3,) or (distances, offsets, 3)
+    texture: np.ndarray  # as in Mesh
+    metres: float  # length of road that one repetition of the texture covers
+    # Texture coordinates at the ribbon's offsets; None: the texture repeats every `metres` across the road, too.
     across: ArrayLike | None = None
 
 

@@ -49,18 +49,12 @@ def asphalt(rng: Generator, size: int = 512, grain: float = 0.15, spots: float =
 
 
 class Line(NamedTuple):
-    """A painted line along the road.
+    """A painted line along the road."""
 
-    offset      m from the road's centre line, on both sides
-    half_width  m
-    colour      RGB, 0..1
-    share       of the texture's length that is painted, from its first row on
-    """
-
-    offset: float
-    half_width: float
-    colour: Colour
-    share: float = 1.0
+    offset: float  # m from the road's centre line, on both sides
+    half_width: float  # m
+    colour: Colour  # RGB, 0..1
+    share: float = 1.0  # of the texture's length that is painted, from its first row on
 
 
 def paint_lines(texture: np.ndarray, colour: Colour, half_width: float, lines: Sequence[Line]) -> np.ndarray:

@@ -16,18 +16,12 @@ RENDERED = "rendered-lake"  # the recording of a lap in the stand-in simulator
 
 
 class Track(NamedTuple):
-    """What the networks of one track are trained on, and how they are measured.
+    """What the networks of one track are trained on, and how they are measured."""
 
-    train       the real recording that they are trained on if nothing else is said
-    held_out    the real recording that none of them is trained on
-    speed       mph, of the laps in the stand-in simulator
-    directions  of these laps, one each
-    """
-
-    train: str
-    held_out: str
-    speed: float
-    directions: tuple[str, ...]
+    train: str  # the real recording that they are trained on if nothing else is said
+    held_out: str  # the real recording that none of them is trained on
+    speed: float  # mph, of the laps in the stand-in simulator
+    directions: tuple[str, ...]  # of these laps, one each
 
 
 TRACKS = {
@@ -37,22 +31,14 @@ TRACKS = {
 
 
 class Variant(NamedTuple):
-    """One network of the study.
+    """One network of the study."""
 
-    method      how it is trained, in words: that of networks which differ by their seed only
-    recipe      the same, in figures
-    track       key of TRACKS
-    recordings  names of the recordings that it is trained on
-    seed        of the training
-    recovers    whether its recovery is measured, too
-    """
-
-    method: str
-    recipe: Recipe
-    track: str
-    recordings: tuple[str, ...]
-    seed: int = 0
-    recovers: bool = False
+    method: str  # how it is trained, in words: that of networks which differ by their seed only
+    recipe: Recipe  # the same, in figures
+    track: str  # key of TRACKS
+    recordings: tuple[str, ...]  # names of the recordings that it is trained on
+    seed: int = 0  # of the training
+    recovers: bool = False  # whether its recovery is measured, too
 
     @property
     def name(self) -> str:
