@@ -177,17 +177,14 @@ def observe_recording(observe: Observer, folder: Path) -> Observation:
 
 
 class Part(NamedTuple):
-    """A part of a drive without an interruption; departure: when the car left the road at its end, None if it did not.
-
-    signs: float32 (n, k). blind, time, away: of the drive, (n,).
-    """
+    """A part of a drive without an interruption; blind, time, away: of the drive, (n,)."""
 
     kind: str
-    signs: np.ndarray
+    signs: np.ndarray  # float32 (n, k)
     blind: np.ndarray
     time: np.ndarray
     away: np.ndarray
-    departure: float | None
+    departure: float | None  # when the car left the road at the part's end, None if it did not
 
     @property
     def coming(self) -> np.ndarray:

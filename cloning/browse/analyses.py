@@ -133,8 +133,7 @@ class Analyses:
         """Return how far an analysis is, for the page: {"state", and "progress", "message" or the result's "stamp"}.
 
         The states are ready, running, waiting, paused, failed and, if it is not to begin now and nobody asked for it,
-        none.
-        Raises RecordingError as `stamp` does.
+        none. Raises RecordingError as `stamp` does.
         """
         job = folder, analysis
         now = job, stamp(*job)

@@ -23,19 +23,16 @@ class Haze:
 
 @dataclass(frozen=True)
 class Scenery:
-    """Everything that the cameras see.
-
-    Bonnet and body move with the car; light and tone are those of `looks.Look`; without `shade` nothing casts shadows.
-    """
+    """Everything that the cameras see; light and tone are those of `looks.Look`."""
 
     meshes: list[Mesh]
     sky: Mesh
-    bonnet: Mesh
+    bonnet: Mesh  # moves with the car, as the body does
     body: Body
     light: Light
     haze: Haze | None = None
     tone: np.ndarray | None = None
-    shade: Shade | None = None
+    shade: Shade | None = None  # without, nothing casts shadows
 
     @property
     def asphalt(self) -> Mesh:
