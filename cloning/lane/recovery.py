@@ -36,9 +36,7 @@ class LanePosition(Table):
     """The car's position in its lane, one value for each row of a recording."""
 
     lateral_offset: Column  # float32 (n,): m from the lane's centre to the car's middle, right positive
-    heading_error: (
-        Column  # float32 (n,): radians from the road's direction next to the car to the car's, right positive
-    )
+    heading_error: Column  # float32 (n,): radians from the road's direction beside the car to its own, right positive
     # bool (n,): whether these two values can be relied on: the three cameras' detections agree with each other and over
     # time, or the row is placed.
     trusted: Column
