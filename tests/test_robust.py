@@ -88,10 +88,14 @@ def test_the_lane_is_as_far_from_the_human_as_was_estimated(monkeypatch, bend, o
     assert found.steering(0.0, 0.0)[found.known] == pytest.approx(float(steering_for(bend)), abs=6e-4)
 
 
-def test_where_most_is_not_trusted_the_humans_path_is_the_lane(monkeypatch):
+def test_where_most_is_not_trusted_the_humans_path_is_the_lane_and_that_is_told(monkeypatch, capsys):
     found = lanes(monkeypatch, 0.2, offset=1.0, trusted=np.arange(N) % 2 == 0)
     assert not found.offset.any()
     assert found.steering(found.offset, found.yaw)[found.known] == pytest.approx(0.2, abs=1e-3)
+    told = f"line 1: the lane is not seen for certain; in {N} rows from here on, the driven path counts as its centre"
+    assert told in capsys.readouterr().out
+    lanes(monkeypatch, 0.2, trusted=np.arange(N) % 4 > 0)
+    assert not capsys.readouterr().out
 
 
 def test_the_lane_ahead_is_not_known_before_a_break(monkeypatch):

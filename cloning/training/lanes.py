@@ -4,7 +4,6 @@ Poses and the lane's frame are those of `cloning/lane/recovery.py`.
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -14,13 +13,15 @@ import cv2
 import numpy as np
 import torch
 
+from cloning.base.outputs import plural
 from cloning.base.table import Column, Table
 from cloning.lane.known import lane_position
 from cloning.lane.recovery import LOOKAHEAD, LaneAhead
 from cloning.network.network import CROP
+from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording
 from cloning.road.camera import CAMERA_OFFSETS, EARLIER_FRAME, camera_position
-from cloning.road.motion import AXLE_TO_CAMERA, REAR_AXLE, components, forward_vector, stretches
+from cloning.road.motion import AXLE_TO_CAMERA, MIN_TRUSTED, REAR_AXLE, components, forward_vector, stretches
 from cloning.road.warp import CroppedView, fill_ground
 from cloning.training import light
 from cloning.training.gpu import GpuViews
@@ -45,13 +46,22 @@ class Lanes(LaneAhead):
 
     @classmethod
     def of(cls, recording: Recording) -> Self:
-        """Return the lane at every row of a recording. Raises OSError, and the errors of `lane_position`."""
+        """Return the lane at every row of a recording. Raises OSError, and the errors of `lane_position`.
+
+        Where the driven path counts as the lane's centre, it is printed.
+        """
         lanes = cls.unknown(len(recording))
         if not len(lanes):  # no image is usable
             return lanes
         whole = stretches(recording)
         position = lane_position(recording, whole)
-        for stretch in itertools.chain.from_iterable(position.pieces(recording, each) for each in whole):
+        pieces = [piece for each in whole for piece in position.pieces(recording, each)]
+        if unsure := [piece for piece in pieces if position.trusted[piece.rows].mean() < MIN_TRUSTED]:
+            line, count = recording.lines[unsure[0].rows.start], plural(sum(map(len, unsure)), "row")
+            told = f"the lane is not seen for certain; in {count} from here on, the driven path counts as its centre"
+            remedy = "if it is far from it, cut them; if steering, speed or images are wrong, mend them"
+            print(f"{recording.folder / DRIVING_LOG}: line {line}: {told}: {remedy}", flush=True)
+        for stretch in pieces:
             rows, heading, driven = stretch.rows, stretch.heading, stretch.driven
             ahead = LaneAhead.of_stretch(stretch, position.lateral_offset[rows], position.trusted[rows])
             for column in fields(LaneAhead):
