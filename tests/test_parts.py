@@ -9,7 +9,7 @@ from rendered import without_files
 from cloning.lane.ahead import centre_ahead
 from cloning.lane.cuts import find_cuts
 from cloning.lane.follow import Candidate, TrackFilter, short_of_bend
-from cloning.lane.localise import localise_all, steers_against_bends
+from cloning.lane.localise import cameras_exchanged, localise_all, steers_against_bends
 from cloning.lane.parts import EXPECTED, Placing, certain_parts, unrivalled
 from cloning.lane.reader import DISTANCES_AHEAD, MOUNT_OFFSETS, fuse_detections
 from cloning.lane.recovery import MISHAP, LanePosition
@@ -250,6 +250,13 @@ def test_a_turn_that_the_steering_does_not_explain_ends_a_part(lake):
     undamaged = np.r_[np.ones(400, bool), np.zeros(40, bool), np.ones(460, bool)]
     check(offset, undamaged)
     assert np.isnan(offset[410:430]).all()
+
+
+@pytest.mark.parametrize("cameras", [[0, 2, 1], [1, 0, 2], [2, 1, 0]])
+def test_exchanged_cameras_are_told_from_where_they_see_the_lane(cameras):
+    centres = driven("jungle", 60)[1]
+    assert not cameras_exchanged(centres) and not cameras_exchanged(centres / 2)
+    assert cameras_exchanged(centres[:, cameras]) and cameras_exchanged(-centres), "mirrored"
 
 
 @pytest.mark.parametrize(("rows", "told"), [(700, True), (590, False)])

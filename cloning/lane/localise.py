@@ -36,6 +36,7 @@ LONGEST_MISHAP = 300  # rows: more are another road
 MAX_DIFFERENCE = 0.15  # m, mean: positions by two networks that differ less agree
 # Smoothed over 2 s, steering and bends correlate by 0.83 to 0.95 in 400 rows of two real and two rendered drives.
 AGAINST, AGAINST_ROWS, AGAINST_SMOOTHING = -0.6, 600, 31
+OUT_OF_ORDER = 0.3  # m: in the real recordings, each camera sees the lane 0.7 to 0.9 m beside the next one
 LINE_ROUNDS = 3  # in each, the painted line is expected where the one before found it
 
 Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
@@ -151,6 +152,15 @@ def steers_against_bends(recording: Recording, centres: np.ndarray) -> bool:
     return bool(((steering - steering.mean()) * (bends - bends.mean())).mean() < AGAINST * deviations)
 
 
+def cameras_exchanged(centres: np.ndarray) -> bool:
+    """Return whether the cameras certainly have other names: from further left, the lane is further to the right.
+
+    centres: float32 (n, 3, 5): of `reader.detect_centres`.
+    """
+    centre, left, right = centres[..., :2].mean((0, 2))
+    return bool(max(right - centre, centre - left) > OUT_OF_ORDER)
+
+
 def shipped_networks() -> Iterator[LaneNetwork]:
     """Yield the networks that come with the project: for the known tracks, then for any road. Raises ModelError."""
     return map(load_network, (None, ANY_ROAD_WEIGHTS))
@@ -162,14 +172,18 @@ def estimate_lane_position(
     """Estimate the position in the lane at every row of a recording, as `localise_recording` does.
 
     stretches: of the recording, `motion.stretches`; network: to use instead of the two that come with the project.
-    If the steering's sign is certainly wrong, it is printed. Raises RecordingError for images that can't be read,
-    ModelError without a usable network.
+    If the steering's sign or the cameras' order is certainly wrong, it is printed. Raises RecordingError for images
+    that can't be read, ModelError without a usable network.
     """
     strips = read_strips(recording)
     networks = [network] if network else list(shipped_networks())
     detect = functools.cache(functools.partial(estimate_centres, strips))
     position, localised = localise_recording(recording, stretches, detect, strips.__getitem__, networks)
+    log = recording.folder / DRIVING_LOG
     if not localised and steers_against_bends(recording, detect(networks[-1])):
         against = "the car steers left where the cameras see the road bend to the right, and vice versa"
-        print(f"{recording.folder / DRIVING_LOG}: {against}: is right positive, is no image mirrored?", flush=True)
+        print(f"{log}: {against}: is right positive, is no image mirrored?", flush=True)
+    if len(recording) and cameras_exchanged(detect(networks[0])):
+        exchanged = "the cameras do not see the lane as from the car's left, centre and right"
+        print(f"{log}: {exchanged}: has each image the name of its camera, is none mirrored?", flush=True)
     return position
