@@ -22,7 +22,6 @@ if sys.hexversion < 0x30B0000:  # told before all that an older one does not und
 import _signal as signal  # type: ignore[import-not-found]  # `signal` loads for 3 ms, and `typing` for 5
 import atexit
 import gc
-import io
 import time
 
 TYPE_CHECKING = False
@@ -139,6 +138,7 @@ def run(main: Callable[[], int | None]) -> NoReturn:
     Its UserError or OSError is told by `failed`. Characters that stdout cannot show, such as undecodable bytes of a
     file's name, are printed as escapes there. What is printed to a stream that was closed before (`>&-`) is lost.
     """
+    import io  # not at the top: Python 3.14 has not loaded it already
     from contextlib import suppress
 
     gc.freeze()  # what is loaded stays: each search through it would halt all threads for 0.1 s
