@@ -106,12 +106,12 @@ def test_what_a_hairpin_hides_does_not_count_against_the_track():
 
 @pytest.fixture(scope="module")
 def lake():
-    return driven("lake", 900)
+    return driven("lake", 640)
 
 
 def test_a_car_that_is_stuck_costs_its_own_rows(lake):
     """At full lock with wheels spinning, at the start and in the middle; nothing else is lost."""
-    order = np.r_[np.zeros(40, int), 0:450, np.full(50, 449), 450:900]
+    order = np.r_[np.zeros(40, int), 0:320, np.full(50, 319), 320:640]
     undamaged = np.diff(order, prepend=-1) != 0
     undamaged[:41] = np.arange(41) == 40
     recording = lake[0].take(order, time=np.arange(len(order)) * PAUSE)
@@ -120,7 +120,7 @@ def test_a_car_that_is_stuck_costs_its_own_rows(lake):
 
 
 def test_a_car_that_is_somewhere_else_at_once_is_found_there(lake):
-    order = np.r_[0:400, 370:600, 615:900]  # pushed back by 24 m, and on by 12 m
+    order = np.r_[0:330, 300:500, 515:640]  # pushed back by 24 m, and on by 12 m
     check(placed(lake[0].take(order, time=np.arange(len(order)) * PAUSE), lake[1][order]), np.ones(len(order), bool))
 
 
@@ -155,30 +155,30 @@ def plain(brightness):
     return lambda rows: np.tile(brightness[rows, None, None, None, None], (1, 3, 32, 160, 3))
 
 
-@pytest.mark.parametrize(("rows", "pause"), [(350, PAUSE), (70, 2.0)])
+@pytest.mark.parametrize(("rows", "pause"), [(250, PAUSE), (70, 2.0)])
 def test_no_row_of_another_road_is_taken_for_the_track(lake, rows, pause):
     """It begins and ends in the midst of a recording of the track, in another light."""
     track = Track("road-9")
     other, seen = driven("road-9", rows, start=track.step * np.abs(track.curvature).argmax() - 30)  # a bend
-    recordings = (lake[0].take(slice(0, 450)), other, lake[0].take(slice(450, 900)))
-    pauses = np.full(900 + rows, PAUSE)
-    pauses[[450, 450 + rows]] = pause
+    recordings = (lake[0].take(slice(0, 320)), other, lake[0].take(slice(320, 640)))
+    pauses = np.full(640 + rows, PAUSE)
+    pauses[[320, 320 + rows]] = pause
     recording = Recording.joined(recordings, time=np.cumsum(pauses))
-    foreign = np.zeros(900 + rows, bool)
-    foreign[450 : 450 + rows] = True
+    foreign = np.zeros(640 + rows, bool)
+    foreign[320 : 320 + rows] = True
     strips = plain(np.where(foreign, 90, 60).astype(np.uint8))
-    centres = np.concatenate([lake[1][:450], seen, lake[1][450:]])
+    centres = np.concatenate([lake[1][:320], seen, lake[1][320:]])
     offset = offset_of(len(recording), localise_all(recording, stretches(recording), centres, strips))
-    assert np.isnan(offset[foreign]).all()  # without the cut in the frames, 59 rows of 350 were taken for the lake
+    assert np.isnan(offset[foreign]).all()  # without the cut in the frames, some were taken for the lake
     check(offset, ~foreign)
 
 
-@pytest.mark.parametrize(("rows", "unlike"), [(70, slice(0)), (250, slice(530, 700))])
+@pytest.mark.parametrize(("rows", "unlike"), [(70, slice(0)), (250, slice(400, 570))])
 def test_a_stretch_that_fits_only_where_the_part_before_it_ends_is_another_road(lake, rows, unlike):
     """From the end of 70 rows there was no time to come back to where the lake goes on; of 250 only the start fits."""
-    recording, centres = pieces(lake, np.r_[0:450], np.r_[477 : 477 + rows], np.r_[450:900], pause=2.0)
+    recording, centres = pieces(lake, np.r_[0:320], np.r_[347 : 347 + rows], np.r_[320:640], pause=2.0)
     centres[unlike] = np.random.default_rng(1).uniform(-4, 4, centres[unlike].shape)
-    foreign = np.r_[np.zeros(450, bool), np.ones(rows, bool), np.zeros(450, bool)]
+    foreign = np.r_[np.zeros(320, bool), np.ones(rows, bool), np.zeros(320, bool)]
     offset = placed(recording, centres)
     assert np.isnan(offset[foreign]).all()
     check(offset, ~foreign)
@@ -247,7 +247,7 @@ def test_a_turn_that_the_steering_does_not_explain_ends_a_part(lake):
     steering[400:440] += 0.15
     recording = lake[0].take(slice(None), steering=steering)
     offset = placed(recording, centres)
-    undamaged = np.r_[np.ones(400, bool), np.zeros(40, bool), np.ones(460, bool)]
+    undamaged = np.r_[np.ones(400, bool), np.zeros(40, bool), np.ones(200, bool)]
     check(offset, undamaged)
     assert np.isnan(offset[410:430]).all()
 
@@ -288,11 +288,11 @@ def test_frames_of_nothing_cost_their_own_rows_which_belong_to_no_piece(lake):
     """And the rows before and after them are two."""
     recording, centres = lake
     centres = centres.copy()
-    centres[400:460] = np.random.default_rng(1).uniform(-4, 4, centres[400:460].shape)
-    parts = list(localise_all(recording, stretches(recording), centres, plain(np.zeros(900, np.uint8))))
-    offset = offset_of(900, parts)
-    check(offset, np.r_[np.ones(400, bool), np.zeros(60, bool), np.ones(440, bool)])
-    assert np.isnan(offset[410:450]).all()
+    centres[300:360] = np.random.default_rng(1).uniform(-4, 4, centres[300:360].shape)
+    parts = list(localise_all(recording, stretches(recording), centres, plain(np.zeros(640, np.uint8))))
+    offset = offset_of(640, parts)
+    check(offset, np.r_[np.ones(300, bool), np.zeros(60, bool), np.ones(280, bool)])
+    assert np.isnan(offset[310:350]).all()
     position = fuse_detections(recording, centres)
     assert isinstance(position, LanePosition) and not position.placed.any() and not position.piece.any()
     for number, (rows, _) in enumerate(parts, 1):
