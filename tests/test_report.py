@@ -200,10 +200,11 @@ def test_what_cannot_be_shown_of_the_recordings_is_named_and_those_with_the_same
 
 
 def test_a_recording_is_said_to_be_held_out_only_if_all_that_the_network_learned_from_is_known(
-    written, sample_recording, tmp_path
+    written, sample_recording, tmp_path, monkeypatch
 ):
+    monkeypatch.setattr("cloning.report.content.LIMITS", (1.0,))  # half of the drives
     copy, same = (shutil.copytree(each, tmp_path / each.name) for each in (written, sample_recording))
-    other = render_recording(tmp_path / "other", rows=60, seed=1)
+    other = render_recording(tmp_path / "other", rows=40, seed=1)
     arguments = json.loads((copy / "training_arguments.json").read_bytes())
     unsure = "it may have been trained on"
     for run, words in ({}, "was held out"), ({"from_model": "a.pt"}, unsure), ({"recordings": ["moved"]}, unsure):
