@@ -19,7 +19,7 @@ import warm
 from cloning.base import program
 
 ROOT = Path(__file__).parent.parent
-SHORT = ("--epochs", 2, "--samples-per-epoch", 150, "--batch-size", 8, "--device", "cpu")
+SHORT = ("--epochs", 2, "--samples-per-epoch", 80, "--batch-size", 8, "--device", "cpu")
 TINY = ("--epochs", 1, "--samples-per-epoch", 16, "--batch-size", 8, "--device", "cpu")
 PICTURE = cv2.imencode(".png", np.zeros((100, 160, 3), np.uint8))[1].tobytes()  # for one that takes 0.2 s to draw
 HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from another folder

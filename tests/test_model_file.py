@@ -1,14 +1,16 @@
-"""The model file: what driving needs is in it, damage and what was changed are noticed, and no code in it is run."""
+"""Model files and states of a run: they are whole, damage and changes are noticed, and no code in them is run."""
 
 import copy
 import random
 import re
+import shutil
 import zipfile
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from commands import TINY, edited, finished_run, run_here
 
 from cloning.base.errors import ModelError
 from cloning.network import tensors
@@ -208,3 +210,83 @@ def test_code_in_a_model_file_is_not_run(tmp_path):
     torch.save({"format": "behavioral-cloning", "version": 1, "network": Trap()}, tmp_path / "model.pt")
     refused(tmp_path / "model.pt", "damaged")
     assert not (tmp_path / "sprung").exists()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The state of a run, which --resume continues
+
+
+@pytest.fixture(scope="module")
+def one_epoch(sample_recording, tmp_path_factory):
+    return finished_run(sample_recording, tmp_path_factory.mktemp("one epoch"), *TINY)[1]
+
+
+@pytest.fixture
+def begun(one_epoch, tmp_path):
+    """The folder of a run of one epoch, that a test may change."""
+    return shutil.copytree(one_epoch, tmp_path / "begun")
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def set_average(name, value):
+    return lambda saved: saved["training"]["optimizer"]["state"][3].__setitem__(name, value)
+
+
+def set_position(name, value):
+    return lambda saved: saved["training"].__setitem__(name, value)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (set_average("exp_avg", torch.full((36,), torch.nan)), "exp_avg contains numbers that are not finite"),
+        (set_average("exp_avg_sq", torch.zeros(35)), "exp_avg_sq is a tensor (35,)"),
+        (set_average("step", 3.0), "step is 3.0"),
+        (lambda saved: saved["training"].pop("optimizer"), "optimizer's state"),
+        (set_position("optimizer", {"state": {}}), "optimizer's state"),
+        (set_position("number", -1), "number is -1"),
+        (set_position("images", "4"), "images is '4'"),
+        (set_position("fingerprint", torch.zeros(2)), "other recordings"),
+        (lambda saved: saved.update(training=3), "no state"),
+        (lambda saved: saved.update(history=[1]), "history"),
+        (lambda saved: saved["history"][0].update(val_loss="low"), "val_loss is 'low'"),
+        (lambda saved: saved["history"][0].pop("images"), "history"),
+        (lambda saved: saved.update(run=[1]), "identifier"),
+        (lambda saved: saved.update(arguments=None), "no arguments"),
+        (lambda saved: saved["arguments"]["recipe"].update(batch_size="8"), "--batch-size is of type str"),
+        (lambda saved: saved["arguments"].update(recordings=[1]), "--recordings is of type list"),
+        (lambda saved: saved["arguments"]["recipe"].update(optimizer="sgd"), "optimizer is 'sgd', not adam or muon"),
+        (lambda saved: saved["arguments"]["recipe"].update(turn=(0.2,)), "turn is (0.2,), not 2 numbers"),
+        (lambda saved: saved["arguments"]["recipe"].update(views="Others"), "views is 'Others', not CameraViews"),
+        (lambda saved: saved["arguments"]["recipe"].update(name="mine"), "recipe is 'mine', not report or robust"),
+        (lambda saved: saved["arguments"].pop("recipe") and saved["arguments"].update(loss="cubed"), "loss is 'cubed'"),
+        (lambda saved: saved.update(layers="other"), "layers are 'other', not nvidia"),
+        (lambda saved: saved["recipe"].update(crop=(61, 24)), "its preprocessing is not"),
+        (lambda saved: saved["recipe"].update(scale=0), "scale 0"),
+        (lambda saved: saved["network"].update({"dense.3.bias": torch.full((1,), torch.inf)}), "not finite"),
+    ],
+)
+def test_an_unusable_state_is_named(begun, change, words):
+    path = begun / "model-resume.pt"
+    with edited(path) as saved:
+        change(saved)
+    before = contents(begun)
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    assert done.returncode == 2
+    assert f"model.py: {path}: " in done.stderr and words in done.stderr, done.stderr
+    assert "new run without --resume" in done.stderr
+    assert contents(begun) == before
+
+
+def test_a_flipped_bit_in_the_optimizers_state_is_noticed(begun):
+    path = begun / "model-resume.pt"
+    data = bytearray(path.read_bytes())
+    average = torch.load(path, weights_only=True)["training"]["optimizer"]["state"][10]["exp_avg"]
+    data[data.find(average.numpy().tobytes()) + 1000] ^= 4
+    path.write_bytes(data)
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    assert done.returncode == 2
+    assert f"{path}: " in done.stderr and "checksum" in done.stderr and "new run without --resume" in done.stderr

@@ -46,7 +46,7 @@ def test_what_a_run_prints(finished, sample_recording):
     assert sum(line.startswith("Epoch ") for line in lines) == 2
     epochs = [line for line in lines if "val_loss" in line]
     assert len(epochs) == 2
-    assert all(re.match(r"1[5-9]\d images \[={30}\] - \d+s - loss: ", line) for line in epochs)
+    assert all(re.match(r"[89]\d images \[={30}\] - \d+s - loss: ", line) for line in epochs)
     assert any("steer 0" in line and "model-best.pt" in line for line in lines)
     assert "nan" not in finished[0].stdout
     assert lines[-2] == f"next: python drive.py {finished[1] / 'model.pt'}"
@@ -125,7 +125,7 @@ def test_what_a_run_leaves(finished):
     assert {path.name for path in folder.iterdir()} == models | figures
     rows = log(folder)
     assert [row["epoch"] for row in rows] == ["1", "2"]
-    assert all(int(row["images"]) >= 150 and float(row["loss"]) > 0 < float(row["val_loss"]) for row in rows)
+    assert all(int(row["images"]) >= 80 and float(row["loss"]) > 0 < float(row["val_loss"]) for row in rows)
     assert json.loads((folder / "training_arguments.json").read_text(encoding="utf-8"))["recipe"]["batch_size"] == 8
     saved = torch.load(folder / "model.pt", weights_only=True)
     assert [row["epoch"] for row in saved["history"]] == [1, 2]
@@ -347,7 +347,7 @@ TORCHRUN.append(str(ROOT / "model.py"))
 
 
 def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
-    """Adam moves a weight by up to 1e-4 a step, of which there were 12 or more."""
+    """Adam moves a weight by up to 1e-4 a step, of which there were 6 or more."""
     a, b = weights(one), weights(other)
     for name in a:
         assert (a[name] - b[name]).abs().mean() < 2e-6
