@@ -1,17 +1,20 @@
-"""The optimizers against torch's."""
+"""The optimizers against torch's, and the learning rate from a run's first step to its last."""
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
+import model
 from cloning.base.errors import ModelError
 from cloning.network.network import Network
-from cloning.training.checkpoint import Checkpoint
+from cloning.training.checkpoint import Checkpoint, Progress
 from cloning.training.optimizers import Adam, Muon, orthogonal
 from cloning.training.options import Process, Run
-from model import REPORT
+from model import REPORT, ROBUST
 
 
 class LargeNetwork(Network):
@@ -133,3 +136,29 @@ def test_weights_move_as_with_torchs_muon_and_biases_as_with_adam():
     assert (moved - expected).norm() < 0.05 * expected.norm()  # torch's computes in bfloat16
     assert torch.equal(ours[0].bias, torchs[0].bias)
     assert all(map(torch.equal, ours[1].parameters(), torchs[1].parameters()))
+
+
+@pytest.mark.parametrize("recipe, begins", [(REPORT, 1e-4), (ROBUST, 4e-3)], ids=["report", "robust"])
+def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
+    sample_recording, tmp_path, monkeypatch, recipe, begins
+):
+    rates: list[float] = []  # of the steps
+    done: list[float] = []  # the share of the run that is finished before each
+    step, share = Adam.step, Progress.done
+
+    def noted_step(optimizer, rate):
+        rates.append(rate)
+        step(optimizer, rate)
+
+    def noted_share(progress, recipe):
+        done.append(share(progress, recipe))
+        return done[-1]
+
+    monkeypatch.setattr(Adam, "step", noted_step)
+    monkeypatch.setattr(Progress, "done", noted_share)
+    short = replace(recipe, epochs=2, samples_per_epoch=150, batch_size=8)
+    assert model.train(short, [sample_recording], tmp_path / "model.pt", device="cpu") == 0
+    expected = begins * (1 + np.cos(np.pi * np.array(done))) / 2 if recipe is ROBUST else np.full(len(done), begins)
+    np.testing.assert_allclose(rates, expected, rtol=1e-9)
+    assert len(rates) > 8 and done[0] == 0 and 0.8 < done[-1] < 1
+    assert np.diff(done).min() > 0 and np.median(np.diff(done)) == pytest.approx(29 / 300, rel=0.2)  # of images

@@ -2,13 +2,18 @@
 
 import math
 import os
+import random
+import re
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
+from test_recordings import NUMBERS as PLAIN
+from test_recordings import SPACED, usual
 
 from cloning.base.errors import RecordingError
+from cloning.recordings import rows
 from cloning.recordings.log import read_recording
 
 CAMERAS = ("center", "left", "right")
@@ -179,3 +184,30 @@ def test_no_number_is_ever_silently_wrong(folder, file):
         assert line in truth, f"line {line} is no row"
         assert [recording.name(row, camera) for camera in range(3)] == truth[line][0], f"line {line}"
         np.testing.assert_allclose(numbers[row], truth[line][1], rtol=1e-6, atol=1e-9, err_msg=f"line {line}")
+
+
+def test_plain_rows_are_read_as_all_others(folder, monkeypatch):
+    """Lines with other characters are read in the same way with and without the fast path."""
+    rng = random.Random(0)
+    odd = [*' ",;\t._-+/\\eE0123456789acJ%\0\x0b\xa0\u0660\ufeff\udcff', ".jpg", "1_0", "nan", "1e400", "True", "-0"]
+
+    def outcome(content: bytes) -> tuple:
+        (folder / "driving_log.csv").write_bytes(content)
+        try:
+            found = read_recording(folder)
+        except RecordingError as error:
+            return (str(error),)
+        names = [found.path(row, camera) for row in range(len(found)) for camera in range(3)]
+        columns = [getattr(found, name).tobytes() for name in NUMBERS]
+        return names, columns, found.lines.tolist(), found.repairs, found.rejected
+
+    for _ in range(500):
+        line = rng.choice(usual(rng.choice(["", "IMG/", "C:\\a b\\", " /IMG/"]), rng.choice([PLAIN, SPACED])))
+        for _ in range(rng.randrange(3)):
+            at = rng.randrange(len(line))
+            line = line[:at] + rng.choice(odd) + line[at + rng.randrange(3) :]
+        content = "\n".join([*usual(first=10), line, *usual(first=20)]).encode(errors="surrogateescape")
+        fast = outcome(content)
+        with monkeypatch.context() as patch:
+            patch.setattr(rows, "PLAIN_ROW", re.compile("(?!)"))
+            assert outcome(content) == fast, line

@@ -12,7 +12,6 @@ import time
 from pathlib import Path
 from unittest.mock import patch
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ import warm
 from commands import ROOT
 from drive_process import serving
 from matplotlib.axes import Axes
-from rendered import render_recording
+from rendered import film_of, render_recording
 
 from cloning.base.errors import SimulatorError
 from cloning.lane.recovery import MISHAP, LanePosition
@@ -221,7 +220,7 @@ def test_the_command_gives_the_same_figures_over_the_wire(sample_recording, mode
     assert oracle["autonomy_percent"] == 100 and oracle["distance_mean_m"] == pytest.approx(0.11, abs=0.03)
     assert f"driven): autonomy 100.0 %, 0 interventions; distance: mean {oracle['distance_mean_m']:.2f} m" in alone
     assert (tmp_path / "way.png").read_bytes()[:4] == b"\x89PNG"
-    assert film_widths(tmp_path / "seen.mp4") == [1280] * 60
+    assert [frame.shape[1] for frame in film_of(tmp_path / "seen.mp4")[1]] == [1280] * 60
 
 
 def test_the_film_runs_at_the_recordings_own_rate(recording, tmp_path):
@@ -231,8 +230,7 @@ def test_the_film_runs_at_the_recordings_own_rate(recording, tmp_path):
     film.add(np.zeros((298, 1280, 3), np.uint8))
     film.begin(recording.take(slice(None), time=recording.time * 2))  # of another recording: the film has its rate
     film.close()
-    shown = av.open(str(tmp_path / "seen.mp4")).streams.video[0].average_rate
-    assert shown and 1 / float(shown) == pytest.approx(np.diff(recording.time).mean(), rel=1e-3)
+    assert 1 / film_of(tmp_path / "seen.mp4")[0] == pytest.approx(np.diff(recording.time).mean(), rel=1e-3)
 
 
 def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model_file, capsys):
@@ -246,7 +244,7 @@ def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model_fil
     assert "2 m, from the recorded driver's path: autonomy" in printed and "0.0 % of the rows" in printed
     limits = list(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"])
     assert limits == ["2", "1"], "one given twice counts once"
-    assert film_widths(tmp_path / "x.mp4") == [1280] * 60, "one drive writes the film"
+    assert [frame.shape[1] for frame in film_of(tmp_path / "x.mp4")[1]] == [1280] * 60, "one drive writes the film"
 
 
 @pytest.mark.parametrize("crop", [CROP, (85, 0)])
@@ -326,11 +324,6 @@ def test_what_cannot_be_replayed_is_left_out_of_the_others_report(sample_recordi
     assert sorted(path.name for path in tmp_path.glob("*.png")) == ["way-a-lake.png", "way-b-lake.png"]
 
 
-def film_widths(path) -> list[int]:
-    """The widths of its frames."""
-    return [frame.width for frame in av.open(str(path)).decode(video=0)]
-
-
 def test_a_full_disk_costs_the_film_alone(sample_recording, model_file, tmp_path, capsys, longest_file):
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json", "--picture", tmp_path / "p.png"
     options = "--reference", "human", sample_recording, "--model", model_file, "--limit", "2", *outputs
@@ -342,10 +335,6 @@ def test_a_full_disk_costs_the_film_alone(sample_recording, model_file, tmp_path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["p.png", "r.json"]
     assert "autonomy" in printed.out
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))[0]["limits"]["2"]
-
-
-def kill_itself():
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def fail():
@@ -362,7 +351,7 @@ def interrupt():
     ("at_fault", "message", "here"),
     [
         (fail, "not finite", False),
-        (kill_itself, "was killed", False),
+        (lambda: os.kill(os.getpid(), signal.SIGKILL), "was killed", False),
         (fail, "not finite", True),
         (interrupt, None, True),
     ],

@@ -10,7 +10,6 @@ import torch
 from commands import SHORT, begun_training, edited, finished_run, run_here, same, started_run, weights
 from rendered import render_recording, without_files
 
-import model
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.browse import analyse
 from cloning.lane import recovery
@@ -22,12 +21,11 @@ from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curva
 from cloning.road.warp import ground_mask, with_alpha
 from cloning.training import lanes as lanes_module
 from cloning.training import light
-from cloning.training.checkpoint import Progress
 from cloning.training.lanes import Lanes, Poses
 from cloning.training.observations import Observations
 from cloning.training.optimizers import Adam
 from cloning.training.robust import PoseViews, sample_bends_more, select_known_lane
-from model import REPORT, ROBUST
+from model import ROBUST
 
 N, SPEED = 300, 20.0  # rows; mph
 
@@ -233,32 +231,6 @@ def test_a_robust_run_of_an_earlier_version_goes_on_as_it_began(finished, tmp_pa
     recipe = after["arguments"]["recipe"]
     assert [recipe[name] for name in ("name", "optimizer", "momentum", "huber")] == ["robust", "adam", 0.9, None]
     assert all("exp_avg_sq" in state for state in after["training"]["optimizer"]["state"].values())
-
-
-@pytest.mark.parametrize("recipe, begins", [(REPORT, 1e-4), (ROBUST, 4e-3)], ids=["report", "robust"])
-def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
-    sample_recording, tmp_path, monkeypatch, recipe, begins
-):
-    rates: list[float] = []  # of the steps
-    done: list[float] = []  # the share of the run that is finished before each
-    step, share = Adam.step, Progress.done
-
-    def noted_step(optimizer, rate):
-        rates.append(rate)
-        step(optimizer, rate)
-
-    def noted_share(progress, recipe):
-        done.append(share(progress, recipe))
-        return done[-1]
-
-    monkeypatch.setattr(Adam, "step", noted_step)
-    monkeypatch.setattr(Progress, "done", noted_share)
-    short = replace(recipe, epochs=2, samples_per_epoch=150, batch_size=8)
-    assert model.train(short, [sample_recording], tmp_path / "model.pt", device="cpu") == 0
-    expected = begins * (1 + np.cos(np.pi * np.array(done))) / 2 if recipe is ROBUST else np.full(len(done), begins)
-    np.testing.assert_allclose(rates, expected, rtol=1e-9)
-    assert len(rates) > 8 and done[0] == 0 and 0.8 < done[-1] < 1
-    assert np.diff(done).min() > 0 and np.median(np.diff(done)) == pytest.approx(29 / 300, rel=0.2)  # of images
 
 
 def test_validation_counts_centre_images_and_other_poses_alike(sample_recording, tmp_path):
