@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from commands import TINY, edited, finished_run, run_here
+from commands import edited, run_here
 
 from cloning.base.errors import ModelError
 from cloning.network import tensors
@@ -216,15 +216,10 @@ def test_code_in_a_model_file_is_not_run(tmp_path):
 # The state of a run, which --resume continues
 
 
-@pytest.fixture(scope="module")
-def one_epoch(sample_recording, tmp_path_factory):
-    return finished_run(sample_recording, tmp_path_factory.mktemp("one epoch"), *TINY)[1]
-
-
 @pytest.fixture
-def begun(one_epoch, tmp_path):
-    """The folder of a run of one epoch, that a test may change."""
-    return shutil.copytree(one_epoch, tmp_path / "begun")
+def begun(finished, tmp_path):
+    """The folder of a run of two epochs, that a test may change."""
+    return shutil.copytree(finished[1], tmp_path / "begun")
 
 
 def contents(folder):
@@ -274,7 +269,7 @@ def test_an_unusable_state_is_named(begun, change, words):
     with edited(path) as saved:
         change(saved)
     before = contents(begun)
-    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 3)
     assert done.returncode == 2
     assert f"model.py: {path}: " in done.stderr and words in done.stderr, done.stderr
     assert "new run without --resume" in done.stderr
@@ -287,6 +282,6 @@ def test_a_flipped_bit_in_the_optimizers_state_is_noticed(begun):
     average = torch.load(path, weights_only=True)["training"]["optimizer"]["state"][10]["exp_avg"]
     data[data.find(average.numpy().tobytes()) + 1000] ^= 4
     path.write_bytes(data)
-    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 3)
     assert done.returncode == 2
     assert f"{path}: " in done.stderr and "checksum" in done.stderr and "new run without --resume" in done.stderr
