@@ -19,6 +19,7 @@ from drive_process import ask, awaited, live, serving
 import drive
 from cloning.base.errors import UserError
 from cloning.server import page
+from cloning.server import server as server_module
 from cloning.server.connections import MAX_CONNECTIONS
 from cloning.server.libraries import engineio, eventlet
 from cloning.server.server import HASTE, MAX_CLIENTS, MAX_UNANSWERED, QUIET, Client, Server
@@ -241,6 +242,24 @@ def test_a_message_that_arrives_while_another_is_handled_goes_before_hasty_ones(
         for thread in (*threads, arriving):
             thread.wait()
     assert turns.served == ["hasty", "patient", "hasty too"]
+
+
+def test_pings_take_no_turn(monkeypatch):
+    """Those of a client that sends nothing else kept a car waiting for seconds."""
+    turns, pongs = Turns(), list[str]()
+    turns.add("pings", 1.0, waited=False)
+    turns.add("car", 1.0, waited=True)
+    pings = SimpleNamespace(receive=lambda: eventlet.sleep(0) or "2", send=pongs.append, waited=False, parts=[])
+    monkeypatch.setattr(server_module, "WebSocket", lambda _: pings)
+    client = turns.engine.sockets["pings"]
+    client.waits = False
+    client.queue.put(engineio.packet.Packet(engineio.packet.OPEN))
+    pinging = eventlet.spawn(client._serve, SimpleNamespace(socket=None))
+    while len(pongs) < 10:
+        eventlet.sleep(0)
+    with eventlet.Timeout(10):
+        turns.serve("car")
+    pinging.kill()
 
 
 @pytest.mark.parametrize("early", [False, True])

@@ -80,7 +80,7 @@ class Client(engineio.socket.Socket):
                 self.send(engineio.packet.Packet(engineio.packet.PING))
             if text:
                 self._handle(text)
-                self.served = self.server.served = time.perf_counter()
+                self.served = time.perf_counter()
             elif now > self.served + PING_INTERVAL + PONG_TIMEOUT:
                 break
 
@@ -90,6 +90,7 @@ class Client(engineio.socket.Socket):
         elif text[0] in PACKET_TYPES:  # without: a text that begins with no digit ends the session
             self._take_turn()
             self.receive(engineio.packet.Packet(encoded_packet=UNREADABLE_TEXT if text[:2] in BINARY else text))
+            self.server.served = time.perf_counter()
 
     def _take_turn(self) -> None:
         """Wait while another client with an earlier turn has sent a message, or its beginning just now.
@@ -136,7 +137,7 @@ class Engine(engineio.Server):
         super().__init__(*args, **options)
         engineio.socket.Socket = make_session  # which python-engineio calls for each session of any server
         self.opening = eventlet.semaphore.Semaphore()
-        self.served = time.perf_counter()  # when a message was handled last
+        self.served = time.perf_counter()  # when a client had its turn last
 
     def handle_request(self, environ: WSGIEnvironment, start_response: StartResponse) -> Any:
         """Serve a client until its websocket ends, or tell it why not."""
