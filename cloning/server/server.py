@@ -95,8 +95,8 @@ class Client(engineio.socket.Socket):
     def _take_turn(self) -> None:
         """Wait while another client with an earlier turn has sent a message, or its beginning just now.
 
-        So a car that waits for its answer goes before those that send without waiting. Without: 35 ms beside three such
-        cars instead of 14.
+        So a car that waits for its answer goes before those that send without waiting. Without: a round trip of 24 ms
+        beside three such cars instead of 9, in the median.
         """
         self.waits, seen, others = True, 0.0, self.server.sockets.values()
         while seen < self.server.served or any(each.turn() < self.turn() and each.has_message() for each in others):
