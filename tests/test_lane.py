@@ -5,6 +5,7 @@ Thresholds are about 1.25 times what was measured with bfloat16; with float32 th
 
 import copy
 import re
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -37,6 +38,7 @@ from cloning.lane.recovery import LanePosition
 from cloning.lane.search import MIN_LOG_LIKELIHOOD, Localisation
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
+from cloning.recordings.images import read_frame
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
 from cloning.road.motion import REAR_AXLE, stretches
@@ -224,6 +226,19 @@ def test_noise_is_an_unknown_road(copied):
     for path in (copied / "IMG").iterdir():
         cv2.imwrite(str(path), rng.integers(0, 256, (160, 320, 3)).astype(np.uint8))
     assert not estimate_lane_position(recording, stretches(recording)).trusted.any()
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+@pytest.mark.parametrize("real", [False, *real_recordings.FOLDERS], ids=str)
+def test_images_with_red_and_blue_exchanged_are_told(drive, real, exchanged, tmp_path, capsys):
+    recording = (read_recording(real) if real else drive[0]).take(slice(None, None, 10))
+    changed = replace(recording, folder=tmp_path)
+    (tmp_path / "IMG").mkdir()
+    for row, camera in np.ndindex(len(recording), 3):
+        image = read_frame(recording.path(row, camera))  # RGB
+        cv2.imwrite(str(changed.path(row, camera)), image if exchanged else image[..., ::-1])
+    estimate_lane_position(changed, [])
+    assert ("red and blue exchanged" in capsys.readouterr().out) == exchanged
 
 
 @pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)

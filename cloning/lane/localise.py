@@ -18,6 +18,7 @@ from cloning.lane.follow import Candidate, TrackFilter
 from cloning.lane.parts import certain_parts
 from cloning.lane.reader import (
     ANY_ROAD_WEIGHTS,
+    MOUNT_OFFSETS,
     LaneNetwork,
     estimate_centres,
     fuse_detections,
@@ -37,6 +38,10 @@ MAX_DIFFERENCE = 0.15  # m, mean: positions by two networks that differ less agr
 # Smoothed over 2 s, steering and bends correlate by 0.83 to 0.95 in 400 rows of two real and two rendered drives.
 AGAINST, AGAINST_ROWS, AGAINST_SMOOTHING = -0.6, 600, 31
 OUT_OF_ORDER = 0.3  # m: in the real recordings, each camera sees the lane 0.7 to 0.9 m beside the next one
+SAMPLE = 50  # rows from which exchanged colours are told
+# m, mean, between the cameras. In 200 rows of real recordings it is 0.03 to 0.16, and with red and blue exchanged more
+# than twice that and 0.24 or more; in rendered ones up to 0.21, and at least 0.65 times as much with them exchanged.
+COLOUR_ERROR = 0.2
 LINE_ROUNDS = 3  # in each, the painted line is expected where the one before found it
 
 Strips = Callable[[slice], np.ndarray]  # returns those of the three cameras in rows of a recording, as `read_strips`
@@ -161,6 +166,18 @@ def cameras_exchanged(centres: np.ndarray) -> bool:
     return bool(max(right - centre, centre - left) > OUT_OF_ORDER)
 
 
+def colours_exchanged(strips: np.ndarray, network: LaneNetwork) -> bool:
+    """Return whether red and blue certainly are exchanged: only exchanged again, the cameras see the lane alike.
+
+    strips: uint8 (n, 3, 32, 160, 3), of `reader.read_strips`.
+    """
+    errors = []
+    for seen in (strips, np.ascontiguousarray(strips[..., ::-1])):
+        near = estimate_centres(seen, network)[..., :2] + MOUNT_OFFSETS[:, None]
+        errors.append(np.abs(near[:, 1:] - near[:, :1]).mean())
+    return bool(errors[0] > max(COLOUR_ERROR, 2 * errors[1]))
+
+
 def shipped_networks() -> Iterator[LaneNetwork]:
     """Yield the networks that come with the project: for the known tracks, then for any road. Raises ModelError."""
     return map(load_network, (None, ANY_ROAD_WEIGHTS))
@@ -172,8 +189,8 @@ def estimate_lane_position(
     """Estimate the position in the lane at every row of a recording, as `localise_recording` does.
 
     stretches: of the recording, `motion.stretches`; network: to use instead of the two that come with the project.
-    If the steering's sign or the cameras' order is certainly wrong, it is printed. Raises RecordingError for images
-    that can't be read, ModelError without a usable network.
+    If the steering's sign, the cameras' order or the colours are certainly wrong, it is printed. Raises RecordingError
+    for images that can't be read, ModelError without a usable network.
     """
     strips = read_strips(recording)
     networks = [network] if network else list(shipped_networks())
@@ -183,7 +200,12 @@ def estimate_lane_position(
     if not localised and steers_against_bends(recording, detect(networks[-1])):
         against = "the car steers left where the cameras see the road bend to the right, and vice versa"
         print(f"{log}: {against}: is right positive, is no image mirrored?", flush=True)
-    if len(recording) and cameras_exchanged(detect(networks[0])):
+    if not len(recording):
+        return position
+    if cameras_exchanged(detect(networks[0])):
         exchanged = "the cameras do not see the lane as from the car's left, centre and right"
         print(f"{log}: {exchanged}: has each image the name of its camera, is none mirrored?", flush=True)
+    sample = np.unique(np.linspace(0, len(recording) - 1, SAMPLE).astype(int))
+    if colours_exchanged(strips[sample], networks[-1]):
+        print(f"{log}: the images seem to have red and blue exchanged: exchange them again (cv2 has BGR)", flush=True)
     return position
