@@ -27,7 +27,8 @@ ASK_AGAIN = 5.0  # s without an answer, after which the telemetry is sent again:
 SETTLE = 0.2  # s without a word from the server, after which its greeting is over, and the start of an episode
 STILL = 1 / 15  # s of real time between two telemetries while simulated time stands still
 # How long a driver in another thread than the program's answers is waited for, s: until one is known to be there, and
-# then. Commands may be constant, and drivers in the same thread, so after so many vain attempts it is not waited for.
+# then at first. Drivers may be in the same thread: after so many vain attempts none is waited for. Commands may be
+# constant, and programs end long episodes: each vain attempt halves the patience, to a little more than a driver takes.
 BRIEFLY, PATIENTLY, ATTEMPTS = 0.5, 2.0, 3
 LAUNCHER = "#!/bin/sh\nPYTHONPATH="  # how one begins; another file of its name may be the real simulator
 MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 200,000
@@ -52,7 +53,7 @@ class Joined(ClientSession):
         super().__init__(host, port, wait, max_packet=MAX_PACKET)
         self.dialect, self.pace, self.period = dialect, pace, max(STEP, 1 / rate)
         self.frames, self.time, self.due = 0, 0.0, 0.0  # sent; simulated s in all; when the next is due
-        self._thinking = 0.02  # s that the driver takes
+        self._thinking, self._patience = 0.02, PATIENTLY  # s that the driver takes; that it is waited for
         self._apart: bool | None = None if dialect.apart else False  # whether it is in another thread; None: unknown
         self._vain = self._constant = 0  # attempts to find it there; answers in a row that did not change
         self._is_puzzled = False  # whether the user knows that no answer can be used
@@ -113,19 +114,26 @@ class Joined(ClientSession):
         is_new = not self.dialect.same
         if is_new:
             self._constant = 0
-        if self._apart is False or self.dialect.still or self._constant >= ATTEMPTS:
+        if self._apart is False or self.dialect.still or (not self._apart and self._constant >= ATTEMPTS):
             return
         begin, pause = time.monotonic(), self._thinking
-        while time.monotonic() < begin + (PATIENTLY if self._apart else BRIEFLY):
-            self._listen(pause)
+        until = begin + (max(self._patience, 3 * self._thinking) if self._apart else BRIEFLY)
+        while (left := until - time.monotonic()) > 0:
+            self._listen(min(pause, left))
             if self.dialect.run is not run:  # another episode has begun
                 return
             if self._ask(telemetry) and not self.dialect.same:
                 self._apart = True
-                self._thinking += 0.1 * (min(time.monotonic() - begin, 0.2) - self._thinking)
+                self._patience = min(PATIENTLY, 1.05 * self._patience)
+                if pause > self._thinking:
+                    self._thinking += 0.2 * (min(time.monotonic() - begin, 0.2) - self._thinking)
+                else:  # at once: it may take less
+                    self._thinking = max(0.005, 0.99 * self._thinking)
                 return
             pause *= 1.5
         self._constant += 1
+        if self._apart:
+            self._patience /= 2
         if is_new and self._apart is None:
             self._vain += 1
             self._apart = False if self._vain >= ATTEMPTS else None

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -208,6 +209,33 @@ def test_a_driver_in_another_thread_is_waited_for_and_gets_the_same_drive_howeve
 
     fast = drive(0.005)
     assert len(fast) > 12 and fast == drive(0.03)
+
+
+@pytest.mark.parametrize("run", [1, 3])
+def test_a_driver_is_waited_for_little_longer_than_it_takes_even_if_its_commands_repeat(run, monkeypatch):
+    """Programs end an episode after 30 s of real time. A command stays the same for `run` frames."""
+    clock, frame = SimpleNamespace(now=0.0), SimpleNamespace(n=0, begin=0.0, seen=0)
+    clock.monotonic = lambda: clock.now
+    joined = Joined(Roads(LAKE), "", 0, 1, 0, 15)
+    joined.dialect.still = False
+
+    def listen(joined, pause):
+        clock.now += pause
+
+    def ask(joined, telemetry):
+        clock.now += 0.005
+        joined.dialect.same = clock.now < frame.begin + 0.02 or frame.n % run > 0
+        return True
+
+    monkeypatch.setattr("simulator.join.time", clock)
+    monkeypatch.setattr(Joined, "_listen", listen)
+    monkeypatch.setattr(Joined, "_ask", ask)
+    for frame.n in range(300):
+        frame.begin, joined.dialect.same = clock.now, True
+        joined._await_driver(joined.dialect.run, "")
+        frame.seen += not joined.dialect.same
+    assert frame.seen == 300 / run, "each is seen"
+    assert clock.now < 30
 
 
 def test_a_text_that_is_no_road_ends_the_drive_with_its_reason(capsys):
