@@ -21,6 +21,7 @@ from cloning.recordings.log import CheckedRecording, Recording
 
 COPY_OR_DELETE = "copy it again, or delete the row"
 STANDING = 1.0  # mph: a slower car may see the same again
+STALE = 0.4  # s: an older picture shows another place; a newer one is what a car without each frame sees
 IMAGES_AT_ONCE = 32  # for each thread: Ctrl-C waits for them, and a future takes memory, of perhaps millions of images
 
 
@@ -30,7 +31,7 @@ def check_images(
     """Decode every image of a recording, and return its rows without those that have an unusable image.
 
     An image that is a copy of another camera's is unusable, too: a network would take it for a view from the side. So
-    is a moving car's centre image if it is a copy of an earlier row's: it shows another moment.
+    is a moving car's centre image if it is a copy of one before the last 0.4 s: it shows another moment.
 
     Usable images are remembered in the user's cache folder: one whose file has not changed since (same size and time of
     change) is not decoded again. threads: that decode at the same time; frames: becomes the recording's, and keeps what
@@ -92,8 +93,8 @@ def _originals(recording: Recording, digests: np.ndarray) -> np.ndarray:
         same = content[:, camera] == content[:, other]
         original[same, camera] = recording.images[same, other]
     _, first, inverse = np.unique(content[:, 0], return_index=True, return_inverse=True)
-    moving = recording.speed > STANDING
-    original[moving, 0] = recording.images[first[inverse], 0][moving]
+    stale = (recording.speed > STANDING) & (recording.time > recording.time[first[inverse]] + STALE)
+    original[stale, 0] = recording.images[first[inverse], 0][stale]
     return original
 
 
