@@ -21,7 +21,7 @@ from cloning.recordings.log import CheckedRecording, Recording
 
 COPY_OR_DELETE = "copy it again, or delete the row"
 STANDING = 1.0  # mph: a slower car may see the same again
-STALE = 0.4  # s: an older picture shows another place; a newer one is what a car without each frame sees
+STALE = 0.4  # s: a picture that is older shows another place; a newer one may stand for frames that were lost
 IMAGES_AT_ONCE = 32  # for each thread: Ctrl-C waits for them, and a future takes memory, of perhaps millions of images
 
 

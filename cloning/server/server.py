@@ -15,7 +15,7 @@ from cloning.wire.protocol import PING_INTERVAL, PONG_TIMEOUT
 
 ARRIVAL = 0.002  # s within which a simulator sends the rest of a message, if it is read at once
 MAX_CLIENTS = 4  # at once: more could not be answered in time if all of them sent as much as they can
-HASTE = 0.1  # s that a message has to wait longer that was sent before the answer to the one before
+HASTE = 0.1  # s by which the turn of a message comes later if it was sent before the last answer
 QUIET = 3.0  # s after which a client that has sent nothing gives its place to a new one, if there is no other
 MAX_UNANSWERED = 1000  # texts of a client since it was last sent one; without: 10 s of work when `garbage` has gone
 OPENING_INTERVAL = 0.005  # s between two new clients; without: 23 ms beside reconnections
