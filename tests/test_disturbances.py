@@ -10,12 +10,13 @@ from scenes import Here
 from steer_server import STEER, Server
 
 from cloning.base.errors import SimulatorError
-from cloning.network.network import SHIPPED_MODEL
+from cloning.network.network import SEEN_ROWS, SHIPPED_MODEL
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.replay import replay
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber, disturb
 from cloning.road.track import Track
+from cloning.training import light
 from simulator import driving
 from simulator.__main__ import main
 from simulator.dialects import Episodes, Stage
@@ -88,6 +89,15 @@ def test_frames_come_late_or_not_at_all(frames):
 def test_a_third_of_the_kinds_is_held_out():
     assert set(HELD_OUT) < set(KINDS)
     assert len(HELD_OUT) >= len(KINDS) // 3
+
+
+@pytest.mark.parametrize("kind", ["fog", "sun", "dirt", "occluded"])
+def test_a_training_image_is_disturbed_as_the_same_part_of_a_frame(kind, frames):
+    """Its own 75 rows had been taken for a whole frame, in which boxes and glare were half as high."""
+    which = light.TRAINED.index(Disturbance(kind, 4))
+    for drive in range(5):
+        whole = disturb(frames[0], Disturbance(kind, 4), drive)
+        assert np.array_equal(light.disturbed(frames[0][SEEN_ROWS], which << 20 | drive << 10), whole[SEEN_ROWS])
 
 
 @pytest.mark.parametrize("text", ["fog", "fog:0", "fog:6", "fog:x", "smog:3", "fog:3:1", ""])

@@ -38,8 +38,7 @@ def _drive(seed: int) -> Generator:
 
 MUD = np.array([70, 55, 40], np.float32)
 
-# What lasts is computed once for a drive; a training has drives of a few seeds.
-lasting = functools.lru_cache(maxsize=512)
+lasting = functools.lru_cache(maxsize=32)  # what lasts is computed once for a drive
 
 
 def _clipped(image: np.ndarray) -> np.ndarray:

@@ -13,12 +13,14 @@ import numpy as np
 import torch
 
 from cloning.base.frame import FRAME
-from cloning.network.network import SEEN_SHAPE
+from cloning.network.network import CROP, SEEN_ROWS, SEEN_SHAPE
 from cloning.road.disturbances import HELD_OUT, KINDS, STRENGTHS, Disturbance, disturb
 from cloning.training import gpu
 from cloning.training.recipe import Recipe
 
 TRAINED = [Disturbance(kind, strength) for kind in KINDS if kind not in HELD_OUT for strength in STRENGTHS]
+# Kinds that change an image by places in it, or move it: those of a whole frame, though the network sees less of it.
+PLACED = ("fog", "sun", "dirt", "occluded", "shifted", "turned", "shaken")
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour
 WIDTHS, SOFTNESS, RAGGED = (4, 400), (0.3, 4), (0, 25)  # pixels: of a shadow, of its edges' blur, of their displacement
@@ -105,8 +107,11 @@ def disturbed(image: np.ndarray, disturbance: int) -> np.ndarray:
     """Return an image, uint8 (75, 320, 3), as it is seen under a disturbance of `sample_disturbances`."""
     if disturbance < 0:
         return image
-    which, drive, frame = disturbance >> 20, disturbance >> 15 & 31, disturbance & 0x7FFF
-    return disturb(image, TRAINED[which], drive, frame)
+    which, drive, frame = disturbance >> 20, disturbance >> 10 & 0x3FF, disturbance & 0x3FF
+    if TRAINED[which].kind not in PLACED:
+        return disturb(image, TRAINED[which], drive, frame)
+    whole = cv2.copyMakeBorder(image, *CROP, 0, 0, cv2.BORDER_REPLICATE)
+    return disturb(whole, TRAINED[which], drive, frame)[SEEN_ROWS]
 
 
 def name_of(disturbance: int) -> str:
