@@ -30,6 +30,9 @@ def test_what_is_left_to_measure_with_is_not_trained_on():
     some = [lap.name for lap in laps(21, 10, {"road": 40, "mountain": 30})]
     assert len(set(some)) == len(some) == 2 * (2 * 3 + 20) + 10 + 40 + 30
     assert sum(name.startswith("jungle-") and name.endswith("-fast") for name in some) == 10
+    others = {lap.name for lap in laps(21, 10, {"road": 40, "mountain": 30}, first=1201)}
+    assert len(others) == len(some)
+    assert {name.rpartition("look")[2] for name in others & set(some)} == {"0", "10000", "20000"}
 
 
 def test_each_track_is_rendered_in_both_directions_and_lights():

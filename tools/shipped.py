@@ -3,9 +3,11 @@
     make shipped RECORDINGS="data/lake-ccw data/lake-cw data/jungle data/jungle-shadows"     # or the same without make:
     python -m tools.shipped data/lake-ccw data/lake-cw data/jungle data/jungle-shadows
     python -m tools.shipped data/lake-ccw … --road found/*-*.json --from cloning/network/shipped.pt
+    python -m tools.shipped data/lake-ccw … --first 1201 --from cloning/network/shipped.pt
 
-The last one gives a network the roads on which it failed, which tools.search has found: it is trained on with these and
-all the others, and its weights become the mean of those before and after, which drives better than either.
+The third one gives a network the roads on which it failed, which tools.search has found, the last one roads and looks
+that it has not seen: it is trained on with these and all the others, and its weights become the mean of those before
+and after, which drives better than either.
 
 Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
 The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Roads and
@@ -46,7 +48,7 @@ from simulator.scenery.looks import SHADOWED
 from simulator.workers import started_workers
 from simulator.world import Scene
 from tools.command import ROOT, python
-from tools.lane_frames import FIRST_ROAD, every_second_shadowed
+from tools.lane_frames import every_second_shadowed
 
 REPEATS = 16  # how often each real recording counts, because the rendered ones are many
 EPOCH = 60_000  # images
@@ -77,23 +79,26 @@ class Lap(NamedTuple):
         return f"{track}-{self.direction}-look{self.look}{fast}"
 
 
-def laps(looks: int, fast: int, number_of: dict[str, int], roads: Sequence[PointRoad] = ()) -> list[Lap]:
+def laps(
+    looks: int, fast: int, number_of: dict[str, int], roads: Sequence[PointRoad] = (), first: int = FIRST_LOOK
+) -> list[Lap]:
     """Return the laps to render: of both tracks in so many looks, fast ones of the jungle, and of generated roads.
 
-    number_of: generated roads of each kind; each has a look of its own. roads: others, driven in both directions. Look
-    0, which resembles the real simulator, is driven in both directions, without and with both kinds of shadows, any
-    other look in one direction; every second one has shadows.
+    number_of: generated roads of each kind; each has a look of its own. roads: others, driven in both directions.
+    first: number of the first generated road of each kind, and of the first look besides look 0. Look 0, which
+    resembles the real simulator, is driven in both directions, without and with both kinds of shadows, any other look
+    in one direction; every second one has shadows.
     """
     twins = (0, SHADOWED, 2 * SHADOWED)
     chosen = [Lap(track, direction, look) for track in ROADS for direction in DIRECTIONS for look in twins]
-    for look in range(FIRST_LOOK, FIRST_LOOK + looks - 1):
+    for look in range(first, first + looks - 1):
         chosen += [Lap(track, DIRECTIONS[look % 2], every_second_shadowed(look)) for track in ROADS]
-    for look in range(FIRST_LOOK, FIRST_LOOK + fast):  # not the direction in which the same look is driven slowly
+    for look in range(first, first + fast):  # not the direction in which the same look is driven slowly
         chosen.append(Lap("jungle", DIRECTIONS[1 - look % 2], every_second_shadowed(look), lateral=FAST))
     for kind, count in number_of.items():
-        for road in range(FIRST_ROAD, FIRST_ROAD + count):
+        for road in range(first, first + count):
             chosen.append(Lap(f"{kind}-{road}", DIRECTIONS[road % 2], every_second_shadowed(road), LAPS))
-    for look, points in enumerate(roads, FIRST_LOOK):
+    for look, points in enumerate(roads, first):
         chosen += [Lap(points, direction, every_second_shadowed(look)) for direction in DIRECTIONS]
     return chosen
 
@@ -175,6 +180,8 @@ def main(argv: list[str] | None = None) -> int:
     add("--fast", type=number(int, 0, 100), default=8, help="fast laps of the jungle (default %(default)s)")
     add("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
     add("--mountains", type=number(int, 0, 1000), default=100, help="generated mountain roads (default %(default)s)")
+    text = "number of the first generated road of each kind, and of the first look (default %(default)s)"
+    add("--first", type=number(int, FIRST_LOOK, 9000), default=FIRST_LOOK, help=text)
     add("--road", nargs="+", default=[], metavar="FILE", help="roads by points, such as those that tools.search found")
     text = "train on from this model file, and take the mean of its weights and the new ones"
     add("--from", dest="start", type=Path, metavar="MODEL", help=text)
@@ -193,7 +200,7 @@ def main(argv: list[str] | None = None) -> int:
         begin = ("--from", start)
     real = repeat(options.folder / "real", find_folders(options.recordings))  # first, since rendering takes long
     number_of = {"road": options.roads, "mountain": options.mountains}
-    rendered = render(options.folder / "rendered", laps(options.looks, options.fast, number_of, points))
+    rendered = render(options.folder / "rendered", laps(options.looks, options.fast, number_of, points, options.first))
     length = ("--epochs", options.epochs or epochs, "--samples-per-epoch", EPOCH, "--learning-rate", rate)
     training = ("--robust", *length, "--repeats", REPEATS, "--disturbed", DISTURBED, "--seed", options.seed, "--resume")
     # By name, since the folders may also hold what an earlier run with other options left there.
