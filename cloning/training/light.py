@@ -19,8 +19,9 @@ from cloning.training import gpu
 from cloning.training.recipe import Recipe
 
 TRAINED = [Disturbance(kind, strength) for kind in KINDS if kind not in HELD_OUT for strength in STRENGTHS]
-# Kinds that change an image by places in it, or move it: those of a whole frame, though the network sees less of it.
-PLACED = ("fog", "sun", "dirt", "occluded", "shifted", "turned", "shaken")
+# Kinds that change all of a frame alike, so that to change the rows that the network sees is enough. What the others do
+# depends on the place in the frame.
+ALIKE = ("rain", "night", "defocus", "noise", "contrast", "underexposed", "colour", "pixelated")
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour
 WIDTHS, SOFTNESS, RAGGED = (4, 400), (0.3, 4), (0, 25)  # pixels: of a shadow, of its edges' blur, of their displacement
@@ -108,7 +109,7 @@ def disturbed(image: np.ndarray, disturbance: int) -> np.ndarray:
     if disturbance < 0:
         return image
     which, drive, frame = disturbance >> 20, disturbance >> 10 & 0x3FF, disturbance & 0x3FF
-    if TRAINED[which].kind not in PLACED:
+    if TRAINED[which].kind in ALIKE:
         return disturb(image, TRAINED[which], drive, frame)
     whole = cv2.copyMakeBorder(image, *CROP, 0, 0, cv2.BORDER_REPLICATE)
     return disturb(whole, TRAINED[which], drive, frame)[SEEN_ROWS]
