@@ -6,8 +6,8 @@
     python -m tools.shipped data/lake-ccw … --first 1201 --from cloning/network/shipped.pt
 
 The third one gives a network the roads on which it failed, which tools.search has found, the last one roads and looks
-that it has not seen: it is trained on with these and all the others, and its weights become the mean of those before
-and after, which drives better than either.
+that it has not seen. It is trained on with these and all the others, and its weights become the mean of those before
+and after: with the roads of a search, that drove better than either.
 
 Everything is written to the folder shipped/, which git ignores; an interrupted run continues when it is started again.
 The rendered recordings show both tracks and generated roads, in many looks and with and without shadows. Roads and
@@ -48,7 +48,7 @@ from simulator.scenery.looks import SHADOWED
 from simulator.workers import started_workers
 from simulator.world import Scene
 from tools.command import ROOT, python
-from tools.lane_frames import every_second_shadowed
+from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 
 REPEATS = 16  # how often each real recording counts, because the rendered ones are many
 EPOCH = 60_000  # images
@@ -56,7 +56,7 @@ DISTURBED = 0.4  # share of the images in foul weather, or of a faulty camera
 EPOCHS, LEARNING_RATE = 22, 2e-3  # half of --robust's rate: this training is longer
 EPOCHS_ON, LEARNING_RATE_ON = 4, 5e-4  # with --from
 DIRECTIONS = ("ccw", "cw")
-FIRST_LOOK = 1001  # the first look, besides look 0, that is trained on
+FIRST_LOOK = FIRST_ROAD  # the first look, besides look 0, that is trained on: numbered as the roads
 LAPS = 0.5  # of a generated road: of so many images, more roads teach more than whole laps
 RATE = 7.5  # rows a second, half of the simulator's: of so many images, more roads teach more than denser ones
 FAST = 8.5  # m/s² sideways in the jungle's fast laps; the simulator's drivers reach 8, and frames don't show the speed
