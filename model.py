@@ -60,6 +60,7 @@ from cloning.training.run_files import RunFiles
 from cloning.training.stop import SIGNALS, Interrupted, StopSignals, status_of
 
 PICTURE_EVERY = 6400  # observations between two diagnostic pictures
+VALIDATED = 4096  # observations at most: with twice as many an epoch's val_loss is hardly more certain
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -314,11 +315,10 @@ class TrainingRun:
     def epoch(self) -> None:
         """Train on whole batches until the epoch has at least `samples_per_epoch` images, as Keras 1 counts."""
         recipe, progress, ranks = self.recipe, self.progress, self.ranks
+        total, started = recipe.samples_per_epoch, time.monotonic() - progress.seconds
         self.network.train()
-        started = time.monotonic() - progress.seconds
         if ranks.first:
             print(f"Epoch {len(progress.history) + 1}/{recipe.epochs}", flush=True)
-        total = recipe.samples_per_epoch
         with progress_bar(total, "image", not ranks.first, initial=progress.images, leave=False) as bar:
             while progress.images < total:
                 self.write_pictures()
@@ -342,14 +342,14 @@ class TrainingRun:
                     self.save()
 
     def validate(self) -> tuple[float, float]:
-        """Return val_loss, of 0.2 x samples_per_epoch observations or all of each validation set, and val_drift, m."""
+        """Return val_loss, of 0.2 x samples_per_epoch, VALIDATED or all of the observations, and val_drift, m."""
         self.network.eval()  # as it drives: dark images are brightened, if the recipe says so
-        n, share = len(self.validation), self.ranks.share
-        chosen = default_rng([self.seed, 4]).permutation(n)[: max(self.recipe.samples_per_epoch // 5, 1)]
-        mine, sets = chosen[share], self.validation_sets
+        most = min(max(self.recipe.samples_per_epoch // 5, 1), VALIDATED)
+        chosen = default_rng([self.seed, 4]).permutation(len(self.validation))[:most]
+        mine, sets = chosen[self.ranks.share], self.validation_sets
         guesses = [(self.predict(self.network, images, mine), labels[mine]) for images, labels in sets]
         error = sum(float(((guess - labels) ** 2).sum()) for guess, labels in guesses)
-        far = drifts(self.held_out[share], self.network, self.pool)
+        far = drifts(self.held_out[self.ranks.share], self.network, self.pool)
         error, metres, driven = self.ranks.summed([error, float(far.sum()), float(len(far))], self.device)
         return error / len(sets) / len(chosen), metres / driven if driven else math.nan
 

@@ -242,6 +242,12 @@ def test_validation_counts_centre_images_and_other_poses_alike(sample_recording,
         plain, _ = run.validate()
         run.validation_sets = [(warped, other_labels)]
         assert both == pytest.approx((plain + run.validate()[0]) / 2, rel=1e-6)
+        asked = Mock(side_effect=lambda rows: np.zeros(len(np.unique(rows))))
+        run.validation, run.held_out = range(5000), []
+        run.recipe = replace(run.recipe, samples_per_epoch=50_000)
+        run.validation_sets = [(asked, np.ones(5000))]
+        run.predict = lambda network, images, rows: images(rows)
+        assert (run.validate()[0], len(*asked.call_args.args)) == (1.0, 4096)
     assert not np.allclose(labels, other_labels)
     assert not np.array_equal(center(np.arange(3)), warped(np.arange(3)))
 

@@ -96,7 +96,7 @@ class Recipe:
     learning_rate: float
     cosine_decay: bool  # of the learning rate, to zero at the end
     batch_size: int  # observations; each gives 3.7 images on average
-    samples_per_epoch: int  # images at least; a fifth as many observations validate an epoch
+    samples_per_epoch: int  # images at least; a fifth as many observations, at most 4,096, validate an epoch
     epochs: int
     validation_sets: Callable[..., list[Any]]  # (observations, recipe, seed) -> the sets to validate with
     best_by: str  # the metric of an epoch that tells best how its network drives: val_loss or val_drift
