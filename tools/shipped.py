@@ -50,10 +50,10 @@ from simulator.world import Scene
 from tools.command import ROOT, python
 from tools.lane_frames import FIRST_ROAD, every_second_shadowed
 
-REPEATS = 16  # how often each real recording counts, because the rendered ones are many
+REPEATS = 8  # how often each real recording counts, because the rendered ones are many
 EPOCH = 60_000  # images
 DISTURBED = 0.4  # share of the images in foul weather, or of a faulty camera
-EPOCHS, LEARNING_RATE = 22, 2e-3  # half of --robust's rate: this training is longer
+EPOCHS, LEARNING_RATE = 8, 3e-3  # less than --robust's rate: this training is longer
 EPOCHS_ON, LEARNING_RATE_ON = 4, 5e-4  # with --from
 DIRECTIONS = ("ccw", "cw")
 FIRST_LOOK = FIRST_ROAD  # the first look, besides look 0, that is trained on: numbered as the roads
@@ -176,10 +176,10 @@ def main(argv: list[str] | None = None) -> int:
     parser = command_line("python -m tools.shipped", __doc__)
     add = parser.add_argument
     add("recordings", nargs="+", help="real recordings, or folders of recordings")
-    add("--looks", type=number(int, 1, 101), default=15, help="looks of each track (default %(default)s)")
-    add("--fast", type=number(int, 0, 100), default=8, help="fast laps of the jungle (default %(default)s)")
-    add("--roads", type=number(int, 0, 1000), default=200, help="generated roads (default %(default)s)")
-    add("--mountains", type=number(int, 0, 1000), default=100, help="generated mountain roads (default %(default)s)")
+    add("--looks", type=number(int, 1, 101), default=8, help="looks of each track (default %(default)s)")
+    add("--fast", type=number(int, 0, 100), default=4, help="fast laps of the jungle (default %(default)s)")
+    add("--roads", type=number(int, 0, 1000), default=100, help="generated roads (default %(default)s)")
+    add("--mountains", type=number(int, 0, 1000), default=50, help="generated mountain roads (default %(default)s)")
     text = "number of the first generated road of each kind, and of the first look (default %(default)s)"
     add("--first", type=number(int, FIRST_LOOK, 9000), default=FIRST_LOOK, help=text)
     add("--road", nargs="+", default=[], metavar="FILE", help="roads by points, such as those that tools.search found")

@@ -14,11 +14,12 @@ import torch
 
 from cloning.base.frame import FRAME
 from cloning.network.network import CROP, SEEN_ROWS, SEEN_SHAPE
-from cloning.road.disturbances import HELD_OUT, KINDS, STRENGTHS, Disturbance, disturb
+from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, disturb
 from cloning.training import gpu
 from cloning.training.recipe import Recipe
 
-TRAINED = [Disturbance(kind, strength) for kind in KINDS if kind not in HELD_OUT for strength in STRENGTHS]
+OFTEN = (1, 2, 3, 4, 4, 5, 5)  # strengths: the strong ones more often, because the weak ones are soon learned
+TRAINED = [Disturbance(kind, strength) for kind in KINDS if kind not in HELD_OUT for strength in OFTEN]
 # Kinds that change all of a frame alike, so that to change the rows that the network sees is enough. What the others do
 # depends on the place in the frame.
 ALIKE = ("rain", "night", "defocus", "noise", "contrast", "underexposed", "colour", "pixelated")
