@@ -100,6 +100,15 @@ def test_a_training_image_is_disturbed_as_the_same_part_of_a_frame(kind, frames)
         assert np.array_equal(light.disturbed(frames[0][SEEN_ROWS], which << 20 | drive << 10), whole[SEEN_ROWS])
 
 
+@pytest.mark.parametrize("kind, most", [("contrast", 18), ("defocus", 1.6), ("pixelated", 1)])
+def test_a_training_image_is_nearly_that_of_a_frame_whose_other_rows_count(kind, most, frames):
+    """By its own rows alone: 20, 1.8 and 2.3 of 255 away, since they lack the sky, and large pixels begin elsewhere."""
+    code = light.TRAINED.index(Disturbance(kind, 5)) << 20
+    for frame in frames:
+        expected = disturb(frame, Disturbance(kind, 5), 0)[SEEN_ROWS].astype(int)
+        assert np.abs(light.disturbed(frame[SEEN_ROWS], code) - expected).mean() < most
+
+
 @pytest.mark.parametrize("text", ["fog", "fog:0", "fog:6", "fog:x", "smog:3", "fog:3:1", ""])
 def test_what_is_no_disturbance_is_refused(text):
     with pytest.raises(ValueError, match=r"is not KIND:STRENGTH, such as fog:3; kinds: rain, fog"):

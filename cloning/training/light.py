@@ -21,8 +21,8 @@ from cloning.training.recipe import Recipe
 OFTEN = (1, 2, 3, 4, 4, 5, 5)  # strengths: the strong ones more often, because the weak ones are soon learned
 TRAINED = [Disturbance(kind, strength) for kind in KINDS if kind not in HELD_OUT for strength in OFTEN]
 # Kinds that change all of a frame alike, so that to change the rows that the network sees is enough. What the others do
-# depends on the place in the frame.
-ALIKE = ("rain", "night", "defocus", "noise", "contrast", "underexposed", "colour", "pixelated")
+# depends on the place in the frame, or on its other rows.
+ALIKE = ("rain", "night", "noise", "underexposed", "colour")
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour
 WIDTHS, SOFTNESS, RAGGED = (4, 400), (0.3, 4), (0, 25)  # pixels: of a shadow, of its edges' blur, of their displacement
