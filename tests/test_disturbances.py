@@ -17,7 +17,7 @@ from cloning.replay import replay
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber, disturb
 from cloning.road.track import Track
 from cloning.training import light
-from simulator import driving
+from simulator import driving, record
 from simulator.__main__ import main
 from simulator.dialects import Episodes, Stage
 from simulator.environment import Drive
@@ -151,8 +151,11 @@ def test_late_lost_and_rainy_frames_reach_the_driver_so_and_the_report_says_it(t
     assert rain == again != clear
 
 
-def test_a_recording_shows_the_disturbance_in_all_cameras_and_is_the_same_again(tmp_path):
+def test_a_recording_shows_the_disturbance_in_all_cameras_and_is_the_same_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(record, "started_workers", Here)
+
     def recorded(name, *options):
+        record._cameras.cache_clear()
         assert main(["record", str(tmp_path / name), "--laps", "0.004", *options]) == 0
         recording = read_recording(tmp_path / name)
         return [[recording.path(row, camera).read_bytes() for camera in range(3)] for row in range(len(recording))]
