@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import functools
 import io
 import os
 import subprocess
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 import torch
 import warm
+from PIL import Image
 
 from cloning.base import program
 
@@ -38,6 +40,8 @@ def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
     )
 
 
+# To pack its pictures well would take a fifth of a short run.
+@unittest.mock.patch.object(Image.Image, "save", functools.partialmethod(Image.Image.save, compress_level=1))
 def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
     """The same as `run_model`, in this process: it saves two seconds of imports. No curves are drawn: see PICTURE."""
     import model

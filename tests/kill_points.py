@@ -118,20 +118,20 @@ def main() -> None:
 # ----------------------------------------------------------------------------------------------------------------------
 # In the test
 
-# Costs a child a tenth of what its own imports, a scenery of its own, large pictures and drawn curves would. A renderer
+# Costs a child a tenth of what its own imports, a scenery of its own, and drawn pictures and curves would. A renderer
 # is a copy of the child, which has no thread yet; another way to start it takes a second.
 PREPARE = f"""
 import functools, multiprocessing, sys
 sys.path.append({str(ROOT)!r})
 from cloning.base import figure
-figure.png = lambda *_: {PICTURE!r}
+figure.png = lambda *_, **__: {PICTURE!r}
 import pandas  # or else pyarrow does for its first table, in every child
 import av, matplotlib.figure, model, video, drive, simulator.client, simulator.film, simulator.record, simulator.report
 import cloning.network.attention, cloning.replay.command
 from cloning.report import pictures as charts
 from cloning.training import pictures
 from simulator import record, scenery, workers
-pictures.SCALE, record.MAX_RENDERERS = 1, 1
+pictures.SCALE, record.MAX_RENDERERS, pictures.grid = 1, 1, figure.png
 charts.chart = lambda *draws: charts.Chart("", "")
 workers._context = lambda: multiprocessing.get_context("fork")
 scenery.build = functools.cache(scenery.build)
