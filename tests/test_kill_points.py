@@ -333,8 +333,8 @@ def test_an_analysis_of_the_lane_killed_anywhere(lake, tmp_path):
 
 
 @pytest.fixture(params=["to LeRobot", "from LeRobot"])
-def converting(lake, tmp_path, request):
-    command = ["-m", "cloning.lerobot", lake, "--output", "lake"]
+def converting(tmp_path, request):
+    command = ["-m", "cloning.lerobot", render_recording(tmp_path / "lake", rows=6), "--output", "lake"]
     to_lerobot = Trial(tmp_path / "trial", command)
     if request.param == "to LeRobot":
         return to_lerobot
