@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import warm
 from browser import LOOKS, needs_chromium
-from commands import ROOT, log
+from commands import PICTURE, ROOT, log
 from matplotlib.figure import Figure
 from PIL import Image
 from rendered import render_recording
@@ -203,6 +203,8 @@ def test_a_recording_is_said_to_be_held_out_only_if_all_that_the_network_learned
     written, sample_recording, tmp_path, monkeypatch
 ):
     monkeypatch.setattr("cloning.report.content.LIMITS", (1.0,))  # half of the drives
+    monkeypatch.setattr("cloning.report.content.ModelDriver", lambda _: lambda frame: frame.human_steering)
+    monkeypatch.setattr("cloning.report.content.plot", lambda *_: PICTURE)
     copy, same = (shutil.copytree(each, tmp_path / each.name) for each in (written, sample_recording))
     other = render_recording(tmp_path / "other", rows=40, seed=1)
     arguments = json.loads((copy / "training_arguments.json").read_bytes())
