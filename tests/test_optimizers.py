@@ -90,20 +90,6 @@ def test_every_bit_is_as_with_torchs():
     assert all(parameter.grad is None for parameter in network.parameters())
 
 
-def test_muon_continues_from_its_state():
-    network, earlier = networks()
-    restored, first = Muon(network.parameters()), Muon(earlier.parameters())
-    for seed in range(3):
-        give_gradients((earlier,), seed)
-        first.step(1e-4)
-    network.load_state_dict(earlier.state_dict())
-    restored.restore(first.state)
-    give_gradients((network, earlier), 3)
-    restored.step(1e-4)
-    first.step(1e-4)
-    assert all(map(torch.equal, network.parameters(), earlier.parameters()))
-
-
 def test_orthogonal_keeps_the_singular_vectors_and_makes_the_values_about_one():
     for rows, columns, smallest in [(24, 75, 1e-1), (100, 4224, 1e-1), (50, 20, 1e-1), (8, 8, 0.05)]:
         torch.manual_seed(rows)
