@@ -9,7 +9,6 @@ from rendered import render_recording
 
 from cloning.base import program
 from cloning.base.errors import RecordingError
-from cloning.recordings.check import check_images
 from cloning.recordings.columns import Finding
 from cloning.recordings.log import Recording, find_folders, read_recording
 
@@ -352,11 +351,6 @@ def test_a_header_in_other_words_within_the_file_is_refused(log):
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Folders
-
-
-def test_the_sample_recording_is_whole(tmp_path):
-    found = check_images(read_recording(render_recording(tmp_path / "a b", rows=3)))
-    assert (found.rows_read, len(found), found.rejected, found.repairs) == (3, 3, [], {})
 
 
 def test_folders_are_found_below_links_and_each_once(tmp_path):
