@@ -76,6 +76,7 @@ def test_measures_are_sent_with_the_telemetry(more, capsys):
     assert all(isinstance(value, str) for value in last.values())
     assert decode(base64.b64decode(last["image"])).shape == (160, 320, 3)
     assert (first["lapNumber"], first["crash"], first["tot_crashes"], first["tot_obes"]) == ("1", "0", "0", "0")
+    assert number(first, "distance") == 0, "it has waited"
     assert number(last, "cte") > 0.1, "it has steered to the right"
     assert number(last, "ang_diff") > 2
     assert number(last, "distance") > 5
@@ -286,12 +287,6 @@ def test_a_program_that_thinks_long_and_hangs_up_before_its_first_answer_is_join
     with Program(answer, sessions=2) as program:
         assert join("measures", program, "--wait", "1") == 0
     assert len(program.data) == 5
-
-
-def test_with_a_pace_the_car_stands_still_until_the_first_telemetry():
-    with Program(lambda data, n: [steer(0, 1)] if n < 5 else None) as program:
-        assert join("measures", program, "--pace", "1") == 0
-    assert number(program.data[0], "distance") == 0
 
 
 def test_a_lost_answer_stops_nothing(monkeypatch):
