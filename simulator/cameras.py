@@ -8,11 +8,10 @@ from cloning.base.errors import SimulatorError
 from cloning.base.frame import FRAME
 from cloning.recordings.format import CAMERAS
 from cloning.recordings.images import encode
-from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, MOUNT_PITCH, VERTICAL_FIELD
+from cloning.road.camera import CAMERA_POSITIONS, CAMERA_ROLL, CAMERA_YAW, JPEG_QUALITY, MOUNT_PITCH, VERTICAL_FIELD
 from cloning.road.disturbances import Disturbance, Disturber
 from simulator.world import INSIDE, Scene, free_unused
 
-JPEG_QUALITY = 75  # with colour at half resolution, as the tables in the real simulator's images show
 NEAR_PLANE, FAR_PLANE = 0.3, 1000.0  # m, as for the real simulator's cameras
 ROWS, COLUMNS = FRAME[:2]
 # For each row of a frame two are rendered and averaged; with one, the road far ahead flickers, unlike the real one.

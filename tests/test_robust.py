@@ -252,6 +252,19 @@ def test_validation_counts_centre_images_and_other_poses_alike(sample_recording,
     assert not np.array_equal(center(np.arange(3)), warped(np.arange(3)))
 
 
+def test_weather_is_in_front_of_all_else_that_changes_an_image(sample_recording, tmp_path):
+    run = begun_training(sample_recording, *OPTIONS, "--disturbed", 1, "--output", tmp_path / "model.pt")
+    with run.pool:
+        choices, batch = run.generator.sample(0), run.generator.start_batch(0)()
+    first, which = np.zeros(1, int), [augmentation.name for augmentation in ROBUST.augmentations].index("brightened")
+    view, codes = choices.views.images(first)[which], choices.views.poses[which].disturbance
+    brightened = light.brighten(view, CROP[0], *(column[first] for column in choices.augmenting[which]))[0]
+    seen = batch.images[choices.slots[0, which]]
+    assert np.array_equal(seen, light.disturbed(brightened, int(codes[0]))) and not np.array_equal(seen, brightened)
+    example = choices.views.example(0).images[which]
+    assert np.array_equal(example, view)
+
+
 def test_networks_are_measured_as_they_drive(sample_recording, tmp_path):
     """Ordinary frames are dark to this network, which brightens them when it drives, and not when it learns."""
     run = begun_training(sample_recording, *OPTIONS, "--output", tmp_path / "model.pt")

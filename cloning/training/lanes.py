@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -135,7 +135,7 @@ class Poses(Table):
         return cls(offset, yaw, camera, mirrored, np.stack(warps, axis=1), labels, colours, shade, disturbance)
 
     def view(self, at: int, read: Callable[[int, bool], np.ndarray]) -> np.ndarray:
-        """Return what the network sees of one row: uint8 (75, 320, 3), RGB.
+        """Return what the network sees of one row, undisturbed: uint8 (75, 320, 3), RGB.
 
         at: index of the row; read(camera, earlier): returns the `ROAD_ROWS` of the camera's frame in the row or in the
         earlier one, uint8 (90, 320, 4), RGBA, which is warped faster.
@@ -144,8 +144,16 @@ class Poses(Table):
         image, seen = VIEW.warp(read(camera, False), self.warps[at, 0], mirrored)
         if not seen.all():  # only ground can be missing
             fill_ground(image, cv2.bitwise_not(seen), read(camera, True), self.warps[at, 1, 0])
-        image = light.relight(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), self.colours[at], int(self.shade[at]))
-        return light.disturbed(image, int(self.disturbance[at]))
+        return light.relight(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), self.colours[at], int(self.shade[at]))
+
+    def disturbed(self, images: Any) -> Any:
+        """Return the rows' images, uint8 (n, 75, 320, 3), as they are seen under their disturbances, if there are any.
+
+        All else that changes an image comes before: light falls on the road, the weather is in front of it.
+        """
+        if (self.disturbance < 0).all():
+            return images
+        return np.stack([light.disturbed(*one) for one in zip(images, self.disturbance.tolist(), strict=True)])
 
     def on_gpu(self, road: torch.Tensor, earlier: torch.Tensor) -> torch.Tensor:
         """Return what `view` does for each row, made on a GPU: uint8 (n, 75, 320, 3).

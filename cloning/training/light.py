@@ -14,15 +14,14 @@ import torch
 
 from cloning.base.frame import FRAME
 from cloning.network.network import CROP, SEEN_ROWS, SEEN_SHAPE
+from cloning.recordings.images import compress, compressed_rows
+from cloning.road.camera import JPEG_QUALITY
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, disturb
 from cloning.training import gpu
 from cloning.training.recipe import Recipe
 
 OFTEN = (1, 2, 3, 4, 4, 5, 5)  # strengths: the strong ones more often, because the weak ones are soon learned
 TRAINED = [Disturbance(kind, strength) for kind in KINDS if kind not in HELD_OUT for strength in OFTEN]
-# Kinds that change all of a frame alike, so that to change the rows that the network sees is enough. What the others do
-# depends on the place in the frame, or on its other rows.
-ALIKE = ("rain", "night", "noise", "underexposed", "colour")
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour
 WIDTHS, SOFTNESS, RAGGED = (4, 400), (0.3, 4), (0, 25)  # pixels: of a shadow, of its edges' blur, of their displacement
@@ -106,14 +105,17 @@ def sample_disturbances(share: float, rng: np.random.Generator, n: int) -> np.nd
 
 
 def disturbed(image: np.ndarray, disturbance: int) -> np.ndarray:
-    """Return an image, uint8 (75, 320, 3), as it is seen under a disturbance of `sample_disturbances`."""
+    """Return an image, uint8 (75, 320, 3), as part of a drive's frame under a disturbance of `sample_disturbances`.
+
+    The rest of the frame, on which much depends, is drawn out from the image's edges; the whole is compressed.
+    """
     if disturbance < 0:
         return image
     which, drive, frame = disturbance >> 20, disturbance >> 10 & 0x3FF, disturbance & 0x3FF
-    if TRAINED[which].kind in ALIKE:
-        return disturb(image, TRAINED[which], drive, frame)
     whole = cv2.copyMakeBorder(image, *CROP, 0, 0, cv2.BORDER_REPLICATE)
-    return disturb(whole, TRAINED[which], drive, frame)[SEEN_ROWS]
+    made = compressed_rows(SEEN_ROWS)
+    seen = compress(disturb(whole, TRAINED[which], drive, frame)[made], JPEG_QUALITY)
+    return seen[SEEN_ROWS.start - made.start : SEEN_ROWS.stop - made.start]
 
 
 def name_of(disturbance: int) -> str:

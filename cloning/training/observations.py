@@ -54,6 +54,9 @@ class Views(Protocol):
         part: int (k,), indices into the batch. They may share memory, and are not to be changed.
         """
 
+    def finished(self, augmentation: int, images: Any, part: np.ndarray) -> Any:
+        """Return the images of some observations, augmented, as they are learned from; part: as for `images`."""
+
     def example(self, i: int) -> Example:
         """Return one observation for the diagnostic pictures; i: its index in the batch."""
 
@@ -199,6 +202,10 @@ class CameraViews:
     def images(self, part: np.ndarray) -> list[np.ndarray]:
         """See Views."""
         return self._mirrored(self.observations.cropped(self.rows[part], self.cameras[part]))
+
+    def finished(self, augmentation: int, images: Any, part: np.ndarray) -> Any:
+        """See Views."""
+        return images
 
     def _mirrored(self, images: Any) -> list[Any]:
         """Return the images, uint8 (n, rows, columns, 3), or the flipped ones, as each augmentation needs them."""

@@ -64,7 +64,8 @@ def batch_pictures(choices: Choices, recipe: Recipe) -> dict[str, bytes]:
     panels = []
     for i, augmentation in enumerate(recipe.augmentations):
         chosen = [column[:1] for column in choices.augmenting[i]]
-        image = augmentation.change(example.images[i], example.first_row, *chosen)[0]
+        made = augmentation.change(example.images[i], example.first_row, *chosen)
+        image = choices.views.finished(i, made, np.zeros(1, int))[0]
         caption = f", {augmentation.caption.format(*(column[0] for column in chosen))}" if augmentation.caption else ""
         panels.append(panel(image, example.titles[i] + caption, choices.views.labels[0, i]))
     return {

@@ -65,7 +65,8 @@ def start_batch(
     images: Any = np.empty((len(order), *SEEN_SHAPE), np.uint8) if pool else None
 
     def changed(i: int, seen: Any, which: np.ndarray) -> Any:
-        return augmentations[i].change(seen, CROP[0], *(column[which] for column in choices.augmenting[i]))
+        made = augmentations[i].change(seen, CROP[0], *(column[which] for column in choices.augmenting[i]))
+        return choices.views.finished(i, made, which)
 
     def make(part: slice) -> None:
         for i, seen in enumerate(choices.views.images(mine[part])):

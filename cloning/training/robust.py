@@ -119,6 +119,10 @@ class PoseViews:
         """See `observations.Views`."""
         return warped(self.observations, self.rows[part], [each.take(part) for each in self.poses])
 
+    def finished(self, augmentation: int, images: Any, part: np.ndarray) -> Any:
+        """See `observations.Views`."""
+        return self.poses[augmentation].take(part).disturbed(images)
+
     def example(self, i: int) -> Example:
         """See `observations.Views`."""
         frames = self.observations.frames(self.rows[i])
@@ -133,14 +137,19 @@ def centre_and_poses(observations: Observations, recipe: Recipe, seed: int) -> l
     """Return two validation sets: the centre images, and an image of each observation from a random pose."""
     unmirrored = np.zeros(len(observations), bool)
     poses = observations.lanes.sample_poses(recipe, default_rng([seed, 5]), unmirrored)
-    return [
-        ValidationSet(observations.center, observations.steering),
-        ValidationSet(lambda rows: warped(observations, rows, [poses.take(rows)])[0], poses.steering),
-    ]
+
+    def seen(rows: np.ndarray) -> Any:
+        some = poses.take(rows)
+        return some.disturbed(warped(observations, rows, [some])[0])
+
+    return [ValidationSet(observations.center, observations.steering), ValidationSet(seen, poses.steering)]
 
 
 def warped(observations: Observations, rows: np.ndarray, poses: Sequence[Poses]) -> list[Any]:
-    """Return what the network sees of these k observations, for each item of poses: uint8 (k, 75, 320, 3), RGB."""
+    """Return what the network sees of these k observations, undisturbed, for each item of poses.
+
+    uint8 (k, 75, 320, 3), RGB.
+    """
     if observations.gpu:
         every, at = Poses.joined(poses), np.tile(rows, len(poses))
         road = observations.road_on_gpu(at, observations.row[at], every.camera)
