@@ -98,12 +98,14 @@ def test_an_error_above_that_of_constant_steering_is_explained():
         assert math.isnan(summary.correlation(labels[:1], labels[:1])), "of a single row"
 
 
-def test_the_line_of_a_diagnostic_picture_stays_within_its_image():
+def test_the_line_and_the_texts_of_a_diagnostic_picture_stay_within_it():
     for rows in (75, 160):
         for steering in (-1.0, 0.0, 1.0):
-            picture = np.asarray(pictures.panel(np.zeros((rows, 320, 3), np.uint8), "", steering))
+            texts = "2.0 m right, turned 25° right, underexposed:5", "brightness x 0.75"
+            picture = np.asarray(pictures.panel(np.zeros((rows, 320, 3), np.uint8), texts[0], steering, texts[1]))
             yellow, caption = (picture == (255, 255, 0)).all(2).nonzero()[0], len(picture) - pictures.SCALE * rows
             assert caption < yellow.min() < yellow.max() < len(picture)
+            assert (picture[:caption, -2:] == 255).all(), "the longest title ends before the picture"
 
 
 def test_a_diagnostic_picture_names_the_pose_that_its_image_shows():

@@ -19,10 +19,10 @@ FONT, MARGIN = 44, 12  # pixels: of the captions, which stay legible at a third 
 DPI = 200  # of the curves, which are 8 inches wide
 
 
-def panel(frame: np.ndarray, title: str, steering: float) -> Image.Image:
+def panel(frame: np.ndarray, title: str, steering: float, caption: str = "") -> Image.Image:
     """Return an enlarged frame under a title, with the steering as a number and as the wheels' direction.
 
-    frame: uint8 (rows, columns, 3), RGB; steering: -1..1.
+    frame: uint8 (rows, columns, 3), RGB; steering: -1..1; caption: after the number; a line holds 45 characters.
     """
     rows, columns = frame.shape[:2]
     top, width, height = round(2.5 * FONT), columns * SCALE, rows * SCALE
@@ -32,7 +32,8 @@ def panel(frame: np.ndarray, title: str, steering: float) -> Image.Image:
     picture.paste(image.resize((width, height), Image.Resampling.NEAREST), (0, top))
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(FONT)
-    for line, text in enumerate((title, f"steering {steering + 0:+.3f}")):  # + 0 turns -0 into 0
+    number = f"steering {steering + 0:+.3f}"  # + 0 turns -0 into 0
+    for line, text in enumerate((title, f"{number}, {caption}" if caption else number)):
         draw.text((4, line * 1.2 * FONT), text, "black", font)
     heading = np.radians(FULL_LOCK * steering)
     start, length = np.array([width / 2, top + (rows - 15) * SCALE]), min(75, rows - 20) * SCALE  # within the frame
@@ -66,8 +67,8 @@ def batch_pictures(choices: Choices, recipe: Recipe) -> dict[str, bytes]:
         chosen = [column[:1] for column in choices.augmenting[i]]
         made = augmentation.change(example.images[i], example.first_row, *chosen)
         image = choices.views.finished(i, made, np.zeros(1, int))[0]
-        caption = f", {augmentation.caption.format(*(column[0] for column in chosen))}" if augmentation.caption else ""
-        panels.append(panel(image, example.titles[i] + caption, choices.views.labels[0, i]))
+        caption = augmentation.caption.format(*(column[0] for column in chosen))
+        panels.append(panel(image, example.titles[i], choices.views.labels[0, i], caption))
     return {
         "training_generator_LRC_{}.png": grid([left, center, right], columns=3),
         "training_generator_augmented-{}.png": grid(panels, columns=2),
