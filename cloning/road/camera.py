@@ -22,7 +22,7 @@ FIRST_BONNET_ROW = ROAD_ROWS.stop  # from this row down the bonnet hides the roa
 FAR_SLOPE = 0.004  # tangent of the angle below the horizon: ground nearer to the horizon counts as infinitely far
 EARLIER_FRAME = 3.0  # m: a frame taken this far back shows all the road that a view 2 m to the side lacks
 JPEG_QUALITY = 75  # of the real simulator's images, with colour at half resolution, as their tables show
-VIEW_JPEG_QUALITY = 95  # of a warped frame, which was compressed at quality 75 when it was recorded
+VIEW_JPEG_QUALITY = 95  # of a warped frame, which was compressed once before, when it was recorded
 
 
 def _turn(right: float = 0.0, down: float = 0.0, forward: float = 0.0) -> np.ndarray:

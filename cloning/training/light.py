@@ -20,7 +20,7 @@ from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, disturb
 from cloning.training import gpu
 from cloning.training.recipe import Recipe
 
-OFTEN = (1, 2, 3, 4, 4, 5, 5)  # strengths: the strong ones more often, because the weak ones are soon learned
+OFTEN = (1, 2, 3, 4, 4, 5, 5)  # strengths: the strong ones, at which networks fail, more often
 TRAINED = [Disturbance(kind, strength) for kind in KINDS if kind not in HELD_OUT for strength in OFTEN]
 SHADES = 256  # different pictures of shadows
 SHADE, BLUISH = (0.15, 0.7), np.array([0.85, 1.0, 1.2])  # range of the factor of brightness in the shade; its colour

@@ -73,7 +73,10 @@ FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
     "epochs": (count, "epochs in total; may be raised with --resume"),
     "batch_size": (number(int, 1, MAX_BATCH), "observations in a batch; each gives 3.7 images on average"),
     "learning_rate": (number(float, 1e-9, 10), "learning rate of Adam or, with --robust, of Muon"),
-    "samples_per_epoch": (count, "smallest number of images in an epoch; a fifth as many observations validate it"),
+    "samples_per_epoch": (
+        count,
+        "smallest number of images in an epoch; a fifth as many observations, at most 4,096, validate it",
+    ),
     "throttle_threshold": (any_number, "without --robust: drop rows with less throttle, 0 to 1"),
     "side_correction": (
         any_number,
