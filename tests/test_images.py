@@ -83,6 +83,7 @@ def with_scans(count: int) -> bytes:
         (PLAIN[:HEADER] + PLAIN[SCAN:], "no picture in it"),
         (PLAIN[:SCAN] + b"\xff\xd9", "no picture in it"),
         (PLAIN.replace(b"\xff\xdb", b"\xff\xfe"), "damaged"),  # without quantization tables
+        (cv2.imencode(".png", FRAME)[1].tobytes(), "a PNG: convert it"),
     ],
 )
 def test_what_no_camera_of_the_simulator_writes_is_refused(jpeg, reason):

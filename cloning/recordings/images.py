@@ -40,7 +40,7 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
     if not jpeg:
         raise ValueError("empty")
     if jpeg[:3] != b"\xff\xd8\xff":
-        raise ValueError("not a JPEG")
+        raise ValueError("not a JPEG but a PNG: convert it" if jpeg.startswith(b"\x89PNG") else "not a JPEG")
     if len(jpeg) > MAX_BYTES:
         raise ValueError(f"larger than {MAX_BYTES} bytes")
     size, segments, scans, at = None, 0, 0, 2
