@@ -34,6 +34,41 @@ LAUNCHER = "#!/bin/sh\nPYTHONPATH="  # how one begins; another file of its name 
 MAX_PACKET = 1 << 20  # characters of a message: a road of some kilometres has 200,000
 
 
+class AwaitedDriver:
+    """What is known of a program's driver: whether it is in another thread than the answers, and how long it takes."""
+
+    def __init__(self, may_be_apart: bool):
+        self.apart: bool | None = None if may_be_apart else False  # whether it is in another thread; None: unknown
+        self.takes, self.patience = 0.02, PATIENTLY  # s for an answer; s that it is waited for
+        self.vain = self.constant = 0  # attempts to find it in another thread; answers in a row that did not change
+
+    def is_awaited(self) -> bool:
+        """Return whether it may still answer otherwise than the program did at once."""
+        return self.apart is not False and (self.apart or self.constant < ATTEMPTS)
+
+    def longest(self) -> float:
+        """Return how long to wait for it, s."""
+        return max(self.patience, 3 * self.takes) if self.apart else BRIEFLY
+
+    def answered(self, seconds: float, at_once: bool) -> None:
+        """Learn from an answer after so many seconds; at_once: it was there when it was first asked for."""
+        self.apart = True
+        self.patience = min(PATIENTLY, 1.05 * self.patience)
+        if at_once:  # it may take less
+            self.takes = max(0.005, 0.99 * self.takes)
+        else:
+            self.takes += 0.2 * (min(seconds, 0.2) - self.takes)
+
+    def kept_silent(self, is_new: bool) -> None:
+        """Learn from a vain wait; is_new: for the answer to a telemetry whose first answer was another than before."""
+        self.constant += 1
+        if self.apart:
+            self.patience /= 2
+        elif is_new:
+            self.vain += 1
+            self.apart = False if self.vain >= ATTEMPTS else None
+
+
 class Joined(ClientSession):
     """Sends telemetry to a server and does what it says, until the server has gone for `wait` seconds.
 
@@ -53,9 +88,7 @@ class Joined(ClientSession):
         super().__init__(host, port, wait, max_packet=MAX_PACKET)
         self.dialect, self.pace, self.period = dialect, pace, max(STEP, 1 / rate)
         self.frames, self.time, self.due = 0, 0.0, 0.0  # sent; simulated s in all; when the next is due
-        self._thinking, self._patience = 0.02, PATIENTLY  # s that the driver takes; that it is waited for
-        self._apart: bool | None = None if dialect.apart else False  # whether it is in another thread; None: unknown
-        self._vain = self._constant = 0  # attempts to find it there; answers in a row that did not change
+        self.driver = AwaitedDriver(dialect.apart)
         self._is_puzzled = False  # whether the user knows that no answer can be used
         self._origin = 0.0  # simulated s at time.perf_counter() 0, with a pace
 
@@ -111,32 +144,22 @@ class Joined(ClientSession):
 
     def _await_driver(self, run: Run, telemetry: str) -> None:
         """Send a run's telemetry again until the answer changes, if the program's driver may be in another thread."""
-        is_new = not self.dialect.same
+        driver, is_new = self.driver, not self.dialect.same
         if is_new:
-            self._constant = 0
-        if self._apart is False or self.dialect.still or (not self._apart and self._constant >= ATTEMPTS):
+            driver.constant = 0
+        if self.dialect.still or not driver.is_awaited():
             return
-        begin, pause = time.monotonic(), self._thinking
-        until = begin + (max(self._patience, 3 * self._thinking) if self._apart else BRIEFLY)
+        begin, pause = time.monotonic(), driver.takes
+        until = begin + driver.longest()
         while (left := until - time.monotonic()) > 0:
             self._listen(min(pause, left))
             if self.dialect.run is not run:  # another episode has begun
                 return
             if self._ask(telemetry) and not self.dialect.same:
-                self._apart = True
-                self._patience = min(PATIENTLY, 1.05 * self._patience)
-                if pause > self._thinking:
-                    self._thinking += 0.2 * (min(time.monotonic() - begin, 0.2) - self._thinking)
-                else:  # at once: it may take less
-                    self._thinking = max(0.005, 0.99 * self._thinking)
+                driver.answered(time.monotonic() - begin, at_once=pause == driver.takes)
                 return
             pause *= 1.5
-        self._constant += 1
-        if self._apart:
-            self._patience /= 2
-        if is_new and self._apart is None:
-            self._vain += 1
-            self._apart = False if self._vain >= ATTEMPTS else None
+        driver.kept_silent(is_new)
 
     def _listen(self, pause: float) -> bool:
         """Do what the server says until it is silent for `pause` seconds; return whether it answered a telemetry."""
