@@ -301,7 +301,7 @@ def main(argv: list[str] | None = None) -> int:
     recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
     work = partial(drive_into, folder, options.model)
     with started_workers(threads()) as pool:
-        for _ in results(pool, work, chosen, "drives"):
+        for _ in results(pool, work, chosen, "drive"):
             pass  # its errors are raised here
     driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]
     limits = fit([each for each in driven if each[0].tunes], recordings)

@@ -116,13 +116,13 @@ def compressed_rows(rows: slice) -> slice:
     return slice(first - first % BLOCK_ROWS, end + -end % BLOCK_ROWS)
 
 
-def compress(rows: np.ndarray, quality: int) -> np.ndarray:
+def compress(around: np.ndarray, rows: slice, quality: int) -> np.ndarray:
     """Return rows of a frame as they are after `encode` and `decode` of the whole frame, but sooner.
 
-    rows: `compressed_rows` of a frame, uint8 (k, 320, 3), RGB; quality: 0..100. Returns the same shape. Only the rows
-    of which they are the `compressed_rows` are those of the whole frame.
+    around: the frame's `compressed_rows(rows)`, uint8 (m, 320, 3), RGB; quality: 0..100. Returns uint8 (k, 320, 3).
     """
-    return _pixels(encode(rows, quality))
+    first = compressed_rows(rows).start
+    return _pixels(encode(around, quality))[rows.start - first : rows.stop - first]
 
 
 def read_jpeg(path: Path) -> bytes:

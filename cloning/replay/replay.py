@@ -218,13 +218,12 @@ class ReplayFrame:
 
         rows: of the frame.
         """
+        made = compressed_rows(rows)
         if self.disturber:
-            return compress(self.view, VIEW_JPEG_QUALITY)[rows]
+            return compress(self.view[made], rows, VIEW_JPEG_QUALITY)
         if not any(self.pose):
             return self.recorded[rows]
-        made = compressed_rows(rows)
-        view = compress(self.views.view_from(self.at, *self.pose, made), VIEW_JPEG_QUALITY)
-        return view[rows.start - made.start : rows.stop - made.start]
+        return compress(self.views.view_from(self.at, *self.pose, made), rows, VIEW_JPEG_QUALITY)
 
     def recovery_steering(self) -> float:
         """Return the recovery steering from the car's pose, -1..1: the label of `model.py --robust`.

@@ -113,9 +113,8 @@ def disturbed(image: np.ndarray, disturbance: int) -> np.ndarray:
         return image
     which, drive, frame = disturbance >> 20, disturbance >> 10 & 0x3FF, disturbance & 0x3FF
     whole = cv2.copyMakeBorder(image, *CROP, 0, 0, cv2.BORDER_REPLICATE)
-    made = compressed_rows(SEEN_ROWS)
-    seen = compress(disturb(whole, TRAINED[which], drive, frame)[made], JPEG_QUALITY)
-    return seen[SEEN_ROWS.start - made.start : SEEN_ROWS.stop - made.start]
+    seen = disturb(whole, TRAINED[which], drive, frame)
+    return compress(seen[compressed_rows(SEEN_ROWS)], SEEN_ROWS, JPEG_QUALITY)
 
 
 def name_of(disturbance: int) -> str:
