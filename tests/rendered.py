@@ -7,8 +7,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cloning.base.frame import FRAME
 from cloning.recordings.format import NUMBERS
 from cloning.recordings.log import Recording
+from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, FAR_SLOPE
+from cloning.road.warp import ground_mask
 
 
 def render_frame(bend: float, offset: float, rng: np.random.Generator) -> np.ndarray:
@@ -26,6 +29,20 @@ def render_frame(bend: float, offset: float, rng: np.random.Generator) -> np.nda
     for edge in (left, right):
         frame[60:][(edge - 3 <= columns) & (columns < edge + 3)] = (210, 180, 60)
     return np.clip(frame + rng.integers(-10, 11, frame.shape, np.int8), 0, 255).astype(np.uint8)
+
+
+def plane(right: float, forward: float, heading: float, mirrored: bool = False) -> np.ndarray:
+    """A rendered frame of a smoothly painted plane under a plain sky: uint8 (160, 320, 3)."""
+    columns, rows = np.meshgrid(np.arange(FRAME[1]), np.arange(FRAME[0]))
+    directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(CAMERA_MATRIX).T
+    down = np.maximum(directions[..., 1], FAR_SLOPE)
+    across, ahead = CAMERA_HEIGHT * directions[..., 0] / down, CAMERA_HEIGHT * directions[..., 2] / down
+    if mirrored:
+        across = -across
+    x = right + across * np.cos(heading) + ahead * np.sin(heading)
+    z = forward - across * np.sin(heading) + ahead * np.cos(heading)
+    painted = np.stack([127 + 100 * np.sin(x / a + z / b) for a, b in ((1.1, 9.0), (2.3, -7.0), (-1.7, 12.0))], axis=-1)
+    return np.where(ground_mask()[..., None], painted, 127).round().astype(np.uint8)
 
 
 def film_of(path: Path) -> tuple[float, list[np.ndarray]]:

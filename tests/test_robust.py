@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 from commands import SHORT, begun_training, edited, finished_run, run_here, same, started_run, weights
-from rendered import render_recording, without_files
+from rendered import plane, render_recording, without_files
 
-from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.base.frame import ROAD_ROWS
 from cloning.browse import analyse
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
 from cloning.network.network import CROP, SEEN_SHAPE, Network, load_model
 from cloning.recordings.log import CheckedRecording
-from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, CAMERA_OFFSETS, FAR_SLOPE, FIRST_BONNET_ROW
+from cloning.road.camera import CAMERA_OFFSETS, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
-from cloning.road.warp import ground_mask, with_alpha
+from cloning.road.warp import with_alpha
 from cloning.training import lanes as lanes_module
 from cloning.training import light
 from cloning.training.lanes import Lanes, Poses
@@ -107,20 +107,6 @@ def test_the_lane_ahead_is_not_known_before_a_break(monkeypatch):
 
 # --------------------------------------------------------------------------------------------------
 # Views
-
-
-def plane(right: float, forward: float, heading: float, mirrored: bool = False) -> np.ndarray:
-    """A rendered frame of a smoothly painted plane under a plain sky: uint8 (160, 320, 3)."""
-    columns, rows = np.meshgrid(np.arange(FRAME[1]), np.arange(FRAME[0]))
-    directions = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(CAMERA_MATRIX).T
-    down = np.maximum(directions[..., 1], FAR_SLOPE)
-    across, ahead = CAMERA_HEIGHT * directions[..., 0] / down, CAMERA_HEIGHT * directions[..., 2] / down
-    if mirrored:
-        across = -across
-    x = right + across * np.cos(heading) + ahead * np.sin(heading)
-    z = forward - across * np.sin(heading) + ahead * np.cos(heading)
-    painted = np.stack([127 + 100 * np.sin(x / a + z / b) for a, b in ((1.1, 9.0), (2.3, -7.0), (-1.7, 12.0))], axis=-1)
-    return np.where(ground_mask()[..., None], painted, 127).round().astype(np.uint8)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
