@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import unittest.mock
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import warm
 from PIL import Image
 
 from cloning.base import program
+from cloning.base.errors import UserError
 
 ROOT = Path(__file__).parent.parent
 SHORT = ("--epochs", 2, "--samples-per-epoch", 80, "--batch-size", 8, "--device", "cpu")
@@ -40,6 +41,21 @@ def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
     )
 
 
+def call_here(main: Callable, name: str, *arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
+    """What a command prints, and its exit status, in this process; main: its function, name: as it prints it."""
+    command, out, err = [name, *map(str, arguments)], io.StringIO(), io.StringIO()
+    named = unittest.mock.patch.object(program, "name", name)
+    called = unittest.mock.patch.object(sys, "argv", command)
+    with named, called, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
+        try:
+            status: Any = main()
+        except (UserError, OSError) as error:
+            status = program.failed(error)
+        except SystemExit as error:  # argparse's
+            status = error.code
+    return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
+
+
 # To pack its pictures well would take a fifth of a short run.
 @unittest.mock.patch.object(Image.Image, "save", functools.partialmethod(Image.Image.save, compress_level=1))
 def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
@@ -47,17 +63,8 @@ def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
     import model
     from cloning.training import pictures
 
-    command = list(map(str, arguments))
-    out, err = io.StringIO(), io.StringIO()
-    named = unittest.mock.patch.object(program, "name", "model.py")
-    called = unittest.mock.patch.object(sys, "argv", ["model.py"])  # for argparse
-    small = unittest.mock.patch.multiple(pictures, SCALE=1, png=lambda *_: PICTURE)
-    with named, called, small, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), contextlib.chdir(cwd):
-        try:
-            status: Any = model.main(command)
-        except SystemExit as error:  # argparse's
-            status = error.code
-    return subprocess.CompletedProcess(command, status, out.getvalue(), err.getvalue())
+    with unittest.mock.patch.multiple(pictures, SCALE=1, png=lambda *_: PICTURE):
+        return call_here(model.main, "model.py", *arguments, cwd=cwd)
 
 
 def started_run(*arguments, until: str) -> warm.Process:
@@ -68,11 +75,23 @@ def started_run(*arguments, until: str) -> warm.Process:
     return run
 
 
-def finished_run(recording: Path, folder: Path, *arguments) -> tuple[subprocess.CompletedProcess, Path]:
-    """A run that was never interrupted: what it printed, and its folder."""
-    done = run_here(recording, *arguments, "--output", folder / "model.pt")
+def trained(*arguments, cwd: Path = ROOT) -> str:
+    """What model.py prints that ends as it should, in this process."""
+    done = run_here(*arguments, cwd=cwd)
     assert done.returncode == 0, done.stderr
-    return done, folder
+    return done.stdout
+
+
+def refused(*arguments, cwd: Path = ROOT) -> str:
+    """The error with which model.py ends, in this process."""
+    done = run_here(*arguments, cwd=cwd)
+    assert done.returncode == 2, done.stdout
+    return done.stderr
+
+
+def finished_run(recording: Path, folder: Path, *arguments) -> tuple[str, Path]:
+    """A run that was never interrupted: what it printed, and its folder."""
+    return trained(recording, *arguments, "--output", folder / "model.pt"), folder
 
 
 def begun_training(*arguments) -> Any:

@@ -14,7 +14,7 @@ import pytest
 import warm
 from browse_process import browsing, opened, placed, written_run
 from browser import needs_chromium
-from commands import HERE, run_here
+from commands import HERE, trained
 from drive_process import awaited
 from test_excluded import center
 
@@ -227,8 +227,7 @@ def test_a_run_that_was_killed_before_it_told_of_its_end_tells_when_it_is_resume
     assert progress["finished"] == 2
     files.progress.write_text(json.dumps(progress | {"finished": 1}), encoding="utf-8")
     assert runs.overview(files)["state"] == "stopped"
-    done = run_here("--resume", "--output", files.last)
-    assert done.returncode == 0, done.stderr
+    trained("--resume", "--output", files.last)
     assert runs.overview(files)["state"] == "finished" and json.loads(files.progress.read_bytes()) == progress
 
 

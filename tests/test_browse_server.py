@@ -2,12 +2,12 @@
 
 import json
 import socket
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from browse_process import browsing, opened, placed, replayed, written_run
+from commands import call_here
 from rendered import film_of
 from test_excluded import center
 
@@ -259,12 +259,12 @@ def test_a_recording_that_is_new_is_in_the_list_and_others_are_answered_while_it
         assert list(server.recordings()) == ["lake", "long"], "what is gone is told in its card"
 
 
-def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path, monkeypatch, capsys):
+def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path):
     for arguments, words in (
         ([tmp_path], f"{tmp_path}: no driving_log.csv in or below it. Record some: in the simulator (training mode"),
         ([sample_recording, "--model", tmp_path / "m.pt"], f"{tmp_path / 'm.pt'}: no such model file"),
         ([sample_recording, "--model", SHIPPED_WEIGHTS], f"{SHIPPED_WEIGHTS}: not a model of this project that steers"),
     ):
-        monkeypatch.setattr(sys, "argv", ["browse", *map(str, arguments), "--port", "0"])
-        assert browse.main() == 2 and (said := capsys.readouterr().err).startswith(f"python: {words}")
-        assert "python -m simulator record data/lake" in said or "model" in words
+        done = call_here(browse.main, "browse", *arguments, "--port", 0)
+        assert done.returncode == 2 and done.stderr.startswith(f"browse: {words}")
+        assert "python -m simulator record data/lake" in done.stderr or "model" in words

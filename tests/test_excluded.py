@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warm
-from commands import ROOT, SHORT, run_here
+from commands import ROOT, SHORT, trained
 
 from cloning.base.errors import RecordingError
 from cloning.browse.library import Library
@@ -72,10 +72,9 @@ def test_every_command_honours_and_counts_cuts(copied, capsys):
         f"{file}: line 3: 1 row is left out, from {center(copied, 30)} to {center(copied, 30)}: no reason given",
     ]
     assert capsys.readouterr().out.splitlines() == printed
-    done = run_here(copied, *SHORT, "--epochs", 1, "--output", copied.parent / "model.pt", "--strict")
-    assert done.returncode == 0, done.stderr
-    assert all(line in done.stdout for line in printed)
-    row = next(line for line in done.stdout.splitlines() if line.startswith("total"))
+    told = trained(copied, *SHORT, "--epochs", 1, "--output", copied.parent / "model.pt", "--strict")
+    assert all(line in told for line in printed)
+    row = next(line for line in told.splitlines() if line.startswith("total"))
     assert row.split() == ["total", "60", "11", "0", "5", "44"], "read, excluded, unusable, little throttle, kept"
     assert len(load_recording(copied)) == 49 and printed[0] in capsys.readouterr().out, "replays too"
 

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 import torch
-from commands import SHORT, begun_training, edited, run_here, same, weights
+from commands import SHORT, begun_training, edited, refused, same, trained, weights
 
 from cloning.network import tensors
 from cloning.training.options import parse
@@ -52,17 +52,14 @@ def test_it_keeps_the_file_also_as_its_own_output_and_is_resumed_exactly_without
     """`model.py --from model.pt` in the folder of the earlier run, the shortest command, against a run in two parts."""
     before, parts = weights(base), tmp_path / "parts" / "model.pt"
     command = (sample_recording, *FEW, "--from", base)
-    begun = run_here(*command, "--epochs", 1, "--output", parts)
-    assert f"begins with the weights of {base}" in begun.stdout
-    done = run_here(*command, "--output", base)
-    assert done.returncode == 0, done.stderr
+    assert f"begins with the weights of {base}" in trained(*command, "--epochs", 1, "--output", parts)
+    trained(*command, "--output", base)
     assert same(weights(tmp_path / "base-previous.pt"), before)
     whole = base.rename(tmp_path / "whole.pt")
     assert not same(weights(whole), before)
-    refused = run_here("--resume", "--from", "other.pt", "--output", parts)
-    assert refused.returncode == 2 and f"the run began with --from {str(base)!r}, not 'other.pt'" in refused.stderr
-    resumed = run_here("--epochs", 2, "--resume", "--output", parts)
-    assert resumed.returncode == 0 and "resumed in epoch 2" in resumed.stdout
+    told = f"the run began with --from {str(base)!r}, not 'other.pt'"
+    assert told in refused("--resume", "--from", "other.pt", "--output", parts)
+    assert "resumed in epoch 2" in trained("--epochs", 2, "--resume", "--output", parts)
     assert same(weights(whole), weights(parts))
     for output in (whole, parts):
         assert json.loads(output.with_name("training_arguments.json").read_bytes())["from_model"] == str(base)
@@ -70,8 +67,7 @@ def test_it_keeps_the_file_also_as_its_own_output_and_is_resumed_exactly_without
 
 def test_resume_of_a_run_without_a_file_to_begin_with_refuses_one(finished, base, tmp_path):
     plain = shutil.copytree(finished[1], tmp_path / "plain")
-    refused = run_here("--resume", "--from", base, "--output", plain / "model.pt")
-    assert refused.returncode == 2 and "the run began with --from ''" in refused.stderr
+    assert "the run began with --from ''" in refused("--resume", "--from", base, "--output", plain / "model.pt")
 
 
 @pytest.mark.parametrize(
@@ -84,7 +80,6 @@ def test_resume_of_a_run_without_a_file_to_begin_with_refuses_one(finished, base
 )
 def test_an_unusable_file_is_named_before_anything_is_written(sample_recording, base, tmp_path, change, words):
     change(base)
-    done = run_here(sample_recording, *FEW, "--from", base, "--output", tmp_path / "run" / "model.pt")
-    assert done.returncode == 2 and f"model.py: {base}: " in done.stderr and words in done.stderr
-    assert "name a" in done.stderr
+    told = refused(sample_recording, *FEW, "--from", base, "--output", tmp_path / "run" / "model.pt")
+    assert f"model.py: {base}: " in told and words in told and "name a" in told
     assert not [path for path in (tmp_path / "run").rglob("*") if path.is_file()]

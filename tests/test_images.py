@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import warm
-from commands import HERE, ROOT, SHORT, run_here, same, weights
+from commands import HERE, ROOT, SHORT, refused, run_here, same, trained, weights
 from PIL import Image
 from rendered import render_frame
 
@@ -338,14 +338,11 @@ def test_an_image_that_changes_during_training_is_named_and_can_be_restored(copi
 
     with monkeypatch.context() as patch:
         patch.setattr(model, "split", cut_then_split)
-        done = run_here(copied, *SHORT, "--output", tmp_path / "model.pt")
-    assert done.returncode == 2
-    assert ".jpg: cut short" in done.stderr and str(copied / "IMG") in done.stderr
-    assert "Restore it and continue with --resume" in done.stderr
+        told = refused(copied, *SHORT, "--output", tmp_path / "model.pt")
+    assert ".jpg: cut short" in told and str(copied / "IMG") in told and "Restore it and continue with --resume" in told
     for image, jpeg in images.items():
         image.write_bytes(jpeg)
-    done = run_here(*SHORT, "--output", tmp_path / "model.pt", "--resume")
-    assert done.returncode == 0, done.stderr
+    trained(*SHORT, "--output", tmp_path / "model.pt", "--resume")
     assert same(weights(tmp_path / "model.pt"), weights(finished[1] / "model.pt"))
 
 

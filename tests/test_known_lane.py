@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from commands import run_here
+from commands import refused, trained
 from scenes import lake_drive
 
 from cloning.base.errors import RecordingError
@@ -88,13 +88,11 @@ def test_rows_that_it_does_not_name_are_not_trusted(lane, capsys):
 
 def test_training_says_that_it_is_read_or_why_not(lane, tmp_path):
     short = ("--robust", "--output", tmp_path / "model.pt", "--epochs", 1, "--samples-per-epoch", 64)
-    done = run_here(lane.parent, *short)
-    assert not done.returncode, done.stderr
-    assert f"reading the lane in {lane.parent}" in done.stdout and "estimating" not in done.stdout
+    told = trained(lane.parent, *short)
+    assert f"reading the lane in {lane.parent}" in told and "estimating" not in told
     lane.unlink()
     lane.mkdir()
-    done = run_here(lane.parent, *short)
-    assert done.returncode == 2 and "lane.csv: not a regular file; make it a readable file, or delete it" in done.stderr
+    assert "lane.csv: not a regular file; make it a readable file, or delete it" in refused(lane.parent, *short)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among files")

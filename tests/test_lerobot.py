@@ -1,22 +1,18 @@
 """Recordings as LeRobot's data sets and back; donkeycar's tubs, and drives that drive.py saved, as recordings."""
 
-import contextlib
-import io
 import json
 import runpy
 import shutil
-import sys
 from pathlib import Path
-from unittest.mock import patch
 
 import av
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from commands import call_here
 from rendered import render_frame, render_recording
 
-from cloning.base.errors import UserError, message_of
 from cloning.lerobot import __main__ as lerobot
 from cloning.recordings.check import check_images
 from cloning.recordings.images import encode, read_frame
@@ -28,13 +24,8 @@ CENTER = "observation.images.center"
 
 def run(*arguments) -> tuple[str, str]:
     """What `python -m cloning.lerobot` prints, and its error; here, as a start takes longer than most conversions."""
-    printed, error = io.StringIO(), ""
-    with patch.object(sys, "argv", ["lerobot", *map(str, arguments)]), contextlib.redirect_stdout(printed):
-        try:
-            lerobot.main()
-        except (UserError, OSError) as raised:
-            error = message_of(raised)
-    return printed.getvalue(), error
+    done = call_here(lerobot.main, "lerobot", *arguments, cwd=Path.cwd())
+    return done.stdout, done.stderr.removeprefix("lerobot: ").removesuffix("\n")
 
 
 def converted(*arguments) -> str:

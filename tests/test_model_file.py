@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from commands import edited, run_here
+from commands import edited
+from commands import refused as refused_run
 
 from cloning.base.errors import ModelError
 from cloning.network import tensors
@@ -269,10 +270,8 @@ def test_an_unusable_state_is_named(begun, change, words):
     with edited(path) as saved:
         change(saved)
     before = contents(begun)
-    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 3)
-    assert done.returncode == 2
-    assert f"model.py: {path}: " in done.stderr and words in done.stderr, done.stderr
-    assert "new run without --resume" in done.stderr
+    told = refused_run("--output", begun / "model.pt", "--resume", "--epochs", 3)
+    assert f"model.py: {path}: " in told and words in told and "new run without --resume" in told
     assert contents(begun) == before
 
 
@@ -282,6 +281,5 @@ def test_a_flipped_bit_in_the_optimizers_state_is_noticed(begun):
     average = torch.load(path, weights_only=True)["training"]["optimizer"]["state"][10]["exp_avg"]
     data[data.find(average.numpy().tobytes()) + 1000] ^= 4
     path.write_bytes(data)
-    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 3)
-    assert done.returncode == 2
-    assert f"{path}: " in done.stderr and "checksum" in done.stderr and "new run without --resume" in done.stderr
+    told = refused_run("--output", begun / "model.pt", "--resume", "--epochs", 3)
+    assert f"{path}: " in told and "checksum" in told and "new run without --resume" in told

@@ -6,31 +6,30 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
-import warm
 from browser import LOOKS, needs_chromium
-from commands import PICTURE, ROOT, log
+from commands import PICTURE, call_here, log
 from matplotlib.figure import Figure
 from PIL import Image
 from rendered import render_recording
+from test_demo import REPORT as LAP
 
 from cloning.base.errors import UserError
 from cloning.base.files import csv_bytes
 from cloning.base.film import FilmWriter
 from cloning.recordings.format import BINS
 from cloning.replay.score import YARDSTICKS
+from cloning.report import __main__ as command
 from cloning.report.content import Report, bend
 from cloning.report.pictures import epochs_chart, film_uri, picture_uri, steering_chart
 
 
 def report(*arguments) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "cloning.report", *map(str, arguments)]
-    return warm.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    return call_here(command.main, "report", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -45,14 +44,7 @@ def written(finished, sample_recording, tmp_path_factory):
         row["val_drift"] = drift
     (folder / "training_log.csv").write_bytes(csv_bytes([epochs[0], *(row.values() for row in epochs)]))
     lap = Path(shutil.copy(folder / "training_loss.png", folder / "The lake.png"))
-    figures = {
-        "distance_m": 1137.9,
-        "mean_speed_mph": 29.6,
-        "departures": [],
-        "offset_mean_m": 0.07,
-        "offset_max_m": 0.2,
-    }
-    lap.with_suffix(".json").write_text(json.dumps(figures), encoding="utf-8")
+    lap.with_suffix(".json").write_text(json.dumps(LAP), encoding="utf-8")
     lap.with_suffix(".mp4").write_bytes(b"film")
     done = report(folder, "--held-out", sample_recording, "--lap", lap, folder / "training_loss.png", "--markdown")
     assert done.returncode == 0, done.stderr
@@ -71,7 +63,7 @@ def test_the_report_contains_the_run(written, finished):
     text = re.sub(r"\s+", " ", re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL))
     for title in ("my run", "Data", "Recipe", "Network", "Training", "Driving", "What to do next"):
         assert re.search(rf"<h[12]>[^<]*{title}</h[12]>", page), title
-    printed = finished[0].stdout
+    printed = finished[0]
     layers = printed[printed.index("Layer (type)") : printed.index("Total params")].split()
     assert " ".join(layers) in text, "the table of layers that the run printed"
     assert "The best epoch is 1 : it has the least drift, 0.50 m." in text

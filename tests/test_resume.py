@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warm
-from commands import HERE, SHORT, TINY, edited, finished_run, log, run_here, run_model, same, weights
+from commands import HERE, SHORT, TINY, edited, finished_run, log, refused, run_here, run_model, same, trained, weights
 from killed import ALL
 from rendered import render_recording
 
@@ -72,7 +72,7 @@ def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_inte
     assert "Traceback" not in run.stderr
     state = torch.load(tmp_path / "model-resume.pt", weights_only=True)["training"]
     assert 0 < state["images"] < 80  # in the middle of an epoch
-    assert run_here(sample_recording, "--output", output, "--resume").returncode == 0
+    trained(sample_recording, "--output", output, "--resume")
     for name in ("model.pt", "model-best.pt"):
         assert same(weights(tmp_path / name), weights(finished[1] / name))
     ours, theirs = (
@@ -93,7 +93,7 @@ def test_a_signal_does_not_wait_for_the_validation(finished, sample_recording, t
     assert model.main([str(sample_recording), *map(str, SHORT), "--output", str(output)]) == 128 + signal.SIGINT
     assert torch.load(tmp_path / "model-resume.pt", weights_only=True)["training"]["images"] >= 80, "the whole epoch"
     monkeypatch.undo()
-    assert run_here(sample_recording, "--output", output, "--resume").returncode == 0
+    trained(sample_recording, "--output", output, "--resume")
     assert same(weights(output), weights(finished[1] / "model.pt"))
     saved = list[str]()
     with pytest.raises(Interrupted), StopSignals() as stop:
@@ -146,30 +146,24 @@ def test_a_training_outlives_its_terminal_after_nohup():
 def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
     output, rejected = begun / "model.pt", begun / "rejected_rows.csv"
     rejected.write_text("the run's", encoding="utf-8")
-    other = run_here("--output", output, "--resume", "--learning-rate", 0.1)
-    assert other.returncode == 2
-    assert "--learning-rate 0.0001, not 0.1" in other.stderr
-    changed = run_here(render_recording(tmp_path / "other", rows=20, seed=1), "--output", output, "--resume")
-    assert changed.returncode == 2
-    assert "the run began with other recordings" in changed.stderr
-    few = run_here(render_recording(tmp_path / "few", rows=3), "--output", output, "--resume")
-    assert few.returncode == 2 and "record more" in few.stderr
+    resume = ("--output", output, "--resume")
+    assert "--learning-rate 0.0001, not 0.1" in refused(*resume, "--learning-rate", 0.1)
+    other, few = render_recording(tmp_path / "other", rows=20, seed=1), render_recording(tmp_path / "few", rows=3)
+    assert "the run began with other recordings" in refused(other, *resume)
+    assert "record more" in refused(few, *resume)
     assert rejected.read_text(encoding="utf-8") == "the run's"
     with edited(begun / "model-resume.pt") as saved:
         saved["training"]["images"] = 4
-    fewer = run_here("--output", output, "--resume", "--epochs", 1)
-    assert fewer.returncode == 2 and "the run is in epoch 2; give more --epochs" in fewer.stderr
+    assert "the run is in epoch 2; give more --epochs" in refused(*resume, "--epochs", 1)
 
 
 def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path):
     """Where and how a run was started never comes out of its checkpoint: output, device, strict."""
-    begun = run_here(sample_recording, *SHORT, "--epochs", 1, "--strict", "--output", "runs/a/model.pt", cwd=tmp_path)
-    assert begun.returncode == 0, begun.stderr
+    trained(sample_recording, *SHORT, "--epochs", 1, "--strict", "--output", "runs/a/model.pt", cwd=tmp_path)
     folder = tmp_path / "runs" / "a"
     with edited(folder / "model-resume.pt") as saved:
         assert not {"output", "device", "strict", "resume"} & saved["arguments"].keys()
-    resumed = run_here("--resume", "--epochs", 2, "--device", "cpu", cwd=folder)
-    assert resumed.returncode == 0, resumed.stderr
+    trained("--resume", "--epochs", 2, "--device", "cpu", cwd=folder)
     assert not (folder / "runs").exists()
     assert same(weights(folder / "model.pt"), weights(finished[1] / "model.pt"))
     arguments = json.loads((folder / "training_arguments.json").read_text(encoding="utf-8"))
@@ -190,8 +184,7 @@ def test_a_checkpoint_of_an_earlier_version_is_resumed(finished, begun):
             process = {"output": "elsewhere.pt", "device": "cuda", "strict": True, "resume": False}
             more = {"recordings": saved["arguments"]["recordings"], "seed": 0, "from_": "", "robust": False, "gone": 1}
             saved["arguments"] = flat | process | more | {"optimizer": "adam", "loss": "squared"}
-    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2, "--device", "cpu")
-    assert done.returncode == 0, done.stderr
+    trained("--output", begun / "model.pt", "--resume", "--epochs", 2, "--device", "cpu")
     assert same(weights(begun / "model.pt"), weights(finished[1] / "model.pt"))
     assert not list(begun.glob("*previous*"))
     assert [row["val_drift"] for row in log(begun)] == ["", ""], "a recording of four seconds has no stretch to drive"
@@ -215,9 +208,8 @@ def test_a_finished_run_that_is_resumed_says_how_to_train_on_and_has_its_own_mod
     (begun / "training_log.csv").write_bytes(losses.replace(b"\n1,", b"\n9,"))
     for name in ("model.pt", "model-best.pt", "training_loss.png"):
         (begun / name).unlink()
-    done = run_here("--output", begun / "model.pt", "--resume")
-    assert done.returncode == 0 and "resumed in epoch" not in done.stdout
-    assert "the run has finished its 1 epoch; for more, raise --epochs" in done.stdout
+    told = trained("--output", begun / "model.pt", "--resume")
+    assert "the run has finished its 1 epoch; for more, raise --epochs" in told and "resumed in epoch" not in told
     assert same(weights(begun / "model.pt"), before)
     assert (begun / "training_log.csv").read_bytes() == losses and (begun / "training_loss.png").exists()
 
@@ -227,23 +219,21 @@ def test_a_recording_and_one_below_it_are_found_again(sample_recording, tmp_path
     for folder, seed in ((below, 1), (data / "later", 2)):
         render_recording(folder, rows=20, seed=seed)
         command = (data, *TINY, "--epochs", seed, "--output", tmp_path / "model.pt", "--resume")
-        done = run_here(*command)
         if folder == below:
-            assert done.returncode == 0 and "data/lake" in done.stdout, "both"
-            assert run_here("--output", tmp_path / "model.pt", "--resume", "--epochs", 1).returncode == 0
-            assert run_here(*command).returncode == 0
+            assert "data/lake" in trained(*command), "both"
+            trained("--output", tmp_path / "model.pt", "--resume", "--epochs", 1)
+            trained(*command)
         else:
-            assert done.returncode == 2 and "the run began with other recordings" in done.stderr
-            assert run_here("--output", tmp_path / "model.pt", "--resume").returncode == 0, "those of the run"
+            assert "the run began with other recordings" in refused(*command)
+            trained("--output", tmp_path / "model.pt", "--resume")  # with those of the run
 
 
 def test_a_new_run_keeps_the_models_of_the_ones_before(begun, sample_recording):
     """All files of a run get the same ending, also if one of them was missing."""
     (begun / "model-best.pt").unlink()
     for seed in (1, 2):
-        done = run_here(sample_recording, *TINY, "--seed", seed, "--output", begun / "model.pt")
-        assert done.returncode == 0, done.stderr
-        assert f"{begun / 'model.pt'} of an earlier run is now" in done.stdout
+        told = trained(sample_recording, *TINY, "--seed", seed, "--output", begun / "model.pt")
+        assert f"{begun / 'model.pt'} of an earlier run is now" in told
     endings = ("-previous", "-previous-2", "")
     expected = {f"{name}{ending}.pt": seed for name in MODELS for seed, ending in enumerate(endings)}
     del expected["model-best-previous.pt"]
@@ -291,13 +281,11 @@ def test_killed_at_any_change_of_a_file(begun, sample_recording, tmp_path, monke
     new_run_begun = kill_at > 2
     assert seed_of(begun / "model-resume.pt") == new_run_begun
     copy = shutil.copytree(begun, tmp_path / "copy")
-    done = run_here("--output", copy / "model.pt", "--resume", "--epochs", 1)
-    assert done.returncode == 0, done.stderr
+    trained("--output", copy / "model.pt", "--resume", "--epochs", 1)
     previous = {f"{name}-previous.pt": 0 for name in MODELS}
     copied = {"model-resume-previous.pt": 0} if kill_at == 2 else {}  # for the new run, which has not begun
     assert seeds(copy) == {f"{name}.pt": new_run_begun for name in MODELS} | (previous if new_run_begun else copied)
-    done = run_here(*command, "--seed", 2)
-    assert done.returncode == 0, done.stderr
+    trained(*command, "--seed", 2)
     kept = {f"{name}-previous-2.pt": 1 for name, point in zip(MODELS, (9, 10, 11), strict=True) if kill_at > point}
     assert seeds(begun) == {f"{name}.pt": 2 for name in MODELS} | previous | kept
 
@@ -318,14 +306,13 @@ def test_a_run_that_diverges_stops_and_saves_nothing_of_it(begun, sample_recordi
 
 def test_resume_does_not_replace_the_models_of_another_run(begun, sample_recording):
     command = (sample_recording, *TINY, "--output", begun / "model.pt")
-    assert run_here(*command, "--seed", 1).returncode == 0
+    trained(*command, "--seed", 1)
     shutil.copy(begun / "model-resume-previous.pt", begun / "model-resume.pt")
-    done = run_here("--output", begun / "model.pt", "--resume", "--epochs", 2)
-    assert done.returncode == 2
-    assert f"{begun / 'model.pt'}: damaged, or of another run than model-resume.pt" in done.stderr
+    resume = ("--output", begun / "model.pt", "--resume", "--epochs", 2)
+    assert f"{begun / 'model.pt'}: damaged, or of another run than model-resume.pt" in refused(*resume)
     for name in ("model", "model-best"):
         os.replace(begun / f"{name}-previous.pt", begun / f"{name}.pt")
-    assert run_here("--output", begun / "model.pt", "--resume", "--epochs", 2).returncode == 0
+    trained(*resume)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no locks on folders")

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from commands import SHORT, begun_training, edited, finished_run, run_here, same, started_run, weights
+from commands import SHORT, begun_training, edited, finished_run, refused, same, started_run, trained, weights
 from rendered import plane, render_recording, without_files
 
 from cloning.base.frame import ROAD_ROWS
@@ -178,14 +178,14 @@ def finished(sample_recording, tmp_path_factory):
 
 
 def test_robust_trains_and_reports_what_was_left_out(finished, sample_recording):
-    done, folder = finished
-    assert "lane ahead unknown" in done.stdout
-    row = next(line for line in done.stdout.splitlines() if line.startswith("total"))
+    told, folder = finished
+    assert "lane ahead unknown" in told
+    row = next(line for line in told.splitlines() if line.startswith("total"))
     assert int(row.split()[-1]) == 60 - int(row.split()[-2])
     metres = 2 * recovery.HEADING_CHORD + recovery.LOOKAHEAD  # at the beginning and at the end
     assert int(row.split()[-2]) == pytest.approx(metres / (30.19 * MPH * 0.067), abs=2)
-    assert "correlation with the recovery steering" in done.stdout
-    assert "val_loss is of them and of as many views from other poses" in done.stdout
+    assert "correlation with the recovery steering" in told
+    assert "val_loss is of them and of as many views from other poses" in told
     for name in ("training_generator_LRC_0.png", "training_generator_augmented-0.png"):
         assert (folder / "diagnostic_images" / name).exists()
     arguments = torch.load(folder / "model.pt", weights_only=True)["arguments"]
@@ -198,7 +198,7 @@ def test_robust_killed_and_resumed_ends_with_the_same_weights(finished, sample_r
     run = started_run(sample_recording, *OPTIONS, "--output", tmp_path / "model.pt", until="Epoch 2")
     run.kill()
     run.wait()
-    assert run_here("--output", tmp_path / "model.pt", "--resume").returncode == 0
+    trained("--output", tmp_path / "model.pt", "--resume")
     for name in ("model.pt", "model-best.pt"):
         assert same(weights(finished[1] / name), weights(tmp_path / name))
 
@@ -211,8 +211,7 @@ def test_a_robust_run_of_an_earlier_version_goes_on_as_it_began(finished, tmp_pa
         flat = {name: saved["arguments"]["recipe"][name] for name in figures}
         saved["arguments"] = {"recordings": saved["arguments"]["recordings"], "seed": 0, "robust": True, **flat}
         saved["training"]["optimizer"]["state"] = {number: optimizer.zeros(number) for number in range(18)}
-    done = run_here("--output", tmp_path / "model.pt", "--resume", "--epochs", 3)
-    assert done.returncode == 0, done.stderr
+    trained("--output", tmp_path / "model.pt", "--resume", "--epochs", 3)
     after = torch.load(tmp_path / "model-resume.pt", weights_only=True)
     recipe = after["arguments"]["recipe"]
     assert [recipe[name] for name in ("name", "optimizer", "momentum", "huber")] == ["robust", "adam", 0.9, None]
@@ -271,8 +270,8 @@ def test_networks_are_measured_as_they_drive(sample_recording, tmp_path):
 
 
 def test_drives_too_short_are_named(tmp_path):
-    done = run_here(render_recording(tmp_path / "short", rows=20), *OPTIONS, "--output", tmp_path / "model.pt")
-    assert done.returncode == 2 and "too short" in done.stderr
+    short = render_recording(tmp_path / "short", rows=20)
+    assert "too short" in refused(short, *OPTIONS, "--output", tmp_path / "model.pt")
 
 
 def test_tints_keep_grey_nearly_grey():

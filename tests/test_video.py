@@ -17,12 +17,10 @@ import numpy as np
 import pytest
 import torch
 import warm
-from commands import ROOT
+from commands import ROOT, call_here
 from rendered import film_of
 
 import video
-from cloning.base import program
-from cloning.base.errors import UserError
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.network.network import Network, save_model
 from cloning.replay import command
@@ -46,21 +44,12 @@ def save(folder: Path, count: int, begin=datetime(2018, 7, 16, 17, 11, 43), rows
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
+def run(tmp_path):
     """The command, in this process and in tmp_path: its exit status and what it says."""
 
-    def run(*arguments) -> tuple[object, str]:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["video.py", *arguments])
-        monkeypatch.setattr(program, "name", "video.py")
-        status: object
-        try:
-            status = video.main()
-        except (UserError, OSError) as error:
-            status = program.failed(error)
-        except SystemExit as error:  # argparse's
-            status = error.code
-        return status, "".join(capsys.readouterr())
+    def run(*arguments) -> tuple[int, str]:
+        done = call_here(video.main, "video.py", *arguments, cwd=tmp_path)
+        return done.returncode, done.stdout + done.stderr
 
     return run
 
