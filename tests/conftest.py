@@ -141,6 +141,16 @@ def finished(sample_recording, tmp_path_factory) -> tuple[str, Path]:
     return finished_run(sample_recording, tmp_path_factory.mktemp("run"), *SHORT)
 
 
+@pytest.fixture
+def at_once(monkeypatch):
+    """A program that hangs up is not waited for, so that others are waited for as long as a busy machine takes."""
+
+    def gone(joined, error):
+        raise joined.no_answer()
+
+    monkeypatch.setattr("simulator.join.Joined.count_reconnection", gone)
+
+
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory):
     with chromium(tmp_path_factory.mktemp("profile")) as page:

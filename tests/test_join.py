@@ -22,6 +22,7 @@ from simulator.__main__ import main
 from simulator.dialects import Roads, Stage
 from simulator.join import Joined
 
+pytestmark = pytest.mark.usefixtures("at_once")
 ROADS = ["0,1.9,0@25,1.9,0@40,1.9,3", "125.0,1.9,5.0@125.0,1.9,25.0@128.0,1.9,45.0"]
 LAKE = Stage("lake", None, 0, {})
 
@@ -39,16 +40,6 @@ class Program(Server):
         self.data.append(data)
         answers = self.answer(data, n)
         return None if answers is None else ["42" + json.dumps(answer) for answer in answers]
-
-
-@pytest.fixture(autouse=True)
-def at_once(monkeypatch):
-    """A program that hangs up is not waited for, so that others are waited for as long as a busy machine takes."""
-
-    def gone(joined, error):
-        raise joined.no_answer()
-
-    monkeypatch.setattr(Joined, "count_reconnection", gone)
 
 
 def join(dialect, server, *more):

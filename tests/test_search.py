@@ -40,13 +40,13 @@ def rotation(points):
 
 
 def test_a_server_drives_until_the_end_of_the_road_or_until_it_is_late(monkeypatch):
-    monkeypatch.setattr(driving, "PATIENCE", 3.0)  # instead of half a minute, in 450 frames
-    road = make_road([(0, 0), (30, 0), (60, 0)])
+    monkeypatch.setattr(driving, "PATIENCE", 1.0)  # instead of half a minute, in 450 frames
+    road = make_road([(0, 0), (20, 0), (40, 0)])
     ends = {}
     for throttle in ("1", "0"):
         with Server(lambda packet, n, throttle=throttle: [STEER % ("0", throttle)]) as server:
             ends[throttle] = driving.drive(driving.Conditions(f"127.0.0.1:{server.port}", 30, 0), road)
-    assert ends["1"].ended == "arrived" and ends["1"].along == pytest.approx(60, abs=0.5)
+    assert ends["1"].ended == "arrived" and ends["1"].along == pytest.approx(40, abs=0.5)
     assert ends["1"].farthest < 0.1 and not ends["1"].failed
     assert ends["0"].ended == "late" and ends["0"].failed
 

@@ -210,7 +210,7 @@ def test_drives_with_other_peoples_servers(name, tmp_path, capsys, monkeypatch):
             version, port = server.stdout.readline().split()
             assert version[0] in (name[-1], "f")
             for realtime in (False, True):
-                client = drive(SimpleNamespace(port=int(port)), laps=0.01 if realtime else 0.02, realtime=realtime)
+                client = drive(SimpleNamespace(port=int(port)), laps=LAPS if realtime else 0.01, realtime=realtime)
                 assert client.reconnections == client.unusable == 0
                 assert client.frames > (5 if realtime else 20)  # a busy machine has few frames in real time
                 assert ("the real simulator would get no answer" in capsys.readouterr().err) is asks

@@ -1,11 +1,10 @@
 """tools.study: its plan, what alters the training, its measures against oracles, and the command on tiny recordings."""
 
-import argparse
 import csv
-import multiprocessing
 import os
 import re
-import time
+import subprocess
+import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -15,12 +14,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import warm
+from commands import HERE
 from drive_process import awaited
 from rendered import render_recording
 from scenes import Here
 from test_generator import loaded, observations
 
-from cloning.base.errors import RecordingError, UserError
+from cloning.base.errors import RecordingError
 from cloning.network.network import Network
 from cloning.replay.replay import load_recording
 from model import REPORT, ROBUST, Generator, balance
@@ -87,11 +88,6 @@ def test_driving_is_told_by_departures_and_among_equals_by_distance():
     assert np.argsort(figures.column(rows, "driving")).tolist() == [1, 0, 2, 3]
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
-    return load_recording(render_recording(tmp_path_factory.mktemp("study") / "lake-cw", rows=100))
-
-
 class Constant(Network):
     """A network that always steers alike, or one that repeats the recorded steering plus something."""
 
@@ -104,13 +100,14 @@ class Constant(Network):
         return torch.from_numpy(now)
 
 
-def test_errors_on_recorded_frames(recording):
-    found = offline(Constant(recording.steering + np.tile([0.1, 0.3], 50)), recording)
+def test_errors_on_recorded_frames(sample_recording):
+    recording = load_recording(sample_recording)
+    found = offline(Constant(recording.steering + np.tile([0.1, 0.3], 30)), recording)
     assert found["mse"] == pytest.approx(0.05, rel=1e-4)
     assert found["mae"] == pytest.approx(0.2, rel=1e-4)
     assert found["large_errors"] == 0.5
     assert 0.8 < found["correlation"] < 1
-    still = offline(Constant(np.full(100, 0.2)), recording)
+    still = offline(Constant(np.full(60, 0.2)), recording)
     assert (still["whiteness"], still["correlation"]) == (0, 0)
 
 
@@ -160,36 +157,44 @@ def test_the_command_measures_and_goes_on(tmp_path, capsys, monkeypatch):
         study.main(command)
 
 
+# In a module of its own, so that a network's process loads little else.
+MEASURES = """
+import os, time
 def end_process(*_):
     os._exit(9)
-
-
-def test_a_killed_process_is_named(tmp_path, monkeypatch):
-    """As when memory is short."""
-    monkeypatch.setattr(study, "measure", end_process)
-    options = argparse.Namespace(folder=tmp_path, recordings=tmp_path, images=1, laps=1, starts=1)
-    with pytest.raises(UserError, match="lake-centre-camera-seed-0: its process was killed"):
-        study.result(plan()[0], options)
-
-
 def keep_measuring(variant, recordings, file, *_):
     file.parent.with_suffix(".pid").write_text(str(os.getpid()))
     time.sleep(60)
+"""
+STUDY = """
+import sys, measures
+from argparse import Namespace
+from pathlib import Path
+from tools.study import __main__ as study
+study.measure = getattr(measures, sys.argv[1])
+study.result(Namespace(name="lake"), Namespace(folder=Path(), recordings=None, images=1, laps=1, starts=1))
+"""
 
 
-def study_one(folder):
-    study.measure = keep_measuring
-    study.result(plan()[0], argparse.Namespace(folder=folder, recordings=folder, images=1, laps=1, starts=1))
+def study_one(folder: Path, measure: str) -> warm.Process:
+    """Start a study of one network, which one of MEASURES measures."""
+    (folder / "measures.py").write_text(MEASURES, encoding="utf-8")
+    command = [sys.executable, "-c", STUDY, measure]
+    return warm.Popen(command, cwd=folder, env={**os.environ, **HERE}, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_killed_process_is_named(tmp_path):
+    """As when memory is short."""
+    assert "UserError: lake: its process was killed; " in study_one(tmp_path, "end_process").communicate(timeout=60)[1]
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="without /proc processes cannot be listed")
 def test_a_killed_study_leaves_no_process(tmp_path):
     """Which would train the same network as the study that is started again."""
-    parent = multiprocessing.get_context("spawn").Process(target=study_one, args=(tmp_path,))
-    parent.start()
+    study = study_one(tmp_path, "keep_measuring")
     pid = awaited(lambda: [file.read_text() for file in tmp_path.glob("*.pid") if file.read_text()])[0]
-    parent.kill()
-    parent.join()
+    study.kill()
+    study.wait(60)  # not for its output, which its process has, too
     awaited(lambda: not Path("/proc", pid).exists(), 30)
 
 

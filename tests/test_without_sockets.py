@@ -19,7 +19,7 @@ import model, simulator.__main__ as simulator
 recording, trained, *short = sys.argv[1:]
 assert model.main([recording, "--robust", *short, "--output", trained]) == 0
 assert not {"torch._dynamo", "sympy"} & set(sys.modules)  # torch's own optimizers load its compiler, for seconds
-assert simulator.main(["replay", recording, "--model", trained, "--limit", "1"]) in (0, 1)
+assert simulator.main(["replay", recording, "--model", trained, "--limit", "1", "--reference", "human"]) in (0, 1)
 """
 
 
