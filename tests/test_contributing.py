@@ -5,7 +5,6 @@ import re
 import numpy as np
 from commands import ROOT
 from PIL import Image
-from rendered import render_recording
 
 from cloning.network.attention import visual_backprop
 from cloning.network.network import NETWORKS, load_model
@@ -21,8 +20,7 @@ def run_example(heading: str) -> None:
     exec(compile(code[1].replace("replace(REPORT, ", SHORT), heading, "exec"), {"__name__": "example"})
 
 
-def test_an_augmentation_is_added(tmp_path, monkeypatch):
-    render_recording(tmp_path / "data" / "lake")
+def test_an_augmentation_is_added(linked, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_example("How to add an augmentation")
     assert (tmp_path / "runs/noisy/model.pt").exists()
@@ -31,8 +29,7 @@ def test_an_augmentation_is_added(tmp_path, monkeypatch):
     assert np.abs(np.diff(fifth[::3], axis=0)).mean() > 5
 
 
-def test_a_network_is_added(tmp_path, monkeypatch):
-    render_recording(tmp_path / "data" / "lake")
+def test_a_network_is_added(linked, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cloning.network.network.NETWORKS", NETWORKS)
     try:

@@ -5,7 +5,6 @@ import json
 
 import numpy as np
 import pytest
-from rendered import render_recording
 from scenes import Here
 from steer_server import STEER, Server
 
@@ -174,8 +173,8 @@ def test_a_recording_shows_the_disturbance_in_all_cameras_and_is_the_same_again(
     assert (change.max(axis=-1) > 25).mean((1, 2)) == pytest.approx(0.3, abs=0.07), "of each camera's lens"
 
 
-def test_a_replay_disturbs_the_warped_frame_once_whoever_looks(tmp_path):
-    recording = replay.load_recording(render_recording(tmp_path / "lake", rows=60))
+def test_a_replay_disturbs_the_warped_frame_once_whoever_looks(sample_recording):
+    recording = replay.load_recording(sample_recording)
     lines = replay.reference_lines(recording, by_lane=False)
     views, seen = [], []
 
@@ -231,11 +230,10 @@ def test_a_wrong_text_is_refused(command, capsys):
     assert "--disturb: 'hail:3' is not KIND:STRENGTH, such as fog:3; kinds: rain, fog" in capsys.readouterr().err
 
 
-def test_drives_and_replays_are_measured_once_and_a_run_goes_on(tmp_path, capsys, monkeypatch):
+def test_drives_and_replays_are_measured_once_and_a_run_goes_on(sample_recording, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(robustness, "started_workers", Here)
-    folder = render_recording(tmp_path / "lake", rows=40)
     words = ["--kinds", "late", "--strengths", "5", "--tracks", "lake", "--laps", "0.01"]
-    words += ["--recordings", str(folder), "--output", str(tmp_path / "found")]
+    words += ["--recordings", str(sample_recording), "--output", str(tmp_path / "found")]
     assert robustness.main(words) == 0
     file = tmp_path / "found" / "robustness.json"
     found = json.loads(file.read_text(encoding="utf-8"))
@@ -248,7 +246,7 @@ def test_drives_and_replays_are_measured_once_and_a_run_goes_on(tmp_path, capsys
     conditions = driving.Conditions(str(SHIPPED_MODEL), 30, 0, "cw", 0.01 * Track("lake").length, seed=1)
     alone = driving.drive(conditions._replace(set_back=True, disturbance=Disturbance("late", 5)), "lake")
     assert found[late] == {"autonomy": 100, "departures": 0, "distance": round(alone.mean, 3)}
-    for course in (" lake cw, 30 mph, look 0, 0.01 laps", f"{folder}"):
+    for course in (" lake cw, 30 mph, look 0, 0.01 laps", f"{sample_recording}"):
         assert found[of(f"{course}, clear")]["distance"] != found[of(f"{course}, late:5")]["distance"]
     assert (tmp_path / "found" / "robustness.png").read_bytes().startswith(b"\x89PNG")
     capsys.readouterr()

@@ -13,10 +13,9 @@ from scenes import lake_drive
 from cloning.base.errors import RecordingError
 from cloning.browse import analyse, analyses
 from cloning.lane.known import lane_position
-from cloning.lane.localise import estimate_lane_position
 from cloning.recordings.log import read_recording
 from cloning.replay.replay import load_recording, reference_lines
-from cloning.road.motion import stretches
+from cloning.road.motion import MPH, stretches
 
 HEADER = "center image,lateral offset (m),heading error (radians)\n"
 
@@ -26,13 +25,6 @@ def drive(tmp_path_factory):
     """A recording's folder, and the offsets that the car really had at its rows."""
     recording, true = lake_drive(tmp_path_factory.getbasetemp())
     return recording.folder, true
-
-
-@pytest.fixture(scope="module")
-def estimate(drive):
-    """What the lane networks read in the same recording."""
-    recording = read_recording(drive[0])
-    return estimate_lane_position(recording, stretches(recording))
 
 
 @pytest.fixture
@@ -51,20 +43,19 @@ def known(folder):
     return lane_position(recording, stretches(recording))
 
 
-def test_the_simulator_tells_where_its_car_is(drive, estimate):
+def test_the_simulator_tells_where_its_car_is(drive):
     folder, true = drive
-    position = known(folder)
+    recording, position = read_recording(folder), known(folder)
     assert position.trusted.all()
     assert position.lateral_offset == pytest.approx(true, abs=1e-4)
-    assert np.abs(estimate.lateral_offset - true).mean() > 0.02, "an estimate is never so exact"
-    rolling = slice(15, None)
-    assert np.corrcoef(position.heading_error[rolling], estimate.heading_error[rolling])[0, 1] > 0.9  # measured: 0.97
+    right = np.diff(true) / (np.diff(recording.time) * recording.speed[1:] * MPH)  # m for each metre driven
+    assert np.corrcoef(position.heading_error[16:], right[15:])[0, 1] > 0.97  # measured: 0.99; at first it hardly rolls
     (line,) = reference_lines(load_recording(folder))
     assert line.is_lane_centre and line.offset == pytest.approx(position.lateral_offset[line.rows], abs=1e-6)
 
 
-def test_the_browser_shows_the_known_offset_and_without_the_file_it_is_estimated(drive, estimate, lane, monkeypatch):
-    recording, (_, true) = read_recording(lane.parent), drive
+def test_the_browser_shows_the_known_offset_and_without_the_file_it_is_estimated(drive, lane, monkeypatch):
+    recording, (_, true), estimate = read_recording(lane.parent), drive, object()
     result, stamp = analyse.lane(recording), analyses.stamp(lane.parent, analyses.LANE)
     assert result.column("offset", recording.images[:, 0]) == pytest.approx(true, abs=1e-4)
     lane.unlink()

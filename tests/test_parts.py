@@ -155,7 +155,7 @@ def plain(brightness):
     return lambda rows: np.tile(brightness[rows, None, None, None, None], (1, 3, 32, 160, 3))
 
 
-@pytest.mark.parametrize(("rows", "pause"), [(250, PAUSE), (70, 2.0)])
+@pytest.mark.parametrize(("rows", "pause"), [(120, PAUSE), (70, 2.0)])
 def test_no_row_of_another_road_is_taken_for_the_track(lake, rows, pause):
     """It begins and ends in the midst of a recording of the track, in another light."""
     track = Track("road-9")

@@ -233,12 +233,12 @@ def test_the_film_runs_at_the_recordings_own_rate(recording, tmp_path):
     assert 1 / film_of(tmp_path / "seen.mp4")[0] == pytest.approx(np.diff(recording.time).mean(), rel=1e-3)
 
 
-def test_on_an_unknown_road_the_humans_path_is_the_reference(tmp_path, model_file, capsys):
-    folder, rng = render_recording(tmp_path / "unknown", rows=60), np.random.default_rng(0)
-    for path in (folder / "IMG").iterdir():
+def test_on_an_unknown_road_the_humans_path_is_the_reference(copied, tmp_path, model_file, capsys):
+    rng = np.random.default_rng(0)
+    for path in (copied / "IMG").iterdir():
         cv2.imwrite(str(path), rng.integers(0, 255, (160, 320, 3), np.uint8))
     outputs = "--film", tmp_path / "x.mp4", "--report", tmp_path / "r.json"
-    assert run(folder, "--model", model_file, "--limit", *"212", *outputs) == 0
+    assert run(copied, "--model", model_file, "--limit", *"212", *outputs) == 0
     printed = capsys.readouterr().out
     assert "lane's centre unknown in 60 rows from center_" in printed
     assert "2 m, from the recorded driver's path: autonomy" in printed and "0.0 % of the rows" in printed
