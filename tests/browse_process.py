@@ -128,10 +128,10 @@ def written_run(folder, finished: int, images: int, epochs=4, losses=(0.5, 0.4, 
     return files
 
 
-# The next answer about a recording comes when `late.go` is called.
+# The next answer whose address has this part comes when `late.go` is called.
 LATE = """const own = fetch; late = {asked: 0}; fetch = async (...what) => {
     const answer = await own(...what);
-    if (what[0].includes("/details") && !late.asked++) await new Promise(go => late.go = go);
+    if (what[0].includes("%s") && !late.asked++) await new Promise(go => late.go = go);
     return answer;
 }; 0"""
 

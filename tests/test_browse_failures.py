@@ -10,6 +10,7 @@ from browser import needs_chromium
 from test_excluded import center
 
 from cloning.browse.analyses import Analysis
+from cloning.recordings.log import read_recording
 
 pytestmark = needs_chromium
 
@@ -139,7 +140,7 @@ def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, p
     with browsing(linked, "--model", model, modules=tmp_path) as server:
         page.open(server.base)
         page.wait("document.querySelector('article .road')")
-        page.run(LATE)
+        page.run(LATE % "/details")
         page.run(f"location.hash = '{server.hash('lake')}/7?find=model1 < 0'")
         page.wait("late.go")
         os.utime(model, (0, 0))
@@ -182,3 +183,20 @@ def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, 
         page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
         page.shows("#notice", "does not answer")
         page.wait("document.querySelector('#notice').hidden")
+
+
+def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(linked, page):
+    """As while many others are loaded; an error there would stop all frames in the end."""
+    placed(linked, np.zeros(60))
+    with browsing(linked) as server:
+        page.open(f"{server.base}{server.hash('lake')}/0")
+        at(page, 0)
+        page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
+        page.run(LATE % "/rows/1/left")
+        page.press("ArrowRight")
+        page.wait("late.go")
+        page.run("import('/static/state.js').then(({page: {open: {frames}}}) => frames.forget(1))")
+        page.run("new Promise(done => setTimeout(done, 2000)).then(late.go)")
+        frame = read_recording(linked).path(1, 1).read_bytes()
+        page.until(lambda: page.difference("left", frame) < 3, 20)
+        assert page.complaints() == []

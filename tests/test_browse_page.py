@@ -70,7 +70,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         page.shows("#said", "Marked 3 frames")
         page.press("x")
         page.wait("document.querySelector('#reason[open]')")
-        page.run(LATE)
+        page.run(LATE % "/details")
         page.wait("late.go")
         page.press(*"off", "Enter")
         page.shows("#cuts", "3 frames: off")
@@ -99,10 +99,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         page.press(" ")
         page.wait("seen.join() == 'Pause,Play'")  # 1.1 s later, which a busy machine may miss
         at(page, 59)
-        (linked / "driving_log.csv").unlink()
-        page.press("r")
-        page.shows("#notice", "driving_log.csv: No such file")
-        assert [entry for entry in page.complaints() if "409" not in entry] == []
+        assert page.complaints() == []
         assert all(address.startswith((server.base, "data:")) for address in page.addresses()), "no outside host"
 
 
@@ -183,13 +180,12 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     page.look(390, 844)
     page.wait("innerWidth == 390")
     assert page.run("document.querySelector('#where').getBoundingClientRect().bottom") <= 844
-    assert page.complaints() == []
 
 
 def test_frames_are_found_cut_together_and_exported(linked, page):
     """By a condition and on the histogram; undoing outlives the page, whose address has all that it shows."""
     placed(linked, np.where(np.arange(60) > 40, 1.5, 0.0))
-    recording, cuts = read_recording(linked), linked / "excluded.csv"
+    recording = read_recording(linked)
     with browsing(linked) as server:
         page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4&of=offset")
         page.shows("#matches", "19 frames in 1 stretch")
@@ -232,11 +228,6 @@ def test_frames_are_found_cut_together_and_exported(linked, page):
         page.press("z")
         page.shows("#cuts", "None")
         assert len(read_recording(linked)) == 60
-        page.press("y")
-        page.wait("document.querySelectorAll('#cuts button').length")
-        page.press("z")
-        page.shows("#cuts", "None")
-        assert len(cuts.read_text(encoding="utf-8").splitlines()) == 1
         page.press("End")
         page.press("i", *["ArrowLeft"] * 9, "o", ">", "b", " ")
         page.wait("['mark=50-59', 'speed=2', 'loop=1'].every(part => location.hash.includes(part))")
@@ -366,7 +357,6 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
     assert page.box("#table td")[0] < 600, "the figures are beside a long name, not below it"
     for words in ("one.pt", "two.pt", "90.0 %", "0.25 m", f"{np.sqrt(np.mean(difference**2)):.3f}", "lake"):
         assert words in page.text("#table")
-    assert page.barriers() == []
 
 
 @pytest.mark.parametrize("width, dark", LOOKS)
@@ -394,24 +384,6 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
     models = "document.querySelectorAll('#attention button, #plots figcaption > span')"
     page.run(f"{models}.forEach(each => each.textContent = 'a_long_name_'.repeat(9))")
     assert page.fits(), "whatever models are called"
-
-
-def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(served, page, sample_recording):
-    """As while many others are loaded; an error there would stop all frames in the end."""
-    page.open(f"{served.base}{served.hash('lake sample')}/0")
-    at(page, 0)
-    page.wait("document.querySelector('#center').parentNode.textContent.trim() == 'Centre'")
-    page.run("""const own = fetch; fetch = async (...what) => {
-        if (what[0].includes("/rows/1/") && !window.late) await new Promise(go => late = go);
-        return own(...what);
-    }; 0""")
-    page.press("ArrowRight")
-    page.wait("window.late")
-    page.run("import('/static/state.js').then(({page: {open: {frames}}}) => frames.forget(1))")
-    page.run("new Promise(done => setTimeout(done, 2000)).then(late)")
-    frame = read_recording(sample_recording).path(1, 1).read_bytes()
-    page.until(lambda: page.difference("left", frame) < 3, 20)
-    assert page.complaints() == []
 
 
 def test_the_focus_stays_on_a_button_of_what_is_shown_anew(served, page):

@@ -217,21 +217,14 @@ def test_cuts_over_the_socket(linked):
             status, data, _ = server.ask(f"{here}/{path}", "POST", b"[" * 100_000)
             assert status == 400 and b"nested too deeply" in data
         server.refuses("is not the centre image", f"{here}/cuts", "POST", [two, one | {"first": "../x"}])
-        server.refuses("comes before", f"{here}/cuts", "POST", [one | {"last": names[2]}])
         text = f'first image,last image,reason\n{names[10]},{names[10]},"crash, hard"\n'
         assert cuts.read_text(encoding="utf-8") == text
-        cuts.write_text(text + "spoilt\n", encoding="utf-8")
-        server.refuses("excluded.csv: line 3: 1 fields where 3", f"{here}/cuts", "POST", [one])
-        assert cuts.read_text(encoding="utf-8") == text + "spoilt\n"
-        cuts.write_text(text, encoding="utf-8")
         assert (linked / "driving_log.csv").read_bytes() == log
         (linked / "driving_log.csv").write_bytes(log[log.index(b"\n") + 1 :])
         server.refuses("has changed since this page read it", f"{here}/rows/0/left.jpg?version={version}")
         assert server.answer(f"{here}/details")["frames"] == 59
         linked.rename(linked.with_name("elsewhere"))
         gone = "driving_log.csv: No such file"
-        server.refuses(gone, f"{here}/details")
-        server.refuses(gone, f"{here}/rows/0")
         server.refuses(gone, f"{here}/cuts", "POST", [one])
         server.refuses(gone, f"{here}/columns/offset", "POST")
         assert gone in server.answer(f"{here}/overview")["message"]
