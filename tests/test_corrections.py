@@ -2,7 +2,6 @@
 
 import itertools
 import re
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -159,9 +158,6 @@ class Seat(Window):
     def show(self, by_hand):
         pass
 
-    def userExit(self):
-        sys.exit()
-
     def ticks(self, seconds, monkeypatch):
         """Let so many seconds pass, in frames of a tenth."""
         for _ in range(round(10 * seconds)):
@@ -190,16 +186,6 @@ def test_the_window_records_only_what_the_person_drives(tmp_path, monkeypatch):
     assert len(rows) in (14, 15, 16), "two halves of a second"
     assert (np.diff(times) > DRIVE_GAP).sum() == 1 and steering.any()
     assert steering[times < times[0] + 0.6].min() > 0 > steering[-3:].max()
-
-
-def test_the_window_removes_a_recording_without_rows(tmp_path, monkeypatch):
-    seat = Seat(tmp_path / "x-corrections")
-    seat.do_record()
-    seat.ticks(0.5, monkeypatch)
-    with pytest.raises(SystemExit):
-        seat.do_quit()
-    seat.finish()
-    assert not any(tmp_path.iterdir())
 
 
 def test_the_window_refuses_a_name_for_corrections_that_training_would_not_repeat(tmp_path):

@@ -117,9 +117,9 @@ def test_recording_killed_anywhere(recording):
         if not log.exists() or not log.stat().st_size:
             trial.goes_on(wanted)
             return
-        assert rows_of(log.parent) in [complete[:count] for count in range(len(complete) + 1)]
         ended = trial.run(trial.command)
         assert ended.status == 2 and "exists already; name another folder, or delete this one" in ended.printed
+        assert rows_of(log.parent) in [complete[:count] for count in range(len(complete) + 1)]
 
     trial.killed_everywhere(2, next_run)
 
@@ -206,7 +206,6 @@ def test_driving_killed_anywhere(driving, jpegs):
     trial, car = driving
     trial.restore()
     points = trial.run(trial.command).points
-    assert saved(trial.folder / "run1") == jpegs[:6]
     for number in chosen(points, 4):
         trial.restore()
         assert trial.run(trial.command, kill=number).status == KILLED
@@ -218,7 +217,6 @@ def test_driving_killed_anywhere(driving, jpegs):
             film = trial.run([ROOT / "video.py", "run1"])
             trial.companion = car.drive
             assert film.status == 0 and f"run1.mp4: {len(frames)} frames" in film.printed
-            assert "unreadable" not in film.printed
         assert trial.run(trial.command).status == trial.done
         assert saved(trial.folder / "run1") == jpegs[:6]
         assert not list((trial.folder / "run1").glob(".*"))

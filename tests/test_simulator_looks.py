@@ -12,10 +12,8 @@ from scipy.spatial import cKDTree
 from cloning.base.errors import OutputError
 from cloning.base.film import DriveFilm
 from cloning.recordings.format import SAMPLE_RATE
-from cloning.recordings.images import decode
 from cloning.road.track import LEFT, Track
 from simulator import record
-from simulator.cameras import jpeg
 from simulator.expert import Recovery
 from simulator.film import MAX_BITS, ChaseFilm
 from simulator.run import Run
@@ -144,13 +142,6 @@ def test_a_films_limit_of_bits_holds_for_frames_that_cannot_be_compressed(tmp_pa
         film.add(rng.integers(0, 255, (180, 320, 3), np.uint8))
     film.close()
     assert 8 * (tmp_path / "noise.mp4").stat().st_size < 1.6 * 4 * MAX_BITS  # the first seconds may fill the buffer
-
-
-def test_jpegs_are_the_simulators_size_and_rgb():
-    frame = np.zeros((160, 320, 3), np.uint8)
-    frame[..., 0] = 200
-    decoded = decode(jpeg(frame))
-    assert np.abs(decoded[80, 160].astype(int) - (200, 0, 0)).max() < 2
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -21,14 +21,6 @@ class Car:
         self.speed = max(0.0, self.speed + 0.067 * (13 * throttle - 0.1 * self.speed - 22 * slope))
 
 
-def test_controller_begins_as_the_original():
-    """0.1 e + 0.002 Σe by hand, at set speed 9."""
-    controller = SpeedController(9)
-    assert controller.throttle(4) == pytest.approx(0.1 * 5 + 0.002 * 5)
-    assert controller.throttle(8) == pytest.approx(0.1 * 1 + 0.002 * 6)
-    assert controller.throttle(10) == pytest.approx(-0.1 + 0.002 * 5)
-
-
 @pytest.mark.parametrize("set_speeds", [(9, 25, 12), (30,)])
 def test_controller_settles_at_each_set_speed_and_is_not_wound_up_by_a_wait_or_a_hill(set_speeds):
     controller, car = SpeedController(set_speeds[0]), Car()
