@@ -125,14 +125,11 @@ def test_a_file_that_is_no_text_and_one_that_leaves_nothing(linked):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among files")
-@pytest.mark.parametrize("name", ["driving_log.csv", "excluded.csv"])
-def test_a_named_pipe_is_refused_and_not_waited_for(linked, name):
-    (linked / name).unlink(missing_ok=True)
-    os.mkfifo(linked / name)
-    with pytest.raises(RecordingError, match=f"{name}: not a regular file; "):
+def test_a_named_pipe_is_refused_and_not_waited_for(linked):
+    (linked / "driving_log.csv").unlink()
+    os.mkfifo(linked / "driving_log.csv")
+    with pytest.raises(RecordingError, match=r"driving_log\.csv: not a regular file; "):
         read_recording(linked)
-    with pytest.raises(RecordingError, match=r"excluded.csv: "):
-        delete_cuts(linked, Cut("a.jpg", "b.jpg", ""))
 
 
 @pytest.mark.parametrize(

@@ -36,14 +36,12 @@ from cloning.lane.reader import (
 )
 from cloning.lane.recovery import LanePosition
 from cloning.lane.search import MIN_LOG_LIKELIHOOD, Localisation
-from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import read_frame
 from cloning.recordings.log import read_recording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX
 from cloning.road.motion import REAR_AXLE, stretches
 from cloning.road.track import Track
-from simulator import __main__ as simulator
 from tools import lane_accuracy, lane_frames, likeness, train_lane
 from tools.lane_frames import RenderedScene, render_strips
 from tools.train_lane import consistency_loss, strip_homography, visible_mask
@@ -220,14 +218,6 @@ def test_an_unknown_road_is_read_by_the_network_for_any_road(drive, difference, 
     assert position.placed[:known].all() and not position.placed[known:].any()
 
 
-def test_noise_is_an_unknown_road(copied):
-    recording = read_recording(copied)
-    rng = np.random.default_rng(0)
-    for path in (copied / "IMG").iterdir():
-        cv2.imwrite(str(path), rng.integers(0, 256, (160, 320, 3)).astype(np.uint8))
-    assert not estimate_lane_position(recording, stretches(recording)).trusted.any()
-
-
 @pytest.mark.parametrize("exchanged", [False, True])
 @pytest.mark.parametrize("real", [False, *real_recordings.FOLDERS], ids=str)
 def test_images_with_red_and_blue_exchanged_are_told(drive, real, exchanged, tmp_path, capsys):
@@ -287,19 +277,6 @@ def test_unusable_weights_are_named_with_the_remedy_and_those_of_earlier_version
     weights["dense.2.bias"][0] = torch.nan
     torch.save(weights, path)
     refused("holds no weights .*dense\\.2\\.bias.*not finite")
-
-
-def test_commands_without_weights_report_it(sample_recording, tmp_path, monkeypatch, capsys):
-    import model
-
-    monkeypatch.setattr(reader, "SHIPPED_WEIGHTS", tmp_path / "lane.pt")
-    load_network.cache_clear()
-    assert model.main([str(sample_recording), "--robust", "--output", str(tmp_path / "model.pt")]) == 2
-    assert "lane.pt: no such file" in capsys.readouterr().err
-    assert simulator.main(["replay", str(sample_recording), "--model", str(SHIPPED_MODEL)]) == 2
-    error = capsys.readouterr().err
-    assert "python: " in error and "lane.pt: no such file" in error
-    load_network.cache_clear()
 
 
 def test_a_damaged_image_is_named(copied):

@@ -293,8 +293,6 @@ def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, p
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "no such folder"),
-        (["FOLDER", "--model", "nothing.pt"], "no such file"),
         (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
         (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
     ],

@@ -161,6 +161,7 @@ def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path)
     """Where and how a run was started never comes out of its checkpoint: output, device, strict."""
     trained(sample_recording, *SHORT, "--epochs", 1, "--strict", "--output", "runs/a/model.pt", cwd=tmp_path)
     folder = tmp_path / "runs" / "a"
+    assert "the run began with --from ''" in refused(*resume, "--from", output)
     with edited(folder / "model-resume.pt") as saved:
         assert not {"output", "device", "strict", "resume"} & saved["arguments"].keys()
     trained("--resume", "--epochs", 2, "--device", "cpu", cwd=folder)
