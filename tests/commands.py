@@ -28,17 +28,10 @@ PICTURE = cv2.imencode(".png", np.zeros((100, 160, 3), np.uint8))[1].tobytes()  
 HERE = {"PYTHONPATH": str(ROOT)}  # for a command that imports the project from another folder
 
 
-def run_model(*arguments, command=None, **more) -> subprocess.CompletedProcess:
-    """model.py, or another command of this Python, in a process of its own, with its output."""
-    command = command or [sys.executable, str(ROOT / "model.py")]
-    return warm.run(
-        [*command, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env={**os.environ, **more.pop("env", {})},
-        **more,
-    )
+def python(*words, cwd: Path = ROOT, env: dict[str, str] = HERE) -> subprocess.CompletedProcess:
+    """This Python with these words, in a process of its own, and what it prints."""
+    command = [sys.executable, *map(str, words)]
+    return warm.run(command, cwd=cwd, env={**os.environ, **env}, capture_output=True, text=True, timeout=300)
 
 
 def call_here(main: Callable, name: str, *arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
@@ -59,7 +52,7 @@ def call_here(main: Callable, name: str, *arguments, cwd: Path = ROOT) -> subpro
 # To pack its pictures well would take a fifth of a short run.
 @unittest.mock.patch.object(Image.Image, "save", functools.partialmethod(Image.Image.save, compress_level=1))
 def run_here(*arguments, cwd: Path = ROOT) -> subprocess.CompletedProcess:
-    """The same as `run_model`, in this process: it saves two seconds of imports. No curves are drawn: see PICTURE."""
+    """model.py in this process, which saves two seconds of imports. No curves are drawn: see PICTURE."""
     import model
     from cloning.training import pictures
 

@@ -107,11 +107,6 @@ def script(name: str, first: str = "") -> list[str]:
     return [sys.executable, "-c", f"{first}\n{run}", name]
 
 
-def warm_python(*words: object, **options) -> subprocess.CompletedProcess:
-    """As `tools.command.python`."""
-    return warm.run([sys.executable, *map(str, words)], text=True, **options)
-
-
 @contextmanager
 def serving(*arguments, **more):
     process = Process(*arguments, **more)

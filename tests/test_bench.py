@@ -4,7 +4,7 @@ import json
 import re
 from dataclasses import replace
 
-from drive_process import warm_python
+from commands import python
 
 import model
 from cloning.base.program import DONE, INCOMPLETE
@@ -28,7 +28,7 @@ def test_the_operations_are_those_of_the_network():
 
 
 def test_a_speed_run_trains_drives_and_says_how_many_passed(sample_recording, capsys, monkeypatch):
-    monkeypatch.setattr(speedrun, "python", warm_python)
+    monkeypatch.setattr(speedrun, "python", lambda *words, env, **_: python(*words, env=env))
     few = ["--in-sample", "--seeds", "1", "--images", "60", "--limit", "20", "--autonomy", "101"]
     assert speedrun.main([str(sample_recording), *few]) == INCOMPLETE
     printed, name = capsys.readouterr().out, sample_recording.name

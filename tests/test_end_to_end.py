@@ -5,8 +5,8 @@ import shutil
 import subprocess
 
 import pytest
-from commands import ROOT
-from drive_process import serving, warm_python
+from commands import ROOT, python
+from drive_process import serving
 
 from cloning.road.track import Track
 
@@ -17,7 +17,7 @@ def test_the_shipped_network_stays_on_the_road(track, mean_offset, tmp_path):
     laps, report = 150 / Track(track).length, tmp_path / "lap.json"
     with serving("cloning/network/shipped.pt", "--speed", 15, cwd=ROOT) as server:
         drive = ("-m", "simulator", "drive", "--track", track, "--port", server.port, "--report", report)
-        done = warm_python(*drive, "--laps", f"{laps:.4f}", cwd=ROOT, capture_output=True, timeout=300)
+        done = python(*drive, "--laps", f"{laps:.4f}")
     assert done.returncode == 0, done.stdout + done.stderr
     lap = json.loads(report.read_text(encoding="utf-8"))
     assert lap["departures"] == []

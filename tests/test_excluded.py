@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import warm
-from commands import ROOT, SHORT, trained
+from commands import SHORT, python, trained
 
 from cloning.base.errors import RecordingError
 from cloning.browse.library import Library
@@ -178,7 +177,7 @@ for n in range(20):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no lock here")
 def test_programs_that_cut_at_the_same_time_lose_nothing(linked):
     def add(name: str) -> None:
-        warm.run([sys.executable, "-c", ADD, str(linked), name], check=True, cwd=ROOT, timeout=120)
+        python("-c", ADD, linked, name).check_returncode()
 
     with ThreadPoolExecutor(3) as pool:
         list(pool.map(add, "xyz"))

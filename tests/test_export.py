@@ -3,14 +3,12 @@
 import os
 import shutil
 import subprocess
-import sys
 
 import numpy as np
 import onnxruntime
 import pytest
 import torch
-import warm
-from commands import HERE, ROOT
+from commands import HERE, ROOT, python
 from real_recordings import FOLDERS, MISSING
 
 from cloning.network.network import SHIPPED_MODEL, load_model
@@ -19,8 +17,7 @@ from simulator.driving import load_driver
 
 
 def run(*arguments, **environment) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "cloning.network.export", *map(str, arguments)]
-    return warm.run(command, cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True)
+    return python("-m", "cloning.network.export", *arguments, env=environment)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +69,6 @@ def test_no_output_replaces_the_model_itself(tmp_path):
         done = run(model, output)
         assert (done.returncode, done.stdout) == (2, "")
         assert done.stderr == f"export: {output}: is the model itself, which would be replaced; name another file\n"
-    command = [sys.executable, "-m", "simulator", "replay", tmp_path, "--model", model, "--report", model]
-    done = warm.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = python("-m", "simulator", "replay", tmp_path, "--model", model, "--report", model)
     assert done.returncode == 2 and "is the model itself" in done.stderr
     assert (tmp_path / "shipped.pt").read_bytes() == SHIPPED_MODEL.read_bytes()

@@ -8,7 +8,7 @@ import time
 
 import pytest
 import warm
-from commands import HERE, ROOT
+from commands import HERE, ROOT, python
 
 from cloning.base import progress
 from cloning.base.outputs import as_typed
@@ -132,7 +132,7 @@ def test_a_missing_library_is_told_in_one_sentence(tmp_path, program, library, c
 )
 def test_an_empty_argument_is_not_the_current_folder(program, command):
     """As from a shell's variable that is not set."""
-    done = warm.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True)
+    done = python(*command)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (FAILED, "", 1), done.stderr
     assert done.stderr.startswith(f"{program}: an argument is empty")
 

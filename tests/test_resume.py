@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warm
-from commands import HERE, SHORT, TINY, edited, finished_run, log, refused, run_here, run_model, same, trained, weights
+from commands import HERE, SHORT, TINY, edited, finished_run, log, python, refused, run_here, same, trained, weights
 from killed import ALL
 from rendered import render_recording
 
@@ -65,8 +65,7 @@ def test_a_signal_ends_cleanly_and_the_resumed_run_ends_as_one_that_was_not_inte
     finished, sample_recording, tmp_path, name
 ):
     output, number = tmp_path / "model.pt", getattr(signal, name)
-    command = [sys.executable, "-c", SIGNALLED, str(int(number))]
-    run = run_model(sample_recording, *SHORT, "--output", output, command=command, env=HERE)
+    run = python("-c", SIGNALLED, int(number), sample_recording, *SHORT, "--output", output)
     assert run.returncode == 128 + number
     assert run.stderr.startswith("model.py: ") and "--resume" in run.stderr
     assert "Traceback" not in run.stderr
@@ -148,6 +147,7 @@ def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
     rejected.write_text("the run's", encoding="utf-8")
     resume = ("--output", output, "--resume")
     assert "--learning-rate 0.0001, not 0.1" in refused(*resume, "--learning-rate", 0.1)
+    assert "the run began with --from ''" in refused(*resume, "--from", output)
     other, few = render_recording(tmp_path / "other", rows=20, seed=1), render_recording(tmp_path / "few", rows=3)
     assert "the run began with other recordings" in refused(other, *resume)
     assert "record more" in refused(few, *resume)
@@ -161,7 +161,6 @@ def test_a_moved_run_continues_where_it_is(finished, sample_recording, tmp_path)
     """Where and how a run was started never comes out of its checkpoint: output, device, strict."""
     trained(sample_recording, *SHORT, "--epochs", 1, "--strict", "--output", "runs/a/model.pt", cwd=tmp_path)
     folder = tmp_path / "runs" / "a"
-    assert "the run began with --from ''" in refused(*resume, "--from", output)
     with edited(folder / "model-resume.pt") as saved:
         assert not {"output", "device", "strict", "resume"} & saved["arguments"].keys()
     trained("--resume", "--epochs", 2, "--device", "cpu", cwd=folder)
@@ -322,8 +321,8 @@ def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkey
     others = []
 
     def meanwhile(*arguments):
-        others.append(run_model(sample_recording, *SHORT, "--output", begun / "model.pt", *arguments))
-        others.append(run_model(sample_recording, *SHORT, "--output", begun / "other.pt"))
+        others.append(python("model.py", sample_recording, *SHORT, "--output", begun / "model.pt", *arguments))
+        others.append(python("model.py", sample_recording, *SHORT, "--output", begun / "other.pt"))
         raise Killed
 
     with monkeypatch.context() as patch:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 import warm
-from commands import HERE, ROOT, SHORT, TINY, begun_training, log, refused, run_model, same, trained, weights
+from commands import ROOT, SHORT, TINY, begun_training, log, python, refused, same, trained, weights
 from PIL import Image
 from rendered import render_recording
 from steer_server import unused_port
@@ -192,7 +192,7 @@ def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_pat
         "sys.exit(model.main())"
     )
     arguments = (sample_recording, *TINY, "--output", tmp_path / "model.pt")
-    done = run_model(*arguments, command=[sys.executable, "-c", code], env=HERE)
+    done = python("-c", code, *arguments)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "model.pt").exists()
 
@@ -321,7 +321,7 @@ def test_options_are_fields_of_the_recipe_the_run_and_the_process():
 
 def test_importing_does_nothing(tmp_path):
     code = "import model, cloning.recordings.log, cloning.network.network"
-    done = run_model(command=[sys.executable, "-c", code], env=HERE, cwd=tmp_path)
+    done = python("-c", code, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert not os.listdir(tmp_path)
 
@@ -329,8 +329,7 @@ def test_importing_does_nothing(tmp_path):
 # ----------------------------------------------------------------------------------------------------------------------
 # Several processes
 
-TORCHRUN = [sys.executable, *["-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0", "--standalone"]]
-TORCHRUN.append(str(ROOT / "model.py"))
+TORCHRUN = ("-m", "torch.distributed.run", "--nproc_per_node=2", "--master_port=0", "--standalone", ROOT / "model.py")
 
 
 def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
@@ -344,7 +343,7 @@ def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
 def test_two_processes_train_and_go_on_as_one(finished, sample_recording, tmp_path):
     """Two ranks with half of every batch each end where one process ends; they print once, and the losses of both."""
     one, two = shutil.copytree(finished[1], tmp_path / "one") / "model.pt", tmp_path / "two" / "model.pt"
-    done = run_model(sample_recording, *SHORT, "--output", two, command=TORCHRUN)
+    done = python(*TORCHRUN, sample_recording, *SHORT, "--output", two)
     assert done.returncode == 0, done.stderr
     assert_equal_up_to_rounding(one, two)
     losses, of_both = (

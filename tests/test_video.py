@@ -16,8 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import warm
-from commands import ROOT, call_here
+from commands import ROOT, call_here, python
 from rendered import film_of
 
 import video
@@ -56,8 +55,7 @@ def run(tmp_path):
 
 def test_a_trailing_slash_and_the_rate_of_the_time_stamps(tmp_path):
     save(tmp_path / "run1", 30)
-    command = [sys.executable, str(ROOT / "video.py"), "run1/"]
-    result = warm.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    result = python(ROOT / "video.py", "run1/", cwd=tmp_path)
     assert result.returncode == 0 and "run1.mp4: 30 frames at 20 frames/s" in result.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run1", "run1.mp4"]
     fps, seen = film_of(tmp_path / "run1.mp4")
