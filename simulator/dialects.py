@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cloning.base import program
 from cloning.base.errors import TrackError
 from cloning.road.disturbances import Disturbance
 from cloning.road.generated import PointRoad
@@ -115,10 +116,14 @@ class Dialect(Driven):
         return str(int(max(0.0, self.run.travelled) % self.track.length // SECTOR))
 
     def obey(self, data: Any) -> bool:
-        """Drive as an event's data say; return whether they can be used."""
+        """Drive as an event's data say; return whether they can be used, and tell once if they cannot."""
         answer = parse_commands(data)
         if answer:
             self.apply(answer)
+        else:
+            program.warn_once(
+                'an answer cannot be used: it must have "steering_angle" and "throttle", as texts, such as "0.1"'
+            )
         return answer is not None
 
     def handle(self, event: str, data: Any) -> bool:

@@ -257,13 +257,18 @@ def test_a_server_may_open_the_session_late(monkeypatch):
     assert len(program.data) == 4
 
 
-def test_a_program_whose_answers_cannot_be_used_is_told_of_and_is_no_success(monkeypatch, capsys):
+@pytest.mark.parametrize(("usable", "status"), [(0, 2), (2, 0)])
+def test_answers_that_cannot_be_used_are_told_of_once_and_are_no_success(usable, status, monkeypatch, capsys):
     monkeypatch.setattr("simulator.join.ASK_AGAIN", 0.2)
-    with Program(lambda data, n: [["steer", {"steering_angle": 0, "throttle": 1}]] if n < 3 else None) as program:
-        assert join("measures", program) == 2
+    monkeypatch.setattr("cloning.base.program.warned", set())
+    wrong = ["steer", {"steering_angle": 0, "throttle": 1}]
+    with Program(lambda data, n: [steer(0, 1) if n < usable else wrong] if n < usable + 3 else None) as program:
+        assert join("measures", program) == status
     printed = capsys.readouterr()
-    assert printed.out.count("no usable answer in 0.2 s; if none comes, the program may speak another --dialect") == 1
-    assert "0 simulated seconds" in printed.out
+    assert printed.err.count('it must have "steering_angle" and "throttle", as texts, such as "0.1"') == 1
+    none = "no usable answer in 0.2 s; if none comes, the program may speak another --dialect"
+    assert printed.out.count(none) == (not usable)
+    assert f", {usable + 4} telemetries, 0 simulated seconds" in printed.out
 
 
 def test_a_program_that_thinks_long_and_hangs_up_before_its_first_answer_is_joined_again(monkeypatch):
