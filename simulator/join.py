@@ -89,7 +89,7 @@ class Joined(ClientSession):
         self.dialect, self.pace, self.period = dialect, pace, max(STEP, 1 / rate)
         self.frames, self.time, self.due = 0, 0.0, 0.0  # sent; simulated s in all; when the next is due
         self.driver = AwaitedDriver(dialect.apart)
-        self._is_puzzled = False  # whether the user knows that no answer can be used
+        self._is_puzzled = False  # whether the user knows that nothing usable has come
         self._origin = 0.0  # simulated s at time.perf_counter() 0, with a pace
 
     def run(self) -> None:
@@ -121,20 +121,27 @@ class Joined(ClientSession):
         self._start_clock()
         self._listen(SETTLE)
         self._start_clock()
+        until = time.monotonic() + ASK_AGAIN
+        while not self.dialect.ready:
+            if time.monotonic() > until:
+                self._tell_of_silence()
+            self._listen(ASK_AGAIN)
         while not self.dialect.over:
-            while not self.dialect.ready:
-                self._listen(ASK_AGAIN)
             run, telemetry = self.dialect.run, self.dialect.telemetry()
             if self._ask(telemetry):
                 if not self.pace:
                     self._await_driver(run, telemetry)
                 self._drive()
-            elif not (self.time or self._is_puzzled):
-                self._is_puzzled = True
-                print(
-                    f"no usable answer in {ASK_AGAIN:g} s; if none comes, the program may speak another --dialect",
-                    flush=True,
-                )
+            else:
+                self._tell_of_silence()
+
+    def _tell_of_silence(self) -> None:
+        """Say once that a program has not said a usable word, if nothing was driven."""
+        if not (self.time or self._is_puzzled):
+            self._is_puzzled = True
+            print(
+                f"no usable word in {ASK_AGAIN:g} s; if none comes, the program may speak another --dialect", flush=True
+            )
 
     def _ask(self, telemetry: str) -> bool:
         """Send a telemetry; return whether it was answered."""

@@ -266,9 +266,23 @@ def test_answers_that_cannot_be_used_are_told_of_once_and_are_no_success(usable,
         assert join("measures", program) == status
     printed = capsys.readouterr()
     assert printed.err.count('it must have "steering_angle" and "throttle", as texts, such as "0.1"') == 1
-    none = "no usable answer in 0.2 s; if none comes, the program may speak another --dialect"
+    none = "no usable word in 0.2 s; if none comes, the program may speak another --dialect"
     assert printed.out.count(none) == (not usable)
     assert f", {usable + 4} telemetries, 0 simulated seconds" in printed.out
+
+
+def test_a_program_that_begins_no_episode_may_speak_another_dialect(monkeypatch, capsys):
+    monkeypatch.setattr("simulator.join.ASK_AGAIN", 0.2)
+
+    class Elsewhere(Program):
+        def session(self, client):
+            threading.Timer(1.0, client.shutdown, [socket.SHUT_RDWR]).start()
+            super().session(client)
+
+    with Elsewhere(None) as program:
+        assert join("episodes", program) == 2
+    assert program.data == []
+    assert capsys.readouterr().out.count("no usable word in 0.2 s; if none comes, the program may speak another") == 1
 
 
 def test_a_program_that_thinks_long_and_hangs_up_before_its_first_answer_is_joined_again(monkeypatch):
