@@ -220,11 +220,14 @@ class Roads(Dialect):
                 self.restart()
             self.still = True
             return True
-        if event != "track" or not isinstance(data, dict) or not isinstance(data.get("track_string"), str):
+        if event != "track":
             return False
-        self.text, self.still = data["track_string"], True
-        # Programs check their roads by rules of their own, so a faulty course is laid all the same.
-        self.open(make_road(parse_track_string(self.text), name="sent", checked=False, **self.stage.road))
+        self.text, self.still = str(data.get("track_string") if isinstance(data, dict) else None), True
+        try:  # programs check their roads by rules of their own, so a faulty course is laid all the same
+            road = make_road(parse_track_string(self.text), name="sent", checked=False, **self.stage.road)
+        except TrackError as error:
+            raise TrackError(f"the program's track_string: {error}") from None
+        self.open(road)
         return True
 
     def advance(self) -> None:

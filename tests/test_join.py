@@ -230,10 +230,18 @@ def test_a_driver_is_waited_for_little_longer_than_it_takes_even_if_its_commands
     assert clock.now < 30
 
 
-def test_a_text_that_is_no_road_ends_the_drive_with_its_reason(capsys):
-    with Program(lambda data, n: [["track", {"track_string": "0,0,0@1,x,0"}]]) as program:
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        ({"track_string": "0,0,0@1,x,0"}, "point 2: '1,x,0' is not x,y,z"),
+        ({"track_string": [[0, 0], [40, 0]]}, "point 1: '[[0, 0], [40, 0]]' is not x,y,z"),
+        (ROADS[0], "point 1: 'None' is not x,y,z"),
+    ],
+)
+def test_what_is_no_road_ends_the_drive_with_its_reason(data, reason, capsys):
+    with Program(lambda *_: [["track", data]]) as program:
         assert join("roads", program) == 2
-    assert "python: point 2: '1,x,0' is not x,y,z" in capsys.readouterr().err
+    assert f"python: the program's track_string: {reason}" in capsys.readouterr().err
 
 
 def test_a_road_that_crosses_itself_is_laid_all_the_same():
