@@ -126,13 +126,18 @@ class Joined(ClientSession):
             if time.monotonic() > until:
                 self._tell_of_silence()
             self._listen(ASK_AGAIN)
+        asked_again = False
         while not self.dialect.over:
             run, telemetry = self.dialect.run, self.dialect.telemetry()
             if self._ask(telemetry):
+                if asked_again:  # what was late is answered twice, and the second answer is none to a later telemetry
+                    self._listen(SETTLE)
                 if not self.pace:
                     self._await_driver(run, telemetry)
                 self._drive()
+                asked_again = False
             else:
+                asked_again = True
                 self._tell_of_silence()
 
     def _tell_of_silence(self) -> None:

@@ -315,6 +315,18 @@ def test_a_lost_answer_stops_nothing(monkeypatch):
     assert distances[4] == distances[3] != distances[5]
 
 
+def test_a_telemetry_that_was_answered_late_has_a_second_answer_and_a_later_one_its_own(monkeypatch):
+    monkeypatch.setattr("simulator.join.ASK_AGAIN", 0.5)
+
+    def answer(data, n):
+        time.sleep(0.8 * (n == 3))
+        return [steer(n / 1000, 1)] if n < 20 else None
+
+    with Program(answer) as program:
+        assert join("measures", program) == 0
+    assert number(program.data[-1], "steering_angle") == pytest.approx(25 * 19 / 1000), "of the answer just before"
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Started by a program; many episodes
 
