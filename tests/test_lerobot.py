@@ -225,6 +225,22 @@ def test_a_donkeycar_tub_becomes_a_recording(tub, tmp_path, end):
     assert "gone: no such folder; name a recording, data set" in refused(tub / "gone", "--output", tmp_path / "other")
 
 
+def test_a_tubs_camera_of_another_name_is_found_or_can_be_named(tub, tmp_path):
+    def rename(*cameras):
+        for file in (tub / "manifest.json", *tub.glob("*.catalog")):
+            file.write_text(file.read_text(encoding="utf-8").replace("cam/image_array", cameras[0]), encoding="utf-8")
+        lines = (tub / "manifest.json").read_text(encoding="utf-8").splitlines()
+        lines[:2] = json.dumps([*cameras, "user/angle"]), json.dumps(["image_array"] * len(cameras) + ["float"])
+        (tub / "manifest.json").write_text("\n".join(lines), encoding="utf-8")
+
+    assert refused(tub, "--output", tmp_path / "a", "--camera", "x").endswith("with --camera: cam/image_array")
+    rename("cam/left")
+    assert "a: 9 rows" in converted(tub, "--output", tmp_path / "a")
+    rename("cam/left", "cam/right")
+    assert refused(tub, "--output", tmp_path / "b").endswith("Name it with --camera: cam/left, cam/right")
+    assert "b: 9 rows" in converted(tub, "--output", tmp_path / "b", "--camera", "cam/left")
+
+
 def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
     for catalog in tub.glob("*.catalog"):
         catalog.write_text(catalog.read_text(encoding="utf-8").replace('"user"}', r'"\u001b"}'), encoding="utf-8")

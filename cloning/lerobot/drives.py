@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cloning.base.errors import RecordingError
-from cloning.lerobot.source import Sample, decoded
+from cloning.lerobot.source import Sample, chosen_camera, decoded
 from cloning.recordings.images import decode, read_jpeg
 from cloning.recordings.saved_frames import DRIVEN, DRIVEN_COLUMNS, taken_at
 
@@ -29,13 +29,15 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
 
     notes: is added to what does not fit, and how often. Raises RecordingError.
     """
-    camera = camera or "cam/image_array"
     lines = list(_lines(folder / MANIFEST, None).values())
     try:
+        cameras = [name for name, kind in zip(*lines[:2], strict=False) if kind == "image_array"]
         paths, deleted = [folder / name for name in lines[4]["paths"]], set(lines[4].get("deleted_indexes") or ())
     except (AttributeError, IndexError, KeyError, TypeError):
         remedy = "line 5 names no catalogs: not of a tub of version 2; copy it again"
         raise RecordingError(f"{folder / MANIFEST}: {remedy}") from None
+    usual = "cam/image_array"
+    camera = chosen_camera(cameras, usual if camera is None and usual in cameras else camera)
     index = -1
     for path in paths:
         for line, row in _lines(path, notes if path == paths[-1] else None).items():

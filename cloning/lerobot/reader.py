@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from cloning.base.errors import RecordingError
 from cloning.lerobot.dataset import ACTION, RECORDED_AT
-from cloning.lerobot.source import Sample, decoded
+from cloning.lerobot.source import Sample, chosen_camera, decoded
 from cloning.recordings.columns import column_of
 from cloning.recordings.format import CAMERAS, NUMBERS
 
@@ -42,10 +42,7 @@ def _cameras(info: dict[str, Any], camera: str | None) -> list[str]:
     three = [next((key for key in keys if key.endswith(f".{name}")), "") for name in CAMERAS]
     if camera is None and all(three):
         return three
-    chosen = [key for key in keys if camera in (key, None)]
-    if len(chosen) != 1:
-        raise RecordingError(f"which camera looks ahead? Name it with --camera: {', '.join(keys) or 'there is none'}")
-    return chosen
+    return [chosen_camera(keys, camera)]
 
 
 def _columns(info: dict[str, Any], steering: str | None) -> dict[str, tuple[str, int]]:

@@ -89,6 +89,14 @@ def write_recording(samples: Iterator[Sample], folder: Path, full_lock: float, n
     return len(rows)
 
 
+def chosen_camera(names: list[str], camera: str | None) -> str:
+    """Return the camera that looks ahead: the one that is named, or the only one. Raises RecordingError."""
+    chosen = [name for name in names if camera in (name, None)]
+    if len(chosen) != 1:
+        raise RecordingError(f"which camera looks ahead? Name it with --camera: {', '.join(names) or 'there is none'}")
+    return chosen[0]
+
+
 def decoded(image: bytes) -> np.ndarray | None:
     """Return an image file's pixels, uint8 (rows, columns, 3), RGB, or None if it is damaged."""
     return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR_RGB) if image else None
