@@ -77,7 +77,7 @@ class Joined(ClientSession):
     answer changes: then the driver has seen it.
     """
 
-    remedy = ""  # the server is another team's program
+    remedy = "; start the program, or name its --port"
     connect_timeout = math.inf  # it may open a session only when its test begins
 
     def __init__(self, dialect: Dialect, host: str, port: int, wait: float, pace: float, rate: float):
@@ -113,8 +113,7 @@ class Joined(ClientSession):
 
     def no_answer(self) -> SimulatorError:
         """Return the error for a server that is missing or has gone."""
-        host, port = self.address
-        return SimulatorError(f"{self._lost or 'no answer'}; no server at {host}:{port} for {self.wait:g} s")
+        return SimulatorError(f"{self._lost or 'no answer'}{self._remedy_for(self._lost)}; waited {self.wait:g} s")
 
     def _exchange(self) -> None:
         """Send and receive until the program wants no more, or the connection is lost. Raises ConnectionLost."""
