@@ -61,9 +61,10 @@ def check(name: str, value: Any, valid: Callable[[Any], bool], allowed: str) -> 
         raise SimulatorError(f"{name} {value!r}: it must be {allowed}")
 
 
-def check_look(look: Any) -> None:
-    """Raise SimulatorError if a look is not a number of one."""
+def number_of_look(look: Any) -> int:
+    """Return the number that an argument or option gives for a look. Raises SimulatorError."""
     check("look", look, lambda number: operator.index(number) >= 0, "a whole number from 0, as an int")
+    return operator.index(look)  # NumPy's may be too small for what is calculated from it
 
 
 def parse_disturbance(text: Any) -> Disturbance | None:
@@ -140,7 +141,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         """
         EzPickle.__init__(self, track, direction, look, speed, laps, random_start, render_mode, disturb)
         self.track = make_track(track, direction)
-        check_look(look)
+        look = number_of_look(look)
         check("speed", speed, lambda mph: 1 <= mph <= TOP_SPEED_MPH, f"1 to {TOP_SPEED_MPH} (mph)")
         check("laps", laps, lambda number: 0 < number < math.inf, "a number above 0")
         check("random_start", random_start, lambda value: isinstance(value, bool), "True or False")
@@ -201,8 +202,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
             return self.track, self.look
         source, look = options.get("track", self.track.source), options.get("look", self.look)
         track = make_track(source, options.get("direction", None if "track" in options else self.track.direction))
-        check_look(look)
-        return track, look
+        return track, number_of_look(look)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Drive until the next frame is due, or the car leaves the road; return what the class describes.

@@ -202,7 +202,7 @@ def test_an_action_that_is_not_two_finite_numbers_is_refused(lake, action):
 def test_reset_chooses_the_road_the_look_and_the_start(lake):
     env = environment.Drive(laps=1, render_mode="rgb_array")
     road = make_road([(0, 0), (30, 0), (60, 9)], width=7)
-    frame, _ = env.reset(options={"track": road, "look": 3, "s": 20, "offset": 1.0, "turn": 0.1})
+    frame, _ = env.reset(options={"track": road, "look": np.uint8(3), "s": 20, "offset": 1.0, "turn": 0.1})
     other = environment.Drive(road, look=3)
     expected, _ = other.reset(options={"s": 20, "offset": 1.0, "turn": 0.1})
     assert np.array_equal(frame, expected)
