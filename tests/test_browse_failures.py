@@ -180,6 +180,7 @@ def test_an_address_whose_parts_are_gone_shows_the_rest(linked, page, tmp_path, 
         page.shows("#notice", "Not here, of the recordings in this address: 1")
         page.click("#compare-all")
         page.shows("#compared", "2 analyses to do")
+        page.shows("#table", "computing: 0 %")
         page.run("own = fetch; fetch = () => { fetch = own; throw new Error('gone'); }; 0")
         page.shows("#notice", "does not answer")
         page.wait("document.querySelector('#notice').hidden")

@@ -92,5 +92,5 @@ function row({id, name, message, seconds, roads, offset, models}, columns, limit
       : make("td", written[at](value), {class: models.length > 1 && written[at](value) == best[at] ? "best" : ""}))));
 }
 
-const waits = ({state, progress}) => state == "running" ? `${(100 * progress).toFixed(0)} %`
+const waits = ({state, progress}) => state == "running" ? `computing: ${(100 * progress).toFixed(0)} %`
   : {none: "–", ready: "–", waiting: "waits"}[state] ?? state;
