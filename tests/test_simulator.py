@@ -17,7 +17,7 @@ from commands import ROOT
 from drive_process import awaited
 from scenes import cameras, load
 
-from cloning.recordings.writer import csharp_number
+from cloning.recordings.writer import RecordingWriter, csharp_number
 from cloning.road.motion import MPH
 from cloning.road.points import make_road
 from cloning.road.track import LEFT, RIGHT, ROADS, Section, Track
@@ -320,8 +320,12 @@ def test_a_frame_depends_on_the_pose_alone():
 
 
 def test_an_existing_recording_is_kept(tmp_path, capsys):
+    """And one that another process writes, whose rows would be mixed with these."""
     for command in ("record", "correct"):
         folder = tmp_path / f"{command}-corrections"
+        with RecordingWriter(folder):
+            assert main([command, str(folder)]) == 2
+            assert "another program records there; name another folder" in capsys.readouterr().err
         folder.mkdir()
         (folder / "driving_log.csv").write_text("precious\n", encoding="utf-8")
         assert main([command, str(folder)]) == 2

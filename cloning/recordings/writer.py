@@ -4,13 +4,13 @@ import errno
 import math
 import os
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Self
 
 from cloning.base.errors import RecordingError
-from cloning.base.files import written_whole
+from cloning.base.files import locked, written_whole
 from cloning.recordings.format import (
     CAMERAS,
     DRIVE_GAP,
@@ -53,18 +53,24 @@ class RecordingWriter:
     def __init__(self, folder: str | Path, start: datetime = DEFAULT_START):
         """Begin a recording; start: the date and time of simulated second 0, for the names of the images.
 
-        An empty driving_log.csv, of a process that was killed before its first row, is used. Raises RecordingError if
-        the folder already contains a recording, or cannot be made.
+        An empty driving_log.csv, of a process that was killed before its first row, is used. Until `close`, or the end
+        of this process, no other one records there, where a system has locks. Raises RecordingError if one does, if the
+        folder already contains a recording, or if it cannot be made.
         """
         self.folder = Path(folder).absolute()
         self.images = self.folder / IMAGE_FOLDER
         log = self.folder / DRIVING_LOG
         try:
-            if log.exists() and log.stat().st_size:
-                raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
-            self.images.mkdir(parents=True, exist_ok=True)
-            self.log = open(log, "ab", buffering=0)  # noqa: SIM115 - closed in close()
-            self.lane = open(self.folder / LANE_FILE, "wb", buffering=0)  # noqa: SIM115 - likewise
+            with ExitStack() as stack:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                if stack.enter_context(locked(self.folder)) is False:
+                    raise RecordingError(f"{self.folder}: another program records there; name another folder")
+                if log.exists() and log.stat().st_size:
+                    raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
+                self.images.mkdir(exist_ok=True)
+                self.log = stack.enter_context(open(log, "ab", buffering=0))
+                self.lane = stack.enter_context(open(self.folder / LANE_FILE, "wb", buffering=0))
+                self._held = stack.pop_all()
         except OSError as error:
             raise RecordingError(f"{self.folder}: {error.strerror}; name a folder that can be written") from error
         self.start = start
@@ -109,12 +115,13 @@ class RecordingWriter:
             return
         self.log.close()
         self.lane.close()
-        if not self.rows:
-            for name in (DRIVING_LOG, LANE_FILE):
-                (self.folder / name).unlink()
-            for folder in (self.images, self.folder):
-                if not any(folder.iterdir()):
-                    folder.rmdir()
+        with self._held:
+            if not self.rows:
+                for name in (DRIVING_LOG, LANE_FILE):
+                    (self.folder / name).unlink()
+                for folder in (self.images, self.folder):
+                    if not any(folder.iterdir()):
+                        folder.rmdir()
 
     def __enter__(self) -> Self:
         return self
