@@ -193,7 +193,9 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
         runs.Runs([folder]).report(0)
     files = written_run(tmp_path / "old", finished=4, images=0, losses=(0.5, float("nan"), 0.3))
     files.progress.unlink()
+    files.arguments.write_text(files.arguments.read_text(encoding="utf-8").replace("lake", "Dünen"), encoding="utf-8")
     found = runs.overview(files)
+    assert found["options"]["recordings"] == '["Dünen"]'
     assert found["state"] == "stopped" and [row["loss"] for row in found["history"]] == [0.5, None, 0.3]
     assert found["pictures"] == [0, 1200, 6400]
     files = written_run(tmp_path / "diverged", finished=2, images=0, losses=(float("nan"), float("inf")))
