@@ -135,7 +135,9 @@ def test_the_report_is_written_as_markdown(written):
 
 
 def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):
-    for folder, words in ((tmp_path, "no training run in this folder yet"), (tmp_path / "none", "no training run")):
+    missing = "no training run in this folder yet"
+    file = (written / "training_log.csv", "a file; name the folder that")
+    for folder, words in ((tmp_path, missing), (tmp_path / "none", missing), file):
         done = report(folder)
         assert done.returncode == 2 and done.stderr.startswith(f"report: {folder}: {words}") and not done.stdout
     copy = shutil.copytree(written, tmp_path / "copy")

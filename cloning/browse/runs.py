@@ -86,6 +86,8 @@ class Runs:
 def overview(files: RunFiles) -> dict[str, Any]:
     """Return what the page shows of a run. Raises UserError, OSError."""
     if not files.arguments.exists():
+        if files.last.parent.is_file():
+            raise UserError(f"{files.last.parent}: a file; name the folder that `python model.py` has written to")
         command = as_typed("python", "model.py", "--output", files.last)
         raise UserError(f"{files.last.parent}: no training run in this folder yet; `{command}` begins one")
     options, progress = _json(files.arguments, OPTIONS, 1, "recipe"), {}
