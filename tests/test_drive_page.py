@@ -277,7 +277,7 @@ def test_a_drive_is_watched_and_its_set_speed_changed_with_the_keyboard_alone(mo
             assert page.run(PLOTS) == 4, "no distance from the centre"
             assert page.text("#unusable") == "0"
             for keys, answer in (
-                (("Tab", " "), "stops the car"),  # the first control
+                (("Tab", " "), "the car stops"),  # the first control
                 ((" ",), "drives at 9 mph"),
                 (("Tab", "ArrowRight"), "drives at 9.5 mph"),
                 (("Tab", " "), "recording has ended"),

@@ -329,7 +329,7 @@ async function post(path, body, words) {
   }
 }
 
-const setSpeed = speed => post("/set-speed", {set_speed: String(speed)}, speed ? `drives at ${speed} mph` : "stops the car");
+const setSpeed = speed => post("/set-speed", {set_speed: String(speed)}, speed ? `the car drives at ${speed} mph` : "the car stops");
 element("speed").onchange = () => {
   const {value} = element("speed");
   if (isStopped()) answer(`Go drives at ${value} mph`);
