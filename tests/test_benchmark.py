@@ -21,6 +21,7 @@ from scenes import Here
 from steer_server import STEER, Server
 
 from cloning.base.errors import SimulatorError, UserError
+from cloning.base.files import locked
 from cloning.base.program import DONE, FAILED
 from cloning.network.network import SHIPPED_MODEL, save_model
 from cloning.road.autonomy import INTERVENTION_TIME
@@ -174,6 +175,9 @@ def test_a_benchmark_goes_on_after_the_drives_before_its_server_ended(tmp_path, 
         monkeypatch.setattr(driving, "started_workers", Here)  # which saves six seconds
         assert __main__.main([words[0], "straight", *words[2:], "--resume"]) == FAILED
         assert f"has drives of entry 127.0.0.1:{server.port}, not straight; leave out" in capsys.readouterr().err
+        with locked(tmp_path):
+            assert __main__.main([words[0], "straight", *words[2:]]) == FAILED
+        assert "another benchmark writes there; wait" in capsys.readouterr().err
         kept = json.loads((tmp_path / "unfinished.json").read_text(encoding="utf-8"))
         assert list(kept["drives"]) == [task.name for task in TINY[:2]]
         kept["drives"][TINY[0].name]["mean_m"] = 99  # as no drive has

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cloning.base.errors import SimulatorError, UserError
+from cloning.base.files import locked
 from cloning.base.outputs import write_json, write_output
 from simulator import driving
 from simulator.benchmark import page, replays, scores, tasks
@@ -60,7 +61,9 @@ def run(options: argparse.Namespace) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     chosen = tasks.quick_tasks() if options.quick else tasks.all_tasks()
     try:
-        with workers as pool:
+        with locked(folder) as free, workers as pool:
+            if free is False:
+                raise UserError(f"{folder}: another benchmark writes there; wait for its end, or name another --folder")
             drives = drive_all(pool, entry, chosen, unfinished, about, options.resume)
             clips = list(results(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film"))
             drives += results(pool, functools.partial(replays.replay, entry), recordings, "recording")
@@ -76,7 +79,7 @@ def run(options: argparse.Namespace) -> None:
     }
     write_json(folder / "benchmark.json", found)
     write_output(folder / "report.html", page.page(found, clips).encode())
-    unfinished.unlink()
+    unfinished.unlink(missing_ok=True)  # another benchmark may begin there as the drives end
     for group, figures in groups.items():
         print(group, *(f"{name} {value}" for name, value in figures.items()), sep=", ")
     if found["foretelling"]:
