@@ -38,9 +38,8 @@ def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
     """Return the folder's frames and their times, sorted by time. Raises UserError if there are none."""
     if folder.is_file():
         raise UserError(f"{folder}: a file; name the folder in which drive.py has saved frames")
-    remedy = f"`python drive.py model.pt {folder}` saves frames in it"
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; {remedy}")
+        raise UserError(f"{folder}: no such folder; `python drive.py model.pt {folder}` saves frames in it")
     frames: list[tuple[datetime, Path]] = []
     others: list[str] = []
     for path in folder.iterdir():
@@ -51,7 +50,8 @@ def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
         elif path.name != saved_frames.DRIVEN:
             others.append(path.name)
     if not frames:
-        raise UserError(f"{folder}: no frames (files with names like 2018_07_16_17_11_43_382.jpg); {remedy}")
+        names = "files with names like 2018_07_16_17_11_43_382.jpg"
+        raise UserError(f"{folder}: no frames ({names}); name the folder in which drive.py has saved frames")
     if others:
         print_note(f"left out, not frames: {abbreviated(sorted(others))}")
     return sorted(frames)

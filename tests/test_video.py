@@ -186,7 +186,8 @@ def test_odd_sizes_lose_a_row_and_a_column(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name, words", [(None, "no such folder"), ("notes.txt", "no frames"), (FIRST, "none of its 1 frames is readable")]
+    "name, words",
+    [(None, "no such folder"), ("notes.txt", "name the folder in which"), (FIRST, "none of its 1 frames is readable")],
 )
 def test_no_film_is_a_clear_error(run, tmp_path, name, words):
     if name:

@@ -96,5 +96,5 @@ export function jump(reason, back) {
   const from = rows.indexOf(now.row), next = from < 0 ? 0 : (from + (back ? rows.length - 1 : 1)) % rows.length;
   const row = bySize ? rows[next] : others[0] ?? (back ? rows.at(-1) : rows[0]);
   seek(row);
-  say(`${rows.indexOf(row) + 1} of the ${rows.length} ${name}${bySize ? ", the largest first" : ""}`);
+  say(`${rows.indexOf(row) + 1} of ${rows.length}: ${name}${bySize ? ", the largest first" : ""}`);
 }
