@@ -32,8 +32,9 @@ class Page:
     until = staticmethod(awaited)
 
     def __init__(self, profile: Path):
-        inward, self.outgoing = os.pipe()
+        inward, outgoing = os.pipe()
         self.incoming, outward = os.pipe()
+        self.outgoing = open(outgoing, "wb")  # noqa: SIM115 - closed in close(); a signal cuts what os.write writes
         # Chromium reads at 3 and writes at 4; the shell puts the pipes there.
         command = ["bash", "-c", f'exec "$0" "$@" 3<&{inward} 4>&{outward}', CHROMIUM, *OPTIONS]
         self.process = subprocess.Popen(
@@ -59,7 +60,8 @@ class Page:
         message = {"id": self.number, "method": method, "params": parameters}
         if self.session:
             message["sessionId"] = self.session
-        os.write(self.outgoing, json.dumps(message).encode() + b"\0")
+        self.outgoing.write(json.dumps(message).encode() + b"\0")
+        self.outgoing.flush()
         while True:
             answer = self.receive()
             if answer.get("id") == self.number:
@@ -221,7 +223,8 @@ class Page:
             self.send("Browser.close")
         self.process.kill()
         self.process.wait()
-        os.close(self.outgoing)
+        with suppress(OSError):  # what was written to a browser that has ended
+            self.outgoing.close()
         os.close(self.incoming)
 
 
