@@ -60,26 +60,28 @@ def run(options: argparse.Namespace) -> None:
     recordings = replays.folders(options.recordings) if options.recordings else []
     folder.mkdir(parents=True, exist_ok=True)
     chosen = tasks.quick_tasks() if options.quick else tasks.all_tasks()
-    try:
-        with locked(folder) as free, workers as pool:
-            if free is False:
-                raise UserError(f"{folder}: another benchmark writes there; wait for its end, or name another --folder")
-            drives = drive_all(pool, entry, chosen, unfinished, about, options.resume)
-            clips = list(results(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film"))
-            drives += results(pool, functools.partial(replays.replay, entry), recordings, "recording")
-    except SimulatorError as error:
-        raise SimulatorError(f"{error}; with --resume, the benchmark goes on after the drives that are done") from None
-    groups = scores.by_group(drives)
-    found: dict[str, Any] = about | {
-        "quick": options.quick,
-        "score": scores.score(groups),
-        "groups": groups,
-        "foretelling": scores.foretelling(drives),
-        "drives": drives,
-    }
-    write_json(folder / "benchmark.json", found)
-    write_output(folder / "report.html", page.page(found, clips).encode())
-    unfinished.unlink(missing_ok=True)  # another benchmark may begin there as the drives end
+    with locked(folder) as free:
+        if free is False:
+            raise UserError(f"{folder}: another benchmark writes there; wait for its end, or name another --folder")
+        try:
+            with workers as pool:
+                drives = drive_all(pool, entry, chosen, unfinished, about, options.resume)
+                clips = list(results(pool, functools.partial(page.film, entry), page.failures(chosen, drives), "film"))
+                drives += results(pool, functools.partial(replays.replay, entry), recordings, "recording")
+        except SimulatorError as error:
+            on = "with --resume, the benchmark goes on after the drives that are done"
+            raise SimulatorError(f"{error}; {on}") from None
+        groups = scores.by_group(drives)
+        found: dict[str, Any] = about | {
+            "quick": options.quick,
+            "score": scores.score(groups),
+            "groups": groups,
+            "foretelling": scores.foretelling(drives),
+            "drives": drives,
+        }
+        write_json(folder / "benchmark.json", found)
+        write_output(folder / "report.html", page.page(found, clips).encode())
+        unfinished.unlink()
     for group, figures in groups.items():
         print(group, *(f"{name} {value}" for name, value in figures.items()), sep=", ")
     if found["foretelling"]:
