@@ -1,6 +1,7 @@
 """Files are written completely or not at all."""
 
 import errno
+import multiprocessing
 import os
 import sys
 import time
@@ -8,7 +9,7 @@ import time
 import pytest
 
 from cloning.base.errors import OutputError, UserError
-from cloning.base.files import folder_written_whole, write, written_whole
+from cloning.base.files import folder_written_whole, locked, write, written_whole
 from cloning.base.outputs import check_folders, run_all
 
 
@@ -163,3 +164,20 @@ def test_all_outputs_are_tried_and_every_failure_is_reported():
     with pytest.raises(KeyboardInterrupt):
         run_all(lambda: fails(KeyboardInterrupt()), lambda: done.append("film"), lambda: fails(UserError("third")))
     assert done == ["report", "film"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no locks on folders")
+def test_a_folder_is_free_at_the_end_of_its_lock_whatever_was_forked_meanwhile(tmp_path):
+    with locked(tmp_path) as free, locked(tmp_path) as again:
+        other = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
+        other.start()
+        assert (free, again) == (True, False)
+    until = time.monotonic() + 30  # the copy lets go as soon as it runs
+    try:
+        while time.monotonic() < until:
+            with locked(tmp_path) as free:
+                if free:
+                    return
+        pytest.fail("still locked")
+    finally:
+        other.kill()

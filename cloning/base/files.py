@@ -24,6 +24,7 @@ if sys.platform != "win32":
 TEMPORARY_NAME = re.compile(r"\.(.+)\.[0-9a-f]{8}\.part")
 HELD_OPEN = 3.0  # s for which another program may have a file open
 LEFT_BEHIND = 86_400.0  # s: the temporary file of a process that still writes is not so old
+_locked: set[int] = set()  # the folders that this process has locked, as it has opened them
 
 
 @contextmanager
@@ -70,6 +71,8 @@ def locked(folder: Path) -> Iterator[bool | None]:
         yield None
     else:  # not after it: mypy would report that as never reached
         opened = os.open(folder, os.O_RDONLY)
+        _locked.add(opened)
+        _close_in_forks()
         free: bool | None = True
         try:
             try:
@@ -78,7 +81,20 @@ def locked(folder: Path) -> Iterator[bool | None]:
                 free = False if isinstance(error, BlockingIOError) else None
             yield free
         finally:
-            os.close(opened)
+            if opened in _locked:
+                _locked.remove(opened)
+                os.close(opened)
+
+
+@functools.cache  # once
+def _close_in_forks() -> None:
+    """Let a forked process hold none of the folders that this one has locked: it may end later, as after a kill."""
+
+    def close() -> None:
+        while _locked:
+            os.close(_locked.pop())
+
+    os.register_at_fork(after_in_child=close)
 
 
 def _rename(old: Path, new: Path, rename: Callable[[Path, Path], None]) -> None:
