@@ -153,9 +153,9 @@ class Page:
         middle = {"x": left + width / 2, "y": top + height / 2}
         self.send("Input.dispatchMouseEvent", type="mouseWheel", **middle, deltaX=0, deltaY=pixels)
 
-    def look(self, width: int, height: int, dark: bool = False) -> None:
-        """Choose the window's size in px and the system's colours."""
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    def look(self, width: int, height: int, dark: bool = False, scale: int = 1) -> None:
+        """Choose the window's size in px, the system's colours, and the screen's pixels in one of CSS."""
+        size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
         self.send("Emulation.setDeviceMetricsOverride", **size)
         colours = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.send("Emulation.setEmulatedMedia", features=[colours])

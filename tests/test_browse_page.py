@@ -155,8 +155,8 @@ CONTROLS = """[...document.querySelectorAll(':is(#comparison th a, button, selec
 
 
 def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
-    """The answer to a key, and all curves with their scales."""
-    page.look(1366, 768)
+    """The answer to a key, and all curves with their scales, on a screen with small pixels, too."""
+    page.look(1366, 768, scale=2)
     page.open(f"{served.base}{served.hash('lake sample')}/20?limit=1&paths=0")
     page.wait("document.querySelectorAll('.replayed').length == 2")
     needed = "[...document.querySelectorAll('#said, #where, #scrub, #condition, #plots, #cameras')]"
@@ -164,6 +164,9 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     example = "condition.value = condition.placeholder, condition.scrollWidth <= condition.clientWidth"
     assert page.run(example), "all of a condition is read"
     assert now(page, "plots.plots[3].axes[1]._splits") == [0, -1, 1, -2.5, 2.5], "metres from the lane's centre"
+    limit = """document.querySelector('#plots figure:last-child canvas').getContext('2d').getImageData(0, 0, 4000, 999)
+        .data.filter((red, at, data) => at % 4 == 0 && red > 150 && data[at + 1] < 75).length"""
+    assert page.run(limit) > 500, "dashed lines, though the grid lies over them"
     page.run("import('/static/state.js').then(({page: {open}}) => open.plots.setZoom(40, 59))")
     assert page.fits(), "with the row outside of what the curves show"
     page.press("0")

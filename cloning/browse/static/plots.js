@@ -169,22 +169,22 @@ export class Plots {
   // The interventions of the curves are ticks in their colours, which leave the curves to be seen where there are many.
   // Lines at the limits, dashed: where a human would take over, and where the road ends.
   shade(plot, curves, limits) {
-    const {ctx, bbox} = plot, colours = getComputedStyle(document.body);
+    const {ctx, bbox} = plot, colours = getComputedStyle(document.body), px = uPlot.pxRatio; // of the canvas, in one of CSS
     ctx.save();
     ctx.globalAlpha = 0.25;
     for (const [first, end, colour] of this.stretches) {
       const left = Math.max(bbox.left, plot.valToPos(first - 0.5, "x", true));
       const right = Math.min(bbox.left + bbox.width, plot.valToPos(end - 0.5, "x", true));
       ctx.fillStyle = colours.getPropertyValue(colour);
-      if (right > left) ctx.fillRect(left, bbox.top, Math.max(1, right - left), bbox.height);
+      if (right > left) ctx.fillRect(left, bbox.top, Math.max(px, right - left), bbox.height);
     }
     ctx.globalAlpha = 0.7;
     for (const metres of limits) {
-      const at = Math.round(plot.valToPos(metres, "y", true)) + 0.5;
+      const at = Math.round(plot.valToPos(metres, "y", true)) + px % 2 / 2;
       if (at < bbox.top || at > bbox.top + bbox.height) continue;
       ctx.strokeStyle = colours.getPropertyValue(Math.abs(metres) == limits.at(-1) ? "--cut" : "--mark");
-      ctx.lineWidth = 1;
-      ctx.setLineDash([5, 4]);
+      ctx.lineWidth = px; // on a phone, the grid would hide a thinner one
+      ctx.setLineDash([5 * px, 4 * px]);
       ctx.beginPath();
       ctx.moveTo(bbox.left, at);
       ctx.lineTo(bbox.left + bbox.width, at);
@@ -195,7 +195,7 @@ export class Plots {
       for (const row of marks) {
         const at = plot.valToPos(row, "x", true);
         if (at < bbox.left || at > bbox.left + bbox.width) continue;
-        ctx.fillRect(at - 1, bbox.top + 0.7 * bbox.height, 2, 0.3 * bbox.height);
+        ctx.fillRect(at - px, bbox.top + 0.7 * bbox.height, 2 * px, 0.3 * bbox.height);
       }
     }
     ctx.restore();
