@@ -44,6 +44,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
     with browsing(linked) as server:
         page.open(server.base)
         page.wait("document.querySelector('article .road')")
+        assert page.box("article .road img")[2] == pytest.approx(2 * page.box("article .road img")[3], abs=1)
         for words in ("0.1 minutes, 60 frames", "lake, counter-clockwise", "30.2 mph", "1 recording, 60 frames"):
             assert words in page.text()
         assert page.run("document.querySelectorAll('article svg .path').length") == 1
