@@ -253,11 +253,15 @@ def test_a_recording_that_is_new_is_in_the_list_and_others_are_answered_while_it
 
 
 def test_the_command_refuses_what_it_cannot_show(sample_recording, tmp_path):
+    (tmp_path / "run1").mkdir()
+    (tmp_path / "run1/driven.csv").touch()
+    makes = f"python -m cloning.lerobot {tmp_path}/run1 --output {tmp_path}/run1-recording"
     for arguments, words in (
+        ([tmp_path / "run1"], f"{tmp_path}/run1: what drive.py saved; `{makes}` makes a recording of it"),
         ([tmp_path], f"{tmp_path}: no driving_log.csv in or below it. Record some: in the simulator (training mode"),
         ([sample_recording, "--model", tmp_path / "m.pt"], f"{tmp_path / 'm.pt'}: no such model file"),
         ([sample_recording, "--model", SHIPPED_WEIGHTS], f"{SHIPPED_WEIGHTS}: not a model of this project that steers"),
     ):
         done = call_here(browse.main, "browse", *arguments, "--port", 0)
         assert done.returncode == 2 and done.stderr.startswith(f"browse: {words}")
-        assert "python -m simulator record data/lake" in done.stderr or "model" in words
+        assert "python -m simulator record data/lake" in done.stderr or "model" in words or "run1" in words

@@ -13,7 +13,7 @@ import numpy as np
 
 from cloning.base import program
 from cloning.base.errors import RecordingError, printable
-from cloning.base.outputs import plural
+from cloning.base.outputs import as_typed, plural
 from cloning.base.table import Column, Table
 from cloning.recordings.columns import Finding, Rejected, UnclearLogError
 from cloning.recordings.excluded import EXCLUDED, Cut, cut_rows, read_cuts
@@ -21,6 +21,7 @@ from cloning.recordings.format import DRIVE_GAP, DRIVING_LOG, IMAGE_FOLDER, SAMP
 from cloning.recordings.frames import FrameCache
 from cloning.recordings.images import read_frame
 from cloning.recordings.rows import RowReader, read_lines
+from cloning.recordings.saved_frames import DRIVEN
 
 WHERE_TO_GET_RECORDINGS = (
     "Record some: in the simulator (training mode, button R), or by `python -m simulator record data/lake-ccw`; or "
@@ -99,6 +100,9 @@ def find_folders(given: Iterable[str | Path], exact: bool = False) -> list[Path]
         if path.is_file():
             raise RecordingError(f"{path}: a file; name the folder of a recording, with {DRIVING_LOG} and IMG/")
         found = [path] if exact and (path / DRIVING_LOG).is_file() else sorted(folders_below(path))
+        if not found and (path / DRIVEN).is_file():
+            command = as_typed("python", "-m", "cloning.lerobot", path, "--output", f"{path}-recording")
+            raise RecordingError(f"{path}: what drive.py saved; `{command}` makes a recording of it, not for training")
         if not found:
             raise RecordingError(f"{path}: no {DRIVING_LOG} in or below it. {WHERE_TO_GET_RECORDINGS}")
         for folder in found:
