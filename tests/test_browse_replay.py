@@ -243,6 +243,8 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
     for path in files.pictures.iterdir():
         cv2.imwrite(str(path), np.zeros((1, 1), np.uint8))
     with browsing("--run", *(tmp_path / name for name in ("a b/a", "b", "none"))) as server:
+        page.open(f"{server.base}#/run/1?with=2")
+        page.shows("#run-figures", "stopped or killed")
         page.open(f"{server.base}#/run/2")
         page.shows("#notice", "none: no training run in this folder yet; `python model.py --output")
         assert page.barriers() == []

@@ -44,7 +44,7 @@ function showSmooth() {
 // This run, and those laid over it; the others that there are.
 async function load(now) {
   const all = await request("/runs");
-  now.others = now.others.filter(other => all.some(({id}) => id == other)); // the address may be of an earlier server
+  now.others = now.others.filter(other => all.some(({id, message}) => id == other && !message)); // which can be shown
   return {all, runs: await Promise.all([now.id, ...now.others].map(each => request(`/runs/${each}`)))};
 }
 
