@@ -160,7 +160,8 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     page.look(1366, 768, scale=2)
     page.open(f"{served.base}{served.hash('lake sample')}/20?limit=1&paths=0")
     page.wait("document.querySelectorAll('.replayed').length == 2")
-    needed = "[...document.querySelectorAll('#said, #where, #scrub, #condition, #plots, #cameras')]"
+    needed = "[...document.querySelectorAll('#said, #driven, #where, #scrub, #condition, #plots, #cameras')]"
+    assert page.text("#driven") == "one.pt: 90.0 % autonomy, two.pt: 90.0 % autonomy"
     assert max(page.run(f"{needed}.map(each => each.getBoundingClientRect().bottom)")) <= 768
     example = "condition.value = condition.placeholder, condition.scrollWidth <= condition.clientWidth"
     assert page.run(example), "all of a condition is read"

@@ -1,6 +1,6 @@
 // Several recordings and several models in one table: how they were driven, and how the models steer and drive there.
 import {ask, element, make, many, notice, onClick, renew} from "./common.js";
-import {LIMITS} from "./replays.js";
+import {LIMITS, waits} from "./replays.js";
 
 const COLUMNS = { // of each model, and what they mean
   "steering error": "Root mean square of the difference from the driver's steering, in all frames",
@@ -91,6 +91,3 @@ function row({id, name, message, seconds, roads, offset, models}, columns, limit
     ...figures.flatMap(values => values.map((value, at) => !Number.isFinite(value) ? make("td", value)
       : make("td", written[at](value), {class: models.length > 1 && written[at](value) == best[at] ? "best" : ""}))));
 }
-
-const waits = ({state, progress}) => state == "running" ? `computing: ${(100 * progress).toFixed(0)} %`
-  : {none: "–", ready: "–", waiting: "waits"}[state] ?? state;

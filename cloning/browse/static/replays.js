@@ -68,6 +68,8 @@ export async function showReplays() {
   [...element("attention").children].forEach((button, index) =>
     button.setAttribute("aria-pressed", now.attention == index));
   element("replays").hidden = !now.limit;
+  element("driven").textContent = !now.limit ? "" : details.replays.map((replay, index) => // which is far below
+    `${details.models[index].name}: ${replay.state == "ready" ? `${replay.autonomy_percent.toFixed(1)} % autonomy` : waits(replay)}`).join(", ");
   if (now.limit && details.limit == now.limit) {
     const content = [now.id, details.version, details.limit, details.replays];
     renew(element("replay-list"), content, () => details.replays.map(section));
@@ -136,6 +138,10 @@ function section(replay, index) {
   if (more > 0) made.append(make("p", `And ${more} more.`));
   return made;
 }
+
+// What is told of an analysis that is not done.
+export const waits = ({state, progress}) => state == "running" ? `computing: ${(100 * progress).toFixed(0)} %`
+  : {none: "–", ready: "–", waiting: "waits"}[state] ?? state;
 
 const metres = offset => `${Math.abs(offset).toFixed(2)} m to the ${offset > 0 ? "right" : "left"}`;
 
