@@ -79,7 +79,7 @@ class Client(Driven, ClientSession):
         """Drive this number of laps. Raises SimulatorError."""
         goal = laps * self.run.track.length
         drive = self._drive_in_real_time if self.realtime else self._drive_in_lockstep
-        with progress_bar(round(goal), "m", unit_scale=True) as bar:
+        with progress_bar(round(goal), "m") as bar:
             while True:
                 self.connect()
                 try:

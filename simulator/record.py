@@ -88,7 +88,7 @@ def record(
         pool = stack.enter_context(started_workers(renderers))
         for _ in range(renderers):
             pool.submit(_prepare, view)
-        bar = stack.enter_context(progress_bar(round(laps * track.length), "m", unit_scale=True))
+        bar = stack.enter_context(progress_bar(round(laps * track.length), "m"))
 
         def write() -> None:
             images, row = pending.popleft()

@@ -17,6 +17,7 @@ from commands import ROOT
 from drive_process import awaited
 from scenes import cameras, load
 
+from cloning.base import progress
 from cloning.recordings.writer import RecordingWriter, csharp_number
 from cloning.road.motion import MPH
 from cloning.road.points import make_road
@@ -180,7 +181,8 @@ def test_numbers_are_written_as_the_simulators():
     assert [csharp_number(value) for value in values] == ["0", "0", "1", "6.9E-05", "30.1903", "-0.0597", "0.3333333"]
 
 
-def test_recordings_are_as_the_simulators(tmp_path, capsys):
+def test_recordings_are_as_the_simulators(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
     assert main(["record", str(tmp_path / "a"), "--laps", "0.015", "--seed", "5"]) == 0
     rows = list(csv.reader((tmp_path / "a" / "driving_log.csv").read_text(encoding="utf-8").splitlines()))
     times = []
@@ -199,7 +201,9 @@ def test_recordings_are_as_the_simulators(tmp_path, capsys):
     quality_75 = bytes([8, 6, 6, 7, 6, 5, 8, 7])  # how the JPEG standard's luminance table at quality 75 begins
     assert quality_75 in (tmp_path / "a" / "IMG" / rows[0][0]).read_bytes()[:64]
     pattern = r"a: (\d+) rows from (\d+) simulated seconds, at [\d.]+ times real time\n$"
-    closing = re.search(pattern, capsys.readouterr().out)
+    printed = capsys.readouterr()
+    assert re.search(r"\d %, \d+/17 m, ", printed.err), "metres, with no thousands as k"
+    closing = re.search(pattern, printed.out)
     assert closing and int(closing[1]) == len(rows) and int(closing[2]) == pytest.approx(len(rows) / 15, abs=0.6)
     assert main(["record", str(tmp_path / "b"), "--recovery", "--laps", "0.005"]) == 0
     assert capsys.readouterr().out.startswith("nothing was recorded from ") and not (tmp_path / "b").exists()
