@@ -24,7 +24,7 @@ from cloning.base.film import FilmWriter
 from cloning.recordings.format import BINS
 from cloning.replay.score import YARDSTICKS
 from cloning.report import __main__ as command
-from cloning.report.content import Report, bend
+from cloning.report.content import Report, in_words
 from cloning.report.pictures import epochs_chart, film_uri, picture_uri, steering_chart
 
 
@@ -53,9 +53,9 @@ def written(finished, sample_recording, tmp_path_factory):
 
 
 def test_examples_are_named_by_their_own_steering():
-    """In a recording of left bends alone, the least of them was called one to the right."""
-    bends = ["a bend to the left", "hardly a bend", "a bend to the right"]
-    assert [bend(steering) for steering in (-0.52, -0.03, 0.4)] == bends
+    """Who corrects to the right in a bend to the left was said to be in one to the right."""
+    words = ["the driver steers to the left", "the driver hardly steers", "the driver steers to the right"]
+    assert [in_words(steering) for steering in (-0.52, -0.03, 0.4)] == words
 
 
 def test_the_report_contains_the_run(written, finished):

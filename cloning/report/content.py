@@ -33,7 +33,7 @@ from cloning.training.pictures import panel
 from cloning.training.run_files import RunFiles
 from cloning.training.summary import VERDICTS, duration
 
-EXAMPLES = (0.05, 0.5, 0.95)  # quantiles of the steering: most often a bend to the left, none, and one to the right
+EXAMPLES = (0.05, 0.5, 0.95)  # quantiles of the steering: most often to the left, none, and to the right
 HARDLY = 0.05  # steering
 FILMS = 9_000_000  # bytes of all films in the page, which should have less than 15 MB
 SHOWN = 6  # interventions of each replay that are shown
@@ -41,11 +41,11 @@ DRIVERS = {"network": "the network", **YARDSTICKS, ORACLE: "recovery steering"} 
 PICTURES = ("LRC_", "augmented-")  # of the training: the three cameras' images, and those made from them
 
 
-def bend(steering: float) -> str:
-    """Return in words the bend in which a driver steers so, -1..1."""
+def in_words(steering: float) -> str:
+    """Return in words how a driver steers, -1..1: to the left may well be in a bend to the right, to correct."""
     if abs(steering) < HARDLY:
-        return "hardly a bend"
-    return f"a bend to the {'left' if steering < 0 else 'right'}"
+        return "the driver hardly steers"
+    return f"the driver steers to the {'left' if steering < 0 else 'right'}"
 
 
 class Shots:
@@ -170,7 +170,7 @@ class Report:
             self.looked_at = recording  # the network has not seen it, which tells more
 
     def examples(self) -> list[dict[str, str]]:
-        """Return frames in different bends, and with what the network looks at. Raises ModelError, RecordingError."""
+        """Return frames steered differently, and with what the network looks at. Raises ModelError, RecordingError."""
         if self.looked_at is None:
             return []
         recording, shown = self.looked_at, []
@@ -184,7 +184,7 @@ class Report:
                 raise ModelError(f"{self.model}: {error}; train the model again") from None
             recorded = picture_uri(panel(frame, recording.name(row), human))
             attention = frame_uri(overlay(frame, steering, mask))
-            words = {"name": bend(human), "steering": f"{steering:+.2f}, the driver {human:+.2f}"}
+            words = {"name": in_words(human), "steering": f"{steering:+.2f}, the driver {human:+.2f}"}
             shown.append({**words, "recorded": recorded, "attention": attention})
         return shown
 
