@@ -166,7 +166,7 @@ def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):
     (copy / "model.pt").unlink()
     (copy / "model-best.pt").unlink()
     done = report(copy)
-    assert done.returncode == 2 and "no epoch is finished" in done.stderr
+    assert done.returncode == 2 and f"{copy / 'model.pt'}: no such file" in done.stderr
     assert not (copy / "report.html").exists()
 
 

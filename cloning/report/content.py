@@ -91,7 +91,7 @@ class Report:
         arguments = json.loads(files.arguments.read_bytes())
         self.output, best = (folder / name for name in self.run["models"])
         self.model = best if best.exists() else self.output
-        if not self.run["best"] or not self.model.exists():
+        if not self.run["best"]:
             why = "no epoch is finished with a loss that is a number"
             raise UserError(f"{folder}: {why}, so there is nothing to report; let model.py go on, or train again")
         one_thread()  # as drive.py does; replays run at the same time
