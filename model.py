@@ -45,7 +45,7 @@ from cloning.recordings.frames import KEPT_FRAMES, FrameCache
 from cloning.recordings.log import CheckedRecording, find_folders, print_findings, read_recording
 from cloning.replay.drift import drifts, held_out, still_drifts
 from cloning.training import options, summary
-from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, fingerprint, resumed
+from cloning.training.checkpoint import Checkpoint, FirstWeights, SavedRun, fingerprints, resumed
 from cloning.training.distributed import FirstRankFailed, Ranks
 from cloning.training.lanes import Lanes
 from cloning.training.light import brighten, choose_brightness, choose_shadow, shade
@@ -287,7 +287,7 @@ class TrainingRun:
             self.errors = nn.parallel.DistributedDataParallel(self.errors)
         self.predict = functools.partial(predict, device=self.device, precision=self.precision, pool=self.pool)
         self.optimizer = OPTIMIZERS[recipe.optimizer](self.network.parameters(), recipe.momentum, recipe.weight_decay)
-        self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, fingerprint(training, validation))
+        self.checkpoint = Checkpoint(run, process, self.network, self.optimizer, fingerprints(training, validation))
         # Only one batch ahead on a GPU, in this thread, which makes it while the GPU computes.
         self.progress, ahead = self.checkpoint.restore(begin), 1 if self.training.gpu else 2
         self.generator = Generator(self.training, recipe, run.seed, self.pool, ahead, self.progress.number, ranks)

@@ -9,7 +9,7 @@ import numpy as np
 
 from cloning.base.frame import FRAME
 from cloning.recordings.format import NUMBERS
-from cloning.recordings.log import Recording
+from cloning.recordings.log import CheckedRecording
 from cloning.road.camera import CAMERA_HEIGHT, CAMERA_MATRIX, FAR_SLOPE
 from cloning.road.warp import ground_mask
 
@@ -73,9 +73,12 @@ def render_recording(folder: Path, rows: int = 60, seed: int = 0, prefix: str = 
     return folder
 
 
-def without_files(n: int, name: str = "lake", seconds: float = 0.0714, first: float = 0, **columns: float) -> Recording:
+def without_files(
+    n: int, name: str = "lake", seconds: float = 0.0714, first: float = 0, **columns: float
+) -> CheckedRecording:
     """n rows of a recording that has no files; columns: steering and others' values, else 0."""
-    numbers: dict[str, Any] = {column: np.full(n, columns.get(column, 0), np.float32) for column in NUMBERS}
+    more: dict[str, Any] = {column: np.full(n, columns.get(column, 0), np.float32) for column in NUMBERS}
     time, lines = first + np.arange(n) * seconds, np.arange(1, n + 1, dtype=np.int32)
     images = np.tile(np.arange(n, dtype=np.int32)[:, None], 3)  # each row has images of its own
-    return Recording(Path(name), np.array([], "S9"), images, **numbers, time=time, lines=lines, rows_read=n)
+    more |= {"time": time, "lines": lines, "rows_read": n, "digests": np.arange(n, dtype=np.uint64)}
+    return CheckedRecording(Path(name), np.array([], "S9"), images, **more)

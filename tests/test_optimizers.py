@@ -45,7 +45,7 @@ REFUSED = [(LargeNetwork, "too many"), (NormalizedNetwork, "batch norm"), (cropp
 def test_a_network_that_cannot_be_trained_or_saved_whole_is_refused_before(kind, words):
     network, process = kind(), Process("model.pt")
     with pytest.raises(ModelError, match=words):
-        Checkpoint(Run(REPORT, ()), process, network, Adam(network.parameters()), "")
+        Checkpoint(Run(REPORT, ()), process, network, Adam(network.parameters()), ("", ""))
 
 
 def networks():

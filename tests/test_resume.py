@@ -142,14 +142,17 @@ def test_a_training_outlives_its_terminal_after_nohup():
 # --resume, and the models of earlier runs
 
 
-def test_resume_refuses_other_arguments_and_other_recordings(begun, tmp_path):
+def test_resume_refuses_other_arguments_and_other_recordings(begun, copied, tmp_path):
     output, rejected = begun / "model.pt", begun / "rejected_rows.csv"
     rejected.write_text("the run's", encoding="utf-8")
     resume = ("--output", output, "--resume")
     assert "--learning-rate 0.0001, not 0.1" in refused(*resume, "--learning-rate", 0.1)
     assert "the run began with --from ''" in refused(*resume, "--from", output)
     other, few = render_recording(tmp_path / "other", rows=20, seed=1), render_recording(tmp_path / "few", rows=3)
-    assert "the run began with other recordings" in refused(other, *resume)
+    left = sorted((copied / "IMG").glob("left*"))
+    shutil.copy(left[0], left[1])  # a side image alone
+    for changed in (other, copied):
+        assert "the run began with other recordings" in refused(changed, *resume)
     assert "record more" in refused(few, *resume)
     assert rejected.read_text(encoding="utf-8") == "the run's"
     with edited(begun / "model-resume.pt") as saved:
@@ -175,11 +178,18 @@ EARLIER = ["epochs", "batch_size", "learning_rate", "samples_per_epoch"]  # the 
 EARLIER += ["throttle_threshold", "side_correction", "repeats"]
 
 
-def test_a_checkpoint_of_an_earlier_version_is_resumed(finished, begun):
-    """Its arguments were flat, with those of the process and one that is gone; no identifier, no drift of an epoch."""
+def test_a_checkpoint_of_an_earlier_version_is_resumed(finished, begun, sample_recording):
+    """Its arguments were flat, with those of the process and one that is gone; no identifier, no drift of an epoch.
+
+    The side images were not in its fingerprint.
+    """
+    _, training, validation, _ = model.prepare(model.options.parse([str(sample_recording)], REPORT, model.ROBUST))
+    _, fingerprint = model.fingerprints(training, validation)
     for name in ("model", "model-best", "model-resume"):
         with edited(begun / f"{name}.pt") as saved:
             del saved["run"], saved["layers"], saved["history"][0]["val_drift"]
+            if "training" in saved:
+                saved["training"]["fingerprint"] = fingerprint
             flat = {figure: saved["arguments"]["recipe"][figure] for figure in EARLIER}
             process = {"output": "elsewhere.pt", "device": "cuda", "strict": True, "resume": False}
             more = {"recordings": saved["arguments"]["recordings"], "seed": 0, "from_": "", "robust": False, "gone": 1}
@@ -335,7 +345,7 @@ def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkey
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device", "disk")])
-@pytest.mark.parametrize("function, advice", [("fingerprint", "start the run again"), ("write_losses", "--resume")])
+@pytest.mark.parametrize("function, advice", [("fingerprints", "start the run again"), ("write_losses", "--resume")])
 def test_resume_is_recommended_only_once_the_new_run_has_a_state(
     begun, sample_recording, monkeypatch, error, function, advice
 ):

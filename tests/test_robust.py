@@ -15,7 +15,6 @@ from cloning.browse import analyse
 from cloning.lane import recovery
 from cloning.lane.reader import LanePosition
 from cloning.network.network import CROP, SEEN_SHAPE, Network, load_model
-from cloning.recordings.log import CheckedRecording
 from cloning.road.camera import CAMERA_OFFSETS, FIRST_BONNET_ROW
 from cloning.road.motion import AXLE_TO_CAMERA, MPH, REAR_AXLE, WHEELBASE, curvature, steering_for
 from cloning.road.warp import with_alpha
@@ -347,14 +346,10 @@ def test_a_pass_samples_rows_by_their_weights_and_mirrors_half_of_the_views(monk
 def test_the_label_is_the_recovery_steering_and_not_the_drivers(monkeypatch):
     """Rows whose lane is 1 m to the left of a car that a human drives straight on."""
     lanes(monkeypatch, offset=1.0)
-    selected = select_known_lane(checked(recording(0.0)), ROBUST)
+    selected = select_known_lane(recording(0.0), ROBUST)
     assert (selected.steering < -0.1).all()
     assert selected.steering == pytest.approx(selected.lanes.steering(1.0, 0.0), abs=1e-4)
     assert 0.5 * N < len(selected) < N
-
-
-def checked(recording):
-    return CheckedRecording(**vars(recording), digests=np.arange(N, dtype=np.uint64))
 
 
 def test_copies_of_rows_end_no_stretch(monkeypatch):
@@ -367,7 +362,7 @@ def test_copies_of_rows_end_no_stretch(monkeypatch):
     monkeypatch.setattr(lanes_module, "lane_position", centred)
     driven = recording(0.2)
     repeated = driven.take(np.repeat(np.arange(N), 1 + np.arange(N) % 3))
-    plain, copied = (select_known_lane(checked(each), ROBUST) for each in (driven, repeated))
+    plain, copied = (select_known_lane(each, ROBUST) for each in (driven, repeated))
     assert len(plain) > 0.5 * N
     assert np.array_equal(plain.frame, copied.frame) and np.array_equal(plain.steering, copied.steering)
 

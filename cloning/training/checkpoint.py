@@ -247,19 +247,27 @@ def _unusable(path: Path, error: ValueError) -> ModelError:
     return ModelError(f"{path}: its contents do not fit this program: {error}; {NEW_RUN}")
 
 
-def fingerprint(*observations: Observations) -> str:
-    """Return a digest of a run's images and labels, which must not change before the run is resumed."""
+def fingerprints(*observations: Observations) -> tuple[str, str]:
+    """Return a digest of a run's images and labels, which must not change before the run is resumed.
+
+    The second is that of an earlier version, which looked at the centre images alone.
+    """
     digest = hashlib.blake2b(digest_size=16)
     for part in observations:
         digest.update(part.frame.tobytes() + part.steering.tobytes())
-    return digest.hexdigest()
+    earlier = digest.hexdigest()
+    for part in observations:
+        for index, recording in enumerate(part.recordings):
+            images = recording.images[part.row[part.recording == index]]
+            digest.update(recording.digests[images].tobytes())
+    return digest.hexdigest(), earlier
 
 
 class Checkpoint:
     """Writes the model files of a run, and restores the run from them."""
 
-    def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data_fingerprint: str):
-        """network, optimizer: whose state is saved and restored; data_fingerprint: of `fingerprint`.
+    def __init__(self, run: Run, process: Process, network: Network, optimizer: Adam, data: tuple[str, str]):
+        """network, optimizer: whose state is saved and restored; data: its `fingerprints`.
 
         Raises ModelError for a network that can't be saved whole, or sees other rows of a frame.
         """
@@ -272,7 +280,7 @@ class Checkpoint:
         if network.crop != CROP:  # it would drive by other rows than those that it learns from
             raise ModelError(f"a network that crops frames by {network.crop}, not {CROP}, can't be trained here")
         self.run, self.process, self.network, self.optimizer = run, process, network, optimizer
-        self.files, self.fingerprint = RunFiles(process.output), data_fingerprint
+        self.files, self.fingerprints = RunFiles(process.output), data
         self.resumed = False  # whether `restore` found a state of this run
 
     def begin(self, progress: Progress, precision: torch.dtype, labels: np.ndarray) -> None:
@@ -306,7 +314,7 @@ class Checkpoint:
         more = {"arguments": self.run.saved(), "history": progress.history, "run": progress.run}
         position = {name: getattr(progress, name) for name in POSITION}
         position["trail"] = progress.trail
-        training = {"optimizer": {"state": self.optimizer.state}, **position, "fingerprint": self.fingerprint}
+        training = {"optimizer": {"state": self.optimizer.state}, **position, "fingerprint": self.fingerprints[0]}
         if models and len(progress.history) == 1:
             for path in (self.files.last, self.files.best):
                 if path.exists() and _run_of(path) != progress.run:  # its own if it was killed in `save`
@@ -340,7 +348,7 @@ class Checkpoint:
         if not isinstance(begin, SavedRun):
             return Progress()
         state, self.resumed = begin.contents["training"], True
-        if state.get("fingerprint") != self.fingerprint:
+        if state.get("fingerprint") not in self.fingerprints:
             raise ModelError(f"{begin.path}: the run began with other recordings; restore them, or {NEW_RUN}")
         try:
             _restore_network(self.network, begin.contents)

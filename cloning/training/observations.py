@@ -17,7 +17,7 @@ from cloning.base.table import Column, Table
 from cloning.network.network import SEEN_ROWS
 from cloning.recordings.format import CAMERAS, DRIVE_GAP, PROBLEM_AREAS
 from cloning.recordings.images import read_frame
-from cloning.recordings.log import CheckedRecording, Recording
+from cloning.recordings.log import CheckedRecording
 from cloning.training.gpu import GpuFrames
 from cloning.training.lanes import Lanes
 from cloning.training.recipe import Recipe
@@ -76,7 +76,7 @@ class Choices(NamedTuple):
 class Observations(Table):
     """Observations in columns: one entry for each row of a recording that is used, or for a copy of it."""
 
-    recordings: list[Recording]  # that the rows come from
+    recordings: list[CheckedRecording]  # that the rows come from
     recording: Column  # int16 (n,): index into `recordings`
     row: Column  # int32 (n,): row of that recording
     steering: Column  # float32 (n,): the label, -1..1, right positive
