@@ -42,8 +42,10 @@ class AwaitedDriver:
         self.takes, self.patience = 0.02, PATIENTLY  # s for an answer; s that it is waited for
         self.vain = self.constant = 0  # attempts to find it in another thread; answers in a row that did not change
 
-    def is_awaited(self) -> bool:
-        """Return whether it may still answer otherwise than the program did at once."""
+    def is_awaited(self, is_new: bool) -> bool:
+        """Return whether it may still answer otherwise than the program did at once; is_new: as for `kept_silent`."""
+        if is_new:
+            self.constant = 0
         return self.apart is not False and (self.apart or self.constant < ATTEMPTS)
 
     def longest(self) -> float:
@@ -156,9 +158,7 @@ class Joined(ClientSession):
     def _await_driver(self, run: Run, telemetry: str) -> None:
         """Send a run's telemetry again until the answer changes, if the program's driver may be in another thread."""
         driver, is_new = self.driver, not self.dialect.same
-        if is_new:
-            driver.constant = 0
-        if self.dialect.still or not driver.is_awaited():
+        if not driver.is_awaited(is_new) or self.dialect.still:
             return
         begin, pause = time.monotonic(), driver.takes
         until = begin + driver.longest()
