@@ -165,8 +165,11 @@ class Measures(Dialect):
         """Steer, or drive on as before; remember after how many laps it is over."""
         if event != "steer" or not self.obey(data):
             return event == "manual"
-        if (laps := str(data.get("max_laps"))).isdecimal():
+        laps = data.get("max_laps")
+        if str(laps).isdecimal():
             self.max_laps = float(laps)  # int() refuses thousands of digits
+        elif laps is not None:
+            program.warn_once(f'"max_laps" {str(laps)[:40]!r} is no number of laps, and is ignored')
         return True
 
     def advance(self) -> None:
@@ -222,7 +225,10 @@ class Roads(Dialect):
             return True
         if event != "track":
             return False
-        self.text, self.still = str(data.get("track_string") if isinstance(data, dict) else None), True
+        text = data.get("track_string") if isinstance(data, dict) else None
+        if not isinstance(text, str):
+            raise TrackError('the program\'s event "track" has no text "track_string"')
+        self.text, self.still = text, True
         try:  # programs check their roads by rules of their own, so a faulty course is laid all the same
             road = make_road(parse_track_string(self.text), name="sent", checked=False, **self.stage.road)
         except TrackError as error:

@@ -95,11 +95,16 @@ def test_a_departure_is_an_out_of_bound_episode_and_the_car_is_set_back():
     assert min(number(data, "ang_diff") for data in program.data) >= 0
 
 
-def test_the_last_lap_that_a_program_wants_ends_the_drive(tmp_path):
+def test_the_last_lap_that_a_program_wants_ends_the_drive(tmp_path, capsys):
     (tmp_path / "road.csv").write_text("0,0\n25,0\n")
-    wanted = {"max_laps": "2".zfill(5000), "confidence": "1", "loss": "0.01"}
-    with Program(lambda data, n: [["steer", steer(0, 1)[1] | wanted]] if n < 200 else None) as program:
+
+    def answer(data, n):
+        wanted = {"max_laps": "2".zfill(5000) if n else "-3", "confidence": "1", "loss": "0.01"}
+        return [["steer", steer(0, 1)[1] | wanted]] if n < 200 else None
+
+    with Program(answer) as program:
         assert join("measures", program, "--road", str(tmp_path / "road.csv")) == 0
+    assert "\"max_laps\" '-3' is no number of laps, and is ignored" in capsys.readouterr().err
     places = {(data["lapNumber"], data["currentWayPoint"]) for data in program.data}
     assert places == {(lap, place) for lap in "12" for place in "012"}, "each lap begins in the first sector"
 
@@ -233,15 +238,15 @@ def test_a_driver_is_waited_for_little_longer_than_it_takes_even_if_its_commands
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        ({"track_string": "0,0,0@1,x,0"}, "point 2: '1,x,0' is not x,y,z"),
-        ({"track_string": [[0, 0], [40, 0]]}, "point 1: '[[0, 0], [40, 0]]' is not x,y,z"),
-        (ROADS[0], "point 1: 'None' is not x,y,z"),
+        ({"track_string": "0,0,0@1,x,0"}, "track_string: point 2: '1,x,0' is not x,y,z"),
+        ({"track_string": [[0, 0], [40, 0]]}, 'event "track" has no text "track_string"'),
+        (ROADS[0], 'event "track" has no text "track_string"'),
     ],
 )
 def test_what_is_no_road_ends_the_drive_with_its_reason(data, reason, capsys):
     with Program(lambda *_: [["track", data]]) as program:
         assert join("roads", program) == 2
-    assert f"python: the program's track_string: {reason}" in capsys.readouterr().err
+    assert f"python: the program's {reason}" in capsys.readouterr().err
 
 
 def test_a_road_that_crosses_itself_is_laid_all_the_same():
