@@ -22,9 +22,9 @@ import simulator.__main__ as simulator
 from cloning.base.errors import RecordingError
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings import check
-from cloning.recordings.check import COPY_OR_DELETE, check_images
+from cloning.recordings.check import check_images
 from cloning.recordings.columns import Finding, Rejected
-from cloning.recordings.images import MAX_BYTES, decode, encode, jpeg_size, read_frame, read_jpeg
+from cloning.recordings.images import MAX_BYTES, REMEDY, decode, encode, jpeg_size, read_frame, read_jpeg
 from cloning.recordings.log import read_recording
 from cloning.replay import command, replay
 
@@ -85,7 +85,8 @@ def with_scans(count: int) -> bytes:
         (PLAIN[:HEADER] + PLAIN[SCAN:], "no picture in it"),
         (PLAIN[:SCAN] + b"\xff\xd9", "no picture in it"),
         (PLAIN.replace(b"\xff\xdb", b"\xff\xfe"), "damaged"),  # without quantization tables
-        (cv2.imencode(".png", FRAME)[1].tobytes(), "a PNG: convert it"),
+        (cv2.imencode(".png", FRAME)[1].tobytes(), "not a JPEG but a PNG"),
+        (b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS: run `git lfs pull`"),
     ],
 )
 def test_what_no_camera_of_the_simulator_writes_is_refused(jpeg, reason):
@@ -171,7 +172,7 @@ def test_what_is_no_regular_file_is_not_read(tmp_path):
     with open(tmp_path / "huge.jpg", "wb") as file:
         file.truncate(1 << 33)
     assert len(read_jpeg(tmp_path / "huge.jpg")) == MAX_BYTES + 1
-    with pytest.raises(RecordingError, match=r"huge\.jpg: not a JPEG; copy it again"):
+    with pytest.raises(RecordingError, match=r"huge\.jpg: not a JPEG; put the right JPEG"):
         read_frame(tmp_path / "huge.jpg")
 
 
@@ -189,7 +190,7 @@ def test_rows_of_links_pipes_and_folders_are_left_out(copied):
     assert len(found) == 55
     missing, unusable = Finding.IMAGE_MISSING, Finding.IMAGE_UNUSABLE
     reasons = ["missing; its link leads nowhere: copy the image instead, or delete the row"] * 2
-    reasons += [f"{why}; {COPY_OR_DELETE}" for why in ("not a regular file", "Is a directory", "not a regular file")]
+    reasons += [f"{why}; {REMEDY}" for why in ("not a regular file", "Is a directory", "not a regular file")]
     assert [row.finding for row in found.rejected] == [missing, missing, unusable, unusable, unusable]
     assert [row.detail for row in found.rejected] == [
         f"IMG/{image.name}: {reason}" for image, reason in zip(images, reasons, strict=True)
@@ -219,12 +220,12 @@ def test_images_are_checked_named_and_left_out(copied, monkeypatch):
     given = read_recording(copied)
     found = check_images(given)
     assert len(given) == 60 and given.rejected == [], "not changed"
-    expected = [Rejected(2, Finding.IMAGE_MISSING, f"IMG/{images[1].name}: missing; {COPY_OR_DELETE}")]
+    expected = [Rejected(2, Finding.IMAGE_MISSING, f"IMG/{images[1].name}: missing; {REMEDY}")]
     for at, (_, reason) in damaged.items():
-        detail = f"IMG/{images[at].name}: {reason}; {COPY_OR_DELETE}"
+        detail = f"IMG/{images[at].name}: {reason}; {REMEDY}"
         expected.append(Rejected(at + 1, Finding.IMAGE_UNUSABLE, detail))
     for line, (copy, original) in enumerate(copies.items(), 8):
-        detail = f"IMG/{copy.name}: the same picture as {original.name}; {COPY_OR_DELETE}"
+        detail = f"IMG/{copy.name}: the same picture as {original.name}; {REMEDY}"
         expected.append(Rejected(line, Finding.IMAGE_UNUSABLE, detail))
     assert found.rejected == expected
     assert set(found.lines) == set(range(1, 61)) - set(range(2, 11))
@@ -307,7 +308,7 @@ def test_an_image_that_changes_while_it_is_replayed_is_named(copied, monkeypatch
     assert simulator.main(["replay", str(copied), "--model", str(SHIPPED_MODEL), "--reference", "human"]) == 2
     name = sorted((copied / "IMG").glob("left*"))[30].name.replace("left", "center")
     assert capsys.readouterr().err == (
-        f"python: {copied / 'IMG' / name}: {reason}; copy it again, or delete its row from the log\n"
+        f"python: {copied / 'IMG' / name}: {reason}; put the right JPEG in its place, or delete the row\n"
     )
 
 
@@ -379,7 +380,7 @@ def test_a_cache_that_this_version_has_not_written_is_not_believed(checked, dama
     with np.load(cache) as file:
         damage(cache, file["images"])
     (row,) = check_images(read_recording(folder)).rejected
-    assert row.detail == f"IMG/{image.name}: not a JPEG; copy it again, or delete the row"
+    assert row.detail == f"IMG/{image.name}: not a JPEG; put the right JPEG in its place, or delete the row"
     assert f"{cache}: unreadable" in capsys.readouterr().out
 
 

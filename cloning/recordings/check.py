@@ -16,10 +16,9 @@ from cloning.base.progress import progress_bar
 from cloning.recordings.columns import Finding, Rejected
 from cloning.recordings.format import DRIVING_LOG, IMAGE_FOLDER
 from cloning.recordings.frames import FrameCache
-from cloning.recordings.images import RULES, decode, read_jpeg
+from cloning.recordings.images import REMEDY, RULES, decode, read_jpeg
 from cloning.recordings.log import CheckedRecording, Recording
 
-COPY_OR_DELETE = "copy it again, or delete the row"
 STANDING = 1.0  # mph: a slower car may see the same again
 STALE = 0.4  # s: a picture that is older shows another place; a newer one may stand for frames that were lost
 IMAGES_AT_ONCE = 32  # for each thread: Ctrl-C waits for them, and a future takes memory, of perhaps millions of images
@@ -56,7 +55,7 @@ def check_images(
             frames.put((recording.folder, image), decode(jpeg))
             digests[image] = int.from_bytes(hashlib.blake2b(jpeg, digest_size=8).digest(), "big")
         except ValueError as error:
-            reasons[image] = f"{error}; {COPY_OR_DELETE}"
+            reasons[image] = f"{error}; {REMEDY}"
 
     title, hidden = f"checking images of {recording.folder.name}", not show_progress or not len(todo)
     with ThreadPoolExecutor(threads) as pool, progress_bar(len(todo), "image", hidden, desc=title, leave=False) as bar:
@@ -76,7 +75,7 @@ def check_images(
         camera = int(unusable[row].argmax())
         image, copied = recording.images[row, camera].item(), os.fsdecode(names[original[row, camera]])
         finding = Finding.IMAGE_MISSING if is_missing[image] else Finding.IMAGE_UNUSABLE
-        reason = reasons.get(image, f"the same picture as {copied}; {COPY_OR_DELETE}")
+        reason = reasons.get(image, f"the same picture as {copied}; {REMEDY}")
         detail = f"{IMAGE_FOLDER}/{recording.name(int(row), camera)}: {reason}"
         rejected.append(Rejected(int(recording.lines[row]), finding, detail))
     checked = CheckedRecording(**{**vars(recording), "frames": frames, "rejected": rejected}, digests=digests)
@@ -111,7 +110,7 @@ def _remedies(folder: Path) -> Callable[[str], str]:
             return f"rename {similar.name}, which differs in upper and lower case, or correct the csv"
         if similar.is_symlink():
             return "its link leads nowhere: copy the image instead, or delete the row"
-        return COPY_OR_DELETE if folder.is_dir() else f"there is no folder {folder.name}: copy it beside {DRIVING_LOG}"
+        return REMEDY if folder.is_dir() else f"there is no folder {folder.name}: copy it beside {DRIVING_LOG}"
 
     return remedy
 

@@ -21,7 +21,8 @@ BLOCK_ROWS = 16  # of a frame that `encode` compresses together: colour has half
 FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive; all with Huffman codes
 SCAN_HEADER = 0xDA
 OTHER_SEGMENTS = {0xC4, 0xDB, 0xDD, 0xFE, *range(0xE0, 0xF0)}  # tables, restart interval, comment, application data
-COPY_OR_DELETE = "copy it again, or delete its row from the log"
+REMEDY = "put the right JPEG in its place, or delete the row"  # for an image that is missing or unusable
+OTHER_KINDS = {b"\x89PNG": " but a PNG", b"version https://git-lfs": " but a pointer of Git LFS: run `git lfs pull`"}
 MARKER_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7]")  # the first one ends the scan; restart markers do not
 
 
@@ -40,7 +41,8 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
     if not jpeg:
         raise ValueError("empty")
     if jpeg[:3] != b"\xff\xd8\xff":
-        raise ValueError("not a JPEG but a PNG: convert it" if jpeg.startswith(b"\x89PNG") else "not a JPEG")
+        kind = next((kind for start, kind in OTHER_KINDS.items() if jpeg.startswith(start)), "")
+        raise ValueError(f"not a JPEG{kind}")
     if len(jpeg) > MAX_BYTES:
         raise ValueError(f"larger than {MAX_BYTES} bytes")
     size, segments, scans, at = None, 0, 0, 2
@@ -140,7 +142,7 @@ def read_jpeg(path: Path) -> bytes:
         raise ValueError(error.strerror or str(error)) from error
 
 
-def read_image(path: Path, remedy: str = COPY_OR_DELETE) -> tuple[bytes, np.ndarray]:
+def read_image(path: Path, remedy: str = REMEDY) -> tuple[bytes, np.ndarray]:
     """Return the bytes of a recorded image, and its frame: uint8 (160, 320, 3), RGB.
 
     Raises RecordingError, with the remedy, if the file cannot be read, or is not a whole JPEG of a frame's size.
@@ -152,6 +154,6 @@ def read_image(path: Path, remedy: str = COPY_OR_DELETE) -> tuple[bytes, np.ndar
         raise RecordingError(f"{path}: {error}; {remedy}") from error
 
 
-def read_frame(path: Path, remedy: str = COPY_OR_DELETE) -> np.ndarray:
+def read_frame(path: Path, remedy: str = REMEDY) -> np.ndarray:
     """Read and decode a recorded image: uint8 (160, 320, 3), RGB. Raises RecordingError; see `read_image`."""
     return read_image(path, remedy)[1]
