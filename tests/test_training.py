@@ -208,7 +208,7 @@ def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_pat
         (["data/lake/IMG"], "data/README.md"),
         (["--epochs", "0"], "--epochs"),
         (["--learning-rate", "nan"], "--learning-rate"),
-        (["--side-correction", "inf"], "--side-correction"),
+        (["--side-correction", "100"], "100 is not a finite number of at least -1"),
         (["--seed", str(2**64)], "--seed"),
         (["--throttle-threshold", "2"], "--throttle-threshold drops"),
         (["--batch-size", str(10**18)], "at most"),

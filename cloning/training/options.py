@@ -79,7 +79,7 @@ FIGURES: dict[str, tuple[Callable[[str], float], str]] = {
     ),
     "throttle_threshold": (any_number, "without --robust: drop rows with less throttle, 0 to 1"),
     "side_correction": (
-        any_number,
+        number(float, -1, 1),
         "without --robust: steering added to the label of left images, subtracted from right ones'",
     ),
     "repeats": (number(int, 1, MAX_REPEATS), COPIES),
