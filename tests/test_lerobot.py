@@ -20,6 +20,7 @@ from cloning.recordings.log import CheckedRecording, read_recording
 from cloning.recordings.saved_frames import FrameSaver
 
 CENTER = "observation.images.center"
+VAST = {"action": {"dtype": "float32", "shape": [10**6], "names": None}}
 
 
 def run(*arguments) -> tuple[str, str]:
@@ -223,6 +224,8 @@ def test_a_donkeycar_tub_becomes_a_recording(tub, tmp_path, end):
         middles.append(road.nonzero()[0].mean())
     assert middles[1] > middles[0] + 10 > middles[2] + 20, "seen from the left, the road lies further to the right"
     assert "gone: no such folder; name a recording, data set" in refused(tub / "gone", "--output", tmp_path / "other")
+    (tub / "manifest.json").rename(tub / "record_1.json")
+    assert "tub: a tub of version 1; donkeycar's scripts/conv" in refused(tub, "--output", tmp_path / "other")
 
 
 def test_a_tubs_camera_of_another_name_is_found_or_can_be_named(tub, tmp_path):
@@ -256,9 +259,10 @@ def test_why_a_tub_has_no_usable_row_is_told(tub, tmp_path):
         (lambda folder: shutil.rmtree(folder / "videos" / CENTER), "No such file or directory"),
         (lambda folder: edit(folder, fps=5), "no frame for row 7 of episode 0"),
         (lambda folder: edit(folder, fps=60), "no frame for row 1 of episode 0"),
+        (lambda folder: edit(folder, features=features(folder) | VAST), "action:999, recorded_at:recorded_at"),
         (lambda folder: edit(folder, video_path="http://127.0.0.1:1/film"), "127.0.0.1:1/film: No such file"),
     ],
-    ids=["info", "table", "no film", "short film", "film that lacks frames", "no file"],
+    ids=["info", "table", "no film", "short film", "film that lacks frames", "million numbers", "no file"],
 )
 def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_path, monkeypatch, damage, message):
     damage(data_set)

@@ -52,6 +52,9 @@ def main() -> int:
     is_tub, is_data_set = (source / MANIFEST).is_file(), (source / "meta" / "info.json").is_file()
     if not source.exists():
         raise UserError(f"{source}: no such folder; name a recording, data set, tub or drive")
+    if any(source.glob("record_*.json")):
+        remedy = "donkeycar's scripts/convert_to_tub_v2.py makes one of version 2"
+        raise UserError(f"{source}: a tub of version 1; {remedy}")
     if output.exists():
         raise OutputError(f"{output}: exists already; name another folder, or delete this one")
     is_drive = (source / DRIVEN).is_file()

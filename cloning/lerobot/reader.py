@@ -18,6 +18,7 @@ from cloning.recordings.columns import column_of
 from cloning.recordings.format import CAMERAS, NUMBERS
 
 INFO = "meta/info.json"
+MOST_NUMBERS = 1000  # of a feature without names; a damaged file may tell of any number
 
 
 def read_data_set(folder: Path, camera: str | None, steering: str | None) -> Iterator[Sample]:
@@ -49,7 +50,7 @@ def _columns(info: dict[str, Any], steering: str | None) -> dict[str, tuple[str,
     """Return the feature of each number of a recording that is found, and the number's place in it."""
     found, places = {}, {}
     for key, each in info["features"].items():
-        count = each["shape"][0] if len(each["shape"]) == 1 else 0
+        count = min(each["shape"][0], MOST_NUMBERS) if len(each["shape"]) == 1 else 0
         names = each.get("names") or ([key.rpartition(".")[2]] if count == 1 else [str(at) for at in range(count)])
         while isinstance(names, dict):  # {"motors": [...]}, or each name with its place
             first = next(iter(names.values()))
