@@ -50,8 +50,8 @@ ROAD: Options = {
     },
     "--road": {
         "metavar": "FILE",
-        "help": "drive a road of your own: the points of its centre line in m, as CSV (x,y or x,y,z), JSON "
-        "(road_points) or x,y,z@x,y,z; if its last point is not its first, a lap ends there",
+        "help": "drive a road of your own: the points of its centre line in m, as CSV (x,y or x,y,z; z up), "
+        "JSON (road_points) or x,y,z@x,y,z (y up, as in Unity); if its last point is not its first, a lap ends there",
     },
     "--width": {
         "type": number(float, MIN_WIDTH, MAX_WIDTH),

@@ -6,7 +6,7 @@
 
 A file has one of three forms, whatever its name:
 
-* CSV: a line x,y or x,y,z for each point, below a line with these names, in any order, or none
+* CSV: a line x,y or x,y,z (z up) for each point, below a line with these names, in any order, or none
 * JSON: a list of such points, or an object that has it as "road_points", and may have "width", "marking", "land" and
   "closed" beside it; other keys are ignored
 * the text x,y,z@x,y,z@… that programs of road tests send to the simulator, in which y is the height
