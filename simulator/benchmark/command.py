@@ -50,6 +50,8 @@ def drive_all(
 def run(options: argparse.Namespace) -> None:
     """Drive everything, write the page and the JSON, and print the figures. Raises UserError, OSError."""
     entry, folder = options.entry, options.folder
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: not a folder; name another --folder")
     file, unfinished = Path(entry), folder / "unfinished.json"
     about = {
         "version": tasks.VERSION,
