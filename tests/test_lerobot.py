@@ -20,6 +20,7 @@ from cloning.recordings.log import CheckedRecording, read_recording
 from cloning.recordings.saved_frames import FrameSaver
 
 CENTER = "observation.images.center"
+IMAGE = '{"cam/image_array": "0_cam_image_array_.jpg", "user/angle": %s}'
 VAST = {"action": {"dtype": "float32", "shape": [10**6], "names": None}}
 
 
@@ -272,7 +273,7 @@ def test_a_damaged_data_set_is_reported_and_nothing_is_written(data_set, tmp_pat
 
 
 @pytest.mark.parametrize(("end", "line"), [(b"\n", 7), (b"\r\r\n", 13)])  # the second has an empty line after each
-@pytest.mark.parametrize("row", ["{", "[]", "{}", '{"cam/image_array": "0_cam_image_array_.jpg", "user/angle": null}'])
+@pytest.mark.parametrize("row", ["{", "[]", "{}", *(IMAGE % angle for angle in ("null", "9" * 400))])
 def test_a_damaged_tub_is_reported_with_its_line(tub, tmp_path, row, end, line):
     catalog = tub / "catalog_1.catalog"
     catalog.write_bytes((catalog.read_bytes() + f"{row}\n".encode()).replace(b"\n", end))

@@ -56,7 +56,7 @@ def read_tub(folder: Path, camera: str | None, notes: Counter[str]) -> Iterator[
                     time = row["_timestamp_ms"] / 1000 if "_timestamp_ms" in row else index * FRAME_SECONDS
                     throttle = {"throttle": float(row["user/throttle"])} if "user/throttle" in row else {}
                     yield Sample(time, [image], {"steering": float(row["user/angle"]), **throttle})
-            except (AttributeError, KeyError, TypeError, ValueError) as error:
+            except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
                 problem = f"no {error}" if isinstance(error, KeyError) else str(error)
                 raise RecordingError(f"{path}: line {line}: {problem}; correct or delete the line") from None
 
