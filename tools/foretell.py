@@ -92,11 +92,11 @@ class Course(NamedTuple):
 def courses() -> list[Course]:
     """Return all that is driven, in an order in which any beginning has some of everything."""
     lists = []
-    for first, kinds in ((2001, [kind for kind in KINDS if kind not in HELD_OUT] * 2), (1, list(HELD_OUT) * 4)):
+    for first, kinds in ((2001, [kind for kind in KINDS if kind not in HELD_OUT] * 8), (1, list(HELD_OUT) * 14)):
         tracks = [("lake", "jungle", f"road-{first + i}")[(i + i // 15) % 3] for i in range(len(kinds))]
         foul = [Course(DISTURBED, track, first + i, f"{kinds[i]}:5") for i, track in enumerate(tracks)]
-        hard = [Course(HARD, f"mountain-{first + i}", first + i) for i in range(14)]
-        some = [(f"road-{first + i}", "lake", f"road-{first + i}", "jungle")[i % 4] for i in range(100, 116)]
+        hard = [Course(HARD, f"mountain-{first + i}", first + i) for i in range(30)]
+        some = [(f"road-{first + i}", "lake", f"road-{first + i}", "jungle")[i % 4] for i in range(100, 124)]
         lists += [foul, hard, [Course(ORDINARY, track, first + 100 + i) for i, track in enumerate(some)]]
     return [course for _, course in sorted((i / len(each), course) for each in lists for i, course in enumerate(each))]
 
@@ -247,7 +247,9 @@ def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation
     signs = np.concatenate([part.signs for part in tuned])[rows]
     weights = STEEPNESS * regress(signs, *(np.concatenate(each)[rows] for each in (coming, share)))
     odds = {kind: risks(tuned, kind, lambda part: part.signs @ weights)[1] for kind in CONDITIONS}
-    alarm = np.quantile(np.concatenate(list(odds.values())), 1 - FALSE_ALARMS)
+    counts = np.concatenate([np.full(len(each), 1 / max(len(each), 1)) for each in odds.values()])  # each kind the same
+    every = np.concatenate(list(odds.values()))
+    alarm = np.quantile(every, 1 - FALSE_ALARMS, weights=counts, method="inverted_cdf")
     clear = max((odds[kind].max() for kind in (HARD, ORDINARY) if len(odds[kind])), default=alarm)
     stop = 1 / (1 + np.exp(min(0, alarm - clear) - MARGIN))
     return Limits(ordinary, weights, -float(alarm), float(stop))
