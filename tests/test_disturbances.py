@@ -8,7 +8,7 @@ import pytest
 from scenes import Here
 from steer_server import STEER, Server
 
-from cloning.base.errors import SimulatorError
+from cloning.base.errors import SimulatorError, UserError
 from cloning.network.network import SEEN_ROWS, SHIPPED_MODEL
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
@@ -260,3 +260,6 @@ def test_drives_and_replays_are_measured_once_and_a_run_goes_on(sample_recording
     assert printed == (tmp_path / "found" / "robustness.md").read_text(encoding="utf-8")
     assert "| late (held out) | 100.0 %, 9, " in printed
     assert "| **held out: kinds without a departure** | 0 of 1 |" in printed
+    file.write_text("{", encoding="utf-8")
+    with pytest.raises(UserError, match=r"robustness\.json: damaged .*; delete it, and start again"):
+        robustness.main(words)

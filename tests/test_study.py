@@ -21,7 +21,7 @@ from rendered import render_recording
 from scenes import Here
 from test_generator import loaded, observations
 
-from cloning.base.errors import RecordingError
+from cloning.base.errors import RecordingError, UserError
 from cloning.network.network import Network
 from cloning.replay.replay import load_recording
 from model import REPORT, ROBUST, Generator, balance
@@ -152,6 +152,9 @@ def test_the_command_measures_and_goes_on(tmp_path, capsys, monkeypatch):
     assert float(row["recovered"]) in (0, 1)
     assert study.main(command) == 0
     assert "is measured" not in capsys.readouterr().out, "it was measured before"
+    (folder / "lake-centre-camera-seed-0" / "result.json").write_text("", encoding="utf-8")
+    with pytest.raises(UserError, match=r"result\.json: damaged .*; delete it, and start again"):
+        study.main(command)
     (data / "lake-cw" / "driving_log.csv").rename(data / "lake-cw" / "log.csv")
     with pytest.raises(RecordingError, match="recordings by the names jungle, jungle-shadows, lake-ccw, lake-cw"):
         study.main(command)

@@ -14,7 +14,6 @@ same options give the same results, on any number of processes. The folder gets 
 
 import functools
 import itertools
-import json
 import statistics
 from collections.abc import Sequence
 from concurrent.futures import Executor, as_completed
@@ -28,7 +27,7 @@ from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.figure import png
-from cloning.base.outputs import write_json, write_output
+from cloning.base.outputs import read_json, write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
@@ -104,7 +103,7 @@ def measure(drive: Drive) -> Figures:
 
 def measure_all(drives: Sequence[Drive], file: Path, workers: Executor) -> dict[Drive, Figures]:
     """Return the figures of all drives; the file gets each as it comes, and may have some. Raises UserError."""
-    kept = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    kept = read_json(file) if file.exists() else {}
     coming = {workers.submit(measure, drive): str(drive) for drive in drives if str(drive) not in kept}
     with progress_bar(len(coming), "drive") as bar:
         for done in as_completed(coming):

@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from cloning.base.errors import OutputError, UserError
 from cloning.base.files import write
@@ -43,6 +44,14 @@ def write_output(path: str | Path, data: bytes) -> None:
 def write_json(path: str | Path, value: Mapping | Sequence) -> None:
     """Write a report as JSON. Raises OutputError."""
     write_output(path, json.dumps(value, indent=1).encode() + b"\n")
+
+
+def read_json(path: Path) -> Any:
+    """Return what `write_json` has written. Raises UserError if the file is damaged, OSError."""
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: damaged ({error}); delete it, and start again") from None
 
 
 def as_typed(*words: object) -> str:

@@ -14,7 +14,6 @@ driving, and pictures. An interrupted study continues when it is started again w
 """
 
 import argparse
-import json
 import multiprocessing
 import shutil
 import signal
@@ -27,7 +26,7 @@ from cloning.base.arguments import command_line, number
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import csv_bytes
-from cloning.base.outputs import write_json, write_output
+from cloning.base.outputs import read_json, write_json, write_output
 from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record
@@ -48,7 +47,7 @@ def prepare(options: argparse.Namespace) -> None:
     options.folder.mkdir(parents=True, exist_ok=True)
     file = options.folder / "options.json"
     began = {"images": options.images, "laps": options.laps, "starts": options.starts}
-    if file.exists() and json.loads(file.read_text(encoding="utf-8")) != began:
+    if file.exists() and read_json(file) != began:
         raise UserError(f"{file}: the study began with other options; give these, or another --folder")
     write_json(file, began)
     rendered = options.folder / RENDERED
@@ -72,7 +71,7 @@ def result(variant: Variant, options: argparse.Namespace) -> dict[str, float]:
             except BrokenExecutor:
                 remedy = "start the study again, with fewer --jobs"
                 raise UserError(f"{file.parent}: its process was killed; {remedy}") from None
-    return json.loads(file.read_text(encoding="utf-8"))
+    return read_json(file)
 
 
 def main(argv: list[str] | None = None) -> int:
