@@ -157,7 +157,7 @@ CONTROLS = """[...document.querySelectorAll(':is(#comparison th a, button, selec
 
 def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
     """The answer to a key, and all curves with their scales, on a screen with small pixels, too."""
-    page.look(1366, 768, scale=2)
+    page.look(1280, 768, scale=2)
     page.open(f"{served.base}{served.hash('lake sample')}/20?limit=1&paths=0")
     page.wait("document.querySelectorAll('.replayed').length == 2")
     needed = "[...document.querySelectorAll('#said, #driven, #where, #scrub, #condition, #plots, #cameras')]"

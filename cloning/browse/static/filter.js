@@ -4,7 +4,7 @@ import {askForReason, marked, showStretches} from "./cuts.js";
 import {askForName} from "./export.js";
 import {page, remember, say} from "./state.js";
 
-const SOON = 300, BINS = 60, HEIGHT = 52; // ms after the last letter; of the histogram, and its px
+const SOON = 300, BINS = 60, [WIDTH, HEIGHT] = [270, 52]; // ms after the last letter; of the histogram, and its px
 let typing, plot;
 
 // Show the frames that meet the condition in the page's state.
@@ -73,7 +73,7 @@ export function showHistogram() {
   for (const value of there) counts[Math.min(BINS - 1, Math.floor((value - from) / wide))] += 1;
   plot?.destroy();
   plot = histogram(element("histogram"), name, counts, [from, to], {size: 16, gap: 1, space: 40}, {
-    width: Math.min(300, innerWidth - 24), height: HEIGHT, padding: [2, 10, 0, 10],
+    width: Math.min(WIDTH, innerWidth - 24), height: HEIGHT, padding: [2, 10, 0, 10],
     cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
     hooks: {setSelect: [plot => {
       const {left, width} = plot.select, value = px => Number(plot.posToVal(px, "x").toPrecision(3));
