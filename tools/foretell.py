@@ -63,7 +63,8 @@ DISTURBED, HARD, ORDINARY = "disturbed, strength 5, 25 mph", "mountain roads, 25
 CONDITIONS = (DISTURBED, HARD, ORDINARY)
 MAX_DEPARTURES = 4  # in a drive: more are at the same place
 FALSE_ALARMS = 0.05  # share of the windows without a departure, in drives for tuning, in which there is an alarm
-MARGIN = 0.25  # log odds above that of an alarm and the greatest in clear drives for tuning: there a car is stopped
+NEEDLESS = 0.01  # a car is stopped at a risk that at most this share of the windows in clear drives for tuning has,
+MARGIN = 0.25  # log odds above that, and above an alarm
 OFF_ROAD = 4.0  # m from the centre: taken for where a car is that leaves the road
 NEAR = 0.1  # m added to distances before their logarithm is taken: a car on the centre is not infinitely better
 STEEPNESS = 4.0  # log odds for a distance e times as great
@@ -250,8 +251,8 @@ def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation
     counts = np.concatenate([np.full(len(each), 1 / max(len(each), 1)) for each in odds.values()])  # each kind the same
     every = np.concatenate(list(odds.values()))
     alarm = np.quantile(every, 1 - FALSE_ALARMS, weights=counts, method="inverted_cdf")
-    clear = max((odds[kind].max() for kind in (HARD, ORDINARY) if len(odds[kind])), default=alarm)
-    stop = 1 / (1 + np.exp(min(0, alarm - clear) - MARGIN))
+    clear = np.concatenate([odds[HARD], odds[ORDINARY], [alarm]])
+    stop = 1 / (1 + np.exp(min(0, alarm - np.quantile(clear, 1 - NEEDLESS)) - MARGIN))
     return Limits(ordinary, weights, -float(alarm), float(stop))
 
 
