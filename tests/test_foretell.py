@@ -146,6 +146,16 @@ def test_a_network_that_leaves_every_mountain_road_has_limits_and_one_that_leave
         tool.fit(hard, [])
 
 
+def test_each_kind_of_drive_counts_the_same_for_an_alarm_and_one_odd_window_does_not_decide_on_stops(monkeypatch):
+    odds = {tool.DISTURBED: np.linspace(0, 5, 900), tool.HARD: np.append(np.linspace(-3, 0, 199), 9.0)}
+    odds[tool.ORDINARY] = np.linspace(-3, 0, 100)
+    monkeypatch.setattr(tool, "risks", lambda tuned, kind, risk: (np.empty(0), odds[kind]))
+    rng = np.random.default_rng(5)
+    limits = tool.fit([driven(rng, 2001 + i, kind, strange) for i in range(2) for kind, strange in CLEAR], [])
+    assert np.mean([np.mean(each > -limits.bias) for each in odds.values()]) == pytest.approx(0.05, abs=0.005)
+    assert limits.stop == pytest.approx(1 / (1 + np.exp(-tool.MARGIN)))
+
+
 def test_an_alarm_counts_from_6_to_1_s_before_a_departure():
     time = np.arange(0, 20, 1 / 15)
     part = tool.Part(tool.HARD, np.zeros((len(time), 1)), 0 * time, time, time, 20.0)
