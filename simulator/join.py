@@ -42,10 +42,8 @@ class AwaitedDriver:
         self.takes, self.patience = 0.02, PATIENTLY  # s for an answer; s that it is waited for
         self.vain = self.constant = 0  # attempts to find it in another thread; answers in a row that did not change
 
-    def is_awaited(self, is_new: bool) -> bool:
-        """Return whether it may still answer otherwise than the program did at once; is_new: as for `kept_silent`."""
-        if is_new:
-            self.constant = 0
+    def is_awaited(self) -> bool:
+        """Return whether it may still answer otherwise than the program did at once."""
         return self.apart is not False and (self.apart or self.constant < ATTEMPTS)
 
     def longest(self) -> float:
@@ -60,6 +58,10 @@ class AwaitedDriver:
             self.takes = max(0.005, 0.99 * self.takes)
         else:
             self.takes += 0.2 * (min(seconds, 0.2) - self.takes)
+
+    def changed(self) -> None:
+        """Learn that a telemetry's first answer was another than before."""
+        self.constant = 0
 
     def kept_silent(self, is_new: bool) -> None:
         """Learn from a vain wait; is_new: for the answer to a telemetry whose first answer was another than before."""
@@ -158,7 +160,9 @@ class Joined(ClientSession):
     def _await_driver(self, run: Run, telemetry: str) -> None:
         """Send a run's telemetry again until the answer changes, if the program's driver may be in another thread."""
         driver, is_new = self.driver, not self.dialect.same
-        if not driver.is_awaited(is_new) or self.dialect.still:
+        if is_new:
+            driver.changed()
+        if self.dialect.still or not driver.is_awaited():
             return
         begin, pause = time.monotonic(), driver.takes
         until = begin + driver.longest()
