@@ -68,8 +68,7 @@ export async function showReplays() {
   [...element("attention").children].forEach((button, index) =>
     button.setAttribute("aria-pressed", now.attention == index));
   element("replays").hidden = !now.limit;
-  element("driven").textContent = !now.limit ? "" : details.replays.map((replay, index) => // which is far below
-    `${details.models[index].name}: ${replay.state == "ready" ? `${replay.autonomy_percent.toFixed(1)} % autonomy` : waits(replay)}`).join(", ");
+  element("driven").textContent = now.limit ? details.replays.map(inShort).join(", ") : "";
   if (now.limit && details.limit == now.limit) {
     const content = [now.id, details.version, details.limit, details.replays];
     renew(element("replay-list"), content, () => details.replays.map(section));
@@ -137,6 +136,12 @@ function section(replay, index) {
   const more = replay.unknown.length - LISTED;
   if (more > 0) made.append(make("p", `And ${more} more.`));
   return made;
+}
+
+// A replay's progress, or its autonomy, for the status line: the replays are far below it.
+function inShort(replay, index) {
+  const percent = replay.autonomy_percent?.toFixed(1);
+  return `${page.open.details.models[index].name}: ${replay.state == "ready" ? `${percent} % autonomy` : waits(replay)}`;
 }
 
 // What is told of an analysis that is not done.
