@@ -63,8 +63,9 @@ DISTURBED, HARD, ORDINARY = "disturbed, strength 5, 25 mph", "mountain roads, 25
 CONDITIONS = (DISTURBED, HARD, ORDINARY)
 MAX_DEPARTURES = 4  # in a drive: more are at the same place
 FALSE_ALARMS = 0.05  # share of the windows without a departure, in drives for tuning, in which there is an alarm
-NEEDLESS = 0.01  # a car is stopped at a risk that at most this share of the windows in clear drives for tuning has,
-MARGIN = 0.25  # log odds above that, and above an alarm
+# A car is stopped by so many log odds above an alarm, and above all but this share of the windows in clear drives for
+# tuning.
+MARGIN, NEEDLESS = 0.25, 0.01
 OFF_ROAD = 4.0  # m from the centre: taken for where a car is that leaves the road
 NEAR = 0.1  # m added to distances before their logarithm is taken: a car on the centre is not infinitely better
 STEEPNESS = 4.0  # log odds for a distance e times as great
@@ -248,9 +249,9 @@ def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation
     signs = np.concatenate([part.signs for part in tuned])[rows]
     weights = STEEPNESS * regress(signs, *(np.concatenate(each)[rows] for each in (coming, share)))
     odds = {kind: risks(tuned, kind, lambda part: part.signs @ weights)[1] for kind in CONDITIONS}
-    counts = np.concatenate([np.full(len(each), 1 / max(len(each), 1)) for each in odds.values()])  # each kind the same
-    every = np.concatenate(list(odds.values()))
-    alarm = np.quantile(every, 1 - FALSE_ALARMS, weights=counts, method="inverted_cdf")
+    found = [each for each in odds.values() if len(each)]
+    alike = np.concatenate([np.full(len(each), 1 / len(each)) for each in found])  # each kind counts the same
+    alarm = np.quantile(np.concatenate(found), 1 - FALSE_ALARMS, weights=alike, method="inverted_cdf")
     clear = np.concatenate([odds[HARD], odds[ORDINARY], [alarm]])
     stop = 1 / (1 + np.exp(min(0, alarm - np.quantile(clear, 1 - NEEDLESS)) - MARGIN))
     return Limits(ordinary, weights, -float(alarm), float(stop))
