@@ -177,9 +177,9 @@ def test_a_benchmark_goes_on_after_the_drives_before_its_server_ended(tmp_path, 
         assert f"has drives of entry 127.0.0.1:{server.port}, not straight; leave out" in capsys.readouterr().err
         with locked(tmp_path):
             assert __main__.main([words[0], "straight", *words[2:]]) == FAILED
-        assert "another benchmark writes there; wait" in capsys.readouterr().err
+        assert "another program writes there; wait" in capsys.readouterr().err
         assert __main__.main([*words[:-1], __file__]) == FAILED
-        assert f"{__file__}: not a folder; name another --folder" in capsys.readouterr().err
+        assert f"{__file__}: not a folder; name another folder" in capsys.readouterr().err
         kept = json.loads((tmp_path / "unfinished.json").read_text(encoding="utf-8"))
         assert list(kept["drives"]) == [task.name for task in TINY[:2]]
         kept["drives"][TINY[0].name]["mean_m"] = 99  # as no drive has

@@ -10,7 +10,7 @@ import pytest
 
 from cloning.base.errors import OutputError, UserError
 from cloning.base.files import folder_written_whole, locked, write, written_whole
-from cloning.base.outputs import check_folders, run_all
+from cloning.base.outputs import check_folders, claimed, run_all
 
 
 @pytest.mark.parametrize("name", ["runs", "."])
@@ -164,6 +164,15 @@ def test_all_outputs_are_tried_and_every_failure_is_reported():
     with pytest.raises(KeyboardInterrupt):
         run_all(lambda: fails(KeyboardInterrupt()), lambda: done.append("film"), lambda: fails(UserError("third")))
     assert done == ["report", "film"]
+
+
+def test_a_claimed_folder_is_made_and_no_file_is_taken_for_one(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for wrong, reason in (("file", "not a folder"), ("file/in", "cannot be made")):
+        with pytest.raises(OutputError, match=f"{wrong}: {reason}.*; name another folder"), claimed(tmp_path / wrong):
+            pytest.fail("claimed")
+    with claimed(tmp_path / "new" / "in"):
+        assert (tmp_path / "new" / "in").is_dir()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no locks on folders")

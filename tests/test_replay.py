@@ -294,11 +294,13 @@ def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, p
     ("arguments", "message"),
     [
         (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
+        (["FOLDER", "--model", "MODEL", "--picture", "MODEL"], "is read, and would be replaced; name another file"),
+        (["FOLDER", "--model", "MODEL", "--report", "LOG"], "driving_log.csv: is read, and would be replaced; name"),
         (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
     ],
 )
 def test_unusable_arguments_are_reported(sample_recording, model_file, arguments, message, capsys):
-    known = {"FOLDER": sample_recording, "MODEL": model_file}
+    known = {"FOLDER": sample_recording, "MODEL": model_file, "LOG": sample_recording / "driving_log.csv"}
     assert run(*[known.get(argument, argument) for argument in arguments]) == 2
     assert message in capsys.readouterr().err
 

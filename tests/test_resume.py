@@ -340,7 +340,7 @@ def test_two_runs_never_write_to_the_same_folder(begun, sample_recording, monkey
         with pytest.raises(Killed):
             run_here(sample_recording, *SHORT, "--output", begun / "model.pt")
     assert [run.returncode for run in others] == [2, 2]
-    assert all("another run is writing to this folder" in run.stderr for run in others)
+    assert all("another program writes there" in run.stderr for run in others)
     assert files(begun) == before
 
 

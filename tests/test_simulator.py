@@ -329,7 +329,7 @@ def test_an_existing_recording_is_kept(tmp_path, capsys):
         folder = tmp_path / f"{command}-corrections"
         with RecordingWriter(folder):
             assert main([command, str(folder)]) == 2
-            assert "another program records there; name another folder" in capsys.readouterr().err
+            assert "another program writes there; wait for its end" in capsys.readouterr().err
         folder.mkdir()
         (folder / "driving_log.csv").write_text("precious\n", encoding="utf-8")
         assert main([command, str(folder)]) == 2

@@ -27,6 +27,7 @@ from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.base.outputs import claimed
 from cloning.lane.foretell import (
     ALARM,
     EARLIEST,
@@ -301,10 +302,9 @@ def main(argv: list[str] | None = None) -> int:
     observe, chosen = observer(options.model), courses()[: options.drives]
     # Another network drives otherwise, and an earlier version of this tool did not save how blind the car was.
     folder = options.folder / f"{fingerprint(observe.network)[:8]}-blind"
-    folder.mkdir(parents=True, exist_ok=True)
     recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
     work = partial(drive_into, folder, options.model)
-    with started_workers(threads()) as pool:
+    with claimed(folder), started_workers(threads()) as pool:
         for _ in results(pool, work, chosen, "drive"):
             pass  # its errors are raised here
     driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]

@@ -28,7 +28,7 @@ from cloning.base.arguments import command_line
 from cloning.base.cores import threads
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME
-from cloning.base.outputs import write_json
+from cloning.base.outputs import claimed, write_json
 from cloning.base.progress import progress_bar
 from cloning.network.compute import choose_precision, in_precision
 from cloning.network.export import onnx_program
@@ -260,14 +260,14 @@ def main() -> int:
     import onnxscript  # noqa: F401  # an optional library, with which the networks are written: told before a training
 
     recordings = [check_images(read_recording(folder)) for folder in find_folders(options.recordings)]
-    options.folder.mkdir(parents=True, exist_ok=True)
     for recording in recordings:
         print_findings(recording)
-    for name in options.networks:
-        how, file = PUBLISHED[name], options.folder / f"{name}.onnx"
-        write_json(file.with_suffix(".json"), how.about)
-        save(train(how, file.with_suffix(".json"), recordings), how, file)
-        print(f"{file}: {how.source}", flush=True)
+    with claimed(options.folder):
+        for name in options.networks:
+            how, file = PUBLISHED[name], options.folder / f"{name}.onnx"
+            write_json(file.with_suffix(".json"), how.about)
+            save(train(how, file.with_suffix(".json"), recordings), how, file)
+            print(f"{file}: {how.source}", flush=True)
     return program.DONE
 
 

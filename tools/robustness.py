@@ -27,7 +27,7 @@ from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.figure import png
-from cloning.base.outputs import read_json, write_json, write_output
+from cloning.base.outputs import claimed, read_json, write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.format import SAMPLE_RATE
@@ -242,8 +242,7 @@ def main(argv: list[str] | None = None) -> int:
         for each in disturbances
         for file, name, sha256 in models
     ]
-    options.output.mkdir(parents=True, exist_ok=True)
-    with started_workers(options.processes, options.scheduler) as workers:
+    with claimed(options.output), started_workers(options.processes, options.scheduler) as workers:
         curves = curves_of(measure_all(drives, options.output / "robustness.json", workers))
     tables = table(curves, kinds, strengths)
     print(tables, end="")

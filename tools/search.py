@@ -28,7 +28,7 @@ from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import TrackError, UserError
 from cloning.base.figure import png
-from cloning.base.outputs import write_json, write_output
+from cloning.base.outputs import claimed, write_json, write_output
 from cloning.base.progress import progress_bar
 from cloning.network.network import SHIPPED_MODEL
 from cloning.road.generated import LANDS, MARKINGS, PointRoad
@@ -201,13 +201,12 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     workers = workers_for(options.driver, options.processes, options.scheduler)
     folder: Path = options.folder
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UserError(f"{folder}: is not empty; name a new folder")
-    folder.mkdir(parents=True, exist_ok=True)
     kind = Kind(options.max_angle, options.hills, options.marking, options.land)
     work = functools.partial(drive, Conditions(options.driver, options.speed, options.look))
     searches, failures = [], []
-    with workers as pool:
+    with claimed(folder), workers as pool:
+        if any(folder.iterdir()):
+            raise UserError(f"{folder}: is not empty; name a new folder")
         for seed, search in itertools.product(options.seeds, options.searches):
             figures, failed = run_search(
                 folder, search, seed, options.roads, kind, lambda roads: list(results(pool, work, roads))

@@ -7,12 +7,12 @@ import shlex
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cloning.base.errors import OutputError, UserError
-from cloning.base.files import write
+from cloning.base.files import locked, write
 
 
 def names_folder(path: str) -> bool:
@@ -20,17 +20,37 @@ def names_folder(path: str) -> bool:
     return path.endswith(("/", os.sep)) or Path(path).is_dir()
 
 
-def check_folders(*paths: str | None, model: str | Path | None = None) -> None:
-    """Raise OutputError, before the work, if an output is a folder, in no folder, or the model file that is read."""
+def check_folders(*paths: str | None, read: Iterable[str | Path | None] = ()) -> None:
+    """Raise OutputError, before the work, if an output is a folder, in no folder, or one of the files that are read."""
+    inputs = [each for each in read if each and os.path.exists(each)]
     for path in paths:
-        if path and model and os.path.exists(path) and os.path.exists(model) and os.path.samefile(path, model):
-            raise OutputError(f"{path}: is the model itself, which would be replaced; name another file")
+        if path and os.path.exists(path) and any(os.path.samefile(path, each) for each in inputs):
+            raise OutputError(f"{path}: is read, and would be replaced; name another file")
         if path and not Path(path).absolute().parent.is_dir():
             raise OutputError(f"{path}: no such folder to write it in; make the folder first")
         if path and names_folder(path):
             raise OutputError(f"{path}: is a folder; name a file in it")
         if path and Path(path).exists() and not Path(path).is_file():
             raise OutputError(f"{path}: is a device or a pipe; name a file")
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[bool | None]:
+    """Make a folder for results, and keep other programs that claim it out until the block ends, or this process.
+
+    Yields None where they cannot be kept out, else True: see `locked`. Raises OutputError if the folder cannot be made
+    or another program has claimed it.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            free = stack.enter_context(locked(folder))
+        except OSError as error:
+            reason = "not a folder" if folder.is_file() else f"cannot be made ({error.strerror})"
+            raise OutputError(f"{folder}: {reason}; name another folder") from error
+        if free is False:
+            raise OutputError(f"{folder}: another program writes there; wait for its end, or name another folder")
+        yield free
 
 
 def write_output(path: str | Path, data: bytes) -> None:

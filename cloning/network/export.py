@@ -93,7 +93,7 @@ def main() -> int:
     parser.add_argument("output", type=Path, help="ONNX file to write")
     arguments = parser.parse_args()
     one_thread()  # as drive.py does
-    check_folders(str(arguments.output), model=arguments.model)
+    check_folders(str(arguments.output), read=[arguments.model])
     export(load_model(arguments.model), arguments.output)
     print(f"{arguments.output}: opset {OPSET}, frames uint8 (n, 160, 320, 3) RGB -> steering float32 (n,)")
     print(f"the same steering as {arguments.model} to {TOLERANCE:g}, compared with ONNX Runtime")

@@ -17,7 +17,8 @@ from functools import partial
 from pathlib import Path
 
 from cloning.base.errors import UserError
-from cloning.base.files import TEMPORARY_NAME, locked, written_whole
+from cloning.base.files import TEMPORARY_NAME, written_whole
+from cloning.base.outputs import claimed
 from cloning.recordings.format import parse_time_stamp, time_stamp
 
 # The prefix is that of a recording's centre frames, which video.py films, too.
@@ -65,10 +66,8 @@ def empty_folder(folder: Path) -> ExitStack:
     """
     check_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
-            if stack.enter_context(locked(folder)) is False:
-                raise UserError(f"{folder}: another drive.py saves frames there; stop that, or name another folder")
+            stack.enter_context(claimed(folder))
             for entry in folder.iterdir():
                 entry.unlink()
             return stack.pop_all()

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Self
 
 from cloning.base.errors import RecordingError
-from cloning.base.files import locked, written_whole
+from cloning.base.files import written_whole
+from cloning.base.outputs import claimed
 from cloning.recordings.format import (
     CAMERAS,
     DRIVE_GAP,
@@ -62,9 +63,7 @@ class RecordingWriter:
         log = self.folder / DRIVING_LOG
         try:
             with ExitStack() as stack:
-                self.folder.mkdir(parents=True, exist_ok=True)
-                if stack.enter_context(locked(self.folder)) is False:
-                    raise RecordingError(f"{self.folder}: another program records there; name another folder")
+                stack.enter_context(claimed(self.folder))
                 if log.exists() and log.stat().st_size:
                     raise RecordingError(f"{log}: exists already; name another folder, or delete this one")
                 self.images.mkdir(exist_ok=True)

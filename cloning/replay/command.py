@@ -17,6 +17,7 @@ from cloning.base.errors import SimulatorError, UserError
 from cloning.base.outputs import check_folders, run_all, short_names, write_json, write_output
 from cloning.base.processes import starting
 from cloning.base.progress import progress_bar
+from cloning.recordings.format import DRIVING_LOG
 from cloning.recordings.log import Recording, find_folders
 from cloning.replay.replay import (
     Drive,
@@ -42,8 +43,9 @@ def run(options: argparse.Namespace) -> None:
     options: those of the command, under their names. After an error or Ctrl-C, the files are still written, with the
     recordings replayed until then.
     """
-    check_folders(options.report, options.picture, options.film, model=options.model)
     folders = find_folders(options.folders)
+    read = [options.model, *(folder / DRIVING_LOG for folder in folders)]
+    check_folders(options.report, options.picture, options.film, read=read)
     driver: Driver
     ending: list[Callable[[], object]] = []
     if options.model:  # each driver needs a library of its own, PyTorch or wsproto

@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloning.base.errors import OutputError
 from cloning.base.files import locked
-from cloning.base.outputs import check_folders
+from cloning.base.outputs import check_folders, claimed
 
 if TYPE_CHECKING:
     from cloning.training.distributed import Ranks
@@ -62,11 +61,7 @@ class RunFiles:
                 stack.callback(_remove_empty, new)
                 self.pictures.mkdir(parents=True, exist_ok=True)
                 check_folders(*map(str, (self.last, self.best, self.resume, self.log, self.losses, self.arguments)))
-                free = stack.enter_context(locked(self.last.parent))
-                if free is False:
-                    remedy = "wait for its end, or give an --output in another folder"
-                    raise OutputError(f"{self.last}: another run is writing to this folder; {remedy}")
-                if free is None and sys.platform != "win32":
+                if stack.enter_context(claimed(self.last.parent)) is None and sys.platform != "win32":
                     print(f"{self.last.parent}: cannot be locked; start no other run in it")
 
             ranks.from_first(claim)

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cloning.base.errors import SimulatorError, UserError
-from cloning.base.files import locked
-from cloning.base.outputs import write_json, write_output
+from cloning.base.outputs import claimed, write_json, write_output
 from simulator import driving
 from simulator.benchmark import page, replays, scores, tasks
 from simulator.benchmark.tasks import Task
@@ -50,8 +49,6 @@ def drive_all(
 def run(options: argparse.Namespace) -> None:
     """Drive everything, write the page and the JSON, and print the figures. Raises UserError, OSError."""
     entry, folder = options.entry, options.folder
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder}: not a folder; name another --folder")
     file, unfinished = Path(entry), folder / "unfinished.json"
     about = {
         "version": tasks.VERSION,
@@ -60,11 +57,8 @@ def run(options: argparse.Namespace) -> None:
     }
     workers = driving.workers_for(entry, options.processes, options.scheduler)
     recordings = replays.folders(options.recordings) if options.recordings else []
-    folder.mkdir(parents=True, exist_ok=True)
     chosen = tasks.quick_tasks() if options.quick else tasks.all_tasks()
-    with locked(folder) as free:
-        if free is False:
-            raise UserError(f"{folder}: another benchmark writes there; wait for its end, or name another --folder")
+    with claimed(folder):
         try:
             with workers as pool:
                 drives = drive_all(pool, entry, chosen, unfinished, about, options.resume)

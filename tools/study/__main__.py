@@ -26,7 +26,7 @@ from cloning.base.arguments import command_line, number
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import csv_bytes
-from cloning.base.outputs import read_json, write_json, write_output
+from cloning.base.outputs import claimed, read_json, write_json, write_output
 from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record
@@ -44,7 +44,6 @@ def prepare(options: argparse.Namespace) -> None:
             raise RecordingError(
                 f"{options.recordings / name}: the study needs recordings by the names {', '.join(names)}"
             )
-    options.folder.mkdir(parents=True, exist_ok=True)
     file = options.folder / "options.json"
     began = {"images": options.images, "laps": options.laps, "starts": options.starts}
     if file.exists() and read_json(file) != began:
@@ -87,9 +86,9 @@ def main(argv: list[str] | None = None) -> int:
     add("--folder", type=Path, default=Path("study"), help="where to write (default %(default)s)")
     options = parser.parse_args(argv)
     variants = plan()[: options.networks]
-    prepare(options)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once: its networks' processes end with it
-    with ThreadPoolExecutor(options.jobs) as pool:
+    with claimed(options.folder), ThreadPoolExecutor(options.jobs) as pool:
+        prepare(options)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once: its networks' processes end with it
         try:
             found = list(pool.map(partial(result, options=options), variants))
         except BaseException:
