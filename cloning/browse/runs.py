@@ -91,7 +91,8 @@ def overview(files: RunFiles) -> dict[str, Any]:
         command = as_typed("python", "model.py", "--output", files.last)
         raise UserError(f"{files.last.parent}: no training run in this folder yet; `{command}` begins one")
     options, progress = _json(files.arguments, OPTIONS, 1, "recipe"), {}
-    output = RunFiles(str(files.last.with_name(Path(str(options.get("output", files.last))).name)))  # the last run's
+    written = Path(str(options.get("output", files.last))).name or files.last.name  # by the last run
+    output = RunFiles(str(files.last.with_name(written)))
     history = _history(files.log)
     if files.progress.exists():
         progress = _json(files.progress, PROGRESS, 0)

@@ -77,17 +77,16 @@ function row({id, name, message, seconds, roads, offset, models}, columns, limit
   const link = make("a", name, {href: `#/${id}?limit=${limit}`}), heading = make("th", "", {scope: "row"}, link);
   const error = () => make("td", "", {colspan: 3 + columns, class: "bad"}, make("p", message));
   if (message) return make("tr", "", {}, heading, error());
+  const figure = (analysis, value) => analysis.state == "ready" && value != null ? value
+    : make("span", waits(analysis), analysis.message ? {title: analysis.message, tabindex: 0} : {}); // why it failed
   const figures = models.map(({error, steering, replay}) => [
-    steering.state == "ready" && error != null ? error : waits(steering),
-    replay.state == "ready" ? replay.autonomy_percent : waits(replay),
-    replay.state == "ready" ? replay.distance_mean_m : waits(replay),
-  ]);
+    figure(steering, error), figure(replay, replay.autonomy_percent), figure(replay, replay.distance_mean_m)]);
   const written = [value => value.toFixed(3), value => `${value.toFixed(1)} %`, value => `${value.toFixed(2)} m`];
   const best = [Math.min, Math.max, Math.min].map((choose, at) => // as it is written: equal figures are equally good
     written[at](choose(...figures.map(each => each[at]).filter(Number.isFinite))));
   return make("tr", "", {}, heading, make("td", (seconds / 60).toFixed(1)),
     make("td", roads?.map(([name]) => name).filter((name, at, all) => all.indexOf(name) == at).join(", ") || "–"),
     make("td", offset ? `${offset[0].toFixed(2)} m` : "–"),
-    ...figures.flatMap(values => values.map((value, at) => !Number.isFinite(value) ? make("td", value)
+    ...figures.flatMap(values => values.map((value, at) => !Number.isFinite(value) ? make("td", "", {}, value)
       : make("td", written[at](value), {class: models.length > 1 && written[at](value) == best[at] ? "best" : ""}))));
 }
