@@ -170,10 +170,10 @@ def test_what_is_missing_is_told_in_a_sentence(written, tmp_path):
     assert not (copy / "report.html").exists()
 
 
-def test_what_cannot_be_shown_of_the_recordings_is_named_and_those_with_the_same_name_are_told_apart(
+def test_what_cannot_be_shown_is_named_and_recordings_of_the_same_name_are_told_apart(
     written, sample_recording, tmp_path
 ):
-    """One is gone, one spoilt, and one has lost most of its images."""
+    """One is gone, one spoilt, and one has lost most of its images; a picture of the training is damaged."""
     copy, lossy = shutil.copytree(written, tmp_path / "copy"), tmp_path / "other" / sample_recording.name
     shutil.copytree(sample_recording, lossy)
     for image in sorted((lossy / "IMG").glob("center*"))[10:]:
@@ -184,11 +184,14 @@ def test_what_cannot_be_shown_of_the_recordings_is_named_and_those_with_the_same
     recordings = json.dumps(["gone/<lake>", str(lossy.parent), str(sample_recording)])
     moved = re.sub(r'"recordings": \[[^]]*\]', f'"recordings": {recordings}', arguments)
     (copy / "training_arguments.json").write_text(moved, encoding="utf-8")
+    damaged = sorted((copy / "diagnostic_images").glob("training_generator_*"))[0]
+    damaged.write_bytes(damaged.read_bytes()[:100])
     assert not (done := report(copy, "--held-out", lossy)).returncode, done.stderr
     page = (copy / "report.html").read_text(encoding="utf-8")
     assert "other/lake sample: no two seconds of driving without a break to replay" in page
     assert "Not shown: gone/&lt;lake&gt;: no such folder" in page and "No recording was held out" in page
     assert "a spoilt one/driving_log.csv: line 1: neither a row nor a header" in page
+    assert f"{damaged.name}: not a whole picture" in page
     assert ">other/lake sample</th><td>10</td><td>0</td><td>50</td>" in page, "rows, cut, unusable"
     assert f">{sample_recording.parent.name}/lake sample</th><td>60</td>" in page
 

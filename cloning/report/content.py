@@ -99,13 +99,8 @@ class Report:
         self.arguments = files.arguments
         self.recipe, self.labels = arguments.get("recipe"), arguments.get("training", {}).get("labels")
         self.laps = [Lap.of(picture, FILMS // len(laps)) for picture in laps]
-        numbers = self.run["pictures"]
-        self.augmentations = [
-            (number, *(picture_uri(files.pictures / f"training_generator_{kind}{number}.png") for kind in PICTURES))
-            for number in sorted({*numbers[:1], *numbers[-1:]})
-        ]
         self.recordings: list[dict[str, Any]] = []
-        self.missing: list[str] = []  # why recordings are not shown
+        self.missing: list[str] = []  # why recordings and pictures are not shown
         self.trained_on = set[int]()  # digests of the centre images that the network was given
         self.looked_at: Recording | None = None  # the recording whose frames are shown
         for name in self.run["recordings"]:
@@ -116,6 +111,11 @@ class Report:
         for each, short in zip(self.recordings, short_names(each["folder"] for each in self.recordings), strict=True):
             each["name"] = short
         self.knows_all = not (self.missing or arguments.get("from_model"))  # that the network was trained on
+        numbers, self.augmentations = self.run["pictures"], list[tuple[int, *tuple[str, ...]]]()
+        for number in sorted({*numbers[:1], *numbers[-1:]}):
+            with self._noting_what_is_missing():
+                pictures = [files.pictures / f"training_generator_{kind}{number}.png" for kind in PICTURES]
+                self.augmentations.append((number, *map(picture_uri, pictures)))
         self.replays: list[dict[str, Any]] = []
 
     @contextlib.contextmanager
