@@ -201,8 +201,8 @@ def test_drives_with_other_peoples_servers(name, tmp_path, capsys, monkeypatch):
             subprocess.run([*pip, *packages], check=True, timeout=60)
         except (subprocess.CalledProcessError, subprocess.TimeoutExpired):
             pytest.skip(f"pip can't install {packages} here")
-    monkeypatch.setattr("cloning.wire.client.PING_INTERVAL", 0.5)
-    monkeypatch.setattr("cloning.wire.client.PONG_TIMEOUT", 0.5)
+    monkeypatch.setattr("cloning.wire.client.PING_INTERVAL", 0.3)
+    monkeypatch.setattr("cloning.wire.client.PONG_TIMEOUT", 1.0)  # a drive takes longer than both
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-c", program]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as server:
