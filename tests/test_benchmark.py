@@ -178,7 +178,7 @@ def test_a_benchmark_goes_on_after_the_drives_before_its_server_ended(tmp_path, 
         with locked(tmp_path):
             assert __main__.main([words[0], "straight", *words[2:]]) == FAILED
         assert "another program writes there; wait" in capsys.readouterr().err
-        assert __main__.main([*words[:-1], __file__]) == FAILED
+        assert __main__.main([words[0], "straight", *words[2:-1], __file__]) == FAILED
         assert f"{__file__}: not a folder; name another folder" in capsys.readouterr().err
         kept = json.loads((tmp_path / "unfinished.json").read_text(encoding="utf-8"))
         assert list(kept["drives"]) == [task.name for task in TINY[:2]]

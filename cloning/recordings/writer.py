@@ -55,8 +55,8 @@ class RecordingWriter:
         """Begin a recording; start: the date and time of simulated second 0, for the names of the images.
 
         An empty driving_log.csv, of a process that was killed before its first row, is used. Until `close`, or the end
-        of this process, no other one records there, where a system has locks. Raises RecordingError if one does, if the
-        folder already contains a recording, or if it cannot be made.
+        of this process, no other one records there, where a system has locks. Raises OutputError if one does or the
+        folder cannot be made, RecordingError if it already contains a recording or cannot be written.
         """
         self.folder = Path(folder).absolute()
         self.images = self.folder / IMAGE_FOLDER
