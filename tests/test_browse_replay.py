@@ -272,6 +272,10 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         assert page.run("document.querySelectorAll('#losses .u-series.smoothed').length") == 6, "beside the raw ones"
         average = page.run("import('/static/run.js').then(({average}) => average([1, 0, null, 0], 0.5))")
         assert average == [1, pytest.approx(1 / 3), None, pytest.approx(1 / 7)], "sums of 1, 1/2, 1/4, 1/8"
+        run = {"state": "running", "history": [], "epochs": 2, "samples_per_epoch": 100, "images": 50}
+        run |= {"left": 33.2, "age": 30}  # s: it told of itself 30 s ago
+        told = page.run(f"import('/static/run.js').then(({{stateOf}}) => stateOf({json.dumps(run)}))")
+        assert told == "running: epoch 1 of 2, 50 % of it, 4 s left"
         page.run("smooth.focus()")
         page.press("ArrowLeft", "ArrowRight", "ArrowRight")  # which elsewhere show other pictures
         page.wait("location.hash == '#/run/0?with=1&smooth=0.51'")
