@@ -298,11 +298,12 @@ def test_other_systems_are_told_before_a_server_starts(monkeypatch):
             tool.main([])
 
 
-def test_a_soak_finds_what_does_not_stay_as_it_was(server, tmp_path, monkeypatch):
+def test_a_soak_finds_what_does_not_stay_as_it_was(server, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(soak, "VISIT", 0.1)
     monkeypatch.setattr(soak, "PAUSE", 0.1)
-    lines, found = soak.soak(server, tmp_path, 40)
-    assert len(lines) == 11 and found == []
+    assert soak.soak(server, tmp_path, 40) == []
+    table = capsys.readouterr().out.splitlines()
+    assert len(table) == 2 + 10 and table[-1].startswith("| 40 |")
     monkeypatch.setattr(soak, "MAX_GROWTH", -1000.0)
-    (fault,) = soak.soak(server, tmp_path, 10)[1]
+    (fault,) = soak.soak(server, tmp_path, 10)
     assert re.fullmatch(r"memory grew by -?\d+ MB", fault)

@@ -110,8 +110,8 @@ def timed(car: Car, n: int) -> tuple[bool, float]:
     return answer == car.expected[k], 1000 * (time.perf_counter() - began)
 
 
-def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]]:
-    """Drive this many frames; return the table's lines and what was found wrong. Raises OSError."""
+def soak(server: Target, folder: Path, count: int) -> list[str]:
+    """Drive this many frames, and print the table; return what was found wrong. Raises OSError."""
     jpegs = frames()
     expected = Car(server.port, jpegs).expected
 
@@ -119,7 +119,7 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
         return Car(server.port, jpegs, expected)
 
     car, leaves, wrong = new_car(), 0, 0
-    lines = [head("frames", "MB", "open files", "ms of processor time", "p50, ms", "p99, ms")]
+    print(head("frames", "MB", "open files", "ms of processor time", "p50, ms", "p99, ms"), flush=True)
     car.ask(car.messages[0])  # so that its frames' file is open, too
     time.sleep(SETTLE)
     early = before = Reading(server)
@@ -142,7 +142,8 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
             spent = 1000 * (now.seconds - before.seconds) / answered
             p50, p99 = np.quantile(times, (0.5, 0.99))
             figures = f"{now.memory:.1f}", now.files, f"{spent:.2f}", f"{p50:.1f}", f"{p99:.1f}"
-            lines.append(row((tenth + 1) * count // TENTHS, *figures))
+            with bar.external_write_mode():  # now: it may be interrupted before its end
+                print(row((tenth + 1) * count // TENTHS, *figures), flush=True)
             before = now
     until = time.monotonic() + LEFT_OPEN
     while (files := server.open_files()) != alone and time.monotonic() < until:
@@ -156,7 +157,7 @@ def soak(server: Target, folder: Path, count: int) -> tuple[list[str], list[str]
         f"memory grew by {grown:.0f} MB": grown > MAX_GROWTH,
         f"{files} open files, {alone} at the start": files != alone,
     }
-    return lines, [what for what, is_so in found.items() if is_so]
+    return [what for what, is_so in found.items() if is_so]
 
 
 def in_turns(servers: tuple[Target, ...], count: int) -> np.ndarray:
@@ -177,12 +178,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--frames", type=number(int, 100, 10**9), default=10**6, help="default %(default)s")
     options = parser.parse_args(argv)
     with tempfile.TemporaryDirectory() as folder, Target(options.model, Path(folder) / "frames") as server:
-        lines, found = soak(server, Path(folder), options.frames)
+        found = soak(server, Path(folder), options.frames)
         with Target(options.model, Path(folder) / "new") as new:
             aged, fresh = in_turns((server, new), max(10, options.frames // (50 * TURNS)))
     if aged >= MAX_RATIO * fresh:
         found.append(f"{aged / fresh:.1f} times as slow as a drive.py just started")
-    print("\n".join(lines))
     print(f"\np99, in turns with a drive.py just started: {aged:.1f} ms, and {fresh:.1f} ms")
     print(f"\n{'; '.join(found) or 'as at the start'}")
     return program.INCOMPLETE if found else program.DONE
