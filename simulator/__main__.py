@@ -270,7 +270,7 @@ def run_drive(arguments: argparse.Namespace) -> int:
     from simulator.run import Run
     from simulator.world import Scene
 
-    check_folders(arguments.report, arguments.picture, arguments.film)
+    check_folders(arguments.report, arguments.picture, arguments.film, read=[arguments.road])
     run = Run(chosen_track(arguments), "autonomous")
     scene = Scene(scenery.build(run.track.source, arguments.look))
     cameras = Cameras(scene, ("center",), arguments.disturb)

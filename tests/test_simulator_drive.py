@@ -20,6 +20,9 @@ from simulator.run import Run
 def test_a_report_that_cannot_be_written_is_reported_before_the_drive(tmp_path, capsys):
     assert main(["drive", "--report", str(tmp_path / "no" / "report.json")]) == 2
     assert "no such folder" in capsys.readouterr().err
+    (road := tmp_path / "road.csv").write_text("0,0\n200,0\n")
+    assert main(["drive", "--road", str(road), "--report", str(road)]) == 2
+    assert "road.csv: is read, and would be replaced; name another file" in capsys.readouterr().err
 
 
 def test_steering_goes_out_in_degrees_the_car_obeys_and_the_report_says_what_happened(tmp_path):
