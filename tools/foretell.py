@@ -302,11 +302,12 @@ def main(argv: list[str] | None = None) -> int:
     observe, chosen = observer(options.model), courses()[: options.drives]
     # Another network drives otherwise, and an earlier version of this tool did not save how blind the car was.
     folder = options.folder / f"{fingerprint(observe.network)[:8]}-blind"
-    recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
     work = partial(drive_into, folder, options.model)
-    with claimed(folder), started_workers(threads()) as pool:
-        for _ in results(pool, work, chosen, "drive"):
-            pass  # its errors are raised here
+    with claimed(folder):
+        recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
+        with started_workers(threads()) as pool:
+            for _ in results(pool, work, chosen, "drive"):
+                pass  # its errors are raised here
     driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]
     limits = fit([each for each in driven if each[0].tunes], recordings)
     save_limits(options.model, observe.network, limits)

@@ -242,12 +242,13 @@ def main(argv: list[str] | None = None) -> int:
         for each in disturbances
         for file, name, sha256 in models
     ]
-    with claimed(options.output), started_workers(options.processes, options.scheduler) as workers:
-        curves = curves_of(measure_all(drives, options.output / "robustness.json", workers))
-    tables = table(curves, kinds, strengths)
-    print(tables, end="")
-    write_output(options.output / "robustness.md", tables.encode())
-    write_output(options.output / "robustness.png", picture(curves, kinds, strengths))
+    with claimed(options.output):
+        with started_workers(options.processes, options.scheduler) as workers:
+            curves = curves_of(measure_all(drives, options.output / "robustness.json", workers))
+        tables = table(curves, kinds, strengths)
+        print(tables, end="")
+        write_output(options.output / "robustness.md", tables.encode())
+        write_output(options.output / "robustness.png", picture(curves, kinds, strengths))
     return program.DONE
 
 

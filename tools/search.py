@@ -204,22 +204,23 @@ def main(argv: list[str] | None = None) -> int:
     kind = Kind(options.max_angle, options.hills, options.marking, options.land)
     work = functools.partial(drive, Conditions(options.driver, options.speed, options.look))
     searches, failures = [], []
-    with claimed(folder), workers as pool:
+    with claimed(folder):
         if any(folder.iterdir()):
             raise UserError(f"{folder}: is not empty; name a new folder")
-        for seed, search in itertools.product(options.seeds, options.searches):
-            figures, failed = run_search(
-                folder, search, seed, options.roads, kind, lambda roads: list(results(pool, work, roads))
-            )
-            searches.append(figures)
-            failures += failed
-    print(head(*(name.replace("_", " ") for name in searches[0])))
-    for figures in searches:
-        print(row(*("" if value is None else value for value in figures.values())))
-    write_json(folder / "search.json", {"options": vars(options) | {"folder": str(folder)}, "searches": searches})
-    if failures:
-        title = f"{len(failures)} failures" + f", the first {SHOWN}" * (len(failures) > SHOWN)
-        write_output(folder / "failures.png", picture(failures[:SHOWN], title))
+        with workers as pool:
+            for seed, search in itertools.product(options.seeds, options.searches):
+                figures, failed = run_search(
+                    folder, search, seed, options.roads, kind, lambda roads: list(results(pool, work, roads))
+                )
+                searches.append(figures)
+                failures += failed
+        print(head(*(name.replace("_", " ") for name in searches[0])))
+        for figures in searches:
+            print(row(*("" if value is None else value for value in figures.values())))
+        write_json(folder / "search.json", {"options": vars(options) | {"folder": str(folder)}, "searches": searches})
+        if failures:
+            title = f"{len(failures)} failures" + f", the first {SHOWN}" * (len(failures) > SHOWN)
+            write_output(folder / "failures.png", picture(failures[:SHOWN], title))
     same = sum(figures["same_again"] for figures in searches)
     print(f"{same} of {len(failures)} failures were the same, to the last digit, when they were driven again")
     return program.DONE if same == len(failures) else program.INCOMPLETE

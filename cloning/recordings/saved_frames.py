@@ -72,7 +72,7 @@ def empty_folder(folder: Path) -> ExitStack:
                 entry.unlink()
             return stack.pop_all()
     except OSError as error:
-        raise UserError(f"{folder}: cannot be made or emptied ({error.strerror}); name another folder") from error
+        raise UserError(f"{folder}: cannot be emptied ({error.strerror}); name another folder") from error
 
 
 class FrameSaver:

@@ -36,14 +36,16 @@ from tools.study.measures import measure
 from tools.study.networks import EPOCH_IMAGES, RENDERED, TRACKS, Variant, plan
 
 
-def prepare(options: argparse.Namespace) -> None:
-    """Check the recordings, and render the one that is rendered. Raises UserError, OSError."""
+def check_recordings(folder: Path) -> None:
+    """Raise RecordingError if a folder lacks one of the study's recordings."""
     names = sorted({name for track in TRACKS.values() for name in (track.train, track.held_out)})
     for name in names:
-        if not (options.recordings / name / DRIVING_LOG).exists():
-            raise RecordingError(
-                f"{options.recordings / name}: the study needs recordings by the names {', '.join(names)}"
-            )
+        if not (folder / name / DRIVING_LOG).exists():
+            raise RecordingError(f"{folder / name}: the study needs recordings by the names {', '.join(names)}")
+
+
+def prepare(options: argparse.Namespace) -> None:
+    """Check the options against those with which the study began, and render a recording. Raises UserError, OSError."""
     file = options.folder / "options.json"
     began = {"images": options.images, "laps": options.laps, "starts": options.starts}
     if file.exists() and read_json(file) != began:
@@ -86,19 +88,21 @@ def main(argv: list[str] | None = None) -> int:
     add("--folder", type=Path, default=Path("study"), help="where to write (default %(default)s)")
     options = parser.parse_args(argv)
     variants = plan()[: options.networks]
-    with claimed(options.folder), ThreadPoolExecutor(options.jobs) as pool:
+    check_recordings(options.recordings)
+    with claimed(options.folder):
         prepare(options)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)  # at once: its networks' processes end with it
-        try:
-            found = list(pool.map(partial(result, options=options), variants))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    rows, study = [row(*pair) for pair in zip(variants, found, strict=True)], options.folder / "study.md"
-    write_output(study.with_suffix(".csv"), csv_bytes([rows[0], *(network.values() for network in rows)]))
-    write_output(study, report(rows).encode())
-    write_output(study.with_name("study_correlation.png"), correlation_picture(rows))
-    write_output(study.with_name("study_recovery.png"), recovery_picture(rows))
+        with ThreadPoolExecutor(options.jobs) as pool:
+            try:
+                found = list(pool.map(partial(result, options=options), variants))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        rows, study = [row(*pair) for pair in zip(variants, found, strict=True)], options.folder / "study.md"
+        write_output(study.with_suffix(".csv"), csv_bytes([rows[0], *(network.values() for network in rows)]))
+        write_output(study, report(rows).encode())
+        write_output(study.with_name("study_correlation.png"), correlation_picture(rows))
+        write_output(study.with_name("study_recovery.png"), recovery_picture(rows))
     print(f"{study}, study.csv and pictures")
     return program.DONE
 
