@@ -5,6 +5,7 @@ import math
 import os
 import re
 import shutil
+import subprocess
 import sys
 import warnings
 from dataclasses import fields, replace
@@ -181,20 +182,34 @@ def test_every_recording_under_data_is_the_default(linked, tmp_path):
     assert next(line.split()[1] for line in told.splitlines() if line.startswith("total")) == "80"
 
 
-def test_it_trains_without_what_only_some_systems_have(sample_recording, tmp_path):
-    """No SIGTERM, processor affinity, fork or mallopt, as on Windows or macOS."""
-    code = (
-        "import ctypes, os, signal, sys, torch\n"
-        "for module, name in ((signal, 'SIGTERM'), (os, 'sched_getaffinity'), (os, 'fork')):\n"
-        "    vars(module).pop(name, None)\n"
-        "ctypes.CDLL = lambda name: object()\n"
-        "import model\n"
-        "sys.exit(model.main())"
-    )
-    arguments = (sample_recording, *TINY, "--output", tmp_path / "model.pt")
-    done = python("-c", code, *arguments)
+# No SIGTERM, processor affinity, fork or mallopt, as on Windows or macOS, and no library of sockets.
+ELSEWHERE = """
+import ctypes, importlib.abc, os, signal, sys, torch
+
+class TakenAway(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {"eventlet", "engineio", "socketio", "flask", "wsproto"}:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, TakenAway())
+for module, name in ((signal, "SIGTERM"), (os, "sched_getaffinity"), (os, "fork")):
+    vars(module).pop(name, None)
+ctypes.CDLL = lambda name: object()
+import cloning.network.network, cloning.network.attention, cloning.network.compute
+import model, simulator.__main__ as simulator
+recording, trained, *tiny = sys.argv[1:]
+for recipe in ("--no-robust", "--robust"):
+    assert model.main([recording, recipe, *tiny, "--output", trained]) == 0
+assert not {"torch._dynamo", "sympy"} & set(sys.modules)  # torch's own optimizers load its compiler, for seconds
+assert simulator.main(["replay", recording, "--model", trained, "--limit", "1", "--reference", "human"]) in (0, 1)
+"""
+
+
+def test_it_trains_and_replays_without_what_only_some_systems_have(sample_recording, tmp_path):
+    command = [sys.executable, "-c", ELSEWHERE, sample_recording, tmp_path / "model.pt", *map(str, TINY)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "model.pt").exists()
+    assert "limit 1 m, from the " in done.stdout and "autonomy" in done.stdout
 
 
 # ----------------------------------------------------------------------------------------------------------------------
