@@ -136,6 +136,12 @@ LATE = """const own = fetch; late = {asked: 0}; fetch = async (...what) => {
 }; 0"""
 
 
+def asks_why(page, *keys: str) -> None:
+    """Press keys, and wait until the page asks for the reason of a cut."""
+    page.press(*keys)
+    page.wait("document.querySelector('#reason[open]')")
+
+
 def at(page, row: int) -> None:
     """Wait until the page shows a row of the sample recording."""
     page.shows("#where", f"frame {row + 1} of 60")

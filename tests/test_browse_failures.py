@@ -5,7 +5,7 @@ import os
 import shutil
 
 import numpy as np
-from browse_process import LATE, at, browsing, placed, replayed, steered, written, written_run
+from browse_process import LATE, asks_why, at, browsing, placed, replayed, steered, written, written_run
 from browser import needs_chromium
 from test_excluded import center
 
@@ -102,8 +102,7 @@ def test_an_undo_that_fails_can_be_tried_again_and_what_another_tab_cuts_is_show
         page.open(f"{server.base}{server.hash('lake')}")
         for row in range(2):
             at(page, row)
-            page.press(*"iox")
-            page.wait("document.querySelector('#reason[open]')")
+            asks_why(page, *"iox")
             page.run("document.querySelector('#reason-text').value = 'off'")
             page.press("Enter")
             page.wait(f"document.querySelectorAll('#cuts button').length == {2 * row + 2}")

@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from browse_process import LATE, at, browsing, placed, replayed, steered, written_run
+from browse_process import LATE, asks_why, at, browsing, placed, replayed, steered, written_run
 from browser import LOOKS, decoded, needs_chromium
 from test_excluded import center
 
@@ -20,9 +20,7 @@ pytestmark = needs_chromium
 @pytest.fixture(scope="module")
 def models(model_file, tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
-    for name in ("one.pt", "two.pt"):
-        (folder / name).write_bytes(model_file.read_bytes())
-    return [folder / "one.pt", folder / "two.pt"]
+    return [shutil.copy(model_file, folder / name) for name in ("one.pt", "two.pt")]
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +67,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         page.until(lambda: page.difference("left", recording.path(44, 1).read_bytes()) < 3)
         page.press("?", "Escape", "i", "ArrowLeft", "ArrowLeft", "o")
         page.shows("#said", "Marked 3 frames")
-        page.press("x")
-        page.wait("document.querySelector('#reason[open]')")
+        asks_why(page, "x")
         page.run(LATE % "/details")
         page.wait("late.go")
         page.press(*"off", "Enter")
@@ -86,8 +83,7 @@ def test_a_recording_is_watched_and_cut_with_the_keyboard_alone(linked, page):
         page.shows("#cuts", "None")
         assert cuts.read_text(encoding="utf-8") == header
         at(page, 42)
-        page.press("o", "ArrowRight", "i", "x")
-        page.wait("document.querySelector('#reason[open]')")
+        asks_why(page, "o", "ArrowRight", "i", "x")
         page.press(*"bend")
         page.run("document.querySelector('#reason [value=tags]').click()")
         page.shows("#tags", "2 frames: bend")
@@ -324,7 +320,6 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
         page.press("Escape")
         page.wait(f"location.hash == '#?find=refused%3E0' && {shown} == 'gone'")
         page.wait("document.activeElement.textContent == 'gone'")
-        page.run("document.querySelector('#query').value = ''; document.querySelector('#query').oninput()")
         page.open(f"{server.base}#?select={server.hash('spoilt')[2:]}")  # which cannot be exported
         page.shows("#total", "4 recordings, 121 frames")
         for name in ("lake", "one"):
@@ -340,8 +335,7 @@ def test_recordings_are_searched_sorted_and_compared(served, page, linked, model
         assert len(read_recording(linked.with_name("both"))) == 61
         page.run(f"location.hash = '{server.hash('lake')}/0?mark=0-0'")
         page.wait("document.querySelector('#stretches .mark')")
-        page.press("x")
-        page.wait("document.querySelector('#reason[open]')")
+        asks_why(page, "x")
         page.run(f"location.hash = '{server.hash('one')}/0?mark=0-0'")
         page.shows("#where", "frame 1 of 1")
         page.wait("document.querySelector('#stretches .mark')")

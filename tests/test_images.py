@@ -111,14 +111,11 @@ def test_what_other_encoders_write_is_read_as_they_meant(jpeg):
     assert np.abs(decode(jpeg).astype(int) - expected).mean() < 1
 
 
-def test_a_jpeg_cut_at_any_byte_is_refused_and_colour_is_rgb():
+def test_a_jpeg_cut_at_any_byte_is_refused():
     assert jpeg_size(PLAIN) == (160, 320)
     for length in range(0, len(PLAIN) - 1, 97):
         with pytest.raises(ValueError, match=r"empty|cut short|not a JPEG"):
             jpeg_size(PLAIN[:length])
-    blue = np.zeros((160, 320, 3), np.uint8)
-    blue[..., 0] = 255  # OpenCV writes BGR
-    assert decode(cv2.imencode(".jpg", blue)[1].tobytes())[80, 160].argmax() == 2
 
 
 def decode_mutations() -> None:

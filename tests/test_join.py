@@ -68,21 +68,16 @@ def test_measures_are_sent_with_the_telemetry(more, capsys):
     assert decode(base64.b64decode(last["image"])).shape == (160, 320, 3)
     assert (first["lapNumber"], first["crash"], first["tot_crashes"], first["tot_obes"]) == ("1", "0", "0", "0")
     assert number(first, "distance") == 0, "it has waited"
-    assert number(last, "cte") > 0.1, "it has steered to the right"
-    assert number(last, "ang_diff") > 2
-    assert number(last, "distance") > 5
-    assert number(last, "speed") > 8  # mph
+    least = {"cte": 0.1, "ang_diff": 2, "distance": 5, "speed": 8}  # mph; it has steered to the right
+    assert all(number(last, key) > value for key, value in least.items()), last | {"image": ""}
     times = [int(data["sim_time"]) for data in program.data]
     if not more:  # in lock-step the frames are those of any other run
         assert times == (np.ceil(np.arange(len(times)) / 15 / 0.02 - 1e-6) * 0.02 + 1e-6).astype(int).tolist()
 
 
 def test_a_departure_is_an_out_of_bound_episode_and_the_car_is_set_back():
-    after = 0  # telemetries after it
-
     def answer(data, n):
-        nonlocal after
-        after += data["tot_obes"] == "1"
+        after = sum(each["tot_obes"] == "1" for each in program.data)
         return None if after > 20 else [steer(1 if n > 25 and not after else 0, 0.1 if after else 1)]
 
     with Program(answer) as program:
@@ -141,18 +136,15 @@ def test_roads_are_laid_driven_to_their_end_and_set_back():
     tests = RoadTests([0.0, 0.0, 3.0])
     with Program(tests) as program:
         assert join("roads", program, "--width", "8", "--land", "forest") == 0
-    (end, x, z), (end_too, x_too, z_too), (none, *_) = tests.results
-    assert (end, end_too, none) == ("end of the road", "end of the road", "none")
-    assert (x, z) == (pytest.approx(40, abs=0.6), pytest.approx(3, abs=0.6))
-    assert (x_too, z_too) == (pytest.approx(128, abs=0.6), pytest.approx(45, abs=0.6))
+    (one, *end), (other, *other_end), (none, *_) = tests.results
+    assert (one, other, none) == ("end of the road", "end of the road", "none")
+    assert end + other_end == pytest.approx([40, 3, 128, 45], abs=0.6)
     begun = next(data for data in program.data if data["track"] == ROADS[1])
-    place = [number(begun, key) for key in ("pos_x", "pos_z")]
-    assert place == pytest.approx([125, 5], abs=0.01)
+    assert [number(begun, key) for key in ("pos_x", "pos_z")] == pytest.approx([125, 5], abs=0.01)
     assert number(begun, "pos_y") == pytest.approx(1.9, abs=0.1)  # y is up
     assert number(begun, "speed") < 0.01
     assert number(begun, "angle6") == pytest.approx(357.9, abs=0.1)  # degrees from north to the right
-    speeds = [number(data, "speed") for data in program.data]
-    assert 5 < max(speeds) <= 13.5  # m/s: 30 mph
+    assert 5 < max(number(data, "speed") for data in program.data) <= 13.5  # m/s: 30 mph
 
 
 def test_each_road_has_the_weather_sent_before_it():
@@ -395,8 +387,7 @@ def test_a_program_may_end_the_simulator_by_a_signal(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 def test_many_episodes_take_no_more_memory():
-    dialect = Roads(LAKE)
-    sizes = []
+    dialect, sizes = Roads(LAKE), list[float]()
     for i in range(14):
         assert dialect.handle("track", {"track_string": f"0,1.9,0@{40 + i},1.9,0@80,1.9,9"})
         dialect.telemetry()

@@ -30,13 +30,10 @@ OTHERS = [
 ]
 
 
-@pytest.mark.parametrize("written, separator", WRITTEN.values(), ids=WRITTEN)
-def test_negative_numbers_of_every_culture(written, separator):
-    assert parse_number(written) == (-12.3456, separator)
-
-
-@pytest.mark.parametrize("written, value, separator", OTHERS)
-def test_other_numbers(written, value, separator):
+@pytest.mark.parametrize(
+    "written, value, separator", [*((written, -12.3456, separator) for written, separator in WRITTEN.values()), *OTHERS]
+)
+def test_numbers_of_every_culture(written, value, separator):
     assert parse_number(written) == (value, separator)
 
 
