@@ -11,6 +11,7 @@ import time
 from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import warm
@@ -254,13 +255,8 @@ def test_closed_pages_are_noticed_while_nobody_drives(server):
 
 
 def test_all_pages_share_a_picture(network, jpegs, monkeypatch):
-    server, drawn, now = drive.DriveServer(network), list[float](), [0.0]
+    server, image, now = drive.DriveServer(network), Mock(return_value="picture"), [0.0]
     session = server.sessions["sid"] = drive.Session(server)
-
-    def image(*_):
-        drawn.append(now[0])
-        return "picture"
-
     monkeypatch.setattr(page, "image", image)
     monkeypatch.setattr(page, "time", SimpleNamespace(monotonic=lambda: now[0], perf_counter=lambda: now[0]))
     monkeypatch.setattr(page, "UPDATE_INTERVAL", 2**-10)
@@ -271,7 +267,7 @@ def test_all_pages_share_a_picture(network, jpegs, monkeypatch):
         for _ in range(2):
             session.answer(telemetry(jpegs[0]))
         texts = {next(reader) for reader in readers}
-        assert len(texts) == 1 and len(drawn) == interval
+        assert len(texts) == 1 and image.call_count == interval
         event = json.loads(texts.pop()[6:])
         assert event["image"] == "picture" and [tuple(row) for row in event["rows"]] == list(session.history)[-2:]
     for reader in readers:

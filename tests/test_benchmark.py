@@ -11,6 +11,7 @@ from concurrent.futures import Executor
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -130,15 +131,11 @@ def test_the_film_of_a_drive_that_went_otherwise_before_says_so():
 
 
 def test_a_server_is_told_no_place_and_its_speed_is_held_for_it():
-    told, steered = [], [0.0]
-
-    def answer(packet, n):
-        told.append(packet)
-        return [STEER % (n / 1000, "0")] * 2
-
-    with Server(answer) as server:
+    steered = [0.0]
+    with Server(lambda packet, n: [STEER % (n / 1000, "0")] * 2) as server:
         conditions = TINY[1].conditions(f"127.0.0.1:{server.port}")
         done = driving.drive(conditions, TINY[1].source, lambda run, _: steered.append(run.steering))
+    told = [message for message in server.messages if message.startswith("42")]
     assert done.ended == "arrived" and 2 < done.seconds < 8  # 15 m, at first at rest
     assert 1000 * steered[-1] > len(told) - 4, "the second answer to a frame is none to the next one"
     fields = {"steering_angle", "throttle", "speed", "image"}
@@ -246,9 +243,7 @@ def test_a_model_that_is_trained_anew_drives_with_its_new_weights(network, tmp_p
 
 
 def test_a_steering_that_is_no_number_is_told_in_replays_too(monkeypatch):
-    def steering(frame):
-        raise ArithmeticError("the network's steering is not finite")
-
+    steering = Mock(side_effect=ArithmeticError("the network's steering is not finite"))
     monkeypatch.setattr(replays, "load_driver", lambda _: steering)
     seen: Any = SimpleNamespace(received=lambda rows: None)
     with pytest.raises(SimulatorError, match=r"own\.onnx: the network's steering is not finite; train the model again"):

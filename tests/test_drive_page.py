@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -177,24 +178,19 @@ def test_the_state_is_what_happens(network, jpegs, monkeypatch):
 
 @pytest.mark.parametrize("tick", [1e-9, 1 / 64])  # s: of the clock; up to Python 3.12 the latter on Windows
 def test_a_page_is_told_of_a_change_at_once_and_else_once_a_second(network, monkeypatch, tick):
-    server, naps = drive.DriveServer(network), []
+    server, pause = drive.DriveServer(network), Mock(side_effect=time.sleep)
     clocks = SimpleNamespace(monotonic=lambda: time.monotonic() // tick * tick, perf_counter=time.perf_counter)
     monkeypatch.setattr(drive_page, "time", clocks)
-
-    def pause(seconds):
-        naps.append(seconds)
-        time.sleep(seconds)
-
     monkeypatch.setattr(drive_page, "UPDATE_INTERVAL", 2**-10)
     events = drive_page.Pages(server, with_attention=False, pause=pause).events()
     quiet = {"state": "waiting", "set_speed": 9.0, "go_speed": 9.0, "recording": False}
     assert json.loads(next(events)[6:]) == quiet
     next(events)
-    assert len(naps) == 1 + drive_page.QUIET_INTERVALS
+    assert pause.call_count == 1 + drive_page.QUIET_INTERVALS
     session = server.sessions["sid"] = drive.Session(server)
     session.heard, session.manual = time.monotonic(), True
     assert json.loads(next(events)[6:])["state"] == "manual"
-    assert len(naps) <= drive_page.QUIET_INTERVALS + 3
+    assert pause.call_count <= drive_page.QUIET_INTERVALS + 3
 
 
 def test_commands_are_the_installed_projects_and_lead_to_the_server(network, monkeypatch):

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from unittest.mock import patch
 
 import av
 import numpy as np
@@ -87,17 +88,13 @@ def test_the_report_contains_the_run(written, finished):
     assert len(page) < 15e6
 
 
-def test_the_titles_of_the_histograms_stay_in_their_places(monkeypatch):
-    figures, save = list[Figure](), Figure.savefig
-
-    def kept(figure, *arguments, **options):
-        figures.append(figure)
-        save(figure, *arguments, **options)
-
-    monkeypatch.setattr(Figure, "savefig", kept)
-    steering_chart(dict.fromkeys(("of {:,} rows, as driven", "of {:,} for training, resampled"), np.full(BINS, 2500)))
-    left, right = (axes.title.get_window_extent() for axes in figures[0].axes)
-    assert left.x0 > 0 and left.x1 < right.x0 and right.x1 < figures[0].bbox.x1
+def test_the_titles_of_the_histograms_stay_in_their_places():
+    titles = "of {:,} rows, as driven", "of {:,} for training, resampled"
+    with patch.object(Figure, "savefig", autospec=True, side_effect=Figure.savefig) as saved:
+        steering_chart(dict.fromkeys(titles, np.full(BINS, 2500)))
+    figure = saved.call_args_list[0].args[0]
+    left, right = (axes.title.get_window_extent() for axes in figure.axes)
+    assert left.x0 > 0 and left.x1 < right.x0 and right.x1 < figure.bbox.x1
 
 
 def test_the_only_epoch_is_a_whole_number():

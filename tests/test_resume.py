@@ -6,6 +6,7 @@ import shutil
 import signal
 import sys
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -350,11 +351,7 @@ def test_resume_is_recommended_only_once_the_new_run_has_a_state(
     begun, sample_recording, monkeypatch, error, function, advice
 ):
     """Before, --resume would continue the earlier run."""
-
-    def fail(*_):
-        raise error
-
-    monkeypatch.setattr(model, function, fail)
+    monkeypatch.setattr(model, function, Mock(side_effect=error))
     done = run_here(sample_recording, *TINY, "--seed", 1, "--output", begun / "model.pt")
     assert done.returncode in (2, 130)
     assert ("--resume" in done.stderr) == (advice == "--resume") and advice in done.stderr

@@ -10,6 +10,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import av
 import cv2
@@ -113,11 +114,7 @@ def test_a_film_that_cannot_be_written(run, tmp_path, monkeypatch):
     (tmp_path / "run1.mp4").mkdir()
     assert run("run1") == (2, "video.py: run1.mp4: Is a directory\n")
     (tmp_path / "run1.mp4").rmdir()
-
-    def fails(*_):
-        raise av.error.ArgumentError(22, "Invalid argument")
-
-    monkeypatch.setattr("av.VideoFrame.from_ndarray", fails)
+    monkeypatch.setattr("av.VideoFrame.from_ndarray", Mock(side_effect=av.error.ArgumentError(22, "Invalid argument")))
     assert run("run1") == (2, "video.py: run1.mp4: Invalid argument\n")
     assert [path.name for path in tmp_path.iterdir()] == ["run1"]
 
@@ -147,11 +144,7 @@ def test_on_windows_a_full_disk_is_as_clear_though_the_film_stays_open(run, tmp_
 
 def test_ctrl_c_in_the_first_frame_leaves_no_film(tmp_path, monkeypatch):
     writer = FilmWriter(tmp_path / "none.mp4", 15)
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    frame = SimpleNamespace(from_ndarray=interrupted)
+    frame = Mock(from_ndarray=Mock(side_effect=KeyboardInterrupt))
     monkeypatch.setattr(writer, "av", SimpleNamespace(VideoFrame=frame, FFmpegError=av.FFmpegError))
     with pytest.raises(KeyboardInterrupt):
         writer.add(red_frame(1))
