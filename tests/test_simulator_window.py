@@ -14,7 +14,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from commands import ROOT
+from commands import HERE, python
 from drive_process import awaited
 from panda3d.core import GamepadButton, InputDevice
 
@@ -241,9 +241,7 @@ window.finish()
 
 
 def test_the_window_tells_of_a_departure_and_of_recording_and_fits_every_shape(screen, tmp_path):
-    environment = {**screen, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", LOOK_AT_WINDOW]
-    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    done = python("-c", LOOK_AT_WINDOW, cwd=tmp_path, env={**screen, **HERE})
     assert done.returncode == 0, done.stderr
     assert "No definition" not in done.stderr, "the font has every letter of the help"
 
@@ -317,8 +315,7 @@ def test_a_jump_back_does_not_count_as_driven():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux names its screen in $DISPLAY")
 def test_without_a_screen_it_reports_that(tmp_path):
-    command = [sys.executable, "-m", "simulator", "window", "--folder", str(tmp_path / "x")]
-    elsewhere = {**os.environ, "DISPLAY": ":65535"}  # without the variable, panda3d takes a desktop's screen, :0
-    done = subprocess.run(command, env=elsewhere, capture_output=True, text=True, timeout=60)
+    elsewhere = {"DISPLAY": ":65535"}  # without the variable, panda3d takes a desktop's screen, :0
+    done = python("-m", "simulator", "window", "--folder", tmp_path / "x", env=elsewhere)
     assert done.returncode == 2
     assert "DISPLAY" in done.stderr and "Traceback" not in done.stderr
