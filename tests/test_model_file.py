@@ -12,6 +12,7 @@ import pytest
 import torch
 from commands import edited
 from commands import refused as refused_run
+from test_resume import files
 
 from cloning.base.errors import ModelError
 from cloning.network import tensors
@@ -223,10 +224,6 @@ def begun(finished, tmp_path):
     return shutil.copytree(finished[1], tmp_path / "begun")
 
 
-def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-
-
 def set_average(name, value):
     return lambda saved: saved["training"]["optimizer"]["state"][3].__setitem__(name, value)
 
@@ -269,10 +266,10 @@ def test_an_unusable_state_is_named(begun, change, words):
     path = begun / "model-resume.pt"
     with edited(path) as saved:
         change(saved)
-    before = contents(begun)
+    before = files(begun)
     told = refused_run("--output", begun / "model.pt", "--resume", "--epochs", 3)
     assert f"model.py: {path}: " in told and words in told and "new run without --resume" in told
-    assert contents(begun) == before
+    assert files(begun) == before
 
 
 def test_a_flipped_bit_in_the_optimizers_state_is_noticed(begun):
