@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import SHORT, python, trained
+from commands import TINY, python, trained
 
 from cloning.base.errors import RecordingError
 from cloning.browse.library import Library
@@ -71,7 +71,7 @@ def test_every_command_honours_and_counts_cuts(copied, capsys):
         f"{file}: line 3: 1 row is left out, from {center(copied, 30)} to {center(copied, 30)}: no reason given",
     ]
     assert capsys.readouterr().out.splitlines() == printed
-    told = trained(copied, *SHORT, "--epochs", 1, "--output", copied.parent / "model.pt", "--strict")
+    told = trained(copied, *TINY, "--output", copied.parent / "model.pt", "--strict")
     assert all(line in told for line in printed)
     row = next(line for line in told.splitlines() if line.startswith("total"))
     assert row.split() == ["total", "60", "11", "0", "5", "44"], "read, excluded, unusable, little throttle, kept"

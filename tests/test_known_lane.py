@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from commands import refused, trained
+from commands import TINY, refused, trained
 from scenes import lake_drive
 
 from cloning.base.errors import RecordingError
@@ -76,12 +76,12 @@ def test_rows_that_it_does_not_name_are_not_trusted(lane, capsys):
 
 
 def test_training_says_that_it_is_read_or_why_not(lane, tmp_path):
-    short = ("--robust", "--output", tmp_path / "model.pt", "--epochs", 1, "--samples-per-epoch", 64)
-    told = trained(lane.parent, *short)
+    command = (lane.parent, "--robust", *TINY, "--output", tmp_path / "model.pt")
+    told = trained(*command)
     assert f"reading the lane in {lane.parent}" in told and "estimating" not in told
     lane.unlink()
     lane.mkdir()
-    assert "lane.csv: not a regular file; make it a readable file, or delete it" in refused(lane.parent, *short)
+    assert "lane.csv: not a regular file; make it a readable file, or delete it" in refused(*command)
 
 
 @pytest.mark.parametrize(
