@@ -95,10 +95,8 @@ def copied(sample_recording, tmp_path) -> Path:
 def linked(sample_recording, tmp_path) -> Path:
     """A recording of 60 rows whose images are links, which a test may change."""
     folder = tmp_path / "data" / "lake"
-    (folder / "IMG").mkdir(parents=True)
+    shutil.copytree(sample_recording / "IMG", folder / "IMG", copy_function=os.link)
     shutil.copy(sample_recording / "driving_log.csv", folder)
-    for image in (sample_recording / "IMG").iterdir():
-        os.link(image, folder / "IMG" / image.name)
     return folder
 
 

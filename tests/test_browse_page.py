@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from browse_process import LATE, asks_why, at, browsing, placed, replayed, steered, written_run
 from browser import LOOKS, decoded, needs_chromium
+from rendered import render_recording
 from test_excluded import center
 
 from cloning.browse import analyse
@@ -282,16 +283,13 @@ def test_curves_are_zoomed_with_wheel_window_and_fingers(served, page):
 def test_recordings_are_searched_sorted_and_compared(served, page, linked, models, sample_recording, tmp_path):
     """A recording of one frame, one without images and one that cannot be read beside a whole one."""
     placed(linked, np.linspace(0, 1.5, 60))
-    for name in ("gone", "one", "spoilt"):
+    render_recording(tmp_path / "data/one", rows=1)
+    for name in ("gone", "spoilt"):
         (tmp_path / "data" / name / "IMG").mkdir(parents=True)
     log = (linked / "driving_log.csv").read_text(encoding="utf-8")
     (tmp_path / "data/gone/driving_log.csv").write_text(log, encoding="utf-8")
     gone = check_images(read_recording(tmp_path / "data/gone"), show_progress=False)
     write_result(gone.folder, LANE, stamp(gone.folder, LANE), analyse.lane(gone))  # else it takes seconds
-    (tmp_path / "data/one/driving_log.csv").write_text(log.splitlines()[0] + "\n", encoding="utf-8")
-    for image in (linked / "IMG").iterdir():
-        if image.name in log.splitlines()[0]:
-            shutil.copy(image, tmp_path / "data/one/IMG")
     (tmp_path / "data/spoilt/driving_log.csv").write_text("x" * 300, encoding="utf-8")
     with browsing(linked.parent, "--run", tmp_path) as server:
         page.look(390, 844)
