@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -128,22 +129,18 @@ def test_weights_move_as_with_torchs_muon_and_biases_as_with_adam():
 def test_the_learning_rate_is_constant_or_decays_to_zero_along_a_cosine(
     sample_recording, tmp_path, monkeypatch, recipe, begins
 ):
-    rates: list[float] = []  # of the steps
-    done: list[float] = []  # the share of the run that is finished before each
-    step, share = Adam.step, Progress.done
-
-    def noted_step(optimizer, rate):
-        rates.append(rate)
-        step(optimizer, rate)
+    done: list[float] = []  # the share of the run that is finished before each step
+    share = Progress.done
 
     def noted_share(progress, recipe):
         done.append(share(progress, recipe))
         return done[-1]
 
-    monkeypatch.setattr(Adam, "step", noted_step)
     monkeypatch.setattr(Progress, "done", noted_share)
     short = replace(recipe, epochs=2, samples_per_epoch=150, batch_size=8)
-    assert model.train(short, [sample_recording], tmp_path / "model.pt", device="cpu") == 0
+    with patch.object(Adam, "step", autospec=True, side_effect=Adam.step) as steps:
+        assert model.train(short, [sample_recording], tmp_path / "model.pt", device="cpu") == 0
+    rates = [call.args[1] for call in steps.call_args_list]
     expected = begins * (1 + np.cos(np.pi * np.array(done))) / 2 if recipe is ROBUST else np.full(len(done), begins)
     np.testing.assert_allclose(rates, expected, rtol=1e-9)
     assert len(rates) > 8 and done[0] == 0 and 0.8 < done[-1] < 1

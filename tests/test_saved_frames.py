@@ -6,7 +6,6 @@ import shutil
 import threading
 import time
 from datetime import datetime, timedelta
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -64,9 +63,6 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
     monkeypatch.setattr(frames, "MAX_QUEUED", 2)
     saver, write, reports = frames.FrameSaver(tmp_path / "run1"), Path.write_bytes, []
 
-    def tell(session: frames.SessionFolder) -> None:
-        reports.append(session.progress())
-
     def fails_for_the_second_session(path, data):
         if data == b"lost":
             raise trouble
@@ -77,8 +73,8 @@ def test_frames_that_cannot_be_saved_are_counted_per_session_and_in_total(tmp_pa
     for n in range(20):
         first.save(b"saved", (0, 0, 0))
         second.save(b"lost" if n < 5 else b"saved", (0, 0, 0))
-    for session in (first, second):
-        session.when_written(partial(tell, session))
+    first.when_written(lambda: reports.append(first.progress()))
+    second.when_written(lambda: reports.append(second.progress()))
     reason = "No space left on device" if isinstance(trouble, OSError) else "ValueError: a bug"
     with pytest.raises(UserError, match=rf"run1: 5 of 40 frames were not saved \({reason}\); free"):
         saver.close()
