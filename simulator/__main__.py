@@ -28,49 +28,7 @@ from cloning.wire.protocol import PORT
 from simulator.workers import add_workers
 
 if TYPE_CHECKING:
-    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
-
-# What several commands have: the options' names, and the arguments with which argparse adds them
-Options = dict[str, dict[str, Any]]
-LAPS: Options = {"--laps": {"type": number(float, 1e-6, 1e5), "default": 1, "help": "laps, such as 0.5 (default 1)"}}
-SERVER: Options = {
-    "--host": {"type": address, "default": "127.0.0.1", "help": "address of the server (default %(default)s)"},
-    "--port": {"type": number(int, 1, MAX_PORT), "default": PORT, "help": "port of the server (default %(default)s)"},
-}
-WAIT: Options = {
-    "--wait": {
-        "type": number(float, 0.01, 1e6),
-        "default": 60.0,
-        "help": "seconds to wait for the server, or for an answer that the car can use (default 60)",
-    }
-}
-ROAD: Options = {
-    "--track": {
-        "help": f"{', '.join(ROADS)}, or a road generated from its number: road-1, mountain-1 and so on (default lake)",
-    },
-    "--road": {
-        "metavar": "FILE",
-        "help": "drive a road of your own: the points of its centre line in m, as CSV (x,y or x,y,z; z up), "
-        "JSON (road_points) or x,y,z@x,y,z (y up, as in Unity); if its last point is not its first, a lap ends there",
-    },
-    "--width": {
-        "type": number(float, MIN_WIDTH, MAX_WIDTH),
-        "help": f"width of the --road in m (default: the file's, or {WIDTH:g})",
-    },
-    "--marking": {"choices": MARKINGS, "help": f"marking of the --road (default: the file's, or {MARKING})"},
-    "--land": {"choices": LANDS, "help": f"land around the --road (default: the file's, or {LAND})"},
-    "--direction": {
-        "choices": ("ccw", "cw"),
-        "help": "default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads; "
-        "as its points are listed on a --road, where for an open one this is called ccw",
-    },
-    "--look": {
-        "type": number(int, 0),
-        "default": 0,
-        "help": "look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
-        "textures and plants; 10000 more: the same with shadows, as at the real simulator's higher graphics quality",
-    },
-}
+    from simulator.client import Client
 
 
 def disturbance(text: str) -> Disturbance:
@@ -81,69 +39,60 @@ def disturbance(text: str) -> Disturbance:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-DISTURB: Options = {
-    "--disturb": {
-        "type": disturbance,
-        "metavar": "KIND:STRENGTH",
-        "help": f"foul weather, dirt or a fault of the cameras, such as fog:3; kinds: {', '.join(KINDS)}; strengths: "
-        f"{STRENGTHS[0]} to {STRENGTHS[-1]}; the same in each drive (default: none)",
-    }
-}
+# The options that several commands have
+LAPS, SERVER, WAIT, ROAD, DISTURB = (argparse.ArgumentParser(add_help=False) for _ in range(5))
+LAPS.add_argument("--laps", type=number(float, 1e-6, 1e5), default=1, help="laps, such as 0.5 (default 1)")
+add = SERVER.add_argument
+add("--host", type=address, default="127.0.0.1", help="address of the server (default %(default)s)")
+add("--port", type=number(int, 1, MAX_PORT), default=PORT, help="port of the server (default %(default)s)")
+text = "seconds to wait for the server, or for an answer that the car can use (default 60)"
+WAIT.add_argument("--wait", type=number(float, 0.01, 1e6), default=60.0, help=text)
+add = ROAD.add_argument
+text = f"{', '.join(ROADS)}, or a road generated from its number: road-1, mountain-1 and so on (default lake)"
+add("--track", help=text)
+text = (
+    "drive a road of your own: the points of its centre line in m, as CSV (x,y or x,y,z; z up), "
+    "JSON (road_points) or x,y,z@x,y,z (y up, as in Unity); if its last point is not its first, a lap ends there"
+)
+add("--road", metavar="FILE", help=text)
+text = f"width of the --road in m (default: the file's, or {WIDTH:g})"
+add("--width", type=number(float, MIN_WIDTH, MAX_WIDTH), help=text)
+add("--marking", choices=MARKINGS, help=f"marking of the --road (default: the file's, or {MARKING})")
+add("--land", choices=LANDS, help=f"land around the --road (default: the file's, or {LAND})")
+text = (
+    "default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads; "
+    "as its points are listed on a --road, where for an open one this is called ccw"
+)
+add("--direction", choices=("ccw", "cw"), help=text)
+text = (
+    "look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
+    "textures and plants; 10000 more: the same with shadows, as at the real simulator's higher graphics quality"
+)
+add("--look", type=number(int, 0), default=0, help=text)
+text = (
+    f"foul weather, dirt or a fault of the cameras, such as fog:3; kinds: {', '.join(KINDS)}; strengths: "
+    f"{STRENGTHS[0]} to {STRENGTHS[-1]}; the same in each drive (default: none)"
+)
+DISTURB.add_argument("--disturb", type=disturbance, metavar="KIND:STRENGTH", help=text)
 
 
-def add_command(
-    commands: "Subparsers", run: Callable, help: str, *shared: Options, epilog: str | None = None
-) -> argparse.ArgumentParser:
-    """Add the command that the function run_NAME runs, with these shared options, and return its parser."""
-    parser = commands.add_parser(run.__name__.removeprefix("run_"), help=help, epilog=epilog)
-    parser.set_defaults(run=run)
-    for options in shared:
-        for name, settings in options.items():
-            parser.add_argument(name, **settings)
-    return parser
-
-
-def _add_record(commands: "Subparsers") -> None:
-    parser = add_command(commands, run_record, "record an expert driver, faster than real time", LAPS, ROAD, DISTURB)
-    add, mph = parser.add_argument, number(float, 1, TOP_SPEED_MPH)
-    add("folder", help="folder for the new recording: IMG/ and driving_log.csv")
-    text = "set speed in mph, 1 to %(default)s (default %(default)s)"
-    add("--speed", type=mph, default=TOP_SPEED_MPH, help=text)
-    add("--recovery", action="store_true", help="record only returns from the sides of the road to the lane centre")
-    text = "seed of the expert's random lateral offsets, the dates in the image names, and --disturb (default 0)"
-    add("--seed", type=number(int, 0), default=0, help=text)
-
-
-def _add_drive(commands: "Subparsers") -> None:
-    parser = add_command(
-        commands,
-        run_drive,
-        "let drive.py drive, and print a lap report",
-        *(LAPS, SERVER, WAIT, ROAD, DISTURB),
-        epilog="Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if an error ended the drive "
-        "or a file could not be written.",
+def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
+    """Parse the command line; its `run` is the command's function."""
+    parser = argparse.ArgumentParser(
+        prog=program.in_commands("python -m simulator"), description="A stand-in for Udacity's driving simulator."
     )
-    add = parser.add_argument
-    text = "simulated time follows the wall clock; by default it waits for each answer, and a drive is repeatable"
-    add("--realtime", action="store_true", help=text)
-    add("--report", metavar="FILE", help="write the lap report as JSON")
-    add("--picture", metavar="FILE.png", help="plot the track from above with the path driven")
-    add("--film", metavar="FILE.mp4", help="film the drive from behind the car, with what its camera sees")
+    commands, mph = parser.add_subparsers(required=True), number(float, 1, TOP_SPEED_MPH)
 
+    def command(
+        run: Callable, help: str, *shared: argparse.ArgumentParser, epilog: str | None = None
+    ) -> argparse.ArgumentParser:
+        """Add the command that the function run_NAME runs, and return its parser."""
+        added = commands.add_parser(run.__name__.removeprefix("run_"), help=help, parents=shared, epilog=epilog)
+        added.set_defaults(run=run)
+        return added
 
-def _add_correct(commands: "Subparsers") -> None:
-    text = "let drive.py drive, and record the expert, who takes over where the car is off the lane's centre"
-    shared = LAPS, SERVER, WAIT, ROAD, DISTURB
-    parser = add_command(commands, run_correct, text, *shared, epilog="Exit status: as that of drive.")
-    endings, mph = " or ".join(PROBLEM_AREAS), number(float, 1, TOP_SPEED_MPH)
-    parser.add_argument("folder", help=f"folder for the new recording; its name must end in {endings}")
-    text = "the expert's set speed in mph, never exceeded: give drive.py the same (default %(default)g, as drive.py's)"
-    parser.add_argument("--speed", type=mph, default=SET_SPEED_MPH, help=text)
-
-
-def _add_replay(commands: "Subparsers") -> None:
     text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
-    add = add_command(commands, run_replay, text, SERVER, WAIT, DISTURB).add_argument
+    add = command(run_replay, text, SERVER, WAIT, DISTURB).add_argument
     add("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
     add("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
     text = (
@@ -159,27 +108,45 @@ def _add_replay(commands: "Subparsers") -> None:
     add("--picture", metavar="FILE.png", help=text)
     add("--film", metavar="FILE.mp4", help="film what the model sees in the drives at the last limit")
 
+    add = command(run_record, "record an expert driver, faster than real time", LAPS, ROAD, DISTURB).add_argument
+    add("folder", help="folder for the new recording: IMG/ and driving_log.csv")
+    text = "set speed in mph, 1 to %(default)s (default %(default)s)"
+    add("--speed", type=mph, default=TOP_SPEED_MPH, help=text)
+    add("--recovery", action="store_true", help="record only returns from the sides of the road to the lane centre")
+    text = "seed of the expert's random lateral offsets, the dates in the image names, and --disturb (default 0)"
+    add("--seed", type=number(int, 0), default=0, help=text)
 
-def _add_window(commands: "Subparsers") -> None:
-    text = "drive and record by hand, or watch drive.py drive"
-    add = add_command(commands, run_window, text, SERVER, ROAD, DISTURB).add_argument
+    status = (
+        "Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if an error ended the drive "
+        "or a file could not be written."
+    )
+    driving = LAPS, SERVER, WAIT, ROAD, DISTURB
+    add = command(run_drive, "let drive.py drive, and print a lap report", *driving, epilog=status).add_argument
+    text = "simulated time follows the wall clock; by default it waits for each answer, and a drive is repeatable"
+    add("--realtime", action="store_true", help=text)
+    add("--report", metavar="FILE", help="write the lap report as JSON")
+    add("--picture", metavar="FILE.png", help="plot the track from above with the path driven")
+    add("--film", metavar="FILE.mp4", help="film the drive from behind the car, with what its camera sees")
+
+    text = "let drive.py drive, and record the expert, who takes over where the car is off the lane's centre"
+    add = command(run_correct, text, *driving, epilog="Exit status: as that of drive.").add_argument
+    add("folder", help=f"folder for the new recording; its name must end in {' or '.join(PROBLEM_AREAS)}")
+    text = "the expert's set speed in mph, never exceeded: give drive.py the same (default %(default)g, as drive.py's)"
+    add("--speed", type=mph, default=SET_SPEED_MPH, help=text)
+
+    add = command(run_window, "drive and record by hand, or watch drive.py drive", SERVER, ROAD, DISTURB).add_argument
     text = "folder for the recording (default data/window-DATE-TIME, with --autonomous window-DATE-TIME-corrections)"
     add("--folder", help=text)
     text = "let drive.py drive; W or S takes over, and only then is anything recorded"
     add("--autonomous", action="store_true", help=text)
 
-
-def _add_join(commands: "Subparsers") -> None:
-    parser = add_command(
-        commands,
-        run_join,
-        "let another team's test program drive, in place of the modified simulator that it expects",
-        *(SERVER, WAIT, ROAD, DISTURB),
-        epilog="It ends when the program's server has gone for --wait seconds, and in the dialect measures also after "
+    ends = (
+        "It ends when the program's server has gone for --wait seconds, and in the dialect measures also after "
         "the laps that the program asks for. Unity's own options, with which such programs start their simulator, are "
-        "accepted: -logFile FILE takes the messages, and -batchmode and -nographics are always so.",
+        "accepted: -logFile FILE takes the messages, and -batchmode and -nographics are always so."
     )
-    add = parser.add_argument
+    text = "let another team's test program drive, in place of the modified simulator that it expects"
+    add = command(run_join, text, SERVER, WAIT, ROAD, DISTURB, epilog=ends).add_argument
     text = (
         "measures: telemetry with cte, laps and so on (SelfOracle, ThirdEye); roads: the program sends roads "
         "(maxitwo, perturbation-drive, MultiSim); episodes: on named tracks, in weathers (udacity-gym)"
@@ -200,27 +167,15 @@ def _add_join(commands: "Subparsers") -> None:
     add("-logFile", dest="log", metavar="FILE", help=argparse.SUPPRESS)
     add("-batchmode", "-nographics", action="store_true", help=argparse.SUPPRESS)
 
-
-def _add_benchmark(commands: "Subparsers") -> None:
-    parser = add_command(commands, run_benchmark, "score a driver on fixed tasks: see LEADERBOARD.md")
-    add = parser.add_argument
+    benchmark = command(run_benchmark, "score a driver on fixed tasks: see LEADERBOARD.md")
+    add = benchmark.add_argument
     add("entry", help="model file, .onnx file, HOST:PORT of a server, straight (steering 0) or expert")
     add("--quick", action="store_true", help="fewer and shorter drives: two minutes on 2 cores, else up to two hours")
     text = "for report.html and benchmark.json (default: %(default)s)"
     add("--folder", type=Path, default=Path("benchmark"), help=text)
     add("--resume", action="store_true", help="go on there after the drives of a benchmark that was interrupted")
     add("--recordings", type=Path, metavar="FOLDER", help="also replay the real recordings of data/README.md in it")
-    add_workers(parser)
-
-
-def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
-    """Parse the command line; its `run` is the command's function."""
-    parser = argparse.ArgumentParser(
-        prog=program.in_commands("python -m simulator"), description="A stand-in for Udacity's driving simulator."
-    )
-    commands = parser.add_subparsers(required=True)
-    for add in (_add_replay, _add_record, _add_drive, _add_correct, _add_window, _add_join, _add_benchmark):
-        add(commands)
+    add_workers(benchmark)
     return parser.parse_args(argv)
 
 
@@ -275,27 +230,21 @@ def run_drive(arguments: argparse.Namespace) -> int:
     scene = Scene(scenery.build(run.track.source, arguments.look))
     cameras = Cameras(scene, ("center",), arguments.disturb)
     client = Client(run, cameras, arguments.host, arguments.port, arguments.wait, arguments.realtime)
-
-    def print_report() -> None:
-        if run.time:
-            print(report.report_text(report.lap_report(run, client)))
-
-    steps: list[Callable[[], object]] = [lambda: client.drive(arguments.laps), print_report]
+    outputs: list[Callable[[], object]] = []
     if arguments.film:
-        film = ChaseFilm(arguments.film, scene, client.cameras)
+        film = ChaseFilm(arguments.film, scene, cameras)
         client.watch = functools.partial(film.watch, run)
-        steps.append(film.close)
+        outputs.append(film.close)
     if arguments.report:
-        steps.append(lambda: write_json(arguments.report, report.lap_report(run, client)))
+        outputs.append(lambda: write_json(arguments.report, report.lap_report(run, client)))
     if arguments.picture:
-        steps.append(lambda: report.write_picture(arguments.picture, run))
-    run_all(*steps)
-    return program.INCOMPLETE if run.departures else program.DONE
+        outputs.append(lambda: report.write_picture(arguments.picture, run))
+    return drive_and_report(client, arguments.laps, *outputs)
 
 
 def run_correct(arguments: argparse.Namespace) -> int:
     """Let drive.py drive with corrections by the expert; print a lap report and what was recorded."""
-    from simulator import report, scenery
+    from simulator import scenery
     from simulator.correct import CorrectedClient
     from simulator.run import Run
     from simulator.world import Scene
@@ -306,13 +255,19 @@ def run_correct(arguments: argparse.Namespace) -> int:
         scene = Scene(scenery.build(run.track.source, arguments.look))
         server = (arguments.host, arguments.port, arguments.wait)
         client = CorrectedClient(run, scene, arguments.speed, recording, *server, arguments.disturb)
+        return drive_and_report(client, arguments.laps, lambda: print(client.summary()) if run.time else None)
 
-        def print_report() -> None:
-            if run.time:
-                print(f"{report.report_text(report.lap_report(run, client))}\n{client.summary()}")
 
-        run_all(lambda: client.drive(arguments.laps), print_report)
-    return program.INCOMPLETE if run.departures else program.DONE
+def drive_and_report(client: "Client", laps: float, *outputs: Callable[[], object]) -> int:
+    """Let a server drive, print the lap report and make the outputs, also of an unfinished drive; return the status."""
+    from simulator import report
+
+    def print_report() -> None:
+        if client.run.time:
+            print(report.report_text(report.lap_report(client.run, client)))
+
+    run_all(lambda: client.drive(laps), print_report, *outputs)
+    return program.INCOMPLETE if client.run.departures else program.DONE
 
 
 def run_replay(arguments: argparse.Namespace) -> int:

@@ -50,7 +50,7 @@ def drive(tmp_path_factory):
             return packet
 
         patch.setattr(CorrectedClient, "next_frame", noted)
-        patch.setattr("builtins.print", lambda text: setattr(sent, "printed", text))
+        patch.setattr("builtins.print", lambda text: setattr(sent, "printed", f"{sent.printed}{text}\n"))
         sent.status = corrected(folder, server, 0.08)
         sent.messages = [text for text in server.messages if text.startswith("42")]
     sent.recording, sent.share = read_recording(folder), expert_time["share"]
