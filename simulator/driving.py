@@ -211,26 +211,20 @@ def server_address(driver: str) -> tuple[str, int] | None:
     return (match[1], int(match[2])) if match else None
 
 
-def check_driver(driver: str) -> None:
-    """Raise UserError if there is no such file or server."""
-    if address := server_address(driver):
-        with closing(ClientSession(*address, WAIT)) as session:
-            session.connect()
-    elif driver not in BUILT_IN:
-        load_driver(driver)
-
-
 def workers_for(driver: str, processes: int, scheduler: str | None) -> AbstractContextManager[Executor]:
     """Return `started_workers` for drives of a driver, one for a server. Raises UserError, also if there is no such.
 
     A server may take the cars that it drives for one and the same.
     """
-    check_driver(driver)
-    if not server_address(driver):
-        return started_workers(processes, scheduler)
-    if scheduler:
-        raise UserError(f"{driver}: a server drives one car at a time; leave out --scheduler")
-    return started_workers(1)
+    if address := server_address(driver):
+        with closing(ClientSession(*address, WAIT)) as session:
+            session.connect()
+        if scheduler:
+            raise UserError(f"{driver}: a server drives one car at a time; leave out --scheduler")
+        return started_workers(1)
+    if driver not in BUILT_IN:
+        load_driver(driver)
+    return started_workers(processes, scheduler)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -18,7 +18,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -55,28 +57,21 @@ class Company:
         """port: of the server; car: makes another one; folder: the frames are saved in its folders."""
         self.port, self.car, self.folder = port, car, folder
         self.asked = self.answered = self.wrong = 0  # of the second car
-        self._ended, self._errors = threading.Event(), list[Exception]()
-        works = (self._visit, self._look, self._delete)
-        self._threads = [threading.Thread(target=self._repeat, args=(work,)) for work in works]
+        self._ended, self._pool, self._works = threading.Event(), ThreadPoolExecutor(), list[Future[None]]()
 
-    def __enter__(self) -> "Company":
-        for thread in self._threads:
-            thread.start()
+    def __enter__(self) -> Self:
+        self._works = [self._pool.submit(self._repeat, work) for work in (self._visit, self._look, self._delete)]
         return self
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
-        for thread in self._threads:
-            thread.join()
-        for error in self._errors:
-            raise error
+        with self._pool:
+            for work in self._works:
+                work.result()
 
     def _repeat(self, work: Callable[[float], None]) -> None:
-        try:
-            while not self._ended.wait(random.expovariate(1 / PAUSE)):
-                work(time.monotonic() + random.expovariate(1 / VISIT))
-        except Exception as error:
-            self._errors.append(error)
+        while not self._ended.wait(random.expovariate(1 / PAUSE)):
+            work(time.monotonic() + random.expovariate(1 / VISIT))
 
     def _visit(self, until: float) -> None:
         car = self.car()

@@ -3,11 +3,13 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from cloning.road.track import LEFT, Track
 
 Colour = tuple[float, float, float]  # RGB, 0..1
+Vector = tuple[float, float, float]  # x, y, z
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class Mesh:
 class Light:
     """The light of a scene."""
 
-    sun: tuple[float, float, float]  # unit vector towards the sun
+    sun: Vector  # unit vector towards the sun
     sunlight: Colour  # colour of its light
     fill: Colour  # colour of the light that reaches shaded sides, too
 
@@ -159,12 +161,7 @@ def distances(start: float, end: float, spacing: float = 1.0) -> np.ndarray:
 
 
 def plants(
-    feet: np.ndarray,
-    heights: np.ndarray,
-    widths: np.ndarray,
-    colours: np.ndarray,
-    texture: np.ndarray,
-    rng: np.random.Generator,
+    feet: np.ndarray, heights: np.ndarray, widths: np.ndarray, colours: np.ndarray, texture: np.ndarray, rng: Generator
 ) -> Mesh:
     """Return two crossed upright images of a plant at each foot, (n, 3); heights, widths: (n,), m; colours: (n, 3)."""
     turn = rng.uniform(0, np.pi, len(feet))[:, None] + np.array([0, np.pi / 2])
@@ -176,13 +173,7 @@ def plants(
     return quads(corners.reshape(-1, 4, 3), np.repeat(colours, 2, axis=0)[:, None], texture)
 
 
-def boulder(
-    centre: tuple[float, float, float],
-    half_axes: tuple[float, float, float],
-    rng: np.random.Generator,
-    colour: Colour,
-    texture: np.ndarray,
-) -> Mesh:
+def boulder(centre: Vector, half_axes: Vector, rng: Generator, colour: Colour, texture: np.ndarray) -> Mesh:
     """Return an uneven ellipsoid; centre and half axes in metres."""
     polar, turn = np.meshgrid(np.linspace(0, np.pi, 9), np.linspace(0, 2 * np.pi, 18), indexing="ij")
     waves = sum(
@@ -194,13 +185,7 @@ def boulder(
     return sheet(points, colour, np.stack([turn / np.pi * 2, -polar / np.pi], axis=-1), texture)
 
 
-def box(
-    foot: tuple[float, float, float],
-    size: tuple[float, float, float],
-    heading: float,
-    colour: Colour,
-    texture: np.ndarray,
-) -> Mesh:
+def box(foot: Vector, size: Vector, heading: float, colour: Colour, texture: np.ndarray) -> Mesh:
     """Return an upright box without a bottom.
 
     foot: centre of its base, m; size: length along `heading` (radians), width and height, m.
