@@ -42,13 +42,11 @@ class AwaitedDriver:
         self.takes, self.patience = 0.02, PATIENTLY  # s for an answer; s that it is waited for
         self.vain = self.constant = 0  # attempts to find it in another thread; answers in a row that did not change
 
-    def is_awaited(self) -> bool:
-        """Return whether it may still answer otherwise than the program did at once."""
-        return self.apart is not False and (self.apart or self.constant < ATTEMPTS)
-
     def longest(self) -> float:
-        """Return how long to wait for it, s."""
-        return max(self.patience, 3 * self.takes) if self.apart else BRIEFLY
+        """Return how long it may still answer otherwise than the program did at once, s; 0: it is not to be awaited."""
+        if self.apart is None:
+            return BRIEFLY if self.constant < ATTEMPTS else 0.0
+        return max(self.patience, 3 * self.takes) if self.apart else 0.0
 
     def answered(self, seconds: float, at_once: bool) -> None:
         """Learn from an answer after so many seconds; at_once: it was there when it was first asked for."""
@@ -162,11 +160,11 @@ class Joined(ClientSession):
         driver, is_new = self.driver, not self.dialect.same
         if is_new:
             driver.changed()
-        if self.dialect.still or not driver.is_awaited():
+        longest = driver.longest()
+        if self.dialect.still or not longest:
             return
         begin, pause = time.monotonic(), driver.takes
-        until = begin + driver.longest()
-        while (left := until - time.monotonic()) > 0:
+        while (left := begin + longest - time.monotonic()) > 0:
             self._listen(min(pause, left))
             if self.dialect.run is not run:  # another episode has begun
                 return

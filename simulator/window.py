@@ -239,7 +239,7 @@ class Window(ShowBase):
             if self.recording and self.recording_on and by_hand and self.clock.due(self.simulation.time):
                 write_row(self.recording, self.cameras, self.simulation)
         for action in self.controls.take_actions():
-            getattr(self, f"do_{action}")()
+            self.act(action)
         for departure in self.simulation.departures[self.departures :]:
             self.tell(
                 f"A wheel left the road on the {departure.side} at {departure.speed / MPH:.0f} mph.\n"
@@ -254,36 +254,28 @@ class Window(ShowBase):
         if self.recording:
             self.recording.begin_drive()
 
-    def do_record(self) -> None:
-        """Start or stop recording."""
-        if self.recording is None:
-            self.recording = RecordingWriter(self.folder, start=datetime.now())
-        self.recording_on = not self.recording_on
-        self.begin_drive()
-
-    def do_save(self) -> None:
-        """Save the car's position."""
-        self.saved = (self.simulation.s, self.simulation.offset)
-
-    def do_jump(self) -> None:
-        """Set the car back to the saved position."""
-        run, length = self.simulation, self.simulation.track.length
-        begin = run.s - run.travelled  # of the laps
-        run.s, run.at_end = self.saved[0], False
-        run.travelled = run.laps * length + (run.s - begin) % length
-        run.set_back(self.saved[1])
-
-    def do_view(self) -> None:
-        """Switch between the chase view and the bonnet view."""
-        self.chase = not self.chase
-
-    def do_help(self) -> None:
-        """Show or hide the help."""
-        (self.help.show if self.help.is_hidden() else self.help.hide)()
-
-    def do_quit(self) -> None:
-        """End the program; `finish` follows, as after any other end."""
-        self.userExit()
+    def act(self, action: str) -> None:
+        """Do what a key or button stands for; action: of `Controls.take_actions`."""
+        run = self.simulation
+        match action:
+            case "record":
+                if self.recording is None:
+                    self.recording = RecordingWriter(self.folder, start=datetime.now())
+                self.recording_on = not self.recording_on
+                self.begin_drive()
+            case "save":
+                self.saved = (run.s, run.offset)
+            case "jump":
+                begin = run.s - run.travelled  # of the laps
+                run.s, run.at_end = self.saved[0], False
+                run.travelled = run.laps * run.track.length + (run.s - begin) % run.track.length
+                run.set_back(self.saved[1])
+            case "view":
+                self.chase = not self.chase
+            case "help":
+                (self.help.show if self.help.is_hidden() else self.help.hide)()
+            case "quit":
+                self.userExit()  # `finish` follows, as after any other end
 
     def finish(self) -> None:
         """Close the recording and the connection."""

@@ -175,7 +175,7 @@ def test_the_window_records_only_what_the_person_drives(tmp_path, monkeypatch):
 
     monkeypatch.setattr(window, "write_row", write_row)
     seat = Seat(tmp_path / "x-corrections")
-    seat.do_record()
+    seat.act("record")
     seat.ticks(1, monkeypatch)
     assert not rows, "drive.py drives"
     for keys in ({"w", "d"}, set(), {"w", "a"}, set()):

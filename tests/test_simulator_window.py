@@ -205,12 +205,12 @@ for size in ((960, 540), (960, 600), (1000, 312), (500, 620)):
     window.tell("too slow for the picture " * 4)
     for _ in range(3):
         window.task_mgr.step()
-    window.do_help()
+    window.act("help")
     width = max(1, window.get_aspect_ratio())
     for text in (window.text, window.help, window.message):
         low, high = text.get_tight_bounds(window.aspect2d)
         assert -width <= low.x < high.x <= width, (size, low, high)
-    window.do_help()
+    window.act("help")
     for wheel in window.scene.wheels:
         low, high = wheel.get_tight_bounds(window.cam)
         assert window.camLens.project(core.Point3(low.x, low.y, low.z), core.Point2()), (size, "a wheel is cut off")
@@ -233,7 +233,7 @@ before = window.scene.wheels[0].get_p()
 window.simulation.distance += 0.1
 window.show(True)
 assert window.scene.wheels[0].get_p() != before, "they roll"
-window.do_record()
+window.act("record")
 window.task_mgr.step()
 assert not window.dot.is_hidden()
 window.finish()
@@ -306,10 +306,10 @@ def test_a_jump_back_does_not_count_as_driven():
     window: Any = SimpleNamespace(simulation=Run(Track("lake")), saved=(5.0, 0.0))
     run, length = window.simulation, window.simulation.track.length
     run.s = run.travelled = 0.95 * length
-    Window.do_jump(window)
+    Window.act(window, "jump")
     assert (run.laps, run.s, run.travelled) == (0, 5, 5)
     window.saved = (0.5 * length, 0.0)
-    Window.do_jump(window)
+    Window.act(window, "jump")
     assert run.travelled == pytest.approx(0.5 * length)
 
 
