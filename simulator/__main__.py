@@ -11,11 +11,11 @@ import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cloning.base.arguments import MAX_PORT, address, number
 from cloning.base.errors import UserError
-from cloning.base.outputs import check_folders, run_all, write_json
+from cloning.base.outputs import check_folders, write_json
 from cloning.recordings.format import PROBLEM_AREAS, SAMPLE_RATE
 from cloning.recordings.writer import RecordingWriter, check_name_of_corrections
 from cloning.road.autonomy import LIMITS
@@ -26,9 +26,6 @@ from cloning.road.points import LAND, MARKING, MAX_WIDTH, MIN_WIDTH, WIDTH, read
 from cloning.road.track import ROADS, Track
 from cloning.wire.protocol import PORT
 from simulator.workers import add_workers
-
-if TYPE_CHECKING:
-    from simulator.client import Client
 
 
 def disturbance(text: str) -> Disturbance:
@@ -218,7 +215,7 @@ def run_record(arguments: argparse.Namespace) -> int:
 
 def run_drive(arguments: argparse.Namespace) -> int:
     """Let drive.py drive, and write the requested files even if the drive ends early."""
-    from simulator import report, scenery
+    from simulator import report
     from simulator.cameras import Cameras
     from simulator.client import Client
     from simulator.film import ChaseFilm
@@ -227,7 +224,7 @@ def run_drive(arguments: argparse.Namespace) -> int:
 
     check_folders(arguments.report, arguments.picture, arguments.film, read=[arguments.road])
     run = Run(chosen_track(arguments), "autonomous")
-    scene = Scene(scenery.build(run.track.source, arguments.look))
+    scene = Scene.of(run.track.source, arguments.look)
     cameras = Cameras(scene, ("center",), arguments.disturb)
     client = Client(run, cameras, arguments.host, arguments.port, arguments.wait, arguments.realtime)
     outputs: list[Callable[[], object]] = []
@@ -239,35 +236,23 @@ def run_drive(arguments: argparse.Namespace) -> int:
         outputs.append(lambda: write_json(arguments.report, report.lap_report(run, client)))
     if arguments.picture:
         outputs.append(lambda: report.write_picture(arguments.picture, run))
-    return drive_and_report(client, arguments.laps, *outputs)
+    return report.drive_and_report(client, arguments.laps, *outputs)
 
 
 def run_correct(arguments: argparse.Namespace) -> int:
     """Let drive.py drive with corrections by the expert; print a lap report and what was recorded."""
-    from simulator import scenery
     from simulator.correct import CorrectedClient
+    from simulator.report import drive_and_report
     from simulator.run import Run
     from simulator.world import Scene
 
     check_name_of_corrections(arguments.folder)
     run = Run(chosen_track(arguments), "autonomous")
     with RecordingWriter(arguments.folder) as recording:
-        scene = Scene(scenery.build(run.track.source, arguments.look))
+        scene = Scene.of(run.track.source, arguments.look)
         server = (arguments.host, arguments.port, arguments.wait)
         client = CorrectedClient(run, scene, arguments.speed, recording, *server, arguments.disturb)
         return drive_and_report(client, arguments.laps, lambda: print(client.summary()) if run.time else None)
-
-
-def drive_and_report(client: "Client", laps: float, *outputs: Callable[[], object]) -> int:
-    """Let a server drive, print the lap report and make the outputs, also of an unfinished drive; return the status."""
-    from simulator import report
-
-    def print_report() -> None:
-        if client.run.time:
-            print(report.report_text(report.lap_report(client.run, client)))
-
-    run_all(lambda: client.drive(laps), print_report, *outputs)
-    return program.INCOMPLETE if client.run.departures else program.DONE
 
 
 def run_replay(arguments: argparse.Namespace) -> int:

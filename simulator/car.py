@@ -127,8 +127,7 @@ class Car:
         for i, wheel in enumerate(WHEELS):
             self.vehicle.apply_engine_force(drive / len(WHEELS) / wheel.radius, i)
             self.vehicle.set_brake(brake, i)
-        down = self.node.get_quat().get_up() * (-DOWNFORCE * speed)
-        self.body.apply_central_force(down)
+        self.body.apply_central_force(self.node.get_quat().get_up() * (-DOWNFORCE * speed))
         self.physics.do_physics(STEP, 1, STEP)
         velocity = self.body.get_linear_velocity()
         if velocity.length() > self.speed_limit:

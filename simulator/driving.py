@@ -41,7 +41,6 @@ from cloning.server.speed import SpeedController
 from cloning.server.telemetry import format_number
 from cloning.wire.client import Answer, ConnectionLost, telemetry_packet
 from cloning.wire.session import ClientSession
-from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Expert
 from simulator.run import Departure, Run
@@ -280,7 +279,7 @@ def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | No
 @functools.lru_cache(maxsize=1)  # of several drives of a road one after another
 def scene_of(road: str | PointRoad, look: int) -> Scene:
     """Return a road's scene; the same as for the last call, if that was for the same one."""
-    return Scene(scenery.build(road, look))
+    return Scene.of(road, look)
 
 
 def cameras_at(road: str | PointRoad, look: int) -> Cameras:

@@ -37,7 +37,6 @@ from cloning.road.disturbances import Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
-from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.film import ChaseView
 from simulator.run import Run
@@ -45,6 +44,7 @@ from simulator.world import Scene, free_unused
 
 ID = "behavioral-cloning/Drive-v0"
 MAX_STEPS = 10 * 60 * SAMPLE_RATE  # ten simulated minutes, so that the episode of a car that stands still ends, too
+Info = dict[str, Any]  # about a step: see `Drive`
 OPTIONS = ("s", "offset", "turn", "track", "direction", "look", "disturb")  # of reset
 DEPARTURE_PENALTY = 100.0  # m of progress; Gymnasium's CarRacing gives the same for leaving its playfield
 # As in a training: what a seed gives to a whole drive, such as drops on the lens, stays in memory.
@@ -150,15 +150,13 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         self.observation_space = spaces.Box(0, 255, FRAME, np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.look, self.speed, self.laps, self.random_start = look, speed, laps, random_start
-        scene = Scene(scenery.build(track, look))
+        scene = Scene.of(track, look)
         self.cameras = Cameras(scene, ("center",))
         self.render_mode, self.view = render_mode, ChaseView(scene) if render_mode else None
         self.state: Literal["new", "driving", "ended", "closed"] = "new"
         self.finished = False  # whether the episode's laps are driven
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         """Begin an episode, with the car at rest on its springs; return the first frame and info.
 
         seed: of the random starts. Of the options "s", m along the track, 0 up to its length, "offset", lateral offset
@@ -181,7 +179,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
             run.s = self.np_random.uniform(0, track.length)
         set_on_road(run, options)
         if (track.source, look) != (self.track.source, self.look):
-            scene = Scene(scenery.build(track.source, look))
+            scene = Scene.of(track.source, look)
             self.cameras.move(scene)
             if self.view:
                 self.view.move(scene)
@@ -204,7 +202,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         track = make_track(source, options.get("direction", None if "track" in options else self.track.direction))
         return track, number_of_look(look)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Drive until the next frame is due, or the car leaves the road; return what the class describes.
 
         Raises gymnasium's InvalidAction for an action that is not two finite numbers, its ResetNeeded before the first
@@ -234,7 +232,7 @@ class Drive(gymnasium.Env[np.ndarray, np.ndarray], EzPickle):
         """Render the centre camera's present frame: uint8 (160, 320, 3), RGB."""
         return self.cameras.frames(self.run.car.node.get_transform())[0]
 
-    def _info(self) -> dict[str, Any]:
+    def _info(self) -> Info:
         """Return the present state; see the class."""
         run = self.run
         east, north, up = run.car.node.get_pos()

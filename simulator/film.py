@@ -19,16 +19,14 @@ DISTANCE_BEHIND, HEIGHT_ABOVE = 7.5, 2.9  # m from the car to the camera
 TARGET_AHEAD, TARGET_HEIGHT = 4.0, 1.0  # m from the car to the point that the camera looks at
 
 
-def place_chase_camera(
-    camera: NodePath, transform: TransformState, before: Vec3 | None = None, turn: float = 1
-) -> Vec3:
+def place_chase_camera(camera: NodePath, transform: TransformState, last: Vec3 | None = None, turn: float = 1) -> Vec3:
     """Put a level camera behind the car at this transform, looking over its roof; return the direction that it looks.
 
-    before, turn: its direction before, and which share of the way from there to the car's it turns, 0..1.
+    last, turn: its direction before, and which share of the way from there to the car's it turns, 0..1.
     """
     ahead = transform.get_quat().get_forward()
     ahead = Vec3(ahead.x, ahead.y, 0.4 * ahead.z)
-    ahead = before + (ahead - before) * turn if before else ahead
+    ahead = last + (ahead - last) * turn if last else ahead
     ahead.normalize()
     camera.set_pos(transform.get_pos() - ahead * DISTANCE_BEHIND + Vec3(0, 0, HEIGHT_ABOVE))
     camera.look_at(transform.get_pos() + ahead * TARGET_AHEAD + Vec3(0, 0, TARGET_HEIGHT))

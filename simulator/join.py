@@ -143,11 +143,10 @@ class Joined(ClientSession):
 
     def _tell_of_silence(self) -> None:
         """Say once that a program has not said a usable word, if nothing was driven."""
-        if not (self.time or self._is_puzzled):
-            self._is_puzzled = True
-            print(
-                f"no usable word in {ASK_AGAIN:g} s; if none comes, the program may speak another --dialect", flush=True
-            )
+        if self.time or self._is_puzzled:
+            return
+        self._is_puzzled = True
+        print(f"no usable word in {ASK_AGAIN:g} s; if none comes, the program may speak another --dialect", flush=True)
 
     def _ask(self, telemetry: str) -> bool:
         """Send a telemetry; return whether it was answered."""

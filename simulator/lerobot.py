@@ -9,7 +9,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 
 from cloning.lerobot import TASK
 from cloning.road.motion import MPH
-from simulator.environment import ID
+from simulator.environment import ID, Info
 
 
 class LeRobotDrive(gymnasium.Wrapper):
@@ -31,21 +31,19 @@ class LeRobotDrive(gymnasium.Wrapper):
         self.observation_space = spaces.Dict({"pixels": pixels, "agent_pos": spaces.Box(-100, 100, (2,), np.float32)})
         self.action_space = spaces.Box(np.array([-1, 0, 0], np.float32), np.ones(3, np.float32))
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], Info]:
         """Begin an episode; seed, options: of the environment. LeRobot's own option, "lerobot_new_rollout", is none."""
         own = {name: value for name, value in (options or {}).items() if name != "lerobot_new_rollout"}
         return self._described(*self.env.reset(seed=seed, options=own))
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], Any, bool, bool, Info]:
         """Drive until the next frame."""
         steering, throttle, brake = action
         frame, reward, terminated, truncated, info = self.env.step(np.array([steering, throttle - brake]))
         observation, info = self._described(frame, info)
         return observation, reward, terminated, truncated, info
 
-    def _described(self, frame: np.ndarray, info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _described(self, frame: np.ndarray, info: Info) -> tuple[dict[str, Any], Info]:
         observation = {"pixels": {"center": frame}, "agent_pos": np.array([1, MPH], np.float32) * info["speed"]}
         return observation, {**info, "is_success": self.get_wrapper_attr("finished")}
 

@@ -18,7 +18,6 @@ from cloning.road.disturbances import Disturbance
 from cloning.road.generated import PointRoad
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from cloning.road.track import Track
-from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.expert import Expert, Recovery
 from simulator.run import Run
@@ -34,7 +33,7 @@ _View = tuple[str | PointRoad, int, Disturbance | None, int]  # road, look, dist
 @functools.cache
 def _cameras(view: _View) -> Cameras:
     source, look, disturbance, seed = view
-    return Cameras(Scene(scenery.build(source, look)), disturbance=disturbance, seed=seed)
+    return Cameras(Scene.of(source, look), disturbance=disturbance, seed=seed)
 
 
 def _prepare(view: _View) -> None:

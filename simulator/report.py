@@ -1,13 +1,15 @@
 """The lap report: the metrics of a drive as JSON and as text, and a picture of the track from above."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.figure import png
-from cloning.base.outputs import plural, write_output
+from cloning.base.outputs import plural, run_all, write_output
 from cloning.road.autonomy import LIMITS, autonomy, lap_in_words
 from cloning.road.motion import MPH
 from cloning.road.track import LEFT, RIGHT, Track
@@ -21,6 +23,17 @@ if TYPE_CHECKING:
 JUMP = 3.0  # m: between plotted points further apart the car was set back, so no line joins them
 MAP_INCHES, MARGIN = 6.0, 15.0  # the longer side of the map, and m that it shows around the centre line
 ARROW_OFFSET, ARROW_LENGTH = 11.0, 35.0  # m from the centre line to the right, and m
+
+
+def drive_and_report(client: Client, laps: float, *outputs: Callable[[], object]) -> int:
+    """Let a server drive, print the lap report and make the outputs, also of an unfinished drive; return the status."""
+
+    def print_report() -> None:
+        if client.run.time:
+            print(report_text(lap_report(client.run, client)))
+
+    run_all(lambda: client.drive(laps), print_report, *outputs)
+    return program.INCOMPLETE if client.run.departures else program.DONE
 
 
 def lap_report(run: Run, client: Client | None = None) -> dict[str, Any]:

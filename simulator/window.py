@@ -20,7 +20,6 @@ from cloning.road.camera import CAMERA_POSITIONS, CAMERA_YAW, MOUNT_PITCH
 from cloning.road.disturbances import Disturbance
 from cloning.road.motion import MPH
 from cloning.road.track import Track
-from simulator import scenery
 from simulator.cameras import FAR_PLANE, NEAR_PLANE, Cameras
 from simulator.car import STEP
 from simulator.client import RemoteDriver
@@ -110,7 +109,7 @@ class Window(ShowBase):
         if not server and track.closed:
             self.simulation.s = track.straight(STRAIGHT)
             self.simulation.set_back()
-        self.scene = Scene(scenery.build(track.source, look))
+        self.scene = Scene.of(track.source, look)
         self.scene.root.reparent_to(self.render)
         self.cameras = Cameras(self.scene, disturbance=disturbance)
         self.controls, self.gamepad = Controls(), Gamepad()

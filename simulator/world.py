@@ -4,12 +4,15 @@ import functools
 import math
 import sys
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 from panda3d import bullet, core
 
+from cloning.road.generated import PointRoad
 from cloning.road.motion import FULL_LOCK
 from cloning.road.track import LEFT, RIGHT, Track
+from simulator import scenery
 from simulator.scenery.body import RADIUS, WHEELS
 from simulator.scenery.parts import Haze, Scenery
 from simulator.scenery.shade import STRETCH, Shade, car_shadow
@@ -210,6 +213,11 @@ def free_unused() -> None:
 
 class Scene:
     """The scenery, the car and its shadow in the engine; its renderer has no fog, so points' colours have the haze."""
+
+    @classmethod
+    def of(cls, source: str | PointRoad, look: int = 0) -> Self:
+        """Return the scene of a road in a look: see `scenery.build`, whose errors are raised."""
+        return cls(scenery.build(source, look))
 
     def __init__(self, scenery: Scenery):
         configure_engine()

@@ -98,6 +98,15 @@ def test_a_lap_that_left_the_road_is_told_and_ends_with_status_1(commands, capsy
     assert f"{lap.title}: 1138 m at 30 mph, left the road 2 times" in capsys.readouterr().out
 
 
+def test_a_damaged_report_of_a_lap_is_named(commands):
+    lap = DRIVES[0]
+    lap.picture.parent.mkdir()
+    lap.picture.touch()
+    lap.picture.with_suffix(".json").write_text("{", encoding="utf-8")
+    with pytest.raises(UserError, match=rf"{lap.title}\.json: damaged"):
+        demo.main([])
+
+
 def test_recordings_of_ones_own_are_trained_on_and_driven(commands, linked, capsys):
     assert demo.main([str(linked), "--track", "jungle"]) == program.DONE
     own = str(Path("demo", "own"))

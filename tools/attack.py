@@ -107,7 +107,7 @@ class Target(ServerProcess):
             raise UserError("needs Linux, because memory is read from /proc")
         import resource  # missing on Windows
 
-        super().__init__(ROOT / "drive.py", model, *folder, "--port", "0")
+        super().__init__(ROOT / "drive.py", model, *folder, "--port", 0)
         resource.prlimit(self.process.pid, resource.RLIMIT_NOFILE, (OPEN_FILES, OPEN_FILES))
 
     def open_files(self) -> int:

@@ -37,7 +37,7 @@ PAGE_OPEN = "drive.py, page open"  # its name in the table
 class Server(ServerProcess):
     """A server process with a connected client, and its measurements; name: in the table."""
 
-    def __init__(self, name: str, *command: str | Path):
+    def __init__(self, name: str, *command: object):
         super().__init__(*command)
         self.name = name
         self.client = Simulator(self.port)
@@ -103,8 +103,8 @@ def measure(model: str, jpegs: list[bytes], frames: int) -> tuple[list[float], l
     messages = [fragments(telemetry_packet(0, 0, 9, jpeg)) for jpeg in jpegs]
     network, bounds = load_model(model), []
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        drive = (ROOT / "drive.py", model, "--port", "0")
-        commands: dict[str, tuple[str | Path, ...]] = {
+        drive = (ROOT / "drive.py", model, "--port", 0)
+        commands: dict[str, tuple[object, ...]] = {
             "drive.py": drive,
             "drive.py, saving frames": (*drive, Path(folder) / "run1"),
             PAGE_OPEN: drive,

@@ -31,7 +31,7 @@ def head(*titles: str) -> str:
 class ServerProcess:
     """A server, such as drive.py, in a process that ends with the `with` statement; port: that it listens on."""
 
-    def __init__(self, *command: str | Path):
+    def __init__(self, *command: object):
         """Run Python with these arguments until it listens; what it prints later is lost. Raises UserError."""
         self.process = subprocess.Popen(
             [sys.executable, *map(str, command)], stderr=subprocess.PIPE, encoding="utf-8", errors="replace"

@@ -11,7 +11,6 @@ stopped continues when it is started again; without the folder it begins anew.
 Exit status: 0 if every lap was driven without leaving the road, 1 if the car left it, 2 if a step failed.
 """
 
-import json
 import subprocess
 import time
 from collections.abc import Callable
@@ -24,6 +23,7 @@ from cloning.base import program
 from cloning.base.arguments import command_line
 from cloning.base.cores import threads
 from cloning.base.errors import SimulatorError, UserError
+from cloning.base.outputs import read_json
 from cloning.network.network import SHIPPED_MODEL
 from cloning.recordings.log import find_folders
 from cloning.road.autonomy import lap_in_words
@@ -58,7 +58,7 @@ class Drive(NamedTuple):
 
     def report(self) -> dict[str, Any]:
         """Return the lap report, once the lap is driven."""
-        return dict(json.loads(self.picture.with_suffix(".json").read_bytes()))
+        return read_json(self.picture.with_suffix(".json"))
 
 
 def drives(folder: Path, track: str = "lake") -> list[Drive]:
@@ -75,7 +75,7 @@ def drives(folder: Path, track: str = "lake") -> list[Drive]:
 def check(folder: Path, recordings: list[Path]) -> None:
     """Raise UserError if a demo in the folder was begun with other recordings."""
     arguments = folder / "training_arguments.json"
-    trained_on = json.loads(arguments.read_bytes())["recordings"] if arguments.exists() else []
+    trained_on = read_json(arguments)["recordings"] if arguments.exists() else []
     if trained_on and [Path(each).resolve() for each in trained_on] != [each.resolve() for each in recordings]:
         raise UserError(f"{folder} has a demo with other recordings, {', '.join(trained_on)}: delete the folder first")
 
@@ -99,9 +99,7 @@ def drive(lap: Drive) -> None:
         with TemporaryDirectory(dir=lap.folder, prefix="unfinished-") as folder:
             files = {kind: Path(folder, f"lap.{kind}") for kind in ("json", "mp4", "png")}
             outputs = ("--report", files["json"], "--film", files["mp4"], "--picture", files["png"])
-            with ServerProcess(
-                ROOT / "drive.py", lap.model, "--speed", str(SPEEDS[lap.track]), "--port", "0"
-            ) as server:
+            with ServerProcess(ROOT / "drive.py", lap.model, "--speed", SPEEDS[lap.track], "--port", 0) as server:
                 road = ("--track", lap.track, "--direction", lap.direction, "--port", server.port)
                 done = python("-m", "simulator", "drive", *road, *outputs, capture_output=True)
             if done.returncode not in (program.DONE, program.INCOMPLETE) or not files["json"].exists():

@@ -17,7 +17,6 @@ from cloning.network.compute import threads
 from cloning.recordings.images import decode
 from cloning.road.motion import CAMERA_FORWARD
 from cloning.road.track import Track
-from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.scenery.looks import SHADOWED
 from simulator.workers import results, started_workers
@@ -75,7 +74,7 @@ def render_strips(scene: RenderedScene, seed: int) -> tuple[np.ndarray, np.ndarr
     """
     name, look, frames = scene
     rng = np.random.default_rng([seed, look, *name.encode()])
-    cameras = Cameras(Scene(scenery.build(name, look)), ("center",))
+    cameras = Cameras(Scene.of(name, look), ("center",))
     tracks = [Track(name, direction) for direction in ("ccw", "cw")]
     strips, centres = np.empty((frames, *STRIP_SHAPE), np.uint8), np.empty((frames, len(DISTANCES_AHEAD)), np.float32)
     positions = np.sort(rng.uniform(0, tracks[0].length, frames))  # sorted, because haze is computed again every 25 m

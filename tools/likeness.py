@@ -24,7 +24,6 @@ from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.road.motion import REAR_AXLE, stretches
 from cloning.road.track import Pose, Track
-from simulator import scenery
 from simulator.cameras import Cameras, jpeg
 from simulator.run import Run
 from simulator.world import Scene
@@ -37,7 +36,7 @@ MEASURES = ("dark pixels, %", "saturation, of 255", "edges, % of pixels", "varia
 
 def render(track: Track, look: int, states: np.ndarray) -> np.ndarray:
     """Render the three cameras at the states of a `Localisation`, (n, 3): uint8 (n, 3, 160, 320, 3), RGB."""
-    run, cameras = Run(track), Cameras(Scene(scenery.build(track.name, look)))
+    run, cameras = Run(track), Cameras(Scene.of(track.name, look))
     rendered = []
     for s, right, yaw in states:
         axle = track.at(s, right)

@@ -32,6 +32,7 @@ CLIPS = (("lake", 0), ("jungle", 0), ("jungle", SHADOWED))  # track and look of 
 STARTS, SECONDS = {"lake": 29, "jungle": 15}, 3  # s from the start of a lap to a bend with shadows; of each clip
 EVERY = 2  # frames: 7.5 a second are enough
 QUALITY, EFFORT = 35, 6  # of 100; of 6: the film has 0.6 MB
+SEES = "what it sees; green: where it steers; magenta: what it looks at"
 ROWS, STRIP = 200, 26  # of the pictures, and of the captions above them
 WHITE, ABOVE = (255, 255, 255), 18  # of the captions: colour, and row of their letters' feet
 
@@ -54,9 +55,7 @@ def clip(network: Network, track: str, look: int) -> list[np.ndarray]:
     for step in range((STARTS[track] + SECONDS) * SAMPLE_RATE):
         steering, mask = visual_backprop(network, frame)
         if step >= STARTS[track] * SAMPLE_RATE and step % EVERY == 0:
-            sees = panel(
-                overlay(frame, steering, mask), "what it sees; green: where it steers; magenta: what it looks at"
-            )
+            sees = panel(overlay(frame, steering, mask), SEES)
             frames.append(np.concatenate([panel(np.asarray(env.render()), road), sees], axis=1))
         frame, _, terminated, _, _ = env.step(np.array([steering, 1], np.float32))
         if terminated:

@@ -39,7 +39,6 @@ from cloning.recordings.writer import DEFAULT_START, RecordingWriter, SampleCloc
 from cloning.road.generated import PointRoad
 from cloning.road.points import read_road
 from cloning.road.track import ROADS, Track
-from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.expert import LATERAL_ACCELERATION, Expert
 from simulator.record import write_row
@@ -107,7 +106,7 @@ def drive_lap(folder: Path, lap: Lap, seed: int) -> int:
     """Record the expert's lap in this process; return its rows. Raises RecordingError, also if it leaves the road."""
     track = Track(lap.track, lap.direction)
     run, expert, clock = Run(track), Expert(track, seed, lateral=lap.lateral), SampleClock(rate=RATE)
-    cameras = Cameras(Scene(scenery.build(track.source, lap.look)))
+    cameras = Cameras(Scene.of(track.source, lap.look))
     with RecordingWriter(folder, DEFAULT_START + timedelta(days=seed)) as recording:
         while run.travelled < lap.laps * track.length:
             run.step(*expert.drive(run))

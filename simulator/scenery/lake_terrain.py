@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial import cKDTree
 
 from cloning.road.track import LEFT, RIGHT, Section, Track
@@ -45,7 +46,7 @@ def in_sections(sections: Iterable[Section], s: np.ndarray, side: np.ndarray, le
 class LakeTerrain:
     """The height of the ground, and the nearest point of the road, at any position."""
 
-    def __init__(self, track: Track, rng: np.random.Generator, relief: float = 1.0, shift: float = 0.0):
+    def __init__(self, track: Track, rng: Generator, relief: float = 1.0, shift: float = 0.0):
         """relief: factor of the heights; shift: m by which the land is shifted backwards along the road."""
         self.track, self.relief, self.shift = track, relief, shift
         self.tree = cKDTree(track.points[:, :2])
@@ -80,9 +81,7 @@ class LakeTerrain:
         return np.where(distance < 8.5, -0.15, z + 0.02)
 
 
-def ground(
-    terrain: LakeTerrain, rng: np.random.Generator, light: Light, palette: Palette, soil: np.ndarray
-) -> list[Mesh]:
+def ground(terrain: LakeTerrain, rng: Generator, light: Light, palette: Palette, soil: np.ndarray) -> list[Mesh]:
     """Return two sheets of ground: a fine one near the road, and a coarse one further away and slightly lower."""
     tone = textures.clouds(rng, 256, 12, 4)
     length = terrain.track.length
@@ -109,7 +108,7 @@ def ground(
     return sheets
 
 
-def water(rng: np.random.Generator, palette: Palette) -> Mesh:
+def water(rng: Generator, palette: Palette) -> Mesh:
     """Return the lake's surface."""
     side = np.linspace(-760, 760, 27)
     points = np.stack(np.meshgrid(side, side, WATER_LEVEL), axis=-1)[:, :, 0]

@@ -17,11 +17,9 @@ ASPHALT_LEVEL = 0.72  # mean of the asphalt's texture, 0..1
 
 def noise(rng: Generator, shape: tuple[int, int], blur: float) -> np.ndarray:
     """Return Gaussian noise of unit variance, smoothed over `blur` pixels, that tiles seamlessly."""
-    grain: np.ndarray = rng.standard_normal(shape).astype(np.float32)
-    if blur:
-        edge = int(3 * blur) + 1
-        grain = cv2.GaussianBlur(np.pad(grain, edge, mode="wrap"), (0, 0), blur)[edge:-edge, edge:-edge]
-    return grain / grain.std()
+    grain, edge = rng.standard_normal(shape).astype(np.float32), int(3 * blur) + 1
+    smooth: np.ndarray = cv2.GaussianBlur(np.pad(grain, edge, mode="wrap"), (0, 0), blur)[edge:-edge, edge:-edge]
+    return smooth / smooth.std()
 
 
 def clouds(rng: Generator, size: int, coarsest: float, octaves: int = 5) -> np.ndarray:

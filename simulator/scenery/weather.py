@@ -26,7 +26,5 @@ def in_weather(scenery: Scenery, weather: str) -> Scenery:
     if weather not in WEATHERS:
         raise TrackError(f"{weather[:40]}: there is no such weather; there are sunny, {', '.join(WEATHERS)}")
     haze, (contrast, saturation, brightness) = WEATHERS[weather]
-    sky = replace(
-        scenery.sky, colours=np.broadcast_to(np.array(haze.colour), scenery.sky.points.shape), texture=plain()
-    )
+    sky = replace(scenery.sky, colours=np.broadcast_to(haze.colour, scenery.sky.points.shape), texture=plain())
     return replace(scenery, sky=sky, haze=haze, tone=tone_matrix(contrast, saturation, np.full(3, brightness)))

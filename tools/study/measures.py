@@ -27,7 +27,6 @@ from cloning.replay.replay import load_recording, reference_lines
 from cloning.road.autonomy import LIMITS
 from cloning.road.motion import MPH
 from cloning.road.track import Track
-from simulator import scenery
 from simulator.cameras import Cameras
 from simulator.run import Run
 from simulator.world import Scene
@@ -117,7 +116,7 @@ class Simulator:
     def __init__(self, network: Network, track: str, direction: str, speed: float):
         """speed: set speed, mph, which the car holds where the road allows it."""
         self.network, self.track, self.speed = network, Track(track, direction), speed
-        self.cameras = Cameras(Scene(scenery.build(track)), ("center",))
+        self.cameras = Cameras(Scene.of(track), ("center",))
 
     def start(self) -> Run:
         """Return a new run, whose car stands on the road."""
