@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from cloning.base.errors import RecordingError
 from cloning.base.program import DONE
 from cloning.recordings.images import read_frame
 from simulator.driving import load_driver
@@ -64,3 +65,12 @@ def test_a_rebuilt_network_enters_the_benchmark(sample_recording, tmp_path, monk
     expected = save.call_args.args[0](torch.from_numpy(pixels)).item()
     assert load_driver(str(tmp_path / "ksakmann.onnx"))(frame) == pytest.approx(expected, abs=1e-4)
     assert abs(expected) > 1e-3
+
+
+def test_recordings_without_a_usable_row_are_named(linked, tmp_path, monkeypatch):
+    for image in (linked / "IMG").iterdir():
+        image.unlink()
+    monkeypatch.setattr(sys, "argv", ["public_networks", str(linked), "--folder", str(tmp_path / "public")])
+    with pytest.raises(RecordingError, match=f"{linked}: no usable row is left to train on"):
+        public_networks.main()
+    assert not (tmp_path / "public").exists()

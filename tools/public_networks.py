@@ -26,6 +26,7 @@ from torch import nn
 from cloning.base import program
 from cloning.base.arguments import command_line
 from cloning.base.cores import threads
+from cloning.base.errors import RecordingError
 from cloning.base.files import written_whole
 from cloning.base.frame import FRAME
 from cloning.base.outputs import claimed, write_json
@@ -250,7 +251,7 @@ def save(network: nn.Sequential, how: Published, file: Path) -> None:
 
 
 def main() -> int:
-    """Rebuild the networks; return the exit status."""
+    """Rebuild the networks; return the exit status. Raises UserError, OSError."""
     parser = command_line("python -m tools.public_networks", __doc__)
     add = parser.add_argument
     add("recordings", nargs="+", help="folders of recordings")
@@ -262,6 +263,8 @@ def main() -> int:
     recordings = [check_images(read_recording(folder)) for folder in find_folders(options.recordings)]
     for recording in recordings:
         print_findings(recording)
+    if not any(map(len, recordings)):
+        raise RecordingError(f"{', '.join(options.recordings)}: no usable row is left to train on")
     with claimed(options.folder):
         for name in options.networks:
             how, file = PUBLISHED[name], options.folder / f"{name}.onnx"
