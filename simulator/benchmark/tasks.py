@@ -123,13 +123,12 @@ def quick_tasks() -> list[Task]:
 
 def starts(metres: float) -> list[Task]:
     """Return drives of so many metres that begin beside the lane's centre, all around both tracks."""
-    tasks = []
     poses = [(offset, turn) for offset in OFFSETS for turn in BESIDE]
-    for road in ROADS:
-        for i, pose in enumerate(poses):
-            start = i / len(poses) * length_of(road), *pose
-            tasks.append(Task("off the lane", road, "ccw", 15, look_of(5), metres, start))
-    return tasks
+    return [
+        Task("off the lane", road, "ccw", 15, look_of(5), metres, (i / len(poses) * length_of(road), *pose))
+        for road in ROADS
+        for i, pose in enumerate(poses)
+    ]
 
 
 def disturbed(strengths: Sequence[int], seconds: float) -> list[Task]:

@@ -141,13 +141,9 @@ def bridge(track: Track, rng: Generator, palette: Palette, offsets: np.ndarray) 
 
 def random_shadows(rng: Generator, length: float, count: int) -> list[Shadow]:
     """Return shadows anywhere on a track of this length."""
+    half_lengths = (0.5, 0.5, 3.0, 5.0, 12.0)  # m
     return [
-        Shadow(
-            s=rng.uniform(0, length),
-            right=-rng.uniform(-4, 4),
-            half_length=rng.choice((0.5, 0.5, 3.0, 5.0, 12.0)),
-            half_width=rng.uniform(2, 9),
-        )
+        Shadow(rng.uniform(0, length), -rng.uniform(-4, 4), rng.choice(half_lengths), rng.uniform(2, 9))
         for _ in range(count)
     ]
 

@@ -55,8 +55,7 @@ class ShadowMap:
     def touched(self, polygons: np.ndarray) -> np.ndarray:
         """Return for polygons (n, corners, 3) whether each may touch the rectangle: bool (n,)."""
         flat = polygons[..., :2]
-        inside: np.ndarray = ((flat.max(axis=1) >= self.low) & (flat.min(axis=1) <= self.high)).all(axis=1)
-        return inside
+        return ((flat.max(axis=1) >= self.low) & (flat.min(axis=1) <= self.high)).all(axis=1)
 
     def paint_plants(self, corners: np.ndarray, texture: np.ndarray) -> None:
         """Paint upright images of plants, float (n, 4, 3) from the bottom left corner on, at their middles' heights."""
@@ -84,8 +83,7 @@ class ShadowMap:
         """Return which points (n, 3), projected as the triangles, have something on their ray `margin` m above them."""
         rows, columns = self.height.shape
         column, row = np.round((points[:, :2] - self.low) / self.pixel).astype(int).T
-        above: np.ndarray = self.height[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-        return above > points[:, 2] + margin
+        return self.height[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)] > points[:, 2] + margin
 
 
 def car_shadow(darkness: float) -> Mesh:
