@@ -1,5 +1,6 @@
 """The attacks of `tools.attack`: what each sends to a drive.py, and how often."""
 
+import functools
 import itertools
 import socket
 import struct
@@ -113,18 +114,9 @@ def flooding(opening: bytes, data: bytes = b"", **options: Any) -> Attack:
     return lambda port, until: flood(port, until, opening, data, **options)
 
 
-def websockets(data: bytes, **options: Any) -> Attack:
-    """Return the attack that floods an open websocket with frames.
-
-    What comes before the server's answer may be lost, and the rest not be understood: `then` comes after it.
-    """
-    return flooding(WEBSOCKET % b"", data, **options)
-
-
-def _compressed(message: bytes) -> bytes:
-    """Return a message as in a compressed frame."""
-    pressed = zlib.compressobj(wbits=-zlib.MAX_WBITS)
-    return (pressed.compress(message) + pressed.flush(zlib.Z_SYNC_FLUSH))[:-4]
+# A flood of frames on an open websocket. What comes before the server's answer may be lost, and the rest not be
+# understood: `then` comes after it.
+websockets = functools.partial(flooding, WEBSOCKET % b"")
 
 
 def bad_frames(port: int, until: float) -> None:
@@ -169,7 +161,8 @@ def frames(count: int = 8) -> list[bytes]:
 def all_attacks() -> dict[str, Attack]:
     """Return the attacks by name."""
     driving = b"".join(fragments(telemetry_packet(0, 0, 9, frames(1)[0])))
-    bomb = frame(_compressed(b"4" + bytes(8_000_000)), 0xC1)
+    pressed = zlib.compressobj(wbits=-zlib.MAX_WBITS)
+    bomb = frame((pressed.compress(b"4" + bytes(8_000_000)) + pressed.flush(zlib.Z_SYNC_FLUSH))[:-4], 0xC1)
     nested = b'42["telemetry",' + b"[]," * 300_000 + b"0]"
     names = b"".join(frame(b"40/%d," % n) for n in range(50_000))
     return {

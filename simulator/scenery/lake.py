@@ -3,9 +3,7 @@
 Positions of features along the road were read off frames of the real simulator, as were the colours.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -23,15 +21,6 @@ SLAB_EDGE = 7.0  # m from the centre line to the end of the concrete slabs next 
 INNER_LINE = 3.5  # m from the centre line to the middle of the inner yellow line
 # Sections with red earth instead of concrete next to the asphalt
 VERGES = (Section(RIGHT, 62, 106), Section(RIGHT, 845, 860))
-
-
-class Shadow(NamedTuple):
-    """An elliptic shadow on the road with a soft edge: s and lateral offset of its centre, and its half axes, in m."""
-
-    s: float
-    right: float
-    half_length: float
-    half_width: float
 
 
 PALETTE: Palette = {
@@ -75,14 +64,17 @@ def road_texture(rng: Generator, look: Look) -> np.ndarray:
     return textures.paint_lines(asphalt, palette["asphalt"], ASPHALT_EDGE, lines)
 
 
-def road(track: Track, rng: Generator, look: Look, soil: np.ndarray, shadows: Sequence[Shadow]) -> list[Mesh]:
-    """Return the asphalt with its lines, the roadside, the kerbs and the bridge."""
+def road(track: Track, rng: Generator, look: Look, soil: np.ndarray, shadows: np.ndarray) -> list[Mesh]:
+    """Return the asphalt with its lines, the roadside, the kerbs and the bridge.
+
+    shadows: ellipses on the asphalt with soft edges, (n, 4): s and lateral offset of the centre, and half axes, m.
+    """
     s, palette = distances(0, track.length, 2.0), look.palette
     offsets = np.linspace(-ASPHALT_EDGE, ASPHALT_EDGE, 7)
     shade = np.ones((len(s), len(offsets), 3))
-    for shadow in shadows:
-        along = ((s - shadow.s + track.length / 2) % track.length - track.length / 2)[:, None] / shadow.half_length
-        inside = np.clip(1.6 - np.hypot(along, (offsets - shadow.right) / shadow.half_width) * 1.2, 0, 1)[..., None]
+    for middle, right, half_length, half_width in shadows:
+        along = ((s - middle + track.length / 2) % track.length - track.length / 2)[:, None] / half_length
+        inside = np.clip(1.6 - np.hypot(along, (offsets - right) / half_width) * 1.2, 0, 1)[..., None]
         shade *= 1 - 0.5 * inside
     asphalt = Material(np.array(palette["asphalt"]) * shade, road_texture(rng, look), 2 * ASPHALT_EDGE)
     slabs = Material(palette["slab"], textures.concrete(rng), 3.0, across=(0, 0.5, 0.9, 1))
@@ -139,15 +131,6 @@ def bridge(track: Track, rng: Generator, palette: Palette, offsets: np.ndarray) 
     return meshes
 
 
-def random_shadows(rng: Generator, length: float, count: int) -> list[Shadow]:
-    """Return shadows anywhere on a track of this length."""
-    half_lengths = (0.5, 0.5, 3.0, 5.0, 12.0)  # m
-    return [
-        Shadow(rng.uniform(0, length), -rng.uniform(-4, 4), rng.choice(half_lengths), rng.uniform(2, 9))
-        for _ in range(count)
-    ]
-
-
 def scenery(look: int) -> Scenery:
     """Return the lake's scenery in a look; the calls draw from one generator, so their order matters."""
     rng = np.random.default_rng(look)
@@ -157,9 +140,11 @@ def scenery(look: int) -> Scenery:
     water = lake_terrain.water(rng, palette)
     soil = textures.soil(rng)
     if appearance.shadows is None:
-        shadows = [Shadow(*row) for row in lake_terrain.read_table("lake_shadows.csv")]
+        shadows = lake_terrain.read_table("lake_shadows.csv")
     else:
-        shadows = random_shadows(rng, track.length, appearance.shadows)
+        shadows, half_lengths = np.empty((appearance.shadows, 4)), (0.5, 0.5, 3.0, 5.0, 12.0)
+        for row in shadows:
+            row[:] = rng.uniform(0, track.length), -rng.uniform(-4, 4), rng.choice(half_lengths), rng.uniform(2, 9)
     meshes = [
         *lake_terrain.ground(terrain, rng, light, palette, soil),
         *road(track, rng, appearance, soil, shadows),
