@@ -71,8 +71,7 @@ def record(
 
     speed: set speed in mph; recovery: record only returns from the road's edges; disturbance: of all images. The dates
     in the images' names depend on the seed, not on today's date, so that the same arguments give the same files. Raises
-    RecordingError if the folder cannot be written or holds a recording, SimulatorError if a rendering process is
-    killed.
+    RecordingError if the folder can't be written or holds a recording, SimulatorError if a rendering process is killed.
     """
     run = Run(track)
     run.car.speed_limit = speed * MPH

@@ -125,8 +125,7 @@ def report_text(report: dict[str, Any]) -> str:
 def write_picture(path: str | Path, run: Run) -> None:
     """Plot a drive as PNG: the track from above with the car's path, and the lateral offset along the way.
 
-    The path's colours reach to 1 m, where a human would take over, as in the pictures of all drives.
-    Raises OutputError.
+    Its colours reach to 1 m, where a human would take over, as in the pictures of all drives. Raises OutputError.
     """
     from matplotlib import colors  # here, because loading matplotlib takes long and only this function needs it
     from matplotlib.collections import LineCollection

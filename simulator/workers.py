@@ -90,8 +90,7 @@ def _result(future: Future[Result]) -> Result:
 def _context() -> BaseContext:
     """Return how the processes are started: on Linux as copies of one that has only imported what renders.
 
-    A copy of this process could wait for ever for a lock that one of its threads held at that moment, as torch's and
-    OpenCV's do.
+    A copy of this process could wait for ever for a lock that one of its threads held, as torch's and OpenCV's do.
     """
     context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else None)
     context.set_forkserver_preload(["simulator.record"])

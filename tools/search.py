@@ -56,11 +56,6 @@ class Kind(NamedTuple):
     marking: str
     land: str
 
-    @property
-    def ranges(self) -> np.ndarray:
-        """Least and greatest turn, length and grade: float64 (2, 3)."""
-        return np.array([(-self.sharpest, LENGTHS[0], -self.steepest), (self.sharpest, LENGTHS[1], self.steepest)])
-
 
 class Candidate(NamedTuple):
     """A road of a search; genes: float64 (nodes - 1, 3), the turn, length and grade to each node from that before."""
@@ -71,7 +66,8 @@ class Candidate(NamedTuple):
 
 def make_candidate(rng: np.random.Generator, kind: Kind, name: str, parent: Candidate | None = None) -> Candidate:
     """Return a random road, or a changed parent."""
-    least, most = kind.ranges
+    turn, grade = kind.sharpest, kind.steepest
+    least, most = np.array([(-turn, LENGTHS[0], -grade), (turn, LENGTHS[1], grade)])
     while True:
         if parent is None:
             genes = rng.uniform(least, most, (rng.integers(NODES[0], NODES[1], endpoint=True) - 1, 3))

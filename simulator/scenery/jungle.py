@@ -198,13 +198,10 @@ def palms(terrain: JungleTerrain, rng: Generator, light: Light, palette: Palette
     brightness = rng.uniform(0.8, 1.5, (len(feet), 1))
     colours = np.clip(np.array(palette["palm"]) * brightness * (0.55 + 0.75 * sunlit), 0, 1)
     meshes = []
-    for i in range(4):
+    for i, (draw, tall, wide) in enumerate([(textures.palm, 1.0, 0.9)] * 3 + [(textures.bush, 0.3, 2.0)]):
         chosen = fits & (np.arange(len(feet)) % 4 == i)
-        bush = i == 3
-        texture = textures.bush(rng) if bush else textures.palm(rng)
-        height = heights[chosen] * (0.3 if bush else 1.0)
-        width = (2.0 if bush else 0.9) * height
-        meshes.append(shapes.plants(feet[chosen], height, width, colours[chosen], texture, rng))
+        height = tall * heights[chosen]
+        meshes.append(shapes.plants(feet[chosen], height, wide * height, colours[chosen], draw(rng), rng))
     return meshes
 
 

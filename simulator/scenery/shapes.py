@@ -116,8 +116,7 @@ def illuminate(mesh: Mesh, light: Light, face_up: bool = False) -> Mesh:
 def ribbon(track: Track, s: ArrayLike, offsets: ArrayLike, heights: ArrayLike, material: Material) -> Mesh:
     """Return a strip along the road, through the points at the distances s in metres.
 
-    offsets, heights: (k,), its cross-section from left to right, in metres to the right of the centre line and above
-    the road.
+    offsets, heights: (k,), its cross-section from left to right, m to the right of the centre line and above the road.
     """
     s, offsets = np.asarray(s, float), np.asarray(offsets, float)
     n, k = len(s), len(offsets)
