@@ -59,17 +59,13 @@ class Expert:
         self.target = 0.0
         self.steering = 0.0
 
-    def target_offset(self, travelled: float) -> float:
-        """Return the lateral offset in m to steer for after `travelled` m along the track."""
-        wander = -self.amplitude * float(np.sin(self.waves * travelled + self.phases).sum())
-        return self.target + self.max_wander * math.tanh(wander / self.max_wander)
-
     def drive(self, run: Run) -> tuple[float, float]:
         """Return steering and throttle, both -1..1, for the next step of the run."""
         car = run.car
         speed = car.speed
         ahead = LOOKAHEAD + LOOKAHEAD_TIME * speed
-        goal = self.track.at(run.s + ahead, self.target_offset(run.travelled + ahead))
+        wander = -self.amplitude * float(np.sin(self.waves * (run.travelled + ahead) + self.phases).sum())
+        goal = self.track.at(run.s + ahead, self.target + self.max_wander * math.tanh(wander / self.max_wander))
         position = car.node.get_pos()
         dx, dy = goal.x - position.x, goal.y - position.y
         bearing = wrap_angle(math.atan2(dy, dx) - car.heading)

@@ -149,10 +149,19 @@ class Joined(ClientSession):
         print(f"no usable word in {ASK_AGAIN:g} s; if none comes, the program may speak another --dialect", flush=True)
 
     def _ask(self, telemetry: str) -> bool:
-        """Send a telemetry; return whether it was answered."""
+        """Send a telemetry; return whether it was answered; if not, it has to be sent again."""
         self.connection.send(telemetry)
         self.frames += 1
-        return self._await_answer()
+        run, until = self.dialect.run, time.monotonic() + ASK_AGAIN
+        while (left := until - time.monotonic()) > 0:
+            if self._listen(min(left, STEP) if self.pace else left):
+                self.progressed()
+                return True
+            if self.dialect.run is not run:  # a program may begin an episode instead of an answer, or before one
+                run, until = self.dialect.run, time.monotonic() + SETTLE
+            if self.pace:
+                self._catch_up()
+        return False
 
     def _await_driver(self, run: Run, telemetry: str) -> None:
         """Send a run's telemetry again until the answer changes, if the program's driver may be in another thread."""
@@ -180,38 +189,18 @@ class Joined(ClientSession):
             packet = self.connection.receive(pause)
             if packet is None:
                 break
-            answered = self._handle(packet) or answered
+            if event := parse_event(packet):
+                if self.pace:
+                    self._catch_up()
+                answered = self.dialect.handle(*event) or answered
+                self._reply()
             pause = self.dialect.more if answered else 0.0
-        return answered
-
-    def _handle(self, packet: str) -> bool:
-        """Do what a packet says, and send what the dialect replies; return whether it answers a telemetry."""
-        event = parse_event(packet)
-        if event is None:
-            return False
-        if self.pace:
-            self._catch_up()
-        answered = self.dialect.handle(*event)
-        self._reply()
         return answered
 
     def _reply(self) -> None:
         for reply in self.dialect.replies:
             self.connection.send(reply)
         self.dialect.replies.clear()
-
-    def _await_answer(self) -> bool:
-        """Return whether the telemetry was answered; if not, it has to be sent again."""
-        run, until = self.dialect.run, time.monotonic() + ASK_AGAIN
-        while (left := until - time.monotonic()) > 0:
-            if self._listen(min(left, STEP) if self.pace else left):
-                self.progressed()
-                return True
-            if self.dialect.run is not run:  # a program may begin an episode instead of an answer, or before one
-                run, until = self.dialect.run, time.monotonic() + SETTLE
-            if self.pace:
-                self._catch_up()
-        return False
 
     def _drive(self) -> None:
         """Drive until the next telemetry is due."""

@@ -155,11 +155,8 @@ class Shade:
         stretch: its number; stretch 0 begins at s = 0. uint8 (1024, 128, 3): rows from its end to its start, beyond
         both by OVERLAP, and columns from left to right.
         """
-        if stretch not in self.pictures:
-            self.pictures[stretch] = self._picture(stretch)
-        return self.pictures[stretch]
-
-    def _picture(self, stretch: int) -> np.ndarray | None:
+        if stretch in self.pictures:
+            return self.pictures[stretch]
         rows, columns = PICTURE_SHAPE
         s = stretch * STRETCH - OVERLAP + (np.arange(rows)[::-1] + 0.5) / rows * LENGTH
         offset = ((np.arange(columns) + 0.5) / columns * 2 - 1) * HALF_WIDTH
@@ -177,12 +174,13 @@ class Shade:
         shadows.paint(triangles, triangles[..., 2].mean(axis=1))
         for corners, texture in self.plants:
             shadows.paint_plants(corners, texture)
-        shaded = shadows.shaded(points, FINE_MARGIN).reshape(PICTURE_SHAPE).astype(np.float32)
-        if not shaded.any():
-            return None
-        blur = self.softness / np.array([2 * HALF_WIDTH / columns, LENGTH / rows])
-        soft = cv2.GaussianBlur(shaded, (0, 0), blur[0], sigmaY=blur[1])
-        return np.round(255 * (1 - (1 - self.factor) * soft[..., None])).astype(np.uint8)
+        shaded, picture = shadows.shaded(points, FINE_MARGIN).reshape(PICTURE_SHAPE).astype(np.float32), None
+        if shaded.any():
+            blur = self.softness / np.array([2 * HALF_WIDTH / columns, LENGTH / rows])
+            soft = cv2.GaussianBlur(shaded, (0, 0), blur[0], sigmaY=blur[1])
+            picture = np.round(255 * (1 - (1 - self.factor) * soft[..., None])).astype(np.uint8)
+        self.pictures[stretch] = picture
+        return picture
 
     def coordinates(self, road: np.ndarray, stretch: int) -> np.ndarray:
         """Return the texture coordinates, (n, 2), in a stretch's picture of points (n, 2: s, lateral offset)."""
