@@ -306,8 +306,7 @@ def main(argv: list[str] | None = None) -> int:
     with claimed(folder):
         recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
         with started_workers(threads()) as pool:
-            for _ in results(pool, work, chosen, "drive"):
-                pass  # its errors are raised here
+            list(results(pool, work, chosen, "drive"))  # raises their errors
     driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]
     limits = fit([each for each in driven if each[0].tunes], recordings)
     save_limits(options.model, observe.network, limits)

@@ -78,10 +78,12 @@ def road(track: Track, rng: Generator, look: Look, soil: np.ndarray, shadows: np
         shade *= 1 - 0.5 * inside
     asphalt = Material(np.array(palette["asphalt"]) * shade, road_texture(rng, look), 2 * ASPHALT_EDGE)
     slabs = Material(palette["slab"], textures.concrete(rng), 3.0, across=(0, 0.5, 0.9, 1))
+    stripes = Material(palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
+    kerbs = [(distances(kerb.start, kerb.end), kerb.side) for kerb in ROAD.kerbs]
     return [
         replace(surface(track, s, ASPHALT_EDGE, asphalt), sheen=look.sheen),
         *slabs_and_verges(track, look, slabs, soil),
-        *kerbs(track, look),
+        *(roadside(track, *kerb, (3.86, 4.93), (0.03, 0.06), stripes) for kerb in kerbs),
         *bridge(track, rng, palette, offsets),
     ]
 
@@ -107,15 +109,6 @@ def slabs_and_verges(track: Track, look: Look, slabs: Material, soil: np.ndarray
             verge_mesh = roadside(track, distances(start, end, 2.0), side, offsets, heights, earth)
             meshes.append(illuminate(verge_mesh, light, face_up=True))
     return meshes
-
-
-def kerbs(track: Track, look: Look) -> list[Mesh]:
-    """Return the red and white kerbs."""
-    material = Material(look.palette["kerb"], textures.kerb(), look.stripes, across=(0, 1))
-    return [
-        roadside(track, distances(kerb.start, kerb.end), kerb.side, (3.86, 4.93), (0.03, 0.06), material)
-        for kerb in ROAD.kerbs
-    ]
 
 
 def bridge(track: Track, rng: Generator, palette: Palette, offsets: np.ndarray) -> list[Mesh]:
