@@ -16,7 +16,7 @@ pytestmark = needs_chromium
 
 
 def test_what_failed_is_tried_again(linked, page, tmp_path, model_file):
-    """The road on the list, a model's steering, its replay, and what it looks at."""
+    """The road on the list, what is compared, a model's steering, its replay, and what it looks at."""
     model = shutil.copy(model_file, tmp_path / "one.pt")
     (tmp_path / "torch.py").write_text("raise ImportError('no PyTorch today')", encoding="utf-8")
     with browsing(linked, "--model", model, modules=tmp_path) as server:
@@ -30,6 +30,10 @@ def test_what_failed_is_tried_again(linked, page, tmp_path, model_file):
         page.shows("#findings", "one.pt failed: ImportError")
         page.open(f"{server.base}#/compare")
         page.wait("document.querySelector('#table [title^=ImportError]')?.innerText == 'failed'")
+        page.click("#compare-all")
+        page.shows("#compared", "2 analyses to do")
+        page.wait("document.querySelectorAll('#table [title^=ImportError]').length == 3")
+        page.wait("!document.querySelector('#compare-all').hidden")
         page.open(f"{server.base}{server.hash('lake')}")
         page.shows("#findings", "one.pt failed: ImportError")
         steered(linked, model)

@@ -129,15 +129,17 @@ class Analyses:
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
 
-    def state(self, folder: Path, analysis: Analysis, begin: bool = True) -> dict[str, Any]:
+    def state(self, folder: Path, analysis: Analysis, begin: bool = True, again: bool = False) -> dict[str, Any]:
         """Return how far an analysis is, for the page: {"state", and "progress", "message" or the result's "stamp"}.
 
         The states are ready, running, waiting, paused, failed and, if it is not to begin now and nobody asked for it,
-        none. Raises RecordingError as `stamp` does.
+        none. again: begin one that has failed, too. Raises RecordingError as `stamp` does.
         """
         job = folder, analysis
         now = job, stamp(*job)
         with self.changed:
+            if again:
+                self.failed.pop(now, None)
             if now in self.failed:
                 return {"state": "failed", "message": self.failed[now]}
             if (now in self.ready and result_file(*job).exists()) or read_result(*job):
@@ -165,12 +167,6 @@ class Analyses:
         with self.changed:
             self.paused = False
             self.changed.notify()
-
-    def retry(self, folder: Path, analysis: Analysis) -> None:
-        """Begin an analysis again that has failed. Raises RecordingError as `stamp` does."""
-        with self.changed:
-            self.failed.pop(((folder, analysis), stamp(folder, analysis)), None)
-        self.state(folder, analysis)
 
     def stop(self, folder: Path, analysis: Analysis) -> None:
         """End an analysis that runs or waits; what is done already stays."""

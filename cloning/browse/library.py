@@ -166,7 +166,7 @@ class ShownRecording:
         return [f"replay-{index}-{limit}" for index in range(len(self.models))]
 
     def _replay(self, recording: Recording, column: str, begin: bool = False) -> dict[str, Any]:
-        shown = self._state(column, begin)
+        shown = self._state(column, begin, again=begin)
         if shown["state"] == "ready":
             shown |= replays.figures(self._result(column)[0], recording.images[:, 0])
         return shown
@@ -180,17 +180,17 @@ class ShownRecording:
 
     def retry(self, column: str) -> None:
         """Begin the analysis that has a column again, after it failed. Raises UnknownError, RecordingError."""
-        self.analyses.retry(self.folder, self._analysis(column))
+        self.analyses.state(self.folder, self._analysis(column), again=True)
 
     def _analysis(self, column: str) -> Analysis:
         if column not in self.analysed:
             raise UnknownError(f"no column {column[:40]}")
         return self.analysed[column][0]
 
-    def _state(self, column: str, begin: bool = True) -> dict[str, Any]:
+    def _state(self, column: str, begin: bool = True, again: bool = False) -> dict[str, Any]:
         analysis = self._analysis(column)
         try:
-            return self.analyses.state(self.folder, analysis, begin)
+            return self.analyses.state(self.folder, analysis, begin, again)
         except RecordingError as error:  # the images or the model are gone; all else can be shown
             return {"state": "failed", "message": str(error)}
 
@@ -230,7 +230,7 @@ class ShownRecording:
     def compared(self, limit: str, begin: bool) -> dict[str, Any]:
         """Return the overview with each model's figures: how it steers, and how it drives at a limit.
 
-        begin: begin the analyses that are missing. Raises UnknownError, RecordingError.
+        begin: begin the analyses that are missing or have failed. Raises UnknownError, RecordingError.
         """
         shown, models = self._without_map(), list[dict[str, Any]]()
         if "message" in shown:
@@ -240,7 +240,7 @@ class ShownRecording:
         if begin:
             self.analyses.resume()
         for at, (name, column) in enumerate(zip(self.models, self._replays(limit), strict=True)):
-            steering = self._state(f"model-{at}", begin)
+            steering = self._state(f"model-{at}", begin, again=begin)
             error = None
             if steering["state"] == "ready":
                 difference = (self.column(f"model-{at}") - recording.steering)[kept]

@@ -53,7 +53,7 @@ async function refresh(now, method) {
   const models = found.flatMap(({models = []}) => models);
   const states = models.flatMap(({steering, replay}) => [steering.state, replay.state]);
   const count = state => states.filter(each => each == state).length, pending = count("running") + count("waiting");
-  element("compare-all").hidden = !(count("none") + count("paused"));
+  element("compare-all").hidden = !(count("none") + count("paused") + count("failed"));
   element("compared").textContent = pending ? `${many(pending, "analysis", "analyses")} to do` : "";
   renew(element("table"), found, () => table(found, now.limit));
   if (pending) again();
