@@ -296,6 +296,7 @@ def test_drives_at_several_limits_are_those_at_each_limit(recording, tmp_path, p
         (["FOLDER", "--model", "MODEL", "--report", "nowhere/r.json"], "no such folder"),
         (["FOLDER", "--model", "MODEL", "--picture", "MODEL"], "is read, and would be replaced; name another file"),
         (["FOLDER", "--model", "MODEL", "--report", "LOG"], "driving_log.csv: is read, and would be replaced; name"),
+        (["FOLDER", "--model", "MODEL", "--report", "x", "--film", "./x"], "x: is named for two outputs"),
         (["FOLDER", "--port", "1", "--wait", "0.5"], "no server at"),
     ],
 )

@@ -21,9 +21,15 @@ def names_folder(path: str) -> bool:
 
 
 def check_folders(*paths: str | None, read: Iterable[str | Path | None] = ()) -> None:
-    """Raise OutputError, before the work, if an output is a folder, in no folder, or one of the files that are read."""
+    """Raise OutputError, before the work, for an output that can't be written, or would replace a file that is needed.
+
+    It would if it is one of the files that are read, or another output.
+    """
     inputs = [each for each in read if each and os.path.exists(each)]
+    names = Counter(os.path.realpath(path) for path in paths if path)
     for path in paths:
+        if path and names[os.path.realpath(path)] > 1:
+            raise OutputError(f"{path}: is named for two outputs, and one would replace the other; name another file")
         if path and os.path.exists(path) and any(os.path.samefile(path, each) for each in inputs):
             raise OutputError(f"{path}: is read, and would be replaced; name another file")
         if path and not Path(path).absolute().parent.is_dir():
