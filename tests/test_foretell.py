@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from rendered import render_frame
+from rendered import render_frame, render_recording
 from scipy.spatial.distance import mahalanobis
 
 import drive
@@ -11,6 +11,9 @@ from cloning.base.errors import ModelError, UserError
 from cloning.lane import foretell
 from cloning.lane.foretell import ALARM, Blindness, Foreteller, Limits, Normal, Observation, Observer, Ordinary, Signs
 from cloning.network.network import Network, steer
+from cloning.replay import replay
+from cloning.replay.model_driver import ModelDriver
+from cloning.replay.replay import load_recording
 from cloning.road.motion import MPH, TOP_SPEED_MPH
 from tools import foretell as tool
 from tools.simulator_client import telemetry
@@ -38,7 +41,7 @@ def limits(network) -> Limits:
     observer, rng = Observer(network), np.random.default_rng(1)
     frames = [render_frame(offset, 0.0, rng) for offset in rng.uniform(-1, 1, 12)]
     seen = Observation(*map(np.stack, zip(*map(observer, frames), strict=True)))
-    return Limits(Ordinary.of(seen), np.linspace(-1, 1, 40, dtype=np.float32), -0.25, 0.875)
+    return Limits(Ordinary.of(seen), np.linspace(-1, 1, 40, dtype=np.float32), np.full(20, 9, np.float32), -0.25, 0.875)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -129,7 +132,7 @@ def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
     kinds = [(tool.ORDINARY, False)] * 6 + [(tool.HARD, False)] * 4 + [(tool.HARD, True), (tool.DISTURBED, True)] * 3
     kinds += [(tool.DISTURBED, False)]
     tuning, measuring = ([driven(rng, first + i, *kind) for i, kind in enumerate(kinds)] for first in (2001, 1))
-    limits = tool.fit(tuning, [])
+    limits = tool.fit(tuning)
     assert ALARM < limits.stop < 1
     lines = tool.table(limits, measuring).splitlines()
     hard, every = (line.strip("| ").split(" | ") for line in (lines[3], lines[-1]))
@@ -140,20 +143,65 @@ def test_departures_are_foretold_on_drives_that_nothing_was_tuned_on():
 def test_a_network_that_leaves_every_mountain_road_has_limits_and_one_that_leaves_all_is_refused():
     rng = np.random.default_rng(5)
     fair, hard = ([driven(rng, 2001 + i, kind, strange) for i in range(6)] for kind, strange in CLEAR)
-    limits = tool.fit(fair + hard, [])
+    limits = tool.fit(fair + hard)
     assert ALARM < limits.stop < 1 and tool.table(limits, hard).splitlines()[3].endswith("| 100 % | 100 % | 0 |  |")
     with pytest.raises(UserError, match="leaves the road in every clear drive"):
-        tool.fit(hard, [])
+        tool.fit(hard)
 
 
-def test_each_kind_of_drive_counts_the_same_for_an_alarm_and_one_odd_window_does_not_decide_on_stops(monkeypatch):
-    odds = {tool.DISTURBED: np.linspace(0, 5, 900), tool.HARD: np.append(np.linspace(-3, 0, 199), 9.0)}
-    odds[tool.ORDINARY] = np.linspace(-3, 0, 100)
-    monkeypatch.setattr(tool, "risks", lambda tuned, kind, risk: (np.empty(0), odds[kind]))
+def test_each_kind_of_drive_counts_the_same_for_an_alarm_and_one_odd_window_does_not_decide_on_stops():
+    of_all = [np.linspace(0, 5, 900), np.append(np.linspace(-3, 0, 199), 9.0), np.linspace(-3, 0, 100)]
+    for extreme, wanted in ((0, 0.04), (9, 0.04), (90, 0.1 / 3)):  # windows of the first kind, with the lowest odds
+        of_one = [np.full(len(each), -9.0) for each in of_all]
+        of_one[0][:extreme] = 1.0
+        alarm, stop = tool.thresholds(of_all, of_one)
+        alarms = [(each > alarm) | (one > 0) for each, one in zip(of_all, of_one, strict=True)]
+        assert np.mean([each.mean() for each in alarms]) == pytest.approx(max(wanted, 0.04), abs=0.005)
+        assert stop == pytest.approx(1 / (1 + np.exp(-tool.MARGIN)))
+
+
+def test_what_is_extreme_is_told_by_enough_windows(monkeypatch):
     rng = np.random.default_rng(5)
-    limits = tool.fit([driven(rng, 2001 + i, kind, strange) for i in range(2) for kind, strange in CLEAR], [])
-    assert np.mean([np.mean(each > -limits.bias) for each in odds.values()]) == pytest.approx(0.05, abs=0.005)
-    assert limits.stop == pytest.approx(1 / (1 + np.exp(-tool.MARGIN)))
+    drives = [driven(rng, 2001 + i, tool.ORDINARY, False) for i in range(8)]  # every second one has 5 windows that tell
+    assert (tool.fit(drives).extreme == tool.NEVER).all()
+    monkeypatch.setattr(tool, "RARE", 0.051)
+    limits = tool.fit(drives)
+    signs = [part.signs[: 75 * 5] for drive in drives[1::2] for part in tool.parts(limits.ordinary, *drive)]
+    greatest = np.concatenate(signs).reshape(20, 75, -1).max(1)[:, :20]
+    assert limits.extreme == pytest.approx(np.sort(greatest, 0)[-2], abs=1e-5), "exceeded in one of 20"
+
+
+def test_one_extreme_sign_alone_is_an_alarm(limits):
+    signs = np.full(40, -9.0, np.float32)
+    calm = limits._replace(weights=0 * limits.weights, bias=-30.0, extreme=np.linspace(0, 1, 20, dtype=np.float32))
+    assert calm.risk(signs, 0.0) < 1e-9
+    for at in (0, 19):
+        signs[at] = calm.extreme[at]
+        assert calm.risk(signs, 0.0) == pytest.approx(ALARM)
+        signs[at] += 0.5
+        assert calm.risk(signs, 0.0) == pytest.approx(1 / (1 + np.exp(-2.0)))
+        signs[at] = -9.0
+    signs[20:] = 9.0
+    assert calm.risk(signs, 0.0) < 1e-9, "only the means over the shorter time tell alone"
+
+
+def test_what_is_driven_in_a_recording_is_a_replay_in_pieces(network, tmp_path, monkeypatch):
+    monkeypatch.setattr(tool, "PIECE", 3.0)
+    folder = render_recording(tmp_path / "drive", rows=120)
+    recording = load_recording(folder)
+    whole = replay.drive(recording, replay.reference_lines(recording), 2.5, ModelDriver(network))
+    found = tool.replays(Observer(network), folder)
+    assert len(found) == 3 and all(course.tunes and course.kind == tool.REPLAYED for course, _ in found)
+    assert len({course.name for course, _ in found}) == 3
+    seen, time, away = (
+        [column(each) for _, each in found]
+        for column in (lambda each: each.seen.steering, lambda each: each.time, lambda each: each.away)
+    )
+    assert np.concatenate(seen) == pytest.approx(np.array(whole.steering), abs=1e-6)
+    assert np.concatenate(away) == pytest.approx(np.abs(whole.offset))
+    assert np.concatenate(time) == pytest.approx(recording.time[whole.row])
+    left = np.concatenate([each.departures for _, each in found])
+    assert left == pytest.approx(recording.time[whole.row][list(whole.interventions)]) and len(left)
 
 
 def test_an_alarm_counts_from_6_to_1_s_before_a_departure():

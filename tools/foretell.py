@@ -1,13 +1,14 @@
 """Find a network's limits: fit what foretells that it will leave the road, and measure how well it does so.
 
     python -m tools.foretell                                # the network that comes with the project
-    python -m tools.foretell model.pt --recordings data     # with what is ordinary in these recordings, too
+    python -m tools.foretell model.pt --recordings data     # it also drives in these recordings
 
 The network drives in the stand-in simulator: generated roads and both tracks in foul weather, mountain roads at 25 mph,
-and ordinary roads at 15. Numbers of roads and looks above 2000 and the disturbances of which networks may be trained
-tune the figures; those below 1000 and the other disturbances, on which nothing was tuned, measure them. Departures are
-rare, so what is fitted is how far from the lane's centre the car will be, which every drive tells. The figures are
-written beside the network, as model.limits.pt; from then on drive.py shows the risk.
+and ordinary roads at 15; and in replays of recordings, whose frames differ from drawn ones. Numbers of roads and looks
+above 2000, the disturbances of which networks may be trained, and the recordings tune the figures; numbers below 1000
+and the other disturbances, on which nothing was tuned, measure them. Departures are rare, so what is fitted is how far
+from the lane's centre the car will be, which every drive tells. The figures are written beside the network, as
+model.limits.pt; from then on drive.py shows the risk.
 
 The measure is SelfOracle's (ICSE 2020): a departure is foretold by an alarm 1 to 6 s before it, and false alarms are
 counted in windows of 5 s in drives without a departure. An interrupted run continues when it is started again. A drive
@@ -26,12 +27,13 @@ from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import UserError
 from cloning.base.files import written_whole
-from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.base.outputs import claimed
 from cloning.lane.foretell import (
     ALARM,
     EARLIEST,
     LATEST,
+    MEAN_TIMES,
+    STEEPNESS,
     Blindness,
     Limits,
     Observation,
@@ -40,14 +42,18 @@ from cloning.lane.foretell import (
     Signs,
     fingerprint,
     limits_file,
+    odds_of_one,
     save_limits,
 )
 from cloning.network.compute import one_thread, threads
 from cloning.network.network import SHIPPED_MODEL, load_model
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.recordings.images import decode
-from cloning.recordings.log import find_folders, read_recording
+from cloning.recordings.log import Recording, find_folders
 from cloning.recordings.writer import SampleClock
+from cloning.replay.replay import ReferenceLine, ReplayFrame, load_recording, reference_lines
+from cloning.replay.replay import drive as replay
+from cloning.road.autonomy import LIMITS
 from cloning.road.disturbances import HELD_OUT, KINDS, Disturbance, Disturber
 from cloning.road.motion import MPH
 from cloning.road.track import Track
@@ -62,14 +68,18 @@ from tools.lane_frames import every_second_shadowed
 
 DISTURBED, HARD, ORDINARY = "disturbed, strength 5, 25 mph", "mountain roads, 25 mph", "ordinary roads, 15 mph"
 CONDITIONS = (DISTURBED, HARD, ORDINARY)
+REPLAYED = "replays of recordings"  # which only tune
+PIECE = 40.0  # s of a replay, which count as a drive
 MAX_DEPARTURES = 4  # in a drive: more are at the same place
-FALSE_ALARMS = 0.05  # share of the windows without a departure, in drives for tuning, in which there is an alarm
+# Shares of the windows without a departure, in drives for tuning: in which there is an alarm (there are more of them in
+# drives on which nothing was tuned: 5 %), and in which any one sign is extreme.
+FALSE_ALARMS, RARE = 0.04, 0.002
 # A car is stopped by so many log odds above an alarm, and above all but this share of the windows in clear drives for
 # tuning.
 MARGIN, NEEDLESS = 0.25, 0.01
+NEVER = 100.0  # the logarithm of no sign
 OFF_ROAD = 4.0  # m from the centre: taken for where a car is that leaves the road
 NEAR = 0.1  # m added to distances before their logarithm is taken: a car on the centre is not infinitely better
-STEEPNESS = 4.0  # log odds for a distance e times as great
 DECAY = 0.1  # of the regression's weights
 
 
@@ -166,13 +176,34 @@ def load(path: Path) -> Drive:
     return Drive(Observation(*seen), blind, time, away, departures)
 
 
-def observe_recording(observe: Observer, folder: Path) -> Observation:
-    """Return what is seen in a recording, every fourth frame. Raises RecordingError."""
-    recording, frame, seen = read_recording(folder), np.zeros(FRAME, np.uint8), []
-    for at in range(0, len(recording), 4):
-        frame[ROAD_ROWS] = recording.road(at)
-        seen.append(observe(frame))
-    return joined(seen)
+def replay_line(observe: Observer, recording: Recording, line: ReferenceLine) -> Drive:
+    """Let the network drive along a line of a recording; set back onto it, it counts as having left the road."""
+    blindness, seen, blind = Blindness(), list[Observation](), list[float]()
+
+    def steer(frame: ReplayFrame) -> float:
+        image = decode(frame.jpeg())
+        seen.append(observe(image))
+        blind.append(blindness(image, float(recording.time[frame.row]), frame.speed * MPH))
+        return float(seen[-1].steering)
+
+    done = replay(recording, [line], LIMITS[-1], steer)
+    time = recording.time[done.row]
+    return Drive(joined(seen), np.array(blind), time, np.abs(done.offset), time[list(done.interventions)])
+
+
+def replays(observe: Observer, folder: Path) -> list[tuple[Course, Drive]]:
+    """Return the network's drives in a recording, PIECE s each, which tune the figures. Raises RecordingError."""
+    recording, found = load_recording(folder), list[tuple[Course, Drive]]()
+    for line in reference_lines(recording):
+        driven = replay_line(observe, recording, line)
+        piece = (driven.time - driven.time[0]) // PIECE
+        for each in np.unique(piece):
+            blind, time, away = (column[piece == each] for column in driven[1:4])
+            left = driven.departures[(driven.departures >= time[0]) & (driven.departures <= time[-1])]
+            course = Course(REPLAYED, folder.name, 2001 + len(found))
+            seen = Observation(*(values[piece == each] for values in driven.seen))
+            found.append((course, Drive(seen, blind, time, away, left)))
+    return found
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -233,14 +264,14 @@ def regress(signs: np.ndarray, away: np.ndarray, share: np.ndarray) -> np.ndarra
     return (weights / deviation).astype(np.float32)
 
 
-def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation]) -> Limits:
+def fit(driven: Sequence[tuple[Course, Drive]]) -> Limits:
     """Return the limits; driven: what tunes them. Raises UserError for a network that drives nowhere."""
     fair = [(course, each) for course, each in driven if not course.disturbance and not len(each.departures)]
     if not fair:
         raise UserError("the network leaves the road in every clear drive, so nothing is ordinary; train it longer")
     # Every second one says what is ordinary: in these the networks' activations are nearer to it than in any others.
     known = {course for course, _ in fair[::2]}
-    seen = [each.seen for course, each in fair if course in known] + list(recordings)
+    seen = [each.seen for course, each in fair if course in known]
     ordinary = Ordinary.of(Observation(*map(np.concatenate, zip(*seen, strict=True))))
     drives = [list(parts(ordinary, course, each)) for course, each in driven if course not in known]
     coming = [np.concatenate([part.coming for part in each]) for each in drives]
@@ -249,13 +280,37 @@ def fit(driven: Sequence[tuple[Course, Drive]], recordings: Sequence[Observation
     tuned, rows = [part for each in drives for part in each], np.concatenate(told)
     signs = np.concatenate([part.signs for part in tuned])[rows]
     weights = STEEPNESS * regress(signs, *(np.concatenate(each)[rows] for each in (coming, share)))
-    odds = {kind: risks(tuned, kind, lambda part: part.signs @ weights)[1] for kind in CONDITIONS}
-    found = [each for each in odds.values() if len(each)]
-    alike = np.concatenate([np.full(len(each), 1 / len(each)) for each in found])  # each kind counts the same
-    alarm = np.quantile(np.concatenate(found), 1 - FALSE_ALARMS, weights=alike, method="inverted_cdf")
-    clear = np.concatenate([odds[HARD], odds[ORDINARY], [alarm]])
-    stop = 1 / (1 + np.exp(min(0, alarm - np.quantile(clear, 1 - NEEDLESS)) - MARGIN))
-    return Limits(ordinary, weights, -float(alarm), float(stop))
+
+    def stayed(figure: Callable[[Part], np.ndarray]) -> list[np.ndarray]:
+        return [risks(tuned, kind, figure)[1] for kind in (*CONDITIONS, REPLAYED)]
+
+    def sign(at: int) -> Callable[[Part], np.ndarray]:
+        return lambda part: part.signs[:, at]
+
+    of_all, extreme = stayed(lambda part: part.signs @ weights), np.full(len(weights) // len(MEAN_TIMES), NEVER)
+    if sum(map(len, of_all)) >= 1 / RARE:  # fewer windows can't tell what is rare
+        extreme = np.array([exceeded(stayed(sign(at)), RARE) for at in range(len(extreme))])
+    of_one = stayed(lambda part: odds_of_one(part.signs, extreme))
+    alarm, stop = thresholds(of_all, of_one)
+    return Limits(ordinary, weights, extreme.astype(np.float32), -alarm, stop)
+
+
+def thresholds(of_all: Sequence[np.ndarray], of_one: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return the odds from which it is an alarm, and the risk at which a car is better stopped.
+
+    of_all, of_one: the greatest odds by all signs, and by one alone, in the windows without a departure of disturbed
+    drives and of each kind of clear ones. Where one sign is extreme, there is an alarm whatever the others tell.
+    """
+    alarm = exceeded([np.where(one > 0, np.inf, each) for each, one in zip(of_all, of_one, strict=True)], FALSE_ALARMS)
+    _, *clear = (np.maximum(each - alarm, one) for each, one in zip(of_all, of_one, strict=True))
+    stop = max(0, np.quantile(np.concatenate([*clear, [0]]), 1 - NEEDLESS)) + MARGIN
+    return alarm, float(1 / (1 + np.exp(-stop)))
+
+
+def exceeded(greatest: Sequence[np.ndarray], share: float) -> float:
+    """Return what the greatest values in this share of the windows exceed; each kind of drive counts the same."""
+    alike = np.concatenate([np.full(len(each), 1 / len(each)) for each in greatest if len(each)])
+    return float(np.quantile(np.concatenate(greatest), 1 - share, weights=alike, method="inverted_cdf"))
 
 
 def risks(among: Sequence[Part], kind: str, risk: Callable[[Part], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -294,7 +349,8 @@ def main(argv: list[str] | None = None) -> int:
     add = parser.add_argument
     model = "model file (default: the project's own, whose limits are then replaced)"
     add("model", nargs="?", type=Path, default=SHIPPED_MODEL, help=model)
-    add("--recordings", nargs="*", default=[], help="recordings of ordinary driving, or folders of recordings")
+    recordings = "recordings, or folders of them, in which it drives, too: fewer false alarms on real roads"
+    add("--recordings", nargs="*", default=[], help=recordings)
     drives = "how many drives; fewer have some of each kind, too (default %(default)s, which is all)"
     add("--drives", type=number(int, 20, len(courses())), default=len(courses()), help=drives)
     add("--folder", type=Path, default=Path("foretell"), help="for what the drives show (default %(default)s)")
@@ -304,11 +360,11 @@ def main(argv: list[str] | None = None) -> int:
     folder = options.folder / f"{fingerprint(observe.network)[:8]}-blind"
     work = partial(drive_into, folder, options.model)
     with claimed(folder):
-        recordings = [observe_recording(observe, each) for each in find_folders(options.recordings)]
+        replayed = [each for folder in find_folders(options.recordings) for each in replays(observe, folder)]
         with started_workers(threads()) as pool:
             list(results(pool, work, chosen, "drive"))  # raises their errors
     driven = [(course, load(folder / f"{course.name}.npz")) for course in chosen]
-    limits = fit([each for each in driven if each[0].tunes], recordings)
+    limits = fit([each for each in driven + replayed if each[0].tunes])
     save_limits(options.model, observe.network, limits)
     print(table(limits, [each for each in driven if not each[0].tunes]))
     print(f"\n{limits_file(options.model)}: written; a car is better stopped at a risk of {limits.stop:.2f}")

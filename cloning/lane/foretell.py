@@ -4,8 +4,9 @@ Signs of that are what the lane reader sees (how far off the lane's centre the c
 mirror image tell it the same), steering that does not fit it or changes quickly, and activations of either network that
 are unlike those of ordinary driving (their Mahalanobis distance, arXiv 1807.03888). From the signs' means over a short
 and a longer time, a regression tells how far off the lane's centre the car will be; the farther, the greater the risk.
-Its figures are in a file beside the network's, which `python -m tools.foretell` writes and measures; they fit this one
-network. One more sign needs no figures: a camera that shows nothing new while the car drives.
+A single sign tells, too, where it is greater than in nearly all driving that stays on the road. The figures are in a
+file beside the network's, which `python -m tools.foretell` writes and measures; they fit this one network. One more
+sign needs no figures: a camera that shows nothing new while the car drives.
 """
 
 from collections.abc import Mapping
@@ -23,13 +24,14 @@ from cloning.network import tensors
 from cloning.network.network import Network, steer
 
 ENDING = ".limits.pt"  # of the file beside a network's, and its arrays
-ARRAYS = ("weights", "steering", "activations", "activations_factor", "hidden", "hidden_factor")
+ARRAYS = ("weights", "extreme", "steering", "activations", "activations_factor", "hidden", "hidden_factor")
 MOST_UNITS = 100  # of the driving network's layer whose activations are compared
 MEAN_TIMES = np.array([0.3, 1.5], np.float32)  # s, of the signs' exponential means
 MAX_STEP = 1.0  # s: a longer pause counts as this
 BLIND_STEP = 0.2  # s, likewise in `Blindness`: at 30 mph, one frame that is like the last before a pause is no alarm
 LEAST = 0.01  # added to a sign before its logarithm is taken
 ALARM = 0.5  # the risk from which it is an alarm: the file's figures are shifted so
+STEEPNESS = 4.0  # log odds for a distance, or an extreme sign, e times as great
 EARLIEST, LATEST = 6.0, 1.0  # s before a departure: an alarm in between foretells it
 WINDOW = EARLIEST - LATEST  # s of a drive without a departure, in which false alarms count once
 
@@ -158,6 +160,7 @@ class Limits(NamedTuple):
 
     ordinary: Ordinary
     weights: np.ndarray  # float32 (2 k,), of the signs' means
+    extreme: np.ndarray  # float32 (k,): the signs' means over the shorter time from which one alone is an alarm
     bias: float  # so that the risk is ALARM where an alarm is due
     stop: float  # the risk at which a car is better stopped
 
@@ -166,8 +169,14 @@ class Limits(NamedTuple):
 
         After LOOKAHEAD without a new frame the car is where the last one steered it, and nothing tells what comes.
         """
-        risk = 1 / (1 + np.exp(-np.clip(signs @ self.weights + self.bias, -30, 30)))
+        odds = np.maximum(signs @ self.weights + self.bias, odds_of_one(signs, self.extreme))
+        risk = 1 / (1 + np.exp(-np.clip(odds, -30, 30)))
         return np.maximum(risk, np.minimum(np.divide(blind, LOOKAHEAD), 1))
+
+
+def odds_of_one(signs: np.ndarray, extreme: np.ndarray) -> Any:
+    """Return the log odds that the most extreme of the signs (…, 2 k) tells alone; extreme: see `Limits`."""
+    return STEEPNESS * (signs[..., : len(extreme)] - extreme).max(-1)
 
 
 class Foreteller:
@@ -202,7 +211,7 @@ def fingerprint(network: Network) -> str:
 def save_limits(model: Path, network: Network, limits: Limits) -> None:
     """Write the limits beside the file of their network. Raises OSError."""
     steering, activations, hidden = limits.ordinary
-    numbers = dict(zip(ARRAYS, (limits.weights, steering, *activations, *hidden), strict=True))
+    numbers = dict(zip(ARRAYS, (limits.weights, limits.extreme, steering, *activations, *hidden), strict=True))
     arrays = {name: torch.from_numpy(np.asarray(value, np.float32)) for name, value in numbers.items()}
     about = {"fingerprint": fingerprint(network), "bias": limits.bias, "stop": limits.stop}
     tensors.save(limits_file(model), {**about, "arrays": arrays})
@@ -229,11 +238,11 @@ def _read(saved: Mapping[str, Any]) -> Limits:
     """Return the limits of a file's contents. Raises KeyError, TypeError, ValueError."""
     found = saved["arrays"]
     units, hidden, distances = len(found["activations"]), len(found["hidden"]), len(DISTANCES_AHEAD)
-    signs = len(MEAN_TIMES) * (3 * distances + 5)
-    shapes = (signs,), (distances,), (units,), (units, units), (hidden,), (hidden, hidden)
+    signs = 3 * distances + 5
+    shapes = (len(MEAN_TIMES) * signs,), (signs,), (distances,), (units,), (units, units), (hidden,), (hidden, hidden)
     arrays = tensors.matching(found, dict(zip(ARRAYS, map(torch.empty, shapes), strict=True)))
     if not all(tensors.is_number(saved[name]) for name in ("bias", "stop")):
         raise ValueError("bias and stop are no numbers")
-    weights, steering, *normals = (arrays[name].numpy() for name in ARRAYS)
+    weights, extreme, steering, *normals = (arrays[name].numpy() for name in ARRAYS)
     ordinary = Ordinary(steering, Normal(*normals[:2]), Normal(*normals[2:]))
-    return Limits(ordinary, weights, float(saved["bias"]), float(saved["stop"]))
+    return Limits(ordinary, weights, extreme, float(saved["bias"]), float(saved["stop"]))
