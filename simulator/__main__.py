@@ -36,41 +36,43 @@ def disturbance(text: str) -> Disturbance:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-# The options that several commands have
-LAPS, SERVER, WAIT, ROAD, DISTURB = (argparse.ArgumentParser(add_help=False) for _ in range(5))
-LAPS.add_argument("--laps", type=number(float, 1e-6, 1e5), default=1, help="laps, such as 0.5 (default 1)")
-add = SERVER.add_argument
-add("--host", type=address, default="127.0.0.1", help="address of the server (default %(default)s)")
-add("--port", type=number(int, 1, MAX_PORT), default=PORT, help="port of the server (default %(default)s)")
-text = "seconds to wait for the server, or for an answer that the car can use (default 60)"
-WAIT.add_argument("--wait", type=number(float, 0.01, 1e6), default=60.0, help=text)
-add = ROAD.add_argument
-text = f"{', '.join(ROADS)}, or a road generated from its number: road-1, mountain-1 and so on (default lake)"
-add("--track", help=text)
-text = (
-    "drive a road of your own: the points of its centre line in m, as CSV (x,y or x,y,z; z up), "
-    "JSON (road_points) or x,y,z@x,y,z (y up, as in Unity); if its last point is not its first, a lap ends there"
-)
-add("--road", metavar="FILE", help=text)
-text = f"width of the --road in m (default: the file's, or {WIDTH:g})"
-add("--width", type=number(float, MIN_WIDTH, MAX_WIDTH), help=text)
-add("--marking", choices=MARKINGS, help=f"marking of the --road (default: the file's, or {MARKING})")
-add("--land", choices=LANDS, help=f"land around the --road (default: the file's, or {LAND})")
-text = (
-    "default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads; "
-    "as its points are listed on a --road, where for an open one this is called ccw"
-)
-add("--direction", choices=("ccw", "cw"), help=text)
-text = (
-    "look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
-    "textures and plants; 10000 more: the same with shadows, as at the real simulator's higher graphics quality"
-)
-add("--look", type=number(int, 0), default=0, help=text)
-text = (
-    f"foul weather, dirt or a fault of the cameras, such as fog:3; kinds: {', '.join(KINDS)}; strengths: "
-    f"{STRENGTHS[0]} to {STRENGTHS[-1]}; the same in each drive (default: none)"
-)
-DISTURB.add_argument("--disturb", type=disturbance, metavar="KIND:STRENGTH", help=text)
+def _shared_options() -> list[argparse.ArgumentParser]:
+    """Return the options that several commands have: of laps, the server, the wait, the road, and disturbances."""
+    parsers = laps, server, wait, road, disturb = [argparse.ArgumentParser(add_help=False) for _ in range(5)]
+    laps.add_argument("--laps", type=number(float, 1e-6, 1e5), default=1, help="laps, such as 0.5 (default 1)")
+    add = server.add_argument
+    add("--host", type=address, default="127.0.0.1", help="address of the server (default %(default)s)")
+    add("--port", type=number(int, 1, MAX_PORT), default=PORT, help="port of the server (default %(default)s)")
+    text = "seconds to wait for the server, or for an answer that the car can use (default 60)"
+    wait.add_argument("--wait", type=number(float, 0.01, 1e6), default=60.0, help=text)
+    add = road.add_argument
+    text = f"{', '.join(ROADS)}, or a road generated from its number: road-1, mountain-1 and so on (default lake)"
+    add("--track", help=text)
+    text = (
+        "drive a road of your own: the points of its centre line in m, as CSV (x,y or x,y,z; z up), "
+        "JSON (road_points) or x,y,z@x,y,z (y up, as in Unity); if its last point is not its first, a lap ends there"
+    )
+    add("--road", metavar="FILE", help=text)
+    text = f"width of the --road in m (default: the file's, or {WIDTH:g})"
+    add("--width", type=number(float, MIN_WIDTH, MAX_WIDTH), help=text)
+    add("--marking", choices=MARKINGS, help=f"marking of the --road (default: the file's, or {MARKING})")
+    add("--land", choices=LANDS, help=f"land around the --road (default: the file's, or {LAND})")
+    text = (
+        "default: as in the real simulator, ccw on the lake and cw in the jungle; ccw on generated roads; "
+        "as its points are listed on a --road, where for an open one this is called ccw"
+    )
+    add("--direction", choices=("ccw", "cw"), help=text)
+    text = (
+        "look of the road; 0 (default): like the real simulator; any other number: different light, colours, "
+        "textures and plants; 10000 more: the same with shadows, as at the real simulator's higher graphics quality"
+    )
+    add("--look", type=number(int, 0), default=0, help=text)
+    text = (
+        f"foul weather, dirt or a fault of the cameras, such as fog:3; kinds: {', '.join(KINDS)}; strengths: "
+        f"{STRENGTHS[0]} to {STRENGTHS[-1]}; the same in each drive (default: none)"
+    )
+    disturb.add_argument("--disturb", type=disturbance, metavar="KIND:STRENGTH", help=text)
+    return parsers
 
 
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
@@ -79,6 +81,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
         prog=program.in_commands("python -m simulator"), description="A stand-in for Udacity's driving simulator."
     )
     commands, mph = parser.add_subparsers(required=True), number(float, 1, TOP_SPEED_MPH)
+    laps, server, wait, road, disturb = _shared_options()
 
     def command(
         run: Callable, help: str, *shared: argparse.ArgumentParser, epilog: str | None = None
@@ -89,7 +92,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
         return added
 
     text = "let a model drive real recordings, and print its autonomy and distance from the lane centre"
-    add = command(run_replay, text, SERVER, WAIT, DISTURB).add_argument
+    add = command(run_replay, text, server, wait, disturb).add_argument
     add("folders", nargs="+", metavar="FOLDER", help="recordings, or folders of recordings")
     add("--model", metavar="model.pt", help="drive with this model in this process, without drive.py")
     text = (
@@ -105,7 +108,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     add("--picture", metavar="FILE.png", help=text)
     add("--film", metavar="FILE.mp4", help="film what the model sees in the drives at the last limit")
 
-    add = command(run_record, "record an expert driver, faster than real time", LAPS, ROAD, DISTURB).add_argument
+    add = command(run_record, "record an expert driver, faster than real time", laps, road, disturb).add_argument
     add("folder", help="folder for the new recording: IMG/ and driving_log.csv")
     text = "set speed in mph, 1 to %(default)s (default %(default)s)"
     add("--speed", type=mph, default=TOP_SPEED_MPH, help=text)
@@ -117,7 +120,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
         "Exit status: 0 if the car stayed on the road, 1 if it left the road, 2 if an error ended the drive "
         "or a file could not be written."
     )
-    driving = LAPS, SERVER, WAIT, ROAD, DISTURB
+    driving = laps, server, wait, road, disturb
     add = command(run_drive, "let drive.py drive, and print a lap report", *driving, epilog=status).add_argument
     text = "simulated time follows the wall clock; by default it waits for each answer, and a drive is repeatable"
     add("--realtime", action="store_true", help=text)
@@ -131,7 +134,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     text = "the expert's set speed in mph, never exceeded: give drive.py the same (default %(default)g, as drive.py's)"
     add("--speed", type=mph, default=SET_SPEED_MPH, help=text)
 
-    add = command(run_window, "drive and record by hand, or watch drive.py drive", SERVER, ROAD, DISTURB).add_argument
+    add = command(run_window, "drive and record by hand, or watch drive.py drive", server, road, disturb).add_argument
     text = "folder for the recording (default data/window-DATE-TIME, with --autonomous window-DATE-TIME-corrections)"
     add("--folder", help=text)
     text = "let drive.py drive; W or S takes over, and only then is anything recorded"
@@ -143,7 +146,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
         "accepted: -logFile FILE takes the messages, and -batchmode and -nographics are always so."
     )
     text = "let another team's test program drive, in place of the modified simulator that it expects"
-    add = command(run_join, text, SERVER, WAIT, ROAD, DISTURB, epilog=ends).add_argument
+    add = command(run_join, text, server, wait, road, disturb, epilog=ends).add_argument
     text = (
         "measures: telemetry with cte, laps and so on (SelfOracle, ThirdEye); roads: the program sends roads "
         "(maxitwo, perturbation-drive, MultiSim); episodes: on named tracks, in weathers (udacity-gym)"
@@ -183,7 +186,7 @@ def given_for_road(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def chosen_track(arguments: argparse.Namespace, needs_file: bool = True) -> Track:
-    """Return the track of the ROAD options; needs_file: for options of a road of one's own. Raises UserError."""
+    """Return the track of the road options; needs_file: for options of a road of one's own. Raises UserError."""
     given = given_for_road(arguments)
     if arguments.road is None:
         if given and needs_file:

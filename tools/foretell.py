@@ -200,7 +200,7 @@ def replays(observe: Observer, folder: Path) -> list[tuple[Course, Drive]]:
         for each in np.unique(piece):
             blind, time, away = (column[piece == each] for column in driven[1:4])
             left = driven.departures[(driven.departures >= time[0]) & (driven.departures <= time[-1])]
-            course = Course(REPLAYED, folder.name, 2001 + len(found))
+            course = Course(REPLAYED, str(folder), 2001 + len(found))
             seen = Observation(*(values[piece == each] for values in driven.seen))
             found.append((course, Drive(seen, blind, time, away, left)))
     return found
@@ -276,7 +276,7 @@ def fit(driven: Sequence[tuple[Course, Drive]]) -> Limits:
     drives = [list(parts(ordinary, course, each)) for course, each in driven if course not in known]
     coming = [np.concatenate([part.coming for part in each]) for each in drives]
     told = [np.isfinite(each) for each in coming]
-    share = [rows / rows.sum() / len(drives) for rows in told]  # each drive counts the same
+    share = [rows / max(rows.sum(), 1) / len(drives) for rows in told]  # each drive counts the same
     tuned, rows = [part for each in drives for part in each], np.concatenate(told)
     signs = np.concatenate([part.signs for part in tuned])[rows]
     weights = STEEPNESS * regress(signs, *(np.concatenate(each)[rows] for each in (coming, share)))
