@@ -163,22 +163,6 @@ class Placing:
                     continue
                 at = at + WINDOW_STEP if at + WINDOW == n else min(at + WINDOW_STEP, n - WINDOW)
 
-    def correct(self, forward: bool) -> None:
-        """Replace parts by one next to their neighbour, if that agrees about as well with the rows, or better.
-
-        An S-bend looks the same from both ends: by itself, a part there may be in the wrong direction.
-        """
-        parts, self.parts = self.parts[:: 1 if forward else -1], []
-        while parts:
-            self.parts.append(parts.pop(0))
-            while parts and (found := self.next_to(self.parts[-1], None, forward)):
-                rivals = [part for part in parts if found.overlaps(part)]
-                if not rivals or found.quality() <= AMBIGUOUS * sum(part.quality() for part in rivals):
-                    break
-                parts = [part for part in parts if part not in rivals]
-                self.parts.append(found)
-        self.parts = self.parts[:: 1 if forward else -1]
-
     def spread(self, forward: bool) -> None:
         """Place what is left, from the ends of the parts that there are on, or from their starts back."""
         parts, self.parts = self.parts[:: 1 if forward else -1], []
@@ -374,8 +358,6 @@ def certain_parts(
     """
     placing = Placing(recording, stretches, centres)
     placing.anchors()
-    for forward in (True, False):
-        placing.correct(forward)
     for cuts_ends in (False, True):  # first those that are certain as they are
         placing.cuts_ends = cuts_ends
         for forward in (True, False):
