@@ -307,10 +307,10 @@ def thresholds(of_all: Sequence[np.ndarray], of_one: Sequence[np.ndarray]) -> tu
     return alarm, float(1 / (1 + np.exp(-stop)))
 
 
-def exceeded(greatest: Sequence[np.ndarray], share: float) -> float:
-    """Return what the greatest values in this share of the windows exceed; each kind of drive counts the same."""
-    alike = np.concatenate([np.full(len(each), 1 / len(each)) for each in greatest if len(each)])
-    return float(np.quantile(np.concatenate(greatest), 1 - share, weights=alike, method="inverted_cdf"))
+def exceeded(highest: Sequence[np.ndarray], share: float) -> float:
+    """Return what the highest values of this share of the windows exceed; each kind of drive counts the same."""
+    alike = np.concatenate([np.full(len(each), 1 / len(each)) for each in highest if len(each)])
+    return float(np.quantile(np.concatenate(highest), 1 - share, weights=alike, method="inverted_cdf"))
 
 
 def risks(among: Sequence[Part], kind: str, risk: Callable[[Part], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
