@@ -27,6 +27,7 @@ import numpy as np
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.frame import FRAME
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
+from cloning.lane.predict import Predictor
 from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
 from cloning.recordings.format import SAMPLE_RATE
@@ -247,14 +248,14 @@ def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | No
     if address is None:
         steering, known = load_driver(conditions.driver), conditions.foretell and load_limits_of(conditions.driver)
         foretell, alarms = Foreteller(*known) if known else None, list[float]()
+        predictor = None if conditions.driver.endswith(".onnx") else Predictor()  # as in drive.py
 
         def answer(image: bytes, run: Run) -> Answer:
-            if not foretell:
-                return Answer(float(format_number(steering(decode(image)))))
-            found, risk = foretell(decode(image), run.time, run.speed_mph * MPH)
+            frame, now = decode(image), (run.time, run.speed_mph * MPH)
+            found, risk = foretell(frame, *now) if foretell else (steering(frame), 0.0)
             if risk >= ALARM:
                 alarms.append(run.time)
-            return Answer(float(format_number(float(found))))
+            return Answer(float(format_number(float(predictor(found, frame, *now) if predictor else found))))
 
         try:
             done = _drive(conditions, road, answer, watch)

@@ -45,6 +45,7 @@ from cloning.lane.foretell import (
     odds_of_one,
     save_limits,
 )
+from cloning.lane.predict import Predictor
 from cloning.network.compute import one_thread, threads
 from cloning.network.network import SHIPPED_MODEL, load_model
 from cloning.recordings.format import SAMPLE_RATE
@@ -144,7 +145,7 @@ def drive(model: Path, course: Course) -> Drive:
     run.set_back()
     disturber = Disturber(Disturbance.parse(course.disturbance), course.number) if course.disturbance else None
     controller, clock = SpeedController(15 if course.kind == ORDINARY else 25), SampleClock(1 / SAMPLE_RATE)
-    blindness, seen, blind, time, away = Blindness(), [], [], [], []
+    predictor, blindness, seen, blind, time, away = Predictor(), Blindness(), [], [], [], []
     while run.time < (30 if disturber else 40) and len(run.departures) < MAX_DEPARTURES:
         frame = decode(jpeg(cameras.frames(run.car.node.get_transform())[0]))
         frame = disturber(frame) if disturber else frame
@@ -152,9 +153,10 @@ def drive(model: Path, course: Course) -> Drive:
         blind.append(blindness(frame, run.time, run.speed_mph * MPH))
         time.append(run.time)
         away.append(abs(run.offset))
+        steering = float(predictor(seen[-1].steering.item(), frame, run.time, run.speed_mph * MPH))
         throttle, due = controller.throttle(run.speed_mph), False
         while not due:
-            run.step(float(seen[-1].steering), throttle)
+            run.step(steering, throttle)
             due = clock.due(run.time)
     departures = [departure.time for departure in run.departures]
     return Drive(joined(seen), *map(np.array, (blind, time, away, departures)))

@@ -1,0 +1,173 @@
+"""Steers for where the car is now, though its frames come late, or some of them are lost.
+
+At 30 mph a frame that is 0.3 s late shows where the car was 4 m before. Steered by such frames it weaves more and more,
+until it leaves the road. But what it has done since is known: it has driven as it was steered. From there the steering
+is computed as the network would change it: by the law of the recovery steering that it has learned (pure pursuit of a
+point on the lane's centre). Such a prediction from a delayed measurement is a Smith predictor (Smith, "Closer control
+of loops with dead time", 1957).
+
+How late frames are, they tell themselves: their far background moves to one side as the car turns to the other (the
+visual compass of Milford and Wyeth, "Mapping a suburb with a single camera", 2008), and follows the steering that was
+sent so many frames later. Where this is not certain, and where frames are in time, the network's steering remains.
+"""
+
+import math
+from collections import deque
+
+import cv2
+import numpy as np
+
+from cloning.lane.recovery import LOOKAHEAD
+from cloning.road.camera import CAMERA_MATRIX
+from cloning.road.motion import curvature, lagged_curvature, steering_for
+
+# By how much the network steers to the left, as a curvature in 1/m, for each m and radian that the car is further to
+# the right: pure pursuit of a point LOOKAHEAD ahead of the rear axle, for small angles.
+FOR_OFFSET, FOR_HEADING = 2 / LOOKAHEAD**2, 2 / LOOKAHEAD
+# m: the longer a lost frame is ago, up to this, the more the prediction counts. Over a short distance the last steering
+# fits, as it aims LOOKAHEAD ahead of it.
+REACH = 2 * LOOKAHEAD
+LONGEST_PAUSE = 1.0  # s: after a longer one nothing is known of what the car has done
+
+MOST_LATE = 8  # frames
+BACKGROUND = slice(20, 60)  # the rows of a frame that show it
+MARGIN, FARTHEST = 16, 24  # columns at each edge that are left out, and by which the background moves at most
+CLEAR = 0.3  # least share by which the best match of two backgrounds is better than their median match
+MEMORY, STEADY = 4.0, 0.7  # s over which turns are compared, and over which their mean is taken, which does not count
+LEAST_FRAMES, LEAST_TURN = 20, 0.5  # that tell how late frames are, and columns by which they turn (root mean square)
+# The correlation from which that is certain, and at most how much of the variance that the delay so far leaves
+# unexplained another one may leave.
+CERTAIN, BETTER = 0.8, 0.6
+
+
+class Delay:
+    """How many frames late those of one drive are."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.background = np.empty(0, np.float32)  # of the last frame
+        self.turns = np.zeros(MOST_LATE + 1)  # without their mean, the newest first
+        self.means = np.zeros(2)  # of turns and movements
+        # Running sums over the frames, for each delay if the turns have a part in it
+        self.squares, self.products, self.moved, self.count = np.zeros(MOST_LATE + 1), np.zeros(MOST_LATE + 1), 0.0, 0.0
+
+    def __call__(self, frame: np.ndarray, turn: float, pause: float) -> int:
+        """Return it, 0 if it is unknown, after the next frame, uint8 (160, 320, 3) RGB.
+
+        turn: columns by which the background moves to the left if the car has turned as it was steered since the last
+        frame; pause: s since then.
+        """
+        before, self.background = self.background, _background(frame)
+        fading, memory = math.exp(-pause / STEADY), math.exp(-pause / MEMORY)
+        self.means[0] = turn + fading * (self.means[0] - turn)
+        self.turns = np.r_[turn - self.means[0], self.turns[:-1]]
+        movement = _movement(before, self.background) if before.size else None
+        if movement is None:
+            return self.frames
+        self.means[1] = movement + fading * (self.means[1] - movement)
+        movement -= float(self.means[1])
+        self.squares = self.turns**2 + memory * self.squares
+        self.products = self.turns * movement + memory * self.products
+        self.moved, self.count = movement**2 + memory * self.moved, 1 + memory * self.count
+        correlation = self.products / np.sqrt(self.squares * self.moved + 1e-9)
+        best = int(correlation.argmax())
+        unexplained = 1 - np.maximum(correlation, 0) ** 2
+        enough = self.count > LEAST_FRAMES and self.moved > LEAST_TURN**2 * self.count
+        if enough and correlation[best] > CERTAIN and unexplained[best] < BETTER * unexplained[self.frames]:
+            self.frames = best
+        return self.frames
+
+
+def _background(frame: np.ndarray) -> np.ndarray:
+    """Return how the brightness of a frame's background changes from column to column: float32 (1, 319)."""
+    columns = cv2.blur(cv2.reduce(frame[BACKGROUND], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F), (3, 1))
+    return np.diff(columns.sum(axis=2), axis=1)
+
+
+def _movement(before: np.ndarray, after: np.ndarray) -> float | None:
+    """Return by how many columns a background has moved to the left, None if it is not clear."""
+    part = before[:, MARGIN + FARTHEST : -MARGIN - FARTHEST]
+    difference = cv2.matchTemplate(after[:, MARGIN:-MARGIN], part, cv2.TM_SQDIFF)[0]
+    best = int(difference.argmin())
+    if not 0 < best < len(difference) - 1 or difference[best] > (1 - CLEAR) * np.median(difference):
+        return None
+    left, middle, right = difference[best - 1 : best + 2].tolist()
+    bend = left - 2 * middle + right
+    return FARTHEST - best - (0.5 * (left - right) / bend if bend > 0 else 0.0)
+
+
+class Predictor:
+    """Corrects the steering of one drive, whose frames it is given one after the other."""
+
+    def __init__(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        self.delay = Delay()
+        self.frame, self.time = np.empty(0, np.uint8), 0.0
+        self.sent = self.bend = 0.0  # the steering that was sent last, -1..1; the curvature that the car drives, 1/m
+        # What was driven since the last frame was taken, in the order of time: curvature, 1/m, and m
+        self.since = deque[tuple[float, float]]()
+        # Where the car was when it was taken: m and radians from the lane's centre and direction, right positive, and
+        # the lane's curvature, 1/m; and m from the frame before to this one.
+        self.offset = self.heading = self.road = self.gap = 0.0
+
+    def __call__(self, steering: float | np.floating, frame: np.ndarray, time: float, speed: float) -> np.float32:
+        """Return the steering for where the car is now: just the network's if the frame is new and in time.
+
+        steering: the network's, -1..1, for this frame, uint8 (160, 320, 3) RGB; time: s; speed: m/s.
+        """
+        pause = time - self.time
+        if not (self.frame.size and 0 < pause <= LONGEST_PAUSE):
+            self._begin()
+            self.road = curvature(float(steering))
+            self.frame, self.time, self.sent = frame, time, float(steering)
+            return np.float32(steering)
+        before, metres = self.bend, speed * pause
+        self.bend = lagged_curvature(before, curvature(self.sent), pause)
+        driven = (before + self.bend) / 2
+        self.since.append((driven, metres))
+        self.gap += metres
+        repeated = np.array_equal(frame, self.frame)
+        late = self.delay(frame, CAMERA_MATRIX[0, 0] * driven * metres, pause)
+        self.frame, self.time = frame, time
+        if not repeated:
+            while len(self.since) > late:
+                self.offset, self.heading = self._after(*self.since.popleft(), self.offset, self.heading)
+            self._see(curvature(float(steering)))
+        corrected = np.float32(steering)
+        if self.since:
+            offset, heading = self.offset, self.heading
+            for bend, length in self.since:
+                offset, heading = self._after(bend, length, offset, heading)
+            change = FOR_OFFSET * (self.offset - offset) + FOR_HEADING * (self.heading - heading)
+            weight = 1.0 if late else min(1.0, self.gap / REACH)
+            corrected = np.float32(steering_for(curvature(float(steering)) + weight * change))
+        self.sent = float(corrected)
+        return corrected
+
+    def _after(self, bend: float, metres: float, offset: float, heading: float) -> tuple[float, float]:
+        """Return offset and heading after so many metres of a curvature from these."""
+        turn = (bend - self.road) * metres
+        return offset + (heading + turn / 2) * metres, heading + turn
+
+    def _see(self, aim: float) -> None:
+        """Correct what is known of the lane by the curvature, 1/m, with which the network steers.
+
+        What is new is that the lane bends otherwise, since some place since the frame before: so the car is also turned
+        and beside its centre otherwise than expected, by as much as is likely for a random walk of the curvature.
+        """
+        gap, a, b = self.gap, FOR_OFFSET, FOR_HEADING
+        faded = math.exp(-gap / LOOKAHEAD)  # offset and heading, which are integrals, gather errors
+        self.offset, self.heading = faded * self.offset, faded * self.heading
+        shares = (
+            -(gap**2 / 6 + b * gap**3 / 8 + a * gap**4 / 20),
+            -(gap / 2 + b * gap**2 / 3 + a * gap**3 / 8),
+            1 + b * gap / 2 + a * gap**2 / 6,
+        )
+        new = aim - (self.road - a * self.offset - b * self.heading)
+        new /= shares[2] - a * shares[0] - b * shares[1]
+        self.offset, self.heading, self.road = (
+            known + new * share for known, share in zip((self.offset, self.heading, self.road), shares, strict=True)
+        )
+        self.gap = 0.0

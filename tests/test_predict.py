@@ -1,0 +1,128 @@
+"""Steering for where the car is now: late and lost frames, against a car on a road of which all is known."""
+
+import math
+from collections import deque
+
+import numpy as np
+import pytest
+
+from cloning.base.frame import FRAME
+from cloning.lane.predict import FOR_HEADING, FOR_OFFSET, LONGEST_PAUSE, Predictor
+from cloning.lane.recovery import MAX_LABEL_OFFSET
+from cloning.network.network import SHIPPED_MODEL
+from cloning.road.camera import CAMERA_MATRIX
+from cloning.road.disturbances import Disturbance
+from cloning.road.motion import MPH, TOP_SPEED_MPH, curvature, lagged_curvature, steering_for
+from simulator.driving import Conditions, drive
+
+SPEED, PAUSE = TOP_SPEED_MPH * MPH, 1 / 15  # m/s, s between frames
+
+
+class World:
+    """A car that is steered by the law that the networks learn, on a road that winds, in front of a far background."""
+
+    def __init__(self, seed: int = 0):
+        rng = np.random.default_rng(seed)
+        coarse = np.convolve(rng.uniform(0, 255, 4000), np.ones(3) / 3, "same")
+        self.panorama = np.interp(np.arange(0, 4000, 0.2), np.arange(4000), coarse)
+        self.offset, self.heading, self.turned, self.bend, self.metres = 0.5, 0.0, 0.0, 0.0, 0.0
+
+    @property
+    def road(self) -> float:
+        """The road's curvature where the car is, 1/m."""
+        return 0.015 * math.sin(self.metres / 40)
+
+    def steering(self) -> float:
+        """The steering of a network that sees the car where it is."""
+        offset = min(MAX_LABEL_OFFSET, max(-MAX_LABEL_OFFSET, self.offset))
+        return float(steering_for(self.road - FOR_OFFSET * offset - FOR_HEADING * self.heading))
+
+    def frame(self) -> np.ndarray:
+        """The frame that a camera takes now."""
+        columns = 1800 + np.arange(FRAME[1]) + CAMERA_MATRIX[0, 0] * self.turned
+        seen = np.interp(columns * 5, np.arange(len(self.panorama)), self.panorama)
+        return np.broadcast_to(seen[None, :, None], FRAME).astype(np.uint8)
+
+    def move(self, steering: float) -> None:
+        """Drive to the next frame."""
+        self.bend = lagged_curvature(self.bend, curvature(steering), PAUSE)
+        step = SPEED * PAUSE
+        self.turned += self.bend * step
+        self.heading += (self.bend - self.road) * step
+        self.offset += self.heading * step
+        self.metres += step
+
+
+def drive_with(late: int, lost: float, predictor: Predictor | None, seconds: float = 40) -> list[float]:
+    """Drive with frames that come so many frames late, or a share of which is lost; return the offsets, m."""
+    world, shown, rng = World(), deque[tuple[np.ndarray, float]](maxlen=late + 1), np.random.default_rng(1)
+    offsets = []
+    for number in range(round(seconds / PAUSE)):
+        if not number or rng.random() >= lost:
+            shown.append((world.frame(), world.steering()))
+        frame, steering = shown[0]
+        world.move(float(predictor(steering, frame, number * PAUSE, SPEED)) if predictor else steering)
+        offsets.append(abs(world.offset))
+    return offsets
+
+
+def test_frames_in_time_change_nothing() -> None:
+    """The network's own number is sent, bit for bit."""
+    world, predictor = World(), Predictor()
+    for number in range(300):
+        steering = np.float32(world.steering())
+        assert predictor(steering, world.frame(), number * PAUSE, SPEED) == steering
+        world.move(float(steering))
+    assert predictor.delay.frames == 0
+
+
+@pytest.mark.parametrize("late", [2, 4, 6])
+def test_late_frames(late: int) -> None:
+    """The delay is found, and the car keeps to the lane, which it leaves without a prediction when they are 4 late."""
+    predictor = Predictor()
+    predicted, alone = drive_with(late, 0, predictor), drive_with(late, 0, None)
+    assert predictor.delay.frames in (late, late - 1)  # the background turns half a frame after the steering
+    assert max(predicted[300:]) < 0.3
+    assert late < 4 or max(alone) > 3
+
+
+def test_lost_frames() -> None:
+    """Where most frames are lost, the car stays nearer to the lane's centre."""
+    predicted, alone = drive_with(0, 0.8, predictor := Predictor()), drive_with(0, 0.8, None)
+    assert predictor.delay.frames == 0
+    assert np.mean(predicted) < 0.5 * np.mean(alone)
+
+
+def test_a_car_that_stands_is_steered_as_the_network_says() -> None:
+    """Repeated frames of a car at rest, as the simulator sends them at the start, change nothing."""
+    predictor, frame = Predictor(), World().frame()
+    assert {float(predictor(0.25, frame, number * PAUSE, 0.0)) for number in range(50)} == {0.25}
+
+
+@pytest.mark.parametrize("pause", [LONGEST_PAUSE + 0.1, -5.0])
+def test_a_pause_begins_anew(pause: float) -> None:
+    """What the car did before a pause of the simulator, or a time that runs backwards, is forgotten."""
+    predictor = Predictor()
+    drive_with(4, 0, predictor)
+    assert predictor.delay.frames
+    world = World()
+    assert predictor(0.1, world.frame(), predictor.time + pause, SPEED) == np.float32(0.1)
+    assert (predictor.delay.frames, len(predictor.since), predictor.offset) == (0, 0, 0.0)
+
+
+def test_no_delay_is_seen_without_a_background() -> None:
+    """Frames of one colour, or of noise, tell nothing."""
+    rng = np.random.default_rng(0)
+    for frames in (np.zeros((100, *FRAME), np.uint8), rng.integers(0, 255, (100, *FRAME), np.uint8)):
+        predictor = Predictor()
+        for number, frame in enumerate(frames):
+            predictor(math.sin(number / 3), frame, number * PAUSE, SPEED)
+        assert predictor.delay.frames == 0
+
+
+@pytest.mark.parametrize("disturbance", ["late:5", "dropped:4"])
+def test_the_shipped_network_stays_on_the_road(disturbance: str) -> None:
+    """At 30 mph on the lake, where it leaves the road without a prediction."""
+    conditions = Conditions(str(SHIPPED_MODEL), 30, 1, "ccw", 250, (300.0, 0.0, 0.0))
+    driven = drive(conditions._replace(disturbance=Disturbance.parse(disturbance)), "lake")
+    assert (driven.ended, driven.farthest < 1.5) == ("arrived", True)
