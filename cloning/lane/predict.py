@@ -28,6 +28,7 @@ FOR_OFFSET, FOR_HEADING = 2 / LOOKAHEAD**2, 2 / LOOKAHEAD
 # fits, as it aims LOOKAHEAD ahead of it.
 REACH = 2 * LOOKAHEAD
 LONGEST_PAUSE = 1.0  # s: after a longer one nothing is known of what the car has done
+LONGEST_GAP, FASTEST = 60.0, 50.0  # m without a new frame, and m/s: more counts as so much
 
 MOST_LATE = 8  # frames
 BACKGROUND = slice(20, 60)  # the rows of a frame that show it
@@ -106,11 +107,12 @@ class Predictor:
         self.delay = Delay()
         self.frame, self.time = np.empty(0, np.uint8), 0.0
         self.sent = self.bend = 0.0  # the steering that was sent last, -1..1; the curvature that the car drives, 1/m
-        # What was driven since the last frame was taken, in the order of time: curvature, 1/m, and m
+        # What was driven in the time by which frames are late, the newest last: curvature, 1/m, and m
         self.since = deque[tuple[float, float]]()
-        # Where the car was when it was taken: m and radians from the lane's centre and direction, right positive, and
-        # the lane's curvature, 1/m; and m from the frame before to this one.
-        self.offset = self.heading = self.road = self.gap = 0.0
+        # The pose before that, and that which the last new frame shows: m and radians from the lane's centre and
+        # direction, right positive
+        self.pose = self.seen = (0.0, 0.0)
+        self.road = self.gap = 0.0  # the lane's curvature, 1/m; m since the last new frame
 
     def __call__(self, steering: float | np.floating, frame: np.ndarray, time: float, speed: float) -> np.float32:
         """Return the steering for where the car is now: just the network's if the frame is new and in time.
@@ -123,31 +125,32 @@ class Predictor:
             self.road = curvature(float(steering))
             self.frame, self.time, self.sent = frame, time, float(steering)
             return np.float32(steering)
-        before, metres = self.bend, speed * pause
+        before, metres = self.bend, min(max(speed, 0.0), FASTEST) * pause
         self.bend = lagged_curvature(before, curvature(self.sent), pause)
         driven = (before + self.bend) / 2
         self.since.append((driven, metres))
-        self.gap += metres
-        repeated = np.array_equal(frame, self.frame)
+        self.gap = min(self.gap + metres, LONGEST_GAP)
+        new = not np.array_equal(frame, self.frame)
         late = self.delay(frame, CAMERA_MATRIX[0, 0] * driven * metres, pause)
         self.frame, self.time = frame, time
-        if not repeated:
-            while len(self.since) > late:
-                self.offset, self.heading = self._after(*self.since.popleft(), self.offset, self.heading)
+        while len(self.since) > late:
+            self.pose = self._after(self.pose, *self.since.popleft())
+        if new:
             self._see(curvature(float(steering)))
         corrected = np.float32(steering)
-        if self.since:
-            offset, heading = self.offset, self.heading
-            for bend, length in self.since:
-                offset, heading = self._after(bend, length, offset, heading)
-            change = FOR_OFFSET * (self.offset - offset) + FOR_HEADING * (self.heading - heading)
+        if late or not new:
+            offset, heading = self.pose
+            for driven, metres in self.since:
+                offset, heading = self._after((offset, heading), driven, metres)
+            change = FOR_OFFSET * (self.seen[0] - offset) + FOR_HEADING * (self.seen[1] - heading)
             weight = 1.0 if late else min(1.0, self.gap / REACH)
             corrected = np.float32(steering_for(curvature(float(steering)) + weight * change))
         self.sent = float(corrected)
         return corrected
 
-    def _after(self, bend: float, metres: float, offset: float, heading: float) -> tuple[float, float]:
-        """Return offset and heading after so many metres of a curvature from these."""
+    def _after(self, pose: tuple[float, float], bend: float, metres: float) -> tuple[float, float]:
+        """Return the pose after so many metres of a curvature from this one."""
+        offset, heading = pose
         turn = (bend - self.road) * metres
         return offset + (heading + turn / 2) * metres, heading + turn
 
@@ -158,16 +161,15 @@ class Predictor:
         and beside its centre otherwise than expected, by as much as is likely for a random walk of the curvature.
         """
         gap, a, b = self.gap, FOR_OFFSET, FOR_HEADING
-        faded = math.exp(-gap / LOOKAHEAD)  # offset and heading, which are integrals, gather errors
-        self.offset, self.heading = faded * self.offset, faded * self.heading
+        faded = math.exp(-gap / LOOKAHEAD)  # the pose, which is an integral, gathers errors
+        offset, heading = faded * self.pose[0], faded * self.pose[1]
         shares = (
             -(gap**2 / 6 + b * gap**3 / 8 + a * gap**4 / 20),
             -(gap / 2 + b * gap**2 / 3 + a * gap**3 / 8),
             1 + b * gap / 2 + a * gap**2 / 6,
         )
-        new = aim - (self.road - a * self.offset - b * self.heading)
+        new = aim - (self.road - a * offset - b * heading)
         new /= shares[2] - a * shares[0] - b * shares[1]
-        self.offset, self.heading, self.road = (
-            known + new * share for known, share in zip((self.offset, self.heading, self.road), shares, strict=True)
-        )
+        self.pose = self.seen = offset + new * shares[0], heading + new * shares[1]
+        self.road += new * shares[2]
         self.gap = 0.0

@@ -9,7 +9,7 @@ from cloning.replay.replay import ReplayFrame
 
 
 class ModelDriver:
-    """Steers by a model in this process, with the same arithmetic as drive.py."""
+    """Steers by a model in this process, with drive.py's arithmetic, but without its correction for late frames."""
 
     def __init__(self, model: str | Network):
         """Load the model; model: its file, or the network itself. Raises ModelError."""
