@@ -103,14 +103,28 @@ def test_a_car_that_stands_is_steered_as_the_network_says() -> None:
     assert {float(predictor(0.25, frame, number * PAUSE, 0.0)) for number in range(50)} == {0.25}
 
 
-def test_a_camera_that_freezes_for_long_costs_no_more_and_a_speed_beyond_all_cars_is_no_number_lost() -> None:
+@pytest.mark.parametrize("frames", [1, 2, 3, 7])
+def test_frames_that_recur_are_no_late_or_lost_ones(frames: int) -> None:
+    """A program that sends a few frames again and again, at any speed, gets the network's own numbers."""
+    world, seen, predictor = World(), list[tuple[np.ndarray, np.float32]](), Predictor()
+    for _ in range(frames):
+        seen.append((world.frame(), np.float32(world.steering())))
+        world.move(float(seen[-1][1]))
+    for number in range(400):
+        frame, steering = seen[number % frames]
+        assert predictor(steering, frame.copy(), number * PAUSE, SPEED) == steering
+
+
+def test_a_camera_that_freezes_for_long_and_a_speed_beyond_that_of_cars_do_no_harm() -> None:
     """Whatever is told of the speed, the steering is a number of -1..1, and nothing grows."""
-    predictor, frame = Predictor(), World().frame()
-    for number in range(3000):
+    predictor = Predictor()
+    drive_with(0, 0.8, predictor)
+    frame, until = World(2).frame(), predictor.time
+    for number in range(1, 3000):
         speed = (SPEED, 1e300, -1e300)[number % 3] if number > 2000 else SPEED
-        assert abs(predictor(0.3, frame, number * PAUSE, speed)) <= 1
+        assert abs(predictor(0.3, frame, until + number * PAUSE, speed)) <= 1
     assert len(predictor.since) <= 1
-    assert abs(predictor(0.3, World(1).frame(), 3000 * PAUSE, SPEED)) <= 1
+    assert abs(predictor(0.3, World(1).frame(), until + 3000 * PAUSE, SPEED)) <= 1
 
 
 @pytest.mark.parametrize("pause", [LONGEST_PAUSE + 0.1, -5.0])

@@ -24,9 +24,10 @@ from cloning.road.motion import curvature, lagged_curvature, steering_for
 # By how much the network steers to the left, as a curvature in 1/m, for each m and radian that the car is further to
 # the right: pure pursuit of a point LOOKAHEAD ahead of the rear axle, for small angles.
 FOR_OFFSET, FOR_HEADING = 2 / LOOKAHEAD**2, 2 / LOOKAHEAD
-# m: the longer a lost frame is ago, up to this, the more the prediction counts. Over a short distance the last steering
-# fits, as it aims LOOKAHEAD ahead of it.
-REACH = 2 * LOOKAHEAD
+# m without a new frame from which the prediction counts, by a share of this over REACH, and at most wholly. Over a
+# short distance the last steering fits, as it aims LOOKAHEAD ahead.
+NEAR, REACH = LOOKAHEAD / 3, 2 * LOOKAHEAD
+LEAST_NEW = 5  # new frames after which one that repeats is a lost one; before, the camera may never show another
 LONGEST_PAUSE = 1.0  # s: after a longer one nothing is known of what the car has done
 LONGEST_GAP, FASTEST = 60.0, 50.0  # m without a new frame, and m/s: more counts as so much
 
@@ -36,9 +37,9 @@ MARGIN, FARTHEST = 16, 24  # columns at each edge that are left out, and by whic
 CLEAR = 0.3  # least share by which the best match of two backgrounds is better than their median match
 MEMORY, STEADY = 4.0, 0.7  # s over which turns are compared, and over which their mean is taken, which does not count
 LEAST_FRAMES, LEAST_TURN = 20, 0.5  # that tell how late frames are, and columns by which they turn (root mean square)
-# The correlation from which that is certain, and at most how much of the variance that the delay so far leaves
-# unexplained another one may leave.
-CERTAIN, BETTER = 0.8, 0.6
+# The correlation from which a delay is certain, and how much it leaves unexplained of the variance, at most, as a share
+# of what the delay so far leaves, and any by more than NEXT frames more or less: frames that recur fit at several.
+CERTAIN, BETTER, NEXT = 0.8, 0.6, 2
 
 
 class Delay:
@@ -73,8 +74,9 @@ class Delay:
         correlation = self.products / np.sqrt(self.squares * self.moved + 1e-9)
         best = int(correlation.argmax())
         unexplained = 1 - np.maximum(correlation, 0) ** 2
+        rivals = np.append(unexplained[np.abs(np.arange(MOST_LATE + 1) - best) > NEXT], unexplained[self.frames])
         enough = self.count > LEAST_FRAMES and self.moved > LEAST_TURN**2 * self.count
-        if enough and correlation[best] > CERTAIN and unexplained[best] < BETTER * unexplained[self.frames]:
+        if enough and correlation[best] > CERTAIN and unexplained[best] < BETTER * rivals.min():
             self.frames = best
         return self.frames
 
@@ -112,7 +114,7 @@ class Predictor:
         # The pose before that, and that which the last new frame shows: m and radians from the lane's centre and
         # direction, right positive
         self.pose = self.seen = (0.0, 0.0)
-        self.road = self.gap = 0.0  # the lane's curvature, 1/m; m since the last new frame
+        self.road, self.gap, self.new = 0.0, 0.0, 0  # the lane's curvature, 1/m; m since the last of so many new frames
 
     def __call__(self, steering: float | np.floating, frame: np.ndarray, time: float, speed: float) -> np.float32:
         """Return the steering for where the car is now: just the network's if the frame is new and in time.
@@ -138,13 +140,14 @@ class Predictor:
         if new:
             self._see(curvature(float(steering)))
         corrected = np.float32(steering)
-        if late or not new:
+        if late or (self.gap > NEAR and self.new >= LEAST_NEW):
             offset, heading = self.pose
             for driven, metres in self.since:
                 offset, heading = self._after((offset, heading), driven, metres)
             change = FOR_OFFSET * (self.seen[0] - offset) + FOR_HEADING * (self.seen[1] - heading)
-            weight = 1.0 if late else min(1.0, self.gap / REACH)
-            corrected = np.float32(steering_for(curvature(float(steering)) + weight * change))
+            if change:
+                weight = 1.0 if late else min(1.0, self.gap / REACH)
+                corrected = np.float32(steering_for(curvature(float(steering)) + weight * change))
         self.sent = float(corrected)
         return corrected
 
@@ -172,4 +175,4 @@ class Predictor:
         new /= shares[2] - a * shares[0] - b * shares[1]
         self.pose = self.seen = offset + new * shares[0], heading + new * shares[1]
         self.road += new * shares[2]
-        self.gap = 0.0
+        self.gap, self.new = 0.0, self.new + 1
