@@ -59,14 +59,18 @@ class World:
 
 
 def drive_with(late: int, lost: float, predictor: Predictor | None, seconds: float = 40) -> list[float]:
-    """Drive with frames that come so many frames late, or a share of which is lost; return the offsets, m."""
+    """Drive with frames that come so many frames late, or a share of which is lost; return the offsets, m.
+
+    The times that the predictor is told are wrong by some 5 ms, as those of a server that looks at its clock.
+    """
     world, shown, rng = World(), deque[tuple[np.ndarray, float]](maxlen=late + 1), np.random.default_rng(1)
-    offsets = []
+    offsets, noise = [], np.random.default_rng(2)
     for number in range(round(seconds / PAUSE)):
         if not number or rng.random() >= lost:
             shown.append((world.frame(), world.steering()))
         frame, steering = shown[0]
-        world.move(float(predictor(steering, frame, number * PAUSE, SPEED)) if predictor else steering)
+        time = number * PAUSE + noise.uniform(-0.008, 0.008)
+        world.move(float(predictor(steering, frame, time, SPEED)) if predictor else steering)
         offsets.append(abs(world.offset))
     return offsets
 
@@ -87,7 +91,7 @@ def test_late_frames(late: int, weaves: float) -> None:
     predictor = Predictor()
     predicted, alone = drive_with(late, 0, predictor), drive_with(late, 0, None)
     assert predictor.delay.frames in (late, late - 1)  # the background turns half a frame after the steering
-    assert max(predicted[300:]) < 0.12 * weaves and max(alone[300:]) > weaves
+    assert max(predicted[300:]) < 0.2 * weaves and max(alone[300:]) > weaves
 
 
 def test_lost_frames() -> None:

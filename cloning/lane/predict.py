@@ -40,13 +40,14 @@ LEAST_FRAMES, LEAST_TURN = 20, 0.5  # that tell how late frames are, and columns
 # The correlation from which a delay is certain, and how much it leaves unexplained of the variance, at most, as a share
 # of what the delay so far leaves, and any by more than NEXT frames more or less: frames that recur fit at several.
 CERTAIN, BETTER, NEXT = 0.8, 0.6, 2
+AGAIN = 5  # frames, one after another, that must tell the same, because the time of each is known to some 10 ms only
 
 
 class Delay:
     """How many frames late those of one drive are."""
 
     def __init__(self) -> None:
-        self.frames = 0
+        self.frames = self.found = self.times = 0  # the delay that is told, and another, found so many times running
         self.background = np.empty(0, np.float32)  # of the last frame
         self.turns = np.zeros(MOST_LATE + 1)  # without their mean, the newest first
         self.means = np.zeros(2)  # of turns and movements
@@ -76,7 +77,10 @@ class Delay:
         unexplained = 1 - np.maximum(correlation, 0) ** 2
         rivals = np.append(unexplained[np.abs(np.arange(MOST_LATE + 1) - best) > NEXT], unexplained[self.frames])
         enough = self.count > LEAST_FRAMES and self.moved > LEAST_TURN**2 * self.count
-        if enough and correlation[best] > CERTAIN and unexplained[best] < BETTER * rivals.min():
+        certain = enough and correlation[best] > CERTAIN and unexplained[best] < BETTER * rivals.min()
+        self.times = (self.times + 1 if best == self.found else 1) if certain else 0
+        self.found = best
+        if self.times >= AGAIN:
             self.frames = best
         return self.frames
 
