@@ -58,7 +58,7 @@ class Session(page.Session):
         self.server = server
         self.controller = SpeedController(server.set_speed)
         self.foretell = Foreteller(server.observer, server.limits) if server.observer and server.limits else None
-        self.predictor, self.late = Predictor(), 0  # frames that they come late, as was told last
+        self.predictor, self.late = Predictor(), 0  # how many frames late its frames are, as was told last
         self.heeds = server.stop_when_lost  # whether it slows down and stops where the network is lost
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
