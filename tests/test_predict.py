@@ -154,7 +154,7 @@ def test_no_delay_is_seen_without_a_background() -> None:
 
 @pytest.mark.parametrize("disturbance", ["late:5", "dropped:4"])
 def test_the_shipped_network_stays_on_the_road(disturbance: str) -> None:
-    """At 30 mph on the lake, where it leaves the road without a prediction."""
+    """At 30 mph on the lake, with frames 0.4 s late, or with three of four lost."""
     conditions = Conditions(str(SHIPPED_MODEL), 30, 1, "ccw", 250, (300.0, 0.0, 0.0))
     driven = drive(conditions._replace(disturbance=Disturbance.parse(disturbance)), "lake")
     assert (driven.ended, driven.farthest < 1.5) == ("arrived", True)

@@ -146,8 +146,8 @@ class Predictor:
         corrected = np.float32(steering)
         if late or (self.gap > NEAR and self.new >= LEAST_NEW):
             offset, heading = self.pose
-            for driven, metres in self.since:
-                offset, heading = self._after((offset, heading), driven, metres)
+            for bend, length in self.since:
+                offset, heading = self._after((offset, heading), bend, length)
             change = FOR_OFFSET * (self.seen[0] - offset) + FOR_HEADING * (self.seen[1] - heading)
             if change:
                 weight = 1.0 if late else min(1.0, self.gap / REACH)
@@ -175,8 +175,8 @@ class Predictor:
             -(gap / 2 + b * gap**2 / 3 + a * gap**3 / 8),
             1 + b * gap / 2 + a * gap**2 / 6,
         )
-        new = aim - (self.road - a * offset - b * heading)
-        new /= shares[2] - a * shares[0] - b * shares[1]
-        self.pose = self.seen = offset + new * shares[0], heading + new * shares[1]
-        self.road += new * shares[2]
+        surprise = aim - (self.road - a * offset - b * heading)
+        surprise /= shares[2] - a * shares[0] - b * shares[1]
+        self.pose = self.seen = offset + surprise * shares[0], heading + surprise * shares[1]
+        self.road += surprise * shares[2]
         self.gap, self.new = 0.0, self.new + 1
