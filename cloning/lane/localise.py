@@ -107,21 +107,26 @@ def localise_recording(
 
     stretches: of the recording; detect: returns what `reader.detect_centres` does with a network.
     """
-    positions, localised = list[LanePosition](), list[tuple[slice, Localisation]]()
+    detected, localised = list[np.ndarray](), list[tuple[slice, Localisation]]()
     piece = np.zeros(len(recording), np.int32)
     for network in networks:
-        centres = detect(network)
-        positions.append(fuse_detections(recording, centres))
-        localised = localised or list(localise_all(recording, stretches, centres, strips))
+        detected.append(detect(network))
+        localised = localised or list(localise_all(recording, stretches, detected[-1], strips))
         piece = _pieces(len(recording), stretches, [rows for rows, _ in localised])
         if localised and all(piece[stretch.rows].all() for stretch in stretches):
             break
-    unknown = piece == 0
-    first, last = positions[0], positions[-1]
-    difference = np.abs(first.lateral_offset - last.lateral_offset)[unknown]
-    agree = difference.sum() < MAX_DIFFERENCE * len(difference)
-    is_first = agree and first.trusted[unknown].sum() >= last.trusted[unknown].sum()
-    position = replace(first if is_first else last, placed=piece > 0, piece=piece)
+    placed, unknown = piece > 0, piece == 0
+    if placed.all():
+        offset, heading_error = np.zeros((2, len(recording)), np.float32)
+        position = LanePosition.read(offset, heading_error, placed.copy())
+    else:
+        positions = [fuse_detections(recording, centres) for centres in detected]
+        first, last = positions[0], positions[-1]
+        difference = np.abs(first.lateral_offset - last.lateral_offset)[unknown]
+        agree = difference.sum() < MAX_DIFFERENCE * len(difference)
+        is_first = agree and first.trusted[unknown].sum() >= last.trusted[unknown].sum()
+        position = first if is_first else last
+    position = replace(position, placed=placed, piece=piece)
     for rows, localisation in localised:
         _, offset, heading_error = localisation.states.T
         position.lateral_offset[rows] = offset + REAR_AXLE * np.sin(heading_error)
@@ -171,11 +176,13 @@ def colours_exchanged(strips: np.ndarray, network: LaneNetwork) -> bool:
 
     strips: uint8 (n, 3, 32, 160, 3), of `reader.read_strips`.
     """
-    errors = []
-    for seen in (strips, np.ascontiguousarray(strips[..., ::-1])):
+
+    def error(seen: np.ndarray) -> float:
         near = estimate_centres(seen, network)[..., :2] + MOUNT_OFFSETS[:, None]
-        errors.append(np.abs(near[:, 1:] - near[:, :1]).mean())
-    return bool(errors[0] > max(COLOUR_ERROR, 2 * errors[1]))
+        return float(np.abs(near[:, 1:] - near[:, :1]).mean())
+
+    found = error(strips)
+    return found > COLOUR_ERROR and found > 2 * error(np.ascontiguousarray(strips[..., ::-1]))
 
 
 def shipped_networks() -> Iterator[LaneNetwork]:
