@@ -29,7 +29,7 @@ from cloning.base.arguments import MAX_PORT, address, command_line, number
 from cloning.base.errors import UserError
 from cloning.base.frame import FRAME
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
-from cloning.lane.predict import Predictor
+from cloning.lane.pilot import Pilot
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
 from cloning.recordings import saved_frames
 from cloning.road.motion import MPH, SET_SPEED_MPH, TOP_SPEED_MPH
@@ -57,8 +57,9 @@ class Session(page.Session):
         super().__init__()
         self.server = server
         self.controller = SpeedController(server.set_speed)
-        self.foretell = Foreteller(server.observer, server.limits) if server.observer and server.limits else None
-        self.predictor, self.late = Predictor(), 0  # how many frames late its frames are, as was told last
+        foretell = Foreteller(server.observer, server.limits) if server.observer and server.limits else None
+        self.pilot = Pilot(lambda frame: steer(server.network, frame), foretell)
+        self.late = 0  # how many frames late its frames are, as was told last
         self.heeds = server.stop_when_lost  # whether it slows down and stops where the network is lost
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
@@ -76,14 +77,11 @@ class Session(page.Session):
         try:
             self.separator = decimal_separator(message, self.separator)
             telemetry = parse_telemetry(message)
-            place, risk, speed = telemetry.place, None, telemetry.speed * MPH
+            place = telemetry.place
             now = place.time if place else time.monotonic()
-            if self.foretell:
-                steering, risk = self.foretell(telemetry.image, now, speed)
+            self.steering, risk = self.pilot(telemetry.image, now, telemetry.speed * MPH)
+            if risk is not None:
                 self.slow_down(risk)
-            else:
-                steering = steer(self.server.network, telemetry.image)
-            self.steering = self.predictor(steering, telemetry.image, now, speed)
             self.tell_of_delay()
             throttle = self.controller.throttle(telemetry.speed)
         except Exception as error:  # whatever it is: without an answer the car would stand still
@@ -118,8 +116,8 @@ class Session(page.Session):
 
     def tell_of_delay(self) -> None:
         """Log how late the frames are, if that is found to be otherwise than before."""
-        if self.late != self.predictor.delay.frames:
-            self.late = self.predictor.delay.frames
+        if self.late != self.pilot.predictor.delay.frames:
+            self.late = self.pilot.predictor.delay.frames
             what = f"frames come {self.late} frames late: steering for where the car is now"
             log.warning(what if self.late else "frames are in time again", extra={"warned": self.warned})
 

@@ -27,7 +27,7 @@ import numpy as np
 from cloning.base.errors import SimulatorError, UserError
 from cloning.base.frame import FRAME
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
-from cloning.lane.predict import Predictor
+from cloning.lane.pilot import Pilot
 from cloning.network.compute import one_thread
 from cloning.network.network import load_model, steer
 from cloning.recordings.format import SAMPLE_RATE
@@ -247,19 +247,21 @@ def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | No
         return _drive(conditions, road, None, watch)
     if address is None:
         steering, known = load_driver(conditions.driver), conditions.foretell and load_limits_of(conditions.driver)
-        foretell, alarms = Foreteller(*known) if known else None, list[float]()
-        predictor = None if conditions.driver.endswith(".onnx") else Predictor()  # as in drive.py
+        alarms = list[float]()
+        pilot = None if conditions.driver.endswith(".onnx") else Pilot(steering, Foreteller(*known) if known else None)
 
         def answer(image: bytes, run: Run) -> Answer:
-            frame, now = decode(image), (run.time, run.speed_mph * MPH)
-            found, risk = foretell(frame, *now) if foretell else (steering(frame), 0.0)
-            if risk >= ALARM:
+            frame = decode(image)
+            if not pilot:
+                return Answer(float(format_number(steering(frame))))
+            found, risk = pilot(frame, run.time, run.speed_mph * MPH)  # as in drive.py
+            if risk is not None and risk >= ALARM:
                 alarms.append(run.time)
-            return Answer(float(format_number(float(predictor(found, frame, *now) if predictor else found))))
+            return Answer(float(format_number(float(found))))
 
         try:
             done = _drive(conditions, road, answer, watch)
-            return replace(done, alarms=tuple(alarms)) if foretell else done
+            return replace(done, alarms=tuple(alarms)) if known else done
         except ArithmeticError as error:
             raise SimulatorError(f"{conditions.driver}: {error}; train the model again") from None
     with closing(ClientSession(*address, WAIT)) as session:

@@ -267,7 +267,7 @@ def test_limits_belong_to_one_network_and_a_damaged_file_is_refused(limits, netw
 def test_a_car_slows_down_and_stops_when_the_network_is_lost_and_a_person_may_let_it_go_on(network, limits):
     server = drive.DriveServer(network, 20, limits=limits, stop_when_lost=True)
     session, risks = server.session("sid"), [0.0]
-    session.foretell = lambda *frame: (np.float32(0), risks[0])  # type: ignore[assignment]
+    session.pilot.foretell = lambda *frame: (np.float32(0), risks[0])  # type: ignore[assignment]
 
     def set_speed(risk: float) -> float:
         risks[0] = risk

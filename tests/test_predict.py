@@ -3,9 +3,12 @@
 import json
 import math
 from collections import deque
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+import real_recordings
 
 import drive as drive_py
 from cloning.base.frame import FRAME
@@ -13,6 +16,9 @@ from cloning.lane.predict import FOR_HEADING, FOR_OFFSET, LONGEST_PAUSE, Predict
 from cloning.lane.recovery import MAX_LABEL_OFFSET
 from cloning.network.network import SHIPPED_MODEL, Network
 from cloning.recordings.images import encode
+from cloning.recordings.log import read_recording
+from cloning.replay import replay
+from cloning.replay.model_driver import ModelDriver
 from cloning.road.camera import CAMERA_MATRIX
 from cloning.road.disturbances import Disturbance
 from cloning.road.motion import MPH, TOP_SPEED_MPH, curvature, lagged_curvature, steering_for
@@ -158,6 +164,33 @@ def test_the_shipped_network_stays_on_the_road(disturbance: str) -> None:
     conditions = Conditions(str(SHIPPED_MODEL), 30, 1, "ccw", 250, (300.0, 0.0, 0.0))
     driven = drive(conditions._replace(disturbance=Disturbance.parse(disturbance)), "lake")
     assert (driven.ended, driven.farthest < 1.5) == ("arrived", True)
+
+
+def test_a_disturbed_replay_is_corrected_in_each_stretch_anew(
+    sample_recording: Path, network: Network, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the pilot steers counts; frames as they were recorded are in time."""
+    recording, pilots = read_recording(sample_recording), []
+
+    def pilot(steer: object) -> Callable[..., tuple[np.float32, None]]:
+        pilots.append(steer)
+        return lambda frame, time, speed: (np.float32(0.25), None)
+
+    monkeypatch.setattr("cloning.replay.model_driver.Pilot", pilot)
+    lines = replay.reference_lines(recording, by_lane=False)
+    driven = replay.drive(recording, lines * 2, 2.5, ModelDriver(network), None, Disturbance("late", 3))
+    assert set(driven.steering) == {0.25} and len(pilots) == 2
+    replay.drive(recording, lines, 2.5, ModelDriver(network))
+    assert len(pilots) == 2
+
+
+@pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)
+def test_a_real_recording_is_driven_with_late_frames() -> None:
+    """A lake at 30 mph, 0.3 s late: without the correction, the network leaves the lane again and again."""
+    recording = read_recording(next(each for each in real_recordings.FOLDERS if "lake" in each.name)).take(slice(600))
+    lines = replay.reference_lines(recording)
+    driven = replay.drive(recording, lines, 2.5, ModelDriver(str(SHIPPED_MODEL)), None, Disturbance("late", 4))
+    assert not driven.interventions and np.abs(driven.offset).mean() < 0.4
 
 
 def test_drive_py_tells_once_how_late_frames_are(

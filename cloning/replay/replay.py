@@ -186,14 +186,14 @@ class ReplayedCar:
 
 
 class ReplayFrame:
-    """What a driver is given at one row: speed, and the view from the car's pose, warped when it is first used."""
+    """What a driver is given at one row: speed, time, and the view from the car's pose, warped at its first use."""
 
     def __init__(
         self, recording: Recording, views: StretchViews, car: ReplayedCar, at: int, disturber: Disturber | None = None
     ):
         self.views, self.at, self.pose, self.disturber = views, at, (car.right, car.yaw), disturber
         self.line, self.row = car.line, car.line.rows.start + at
-        self.speed = float(recording.speed[self.row])  # mph
+        self.speed, self.time = float(recording.speed[self.row]), float(recording.time[self.row])  # mph, s
         self.human_steering = float(car.human_steering[at])  # -1..1
 
     @functools.cached_property

@@ -1,0 +1,25 @@
+"""Steers one drive: a network does, but for frames that come late or are lost."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from cloning.lane.foretell import Foreteller
+from cloning.lane.predict import Predictor
+
+
+class Pilot:
+    """Lets the network steer, and corrects it for late and lost frames."""
+
+    def __init__(self, steer: Callable[[np.ndarray], float | np.floating], foretell: Foreteller | None = None):
+        """steer: returns the network's steering, -1..1, for a frame; foretell: steers instead, and tells the risk."""
+        self.steer, self.foretell = steer, foretell
+        self.predictor = Predictor()
+
+    def __call__(self, frame: np.ndarray, time: float, speed: float) -> tuple[np.float32, float | None]:
+        """Return the steering, -1..1, and the risk, 0..1, that the car leaves the road, None if that is not known.
+
+        frame: the drive's next one, uint8 (160, 320, 3) RGB; time: s; speed: m/s. Raises ArithmeticError as `steer`.
+        """
+        found, risk = self.foretell(frame, time, speed) if self.foretell else (self.steer(frame), None)
+        return self.predictor(found, frame, time, speed), risk
