@@ -11,9 +11,9 @@ from cloning.road.motion import MPH
 
 
 class ModelDriver:
-    """Steers by a model in this process, with drive.py's arithmetic, and if frames are disturbed with its correction.
+    """Steers by a model in this process, with drive.py's arithmetic.
 
-    That needs all rows of a frame, which are otherwise not made.
+    Disturbed frames may be late or lost: for them drive.py's correction counts, too, which needs all rows of a frame.
     """
 
     def __init__(self, model: str | Network):
