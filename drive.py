@@ -58,8 +58,9 @@ class Session(page.Session):
         self.server = server
         self.controller = SpeedController(server.set_speed)
         foretell = Foreteller(server.observer, server.limits) if server.observer and server.limits else None
-        self.pilot = Pilot(lambda frame: steer(server.network, frame), foretell)
+        self.pilot = Pilot(lambda frame: steer(server.network, frame), foretell, server.as_mounted)
         self.late = 0  # how many frames late its frames are, as was told last
+        self.moved = [False] * 3  # in which ways its camera is mounted otherwise, likewise
         self.heeds = server.stop_when_lost  # whether it slows down and stops where the network is lost
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
@@ -82,7 +83,7 @@ class Session(page.Session):
             self.steering, risk = self.pilot(telemetry.image, now, telemetry.speed * MPH)
             if risk is not None:
                 self.slow_down(risk)
-            self.tell_of_delay()
+            self.tell_of_camera()
             throttle = self.controller.throttle(telemetry.speed)
         except Exception as error:  # whatever it is: without an answer the car would stand still
             self.unusable += 1
@@ -114,12 +115,17 @@ class Session(page.Session):
             "throttle": format_number(throttle, self.separator),
         }
 
-    def tell_of_delay(self) -> None:
-        """Log how late the frames are, if that is found to be otherwise than before."""
+    def tell_of_camera(self) -> None:
+        """Log how late the frames are, and how they are moved, if that is found to be otherwise than before."""
         if self.late != self.pilot.predictor.delay.frames:
             self.late = self.pilot.predictor.delay.frames
             what = f"frames come {self.late} frames late: steering for where the car is now"
             log.warning(what if self.late else "frames are in time again", extra={"warned": self.warned})
+        mount = self.pilot.mount
+        if mount and self.moved != [bool(move) for move in mount.found]:
+            self.moved = [bool(move) for move in mount.found]
+            what = f"the camera's picture is moved by {mount}: frames are moved back (with --as-mounted they are not)"
+            log.warning(what if any(self.moved) else "the picture is not moved any more", extra={"warned": self.warned})
 
     def slow_down(self, risk: float) -> None:
         """Slow the car down from a risk of ALARM on, and stop it for good at that of the network's limits."""
@@ -159,13 +165,17 @@ class DriveServer:
         model: str = "",
         limits: Limits | None = None,
         stop_when_lost: bool = False,
+        as_mounted: bool = False,
     ):
-        """set_speed: mph; model: the network's name on the page; stop_when_lost: needs the network's limits."""
+        """set_speed: mph; model: the network's name on the page; stop_when_lost: needs the network's limits.
+
+        as_mounted: see `Pilot`.
+        """
         from cloning.server import server  # here, because it needs the socket libraries
 
         self.network, self.model, self.set_speed = network, model, set_speed
         self.go_speed = set_speed or SET_SPEED_MPH
-        self.limits, self.stop_when_lost = limits, stop_when_lost
+        self.limits, self.stop_when_lost, self.as_mounted = limits, stop_when_lost, as_mounted
         self.observer = Observer(network) if limits else None
         self.saver: saved_frames.FrameSaver | None = None  # saves the frames
         self.recording = False  # whether it does so now
@@ -326,6 +336,10 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--port", type=number(int, 0, MAX_PORT), default=PORT, help=port)
     lost = "slow down and stop the car where the network would probably leave the road"
     add("--stop-when-lost", action="store_true", help=lost)
+    mounted = (
+        "take frames as they are, also if the camera seems turned or shifted, as for a network trained on such frames"
+    )
+    add("--as-mounted", action="store_true", help=mounted)
     device = "device that runs the network (default %(default)s, which is fast enough)"
     add("--device", default="cpu", choices=["cpu", "cuda"], help=device)
     parsed = parser.parse_intermixed_args(arguments)  # the folder may follow options
@@ -353,7 +367,8 @@ def main() -> int:
     if arguments.folder:
         saved_frames.check_folder(arguments.folder)
     origin = "the model that comes with the project" if model == SHIPPED_MODEL else ""
-    server = DriveServer(network, arguments.speed, origin or str(model), limits, arguments.stop_when_lost)
+    name, options = origin or str(model), (arguments.stop_when_lost, arguments.as_mounted)
+    server = DriveServer(network, arguments.speed, name, limits, *options)
     where_taken = f"for the stand-in alone choose another --port: Udacity's simulator connects to {PORT} only"
     listener = connections.claim_port(arguments.host, arguments.port, where_taken)
     if arguments.folder:

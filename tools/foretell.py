@@ -45,6 +45,7 @@ from cloning.lane.foretell import (
     odds_of_one,
     save_limits,
 )
+from cloning.lane.mount import Mount
 from cloning.lane.predict import Predictor
 from cloning.network.compute import one_thread, threads
 from cloning.network.network import SHIPPED_MODEL, load_model
@@ -145,10 +146,11 @@ def drive(model: Path, course: Course) -> Drive:
     run.set_back()
     disturber = Disturber(Disturbance.parse(course.disturbance), course.number) if course.disturbance else None
     controller, clock = SpeedController(15 if course.kind == ORDINARY else 25), SampleClock(1 / SAMPLE_RATE)
-    predictor, blindness, seen, blind, time, away = Predictor(), Blindness(), [], [], [], []
+    mount, predictor, blindness = Mount(), Predictor(), Blindness()
+    seen, blind, time, away = list[Observation](), list[float](), list[float](), list[float]()
     while run.time < (30 if disturber else 40) and len(run.departures) < MAX_DEPARTURES:
         frame = decode(jpeg(cameras.frames(run.car.node.get_transform())[0]))
-        frame = disturber(frame) if disturber else frame
+        frame = mount(disturber(frame) if disturber else frame)
         seen.append(observe(frame))
         blind.append(blindness(frame, run.time, run.speed_mph * MPH))
         time.append(run.time)

@@ -11,7 +11,7 @@ and is fast enough for a training: albumentations ended in 2025 (its successor h
 
 import functools
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Self
 
 import cv2
@@ -221,29 +221,34 @@ def occluded(image: np.ndarray, covered: float, seed: int, frame: Generator) -> 
     return changed
 
 
-def _moved(image: np.ndarray, right: float, down: float, degrees: float) -> np.ndarray:
-    """Move a picture by pixels and turn it around its middle; its edges are drawn out."""
-    rows, columns = image.shape[:2]
+def moved(
+    image: np.ndarray, mount: Sequence[float] | np.ndarray, border: int = cv2.BORDER_REPLICATE, back: bool = False
+) -> np.ndarray:
+    """Return a picture turned anticlockwise about its middle, then moved; its edges are drawn out, or as `border` says.
+
+    mount: pixels to the right, pixels down and degrees; back: undo that.
+    """
+    (rows, columns), (right, down, degrees) = image.shape[:2], mount
     matrix = cv2.getRotationMatrix2D((columns / 2, rows / 2), degrees, 1)
     matrix[:, 2] += np.array([right, down])
-    return cv2.warpAffine(image, matrix, (columns, rows), borderMode=cv2.BORDER_REPLICATE)
+    flags = cv2.INTER_LINEAR | (cv2.WARP_INVERSE_MAP if back else 0)
+    return cv2.warpAffine(image, matrix, (columns, rows), flags=flags, borderMode=border)
 
 
 def shifted(image: np.ndarray, pixels: float, seed: int, frame: Generator) -> np.ndarray:
     """Let the camera look in another direction."""
     angle = _drive(seed).uniform(0, 2 * np.pi)
-    return _moved(image, pixels * np.cos(angle), pixels * np.sin(angle), 0)
+    return moved(image, (pixels * np.cos(angle), pixels * np.sin(angle), 0))
 
 
 def turned(image: np.ndarray, degrees: float, seed: int, frame: Generator) -> np.ndarray:
     """Roll the camera to either side."""
-    return _moved(image, 0, 0, _drive(seed).choice((-1, 1)) * degrees)
+    return moved(image, (0, 0, _drive(seed).choice((-1, 1)) * degrees))
 
 
 def shaken(image: np.ndarray, pixels: float, seed: int, frame: Generator) -> np.ndarray:
     """Shake the camera from frame to frame."""
-    right, down, degrees = frame.normal(0, [pixels, pixels, pixels / 3])
-    return _moved(image, right, down, degrees)
+    return moved(image, frame.normal(0, [pixels, pixels, pixels / 3]))
 
 
 def _as_it_is(image: np.ndarray, parameter: float, seed: int, frame: Generator) -> np.ndarray:
