@@ -60,7 +60,7 @@ class Session(page.Session):
         foretell = Foreteller(server.observer, server.limits) if server.observer and server.limits else None
         self.pilot = Pilot(lambda frame: steer(server.network, frame), foretell, server.as_mounted)
         self.late = 0  # how many frames late its frames are, as was told last
-        self.moved = [False] * 3  # in which ways its camera is mounted otherwise, likewise
+        self.moved = [0.0] * 3  # in which ways its camera's picture is moved, likewise
         self.heeds = server.stop_when_lost  # whether it slows down and stops where the network is lost
         self.separator = "."  # decimal separator of the simulator's culture, the only one that it understands
         self.steering = np.float32(0)  # of the last answer, -1..1
@@ -97,7 +97,7 @@ class Session(page.Session):
                 extra={"warned": self.warned},
             )
         else:
-            self.frame = telemetry.image
+            self.frame = self.pilot.seen
             self.driven += 1
             self.place = place
             if self.server.saver and self.server.recording:
@@ -122,10 +122,10 @@ class Session(page.Session):
             what = f"frames come {self.late} frames late: steering for where the car is now"
             log.warning(what if self.late else "frames are in time again", extra={"warned": self.warned})
         mount = self.pilot.mount
-        if mount and self.moved != [bool(move) for move in mount.found]:
-            self.moved = [bool(move) for move in mount.found]
-            what = f"the camera's picture is moved by {mount}: frames are moved back (with --as-mounted they are not)"
-            log.warning(what if any(self.moved) else "the picture is not moved any more", extra={"warned": self.warned})
+        if mount and self.moved != (found := np.sign(mount.found).tolist()):
+            self.moved = found
+            what = f"the camera seems turned or shifted, by {mount}: frames are moved back (with --as-mounted: not)"
+            log.warning(what if any(found) else "the camera seems well mounted again", extra={"warned": self.warned})
 
     def slow_down(self, risk: float) -> None:
         """Slow the car down from a risk of ALARM on, and stop it for good at that of the network's limits."""
@@ -169,7 +169,7 @@ class DriveServer:
     ):
         """set_speed: mph; model: the network's name on the page; stop_when_lost: needs the network's limits.
 
-        as_mounted: see `Pilot`.
+        as_mounted: see `Pilot`. Raises ModelError.
         """
         from cloning.server import server  # here, because it needs the socket libraries
 
@@ -186,7 +186,8 @@ class DriveServer:
         self.socket.on("telemetry", self.telemetry)
         self.socket.on("disconnect", self.disconnect)
         self.app = server.socketio.WSGIApp(self.socket, page.create_app(self, server.eventlet.sleep))
-        steer(network, np.zeros(FRAME, np.uint8))  # the first pass is slow: do it before the first frame
+        # The first pass is slow: do it before the first frame.
+        Pilot(lambda frame: steer(network, frame), None, as_mounted)(np.zeros(FRAME, np.uint8), 0.0, 0.0)
 
     def session(self, sid: str) -> Session:
         """Return the session of a connection; make one for a new connection."""
@@ -367,8 +368,8 @@ def main() -> int:
     if arguments.folder:
         saved_frames.check_folder(arguments.folder)
     origin = "the model that comes with the project" if model == SHIPPED_MODEL else ""
-    name, options = origin or str(model), (arguments.stop_when_lost, arguments.as_mounted)
-    server = DriveServer(network, arguments.speed, name, limits, *options)
+    stop, as_mounted = arguments.stop_when_lost, arguments.as_mounted
+    server = DriveServer(network, arguments.speed, origin or str(model), limits, stop, as_mounted)
     where_taken = f"for the stand-in alone choose another --port: Udacity's simulator connects to {PORT} only"
     listener = connections.claim_port(arguments.host, arguments.port, where_taken)
     if arguments.folder:

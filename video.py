@@ -102,13 +102,15 @@ def load_overlay(model_file: Path) -> Overlay:
     """Return the overlay that shows a model's steering and what it looks at. Raises ModelError."""
     import torch  # takes longer to import than a short film to make
 
+    from cloning.lane.mount import Mount
     from cloning.network.attention import visual_backprop
     from cloning.network.network import load_model
 
     torch.set_num_threads(1)  # more threads are slower for single frames, and the encoder uses the other cores
-    network = load_model(model_file)
+    network, mount = load_model(model_file), Mount()
 
     def picture(frame: np.ndarray) -> np.ndarray:
+        frame = mount(frame)  # as in drive.py
         try:
             return overlay(frame, *visual_backprop(network, frame))
         except ArithmeticError as error:

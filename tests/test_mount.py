@@ -15,7 +15,17 @@ import drive as drive_py
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME
 from cloning.lane import mount
-from cloning.lane.mount import CELLS, LEAST, ODD, SCALES, MeanPicture, Mount, MountNetwork
+from cloning.lane.mount import (
+    CELLS,
+    LEAST,
+    MIRRORED_DIRECTION,
+    MIRRORED_MOUNT,
+    SCALES,
+    MeanPicture,
+    Mount,
+    MountNetwork,
+)
+from cloning.network import tensors
 from cloning.network.network import SHIPPED_MODEL, Network
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
@@ -50,7 +60,7 @@ def directions_of(*frames: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("degrees", [0, 20, 45, 90, 150])
 def test_directions_are_those_of_the_gradient(degrees):
     """It points across the stripes, so twice its angle is 180 degrees more than twice theirs; rows go down."""
-    sine, cosine, strength = directions_of(stripes(degrees))[: len(ODD), 2:-2, 2:-2]
+    sine, cosine, strength = directions_of(stripes(degrees))[: len(MIRRORED_DIRECTION), 2:-2, 2:-2]
     assert sine == pytest.approx(math.sin(math.radians(2 * degrees)), abs=0.05)
     assert cosine == pytest.approx(-math.cos(math.radians(2 * degrees)), abs=0.05)
     assert (strength > 1).all()
@@ -66,22 +76,22 @@ def test_what_changes_from_frame_to_frame_blurs():
 def test_the_mirror_image_gives_the_mirrored_mounting():
     frame = render_frame(0.5, 3.0, np.random.default_rng(1))
     seen, mirrored = directions_of(frame), directions_of(np.ascontiguousarray(frame[:, ::-1]))
-    odd = np.tile(ODD, SCALES)[:, None, None]
+    odd = np.tile(MIRRORED_DIRECTION, SCALES)[:, None, None]
     assert mirrored == pytest.approx(seen[..., ::-1] * odd, abs=0.02)
     network = MountNetwork().eval()
     found, deviations = network(torch.from_numpy(np.stack([seen, seen[..., ::-1] * odd]).astype(np.float32)))
-    assert torch.allclose(found[0] * torch.tensor([-1, 1, -1]), found[1], atol=1e-5)
+    assert torch.allclose(found[0] * torch.tensor(MIRRORED_MOUNT), found[1], atol=1e-5)
     assert torch.allclose(deviations[0], deviations[1], atol=1e-5)
 
 
 def test_weights_are_saved_and_a_damaged_file_is_refused(tmp_path):
     torch.manual_seed(0)
     network, path, inputs = MountNetwork().eval(), tmp_path / "mount.pt", torch.rand(2, 3 * SCALES, *CELLS)
-    mount.save_network(path, network)
+    tensors.save_weights(path, network)
     for saved, wanted in zip(mount.load_network(path)(inputs), network(inputs), strict=True):
         assert torch.allclose(saved, wanted, atol=0.01)
     assert path.stat().st_size < 400_000
-    mount.save_network(tmp_path / "other.pt", MountNetwork(hidden=8))
+    tensors.save_weights(tmp_path / "other.pt", MountNetwork(hidden=8))
     with pytest.raises(ModelError, match=r"other\.pt: .*python -m tools.train_mount"):
         mount.load_network(tmp_path / "other.pt")
 
@@ -116,7 +126,7 @@ def test_what_is_certain_is_moved_back_and_nothing_else():
     seen = moved(stripes(30), (-20, 0, 14), back=True)
     assert np.abs(back[40:120, 80:240].astype(int) - seen[40:120, 80:240]).mean() < 10
     one.network = Tells((0.0, 0.0, 0.6 * LEAST[2]), 0.1)
-    one.sums[:] = 0
+    one.weights, one.weighted, one.readings = np.zeros(3), np.zeros(3), 0.0
     for frame in frames:
         one(frame[::-1])
     assert one.found.tolist() == pytest.approx([0, 0, 0.6 * LEAST[2]]), "what counts goes on to count"
@@ -160,7 +170,7 @@ def test_a_turned_camera_is_driven_with(as_mounted, monkeypatch):
 
 def test_drive_py_tells_of_it_once_and_leaves_it_on_demand(network: Network, caplog: pytest.LogCaptureFixture) -> None:
     rng = np.random.default_rng(5)
-    frames = [drive_py.page.encode(render_frame(offset, 0.0, rng), 90) for offset in rng.uniform(-1, 1, 12)]
+    frames = [drive_py.page.encode(render_frame(offset, 0.0, rng), 90) for offset in rng.uniform(-1, 1, 15)]
     session = drive_py.DriveServer(network).session("sid")
     assert session.pilot.mount
     session.pilot.mount.network = Tells((0, -25, 14), 1.0)
@@ -168,8 +178,8 @@ def test_drive_py_tells_of_it_once_and_leaves_it_on_demand(network: Network, cap
         for frame in frames:
             session.answer(telemetry(frame))
     assert [record.message for record in caplog.records] == [
-        "the camera's picture is moved by 25 pixels up, 14° anticlockwise: "
-        "frames are moved back (with --as-mounted they are not)"
+        "the camera seems turned or shifted, by 25 pixels up, 14° anticlockwise: "
+        "frames are moved back (with --as-mounted: not)"
     ]
     assert drive_py.parse_arguments(["--as-mounted"]).as_mounted
     assert drive_py.DriveServer(network, as_mounted=True).session("sid").pilot.mount is None
@@ -193,7 +203,6 @@ def test_real_cameras_are_mounted_as_ever_and_turned_ones_are_found(folder: Path
 
 def test_the_training_writes_weights_and_measures_them(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(train_mount, "READ", (2, 4))
     options = ["--looks", "0", "--roads", "1", "--drives", "1", "--epochs", "2"]
     assert train_mount.main(options) == 0
     printed = capsys.readouterr().out

@@ -45,8 +45,7 @@ from cloning.lane.foretell import (
     odds_of_one,
     save_limits,
 )
-from cloning.lane.mount import Mount
-from cloning.lane.predict import Predictor
+from cloning.lane.pilot import Pilot
 from cloning.network.compute import one_thread, threads
 from cloning.network.network import SHIPPED_MODEL, load_model
 from cloning.recordings.format import SAMPLE_RATE
@@ -146,16 +145,20 @@ def drive(model: Path, course: Course) -> Drive:
     run.set_back()
     disturber = Disturber(Disturbance.parse(course.disturbance), course.number) if course.disturbance else None
     controller, clock = SpeedController(15 if course.kind == ORDINARY else 25), SampleClock(1 / SAMPLE_RATE)
-    mount, predictor, blindness = Mount(), Predictor(), Blindness()
     seen, blind, time, away = list[Observation](), list[float](), list[float](), list[float]()
+
+    def steer(frame: np.ndarray) -> float:
+        seen.append(observe(frame))
+        return seen[-1].steering.item()
+
+    pilot, blindness = Pilot(steer), Blindness()
     while run.time < (30 if disturber else 40) and len(run.departures) < MAX_DEPARTURES:
         frame = decode(jpeg(cameras.frames(run.car.node.get_transform())[0]))
-        frame = mount(disturber(frame) if disturber else frame)
-        seen.append(observe(frame))
-        blind.append(blindness(frame, run.time, run.speed_mph * MPH))
+        frame, speed = disturber(frame) if disturber else frame, run.speed_mph * MPH
+        steering = float(pilot(frame, run.time, speed)[0])
+        blind.append(blindness(pilot.seen, run.time, speed))
         time.append(run.time)
         away.append(abs(run.offset))
-        steering = float(predictor(seen[-1].steering.item(), frame, run.time, run.speed_mph * MPH))
         throttle, due = controller.throttle(run.speed_mph), False
         while not due:
             run.step(steering, throttle)
@@ -360,8 +363,8 @@ def main(argv: list[str] | None = None) -> int:
     add("--folder", type=Path, default=Path("foretell"), help="for what the drives show (default %(default)s)")
     options = parser.parse_args(argv)
     observe, chosen = observer(options.model), courses()[: options.drives]
-    # Another network drives otherwise, and an earlier version of this tool did not save how blind the car was.
-    folder = options.folder / f"{fingerprint(observe.network)[:8]}-blind"
+    # Another network drives otherwise, and so did earlier versions of the pilot.
+    folder = options.folder / f"{fingerprint(observe.network)[:8]}-mounted"
     work = partial(drive_into, folder, options.model)
     with claimed(folder):
         replayed = [each for folder in find_folders(options.recordings) for each in replays(observe, folder)]

@@ -41,8 +41,8 @@ from cloning.lane.reader import (
     load_network,
     normalize,
     read_strips,
-    save_network,
 )
+from cloning.network import tensors
 from cloning.network.compute import choose_precision, in_precision, one_thread
 from cloning.recordings.log import find_folders, read_recording
 from cloning.road.camera import LEVEL_CAMERA_MATRIX, camera_position, homographies
@@ -326,7 +326,7 @@ def main(argv: list[str] | None = None) -> int:
     print(f"rendering {sum(scene.frames for scene in chosen)} frames of {len(chosen)} scenes", flush=True)
     strips, centres = render_all(chosen, options.seed)
     batches = BatchSampler(strips, centres, recordings, options.seed)
-    save_network(options.output, train(batches, options.steps, options.rate, network))
+    tensors.save_weights(options.output, train(batches, options.steps, options.rate, network))
     return program.DONE
 
 

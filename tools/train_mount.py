@@ -2,11 +2,11 @@
 
     python -m tools.train_mount          # twenty minutes on two cores; no recordings are needed
 
-It is trained on short drives on rendered roads, whose camera is mounted at random: the rendered one, or its frames are
-moved. Two of three are disturbed, too, so that the network learns what rain, fog or dirt hide, and that their own edges
-tell nothing; kinds on which no network may be trained (`disturbances.HELD_OUT`) are left out. At the end it is measured
-on roads and looks that it never saw. The weights are written to mount.pt in the current folder, which git ignores; to
-ship them, copy the file to cloning/lane/mount.pt.
+It is trained on short drives on rendered roads, whose camera is mounted at random: the rendered one is turned, or its
+frames are moved afterwards. Two of three are disturbed, too, so that the network learns what rain, fog or dirt hide,
+and that their own edges tell nothing; kinds on which no network may be trained (`disturbances.HELD_OUT`) are left out.
+At the end it is measured on roads and looks that it never saw. The weights are written to mount.pt in the current
+folder, which git ignores; to ship them, copy the file to cloning/lane/mount.pt.
 """
 
 import functools
@@ -24,7 +24,8 @@ from panda3d.core import NodePath, Point3, TransformState, Vec3
 from cloning.base import program
 from cloning.base.arguments import command_line, number
 from cloning.base.outputs import check_folders
-from cloning.lane.mount import CERTAIN, LEAST, UNITS, MeanPicture, MountNetwork, save_network
+from cloning.lane.mount import UNITS, MeanPicture, MountNetwork, counts
+from cloning.network import tensors
 from cloning.network.compute import threads
 from cloning.recordings.format import SAMPLE_RATE
 from cloning.road.camera import CAMERA_ROLL, CAMERA_YAW, FIRST_BONNET_ROW, FOCAL_LENGTH, MOUNT_PITCH
@@ -39,7 +40,7 @@ from tools.lane_frames import RenderedScene, every_second_shadowed, scenes
 MOST = np.array([32.0, 32.0, 24.0])  # of a mounting: pixels, pixels and degrees
 STRAIGHT = 0.4  # share of the mountings that are 0, in each of the three
 RENDERED = 0.35  # share of the drives whose camera is mounted otherwise; in the others frames are moved
-NO_BONNET = 0.2  # share of these that show no bonnet
+NO_BONNET = 0.2  # share of the drives whose frames are moved that show no bonnet
 READ = (6, 15, 30)  # frames after which the mean picture is read; the last one ends the drive
 SPEEDS = (2.0, 15.0)  # m/s
 FOUL = tuple(kind for kind in KINDS if kind not in (*HELD_OUT, "shifted", "turned"))
@@ -72,10 +73,10 @@ def random_mount(rng: Generator) -> np.ndarray:
 def mount_camera(camera: NodePath, mount: np.ndarray) -> None:
     """Turn a rendered camera so that its picture is as a mounting says, but for the perspective."""
     right, down, turn = mount.tolist()
-    turned, (cos, sin) = math.radians(turn), (math.cos(math.radians(turn)), math.sin(math.radians(turn)))
-    across, along = right * cos - down * sin, right * sin + down * cos  # before the picture is turned
+    cos, sin = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    across, along = right * cos - down * sin, right * sin + down * cos  # of the picture before it is turned
     yaw, pitch = (math.degrees(math.atan(pixels / FOCAL_LENGTH)) for pixels in (across, along))
-    camera.set_hpr(-CAMERA_YAW + yaw, -MOUNT_PITCH + pitch, -CAMERA_ROLL + math.degrees(turned))
+    camera.set_hpr(-CAMERA_YAW + yaw, -MOUNT_PITCH + pitch, -CAMERA_ROLL + turn)
 
 
 def random_drive(track: Track, rng: Generator) -> list[TransformState]:
@@ -126,7 +127,10 @@ class Seen:
 
 
 def render_drives(scene: RenderedScene, seed: int) -> Samples:
-    """Render drives in a scene, as many as its `frames`, each seen by three cameras, of which two are disturbed."""
+    """Render drives in a scene, as many as its `frames`, each as three cameras show it, of which two are disturbed.
+
+    Where the rendered camera is turned, all three are mounted alike.
+    """
     name, look, drives = scene
     rng = default_rng([seed, look, *name.encode()])
     cameras, tracks = Cameras(Scene.of(name, look), ("center",)), [Track(name, way) for way in ("ccw", "cw")]
@@ -161,7 +165,7 @@ def train(samples: Samples, epochs: int, seed: int) -> MountNetwork:
     """Return a network that was trained on samples, by the likelihood of their mountings."""
     torch.manual_seed(seed)
     network, n = MountNetwork(), len(samples.mounts)
-    inputs, mounts = torch.from_numpy(samples.directions), torch.from_numpy(samples.mounts) / torch.tensor(UNITS)
+    inputs, mounts = torch.from_numpy(samples.directions), torch.from_numpy(samples.mounts / UNITS).float()
     optimizer = torch.optim.AdamW(network.parameters(), weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, epochs * -(-n // BATCH))
     for epoch in range(epochs):
@@ -183,7 +187,7 @@ def print_errors(network: MountNetwork, samples: Samples) -> None:
     with torch.inference_mode():
         found, deviation = (each.numpy() * UNITS for each in network(torch.from_numpy(samples.directions).float()))
     wrong, kinds = found - samples.mounts, np.array([each.split(":")[0] or "none" for each in samples.disturbed])
-    false = (samples.mounts == 0) & (np.abs(found) > np.maximum(LEAST, CERTAIN * deviation))
+    false = (samples.mounts == 0) & counts(found, deviation)
     print(head("disturbance", "readings", "px right", "px down", "degrees", "false ones"))
     for kind in sorted(set(kinds)):
         rows = kinds == kind
@@ -209,7 +213,7 @@ def main(argv: list[str] | None = None) -> int:
     unknown = [RenderedScene(f"road-{k}", every_second_shadowed(k), 3) for k in range(1, 2 + options.roads // 5)]
     unknown += [RenderedScene(track, every_second_shadowed(look), 4) for track in ROADS for look in looks]
     network = train(render_all(chosen, options.seed), options.epochs, options.seed)
-    save_network(options.output, network)
+    tensors.save_weights(options.output, network)
     print_errors(network, render_all(unknown, options.seed + 1))
     return program.DONE
 

@@ -1,4 +1,4 @@
-"""Steers one drive: a network does, but for a camera that is mounted askew, and frames that come late or are lost."""
+"""Steers one drive by a network: moves a turned or shifted camera's frames back, and allows for late and lost ones."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from cloning.lane.predict import Predictor
 
 
 class Pilot:
-    """Lets the network steer by frames as the simulator's camera sees them, and corrects it for late and lost ones."""
+    """Lets the network steer by frames as the simulator's camera sees them, and corrects it for their delay."""
 
     def __init__(
         self,
@@ -20,16 +20,18 @@ class Pilot:
     ):
         """steer: returns the network's steering, -1..1, for a frame; foretell: steers instead, and tells the risk.
 
-        as_mounted: frames are taken as they are, however the camera seems to be mounted.
+        as_mounted: frames are taken as they are, however the camera seems to be mounted. Raises ModelError.
         """
         self.steer, self.foretell = steer, foretell
         self.mount, self.predictor = None if as_mounted else Mount(), Predictor()
+        self.seen = np.empty(0, np.uint8)  # the last frame as the network saw it
 
     def __call__(self, frame: np.ndarray, time: float, speed: float) -> tuple[np.float32, float | None]:
         """Return the steering, -1..1, and the risk, 0..1, that the car leaves the road, None if that is not known.
 
         frame: the drive's next one, uint8 (160, 320, 3) RGB; time: s; speed: m/s. Raises ArithmeticError as `steer`.
         """
-        frame = self.mount(frame) if self.mount else frame
-        found, risk = self.foretell(frame, time, speed) if self.foretell else (self.steer(frame), None)
+        self.seen = self.mount(frame) if self.mount else frame
+        found, risk = self.foretell(self.seen, time, speed) if self.foretell else (self.steer(self.seen), None)
+        # By the frame as it came: that the camera's mounting is found out must not look like a movement.
         return self.predictor(found, frame, time, speed), risk

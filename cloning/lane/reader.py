@@ -20,7 +20,6 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME, ROAD_ROWS
 from cloning.lane.recovery import LanePosition
 from cloning.network import tensors
@@ -100,24 +99,12 @@ class LaneNetwork(nn.Module):
         return self.dense(self.convolutions(x).flatten(1)).float()
 
 
-def save_network(path: str | Path, network: LaneNetwork) -> None:
-    """Write the network's weights to a file, in half precision, which is enough. Raises OSError."""
-    weights = network.state_dict().items()
-    tensors.save(path, {name: value.half() if value.is_floating_point() else value for name, value in weights})
-
-
 @functools.cache
 def load_network(path: str | Path | None = None) -> LaneNetwork:
     """Return the network with the weights of a file, or with the shipped ones. Raises ModelError."""
-    path = path or SHIPPED_WEIGHTS
+    path, network = path or SHIPPED_WEIGHTS, LaneNetwork()
     remedy = f"train the lane network with `python -m tools.train_lane --output {path}`"
-    weights = tensors.load(path, remedy)
-    del weights["digest"]
-    network = LaneNetwork()
-    try:
-        network.load_state_dict(tensors.matching(weights, network.state_dict()))
-    except ValueError as error:
-        raise ModelError(f"{path}: holds no weights of the lane network: {error}; {remedy}") from None
+    tensors.load_weights(path, network, "the lane network", remedy)
     return network.eval()
 
 

@@ -60,6 +60,22 @@ def load(path: str | Path, remedy: str) -> dict[str, Any]:
     return contents | {"digest": digest}
 
 
+def save_weights(path: str | Path, network: torch.nn.Module) -> None:
+    """Write a network's weights to a file, in half precision. Raises OSError."""
+    weights = network.state_dict().items()
+    save(path, {name: value.half() if value.is_floating_point() else value for name, value in weights})
+
+
+def load_weights(path: str | Path, network: torch.nn.Module, name: str, remedy: str) -> None:
+    """Give a network the weights of a file; name: of the network, remedy: see `load`. Raises ModelError."""
+    weights = load(path, remedy)
+    del weights["digest"]
+    try:
+        network.load_state_dict(matching(weights, network.state_dict()))
+    except ValueError as error:
+        raise ModelError(f"{path}: holds no weights of {name}: {error}; {remedy}") from None
+
+
 def matching(found: object, expected: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Return copies of a file's tensors, all finite, with the names and shapes of `expected`, and floats where it has.
 

@@ -71,7 +71,7 @@ class Session:
         self.manual = self.ended = False  # whether a person drove then; whether the connection has ended
         self.lost = False  # whether drive.py stopped the car because the network is out of its depth
         self.history: deque[DrivenFrame] = deque(maxlen=HISTORY_FRAMES)
-        self.frame: np.ndarray | None = None  # the last driven one: uint8 (160, 320, 3), RGB
+        self.frame: np.ndarray | None = None  # the last one, as the network saw it: uint8 (160, 320, 3), RGB
         self.driven = self.unusable = 0  # frames
         self.reason = ""  # why the last unusable one was
         self.folder: SessionFolder | None = None  # of its saved frames
