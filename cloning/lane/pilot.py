@@ -10,7 +10,7 @@ from cloning.lane.predict import Predictor
 
 
 class Pilot:
-    """Lets the network steer by frames as the simulator's camera sees them, and corrects it for their delay."""
+    """Lets the network steer by frames as the simulator's camera sees them, and corrects the steering for late ones."""
 
     def __init__(
         self,
