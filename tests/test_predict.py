@@ -29,6 +29,14 @@ from simulator.driving import Conditions, drive
 SPEED, PAUSE = TOP_SPEED_MPH * MPH, 1 / 15  # m/s, s between frames
 
 
+def corrected(
+    predictor: Predictor, steering: float | np.floating, frame: np.ndarray, time: float, speed: float
+) -> np.float32:
+    """Return the steering for where the car is, at the next frame."""
+    predictor.move(time, speed)
+    return predictor.correct(steering, frame)
+
+
 class World:
     """A car that is steered by the law that the networks learn, on a road that winds, in front of a far background."""
 
@@ -76,7 +84,7 @@ def drive_with(late: int, lost: float, predictor: Predictor | None, seconds: flo
             shown.append((world.frame(), world.steering()))
         frame, steering = shown[0]
         time = number * PAUSE + noise.uniform(-0.008, 0.008)
-        world.move(float(predictor(steering, frame, time, SPEED)) if predictor else steering)
+        world.move(float(corrected(predictor, steering, frame, time, SPEED)) if predictor else steering)
         offsets.append(abs(world.offset))
     return offsets
 
@@ -86,7 +94,7 @@ def test_frames_in_time_change_nothing() -> None:
     world, predictor = World(), Predictor()
     for number in range(300):
         steering = np.float32(world.steering())
-        assert predictor(steering, world.frame(), number * PAUSE, SPEED) == steering
+        assert corrected(predictor, steering, world.frame(), number * PAUSE, SPEED) == steering
         world.move(float(steering))
     assert predictor.delay.frames == 0
 
@@ -110,7 +118,7 @@ def test_lost_frames() -> None:
 def test_a_car_that_stands_is_steered_as_the_network_says() -> None:
     """Repeated frames of a car at rest, as the simulator sends them at the start, change nothing."""
     predictor, frame = Predictor(), World().frame()
-    assert {float(predictor(0.25, frame, number * PAUSE, 0.0)) for number in range(50)} == {0.25}
+    assert {float(corrected(predictor, 0.25, frame, number * PAUSE, 0.0)) for number in range(50)} == {0.25}
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 7])
@@ -122,7 +130,7 @@ def test_frames_that_recur_are_no_late_or_lost_ones(frames: int) -> None:
         world.move(float(seen[-1][1]))
     for number in range(400):
         frame, steering = seen[number % frames]
-        assert predictor(steering, frame.copy(), number * PAUSE, SPEED) == steering
+        assert corrected(predictor, steering, frame.copy(), number * PAUSE, SPEED) == steering
 
 
 def test_a_camera_that_freezes_for_long_and_a_speed_beyond_that_of_cars_do_no_harm() -> None:
@@ -132,9 +140,9 @@ def test_a_camera_that_freezes_for_long_and_a_speed_beyond_that_of_cars_do_no_ha
     frame, until = World(2).frame(), predictor.time
     for number in range(1, 3000):
         speed = (SPEED, 1e300, -1e300)[number % 3] if number > 2000 else SPEED
-        assert abs(predictor(0.3, frame, until + number * PAUSE, speed)) <= 1
+        assert abs(corrected(predictor, 0.3, frame, until + number * PAUSE, speed)) <= 1
     assert len(predictor.since) <= 1
-    assert abs(predictor(0.3, World(1).frame(), until + 3000 * PAUSE, SPEED)) <= 1
+    assert abs(corrected(predictor, 0.3, World(1).frame(), until + 3000 * PAUSE, SPEED)) <= 1
 
 
 @pytest.mark.parametrize("pause", [LONGEST_PAUSE + 0.1, -5.0])
@@ -144,7 +152,7 @@ def test_a_pause_begins_anew(pause: float) -> None:
     drive_with(4, 0, predictor)
     assert predictor.delay.frames
     world = World()
-    assert predictor(0.1, world.frame(), predictor.time + pause, SPEED) == np.float32(0.1)
+    assert corrected(predictor, 0.1, world.frame(), predictor.time + pause, SPEED) == np.float32(0.1)
     assert (predictor.delay.frames, len(predictor.since), predictor.pose) == (0, 0, (0.0, 0.0))
 
 
@@ -154,7 +162,7 @@ def test_no_delay_is_seen_without_a_background() -> None:
     for frames in (np.zeros((100, *FRAME), np.uint8), rng.integers(0, 255, (100, *FRAME), np.uint8)):
         predictor = Predictor()
         for number, frame in enumerate(frames):
-            predictor(math.sin(number / 3), frame, number * PAUSE, SPEED)
+            corrected(predictor, math.sin(number / 3), frame, number * PAUSE, SPEED)
         assert predictor.delay.frames == 0
 
 

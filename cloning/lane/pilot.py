@@ -1,9 +1,10 @@
-"""Steers one drive by a network: moves a turned or shifted camera's frames back, and allows for late and lost ones."""
+"""Steers one drive by a network, though its camera is turned or shifted, and its frames are noisy, late or lost."""
 
 from collections.abc import Callable
 
 import numpy as np
 
+from cloning.lane.average import Average
 from cloning.lane.foretell import Foreteller
 from cloning.lane.mount import Mount
 from cloning.lane.predict import Predictor
@@ -23,7 +24,7 @@ class Pilot:
         as_mounted: frames are taken as they are, however the camera seems to be mounted. Raises ModelError.
         """
         self.steer, self.foretell = steer, foretell
-        self.mount, self.predictor = None if as_mounted else Mount(), Predictor()
+        self.mount, self.average, self.predictor = None if as_mounted else Mount(), Average(), Predictor()
         self.seen = np.empty(0, np.uint8)  # the last frame as the network saw it
 
     def __call__(self, frame: np.ndarray, time: float, speed: float) -> tuple[np.float32, float | None]:
@@ -31,7 +32,8 @@ class Pilot:
 
         frame: the drive's next one, uint8 (160, 320, 3) RGB; time: s; speed: m/s. Raises ArithmeticError as `steer`.
         """
-        self.seen = self.mount(frame) if self.mount else frame
+        step = self.predictor.move(time, speed)
+        self.seen = self.average(self.mount(frame) if self.mount else frame, step)
         found, risk = self.foretell(self.seen, time, speed) if self.foretell else (self.steer(self.seen), None)
         # By the frame as it came: that the camera's mounting is found out must not look like a movement.
-        return self.predictor(found, frame, time, speed), risk
+        return self.predictor.correct(found, frame), risk

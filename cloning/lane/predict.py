@@ -13,6 +13,7 @@ sent so many frames later. Where this is not certain, and where frames are in ti
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -103,8 +104,16 @@ def _movement(before: np.ndarray, after: np.ndarray) -> float | None:
     return FARTHEST - best - (0.5 * (left - right) / bend if bend > 0 else 0.0)
 
 
+class Step(NamedTuple):
+    """How the car has moved since the last frame."""
+
+    seconds: float
+    bend: float  # the mean curvature, 1/m, right positive
+    metres: float
+
+
 class Predictor:
-    """Corrects the steering of one drive, whose frames it is given one after the other."""
+    """Knows how the car of one drive has moved, and corrects its steering, one frame after the other."""
 
     def __init__(self) -> None:
         self._begin()
@@ -112,6 +121,7 @@ class Predictor:
     def _begin(self) -> None:
         self.delay = Delay()
         self.frame, self.time = np.empty(0, np.uint8), 0.0
+        self.step: Step | None = None  # since the frame before, None if that is not known
         self.sent = self.bend = 0.0  # the steering that was sent last, -1..1; the curvature that the car drives, 1/m
         # What was driven in the time by which frames are late, the newest last: curvature, 1/m, and m
         self.since = deque[tuple[float, float]]()
@@ -120,25 +130,36 @@ class Predictor:
         self.pose = self.seen = (0.0, 0.0)
         self.road, self.gap, self.new = 0.0, 0.0, 0  # the lane's curvature, 1/m; m since the last of so many new frames
 
-    def __call__(self, steering: float | np.floating, frame: np.ndarray, time: float, speed: float) -> np.float32:
-        """Return the steering for where the car is now: just the network's if the frame is new and in time.
+    def move(self, time: float, speed: float) -> Step | None:
+        """Return how the car has moved since the last frame, None at the first one and after a long pause.
 
-        steering: the network's, -1..1, for this frame, uint8 (160, 320, 3) RGB; time: s; speed: m/s.
+        time: of the next frame, s; speed: m/s.
         """
         pause = time - self.time
         if not (self.frame.size and 0 < pause <= LONGEST_PAUSE):
             self._begin()
+        else:
+            before, metres = self.bend, min(max(speed, 0.0), FASTEST) * pause
+            self.bend = lagged_curvature(before, curvature(self.sent), pause)
+            self.step = Step(pause, (before + self.bend) / 2, metres)
+        self.time = time
+        return self.step
+
+    def correct(self, steering: float | np.floating, frame: np.ndarray) -> np.float32:
+        """Return the steering for where the car is now: just the network's if the frame is new and in time.
+
+        steering: the network's, -1..1, for this frame, uint8 (160, 320, 3) RGB, for whose time `move` was called.
+        """
+        if self.step is None:
             self.road = curvature(float(steering))
-            self.frame, self.time, self.sent = frame, time, float(steering)
+            self.frame, self.sent = frame, float(steering)
             return np.float32(steering)
-        before, metres = self.bend, min(max(speed, 0.0), FASTEST) * pause
-        self.bend = lagged_curvature(before, curvature(self.sent), pause)
-        driven = (before + self.bend) / 2
+        pause, driven, metres = self.step
         self.since.append((driven, metres))
         self.gap = min(self.gap + metres, LONGEST_GAP)
         new = not np.array_equal(frame, self.frame)
         late = self.delay(frame, CAMERA_MATRIX[0, 0] * driven * metres, pause)
-        self.frame, self.time = frame, time
+        self.frame = frame
         while len(self.since) > late:
             self.pose = self._after(self.pose, *self.since.popleft())
         if new:

@@ -13,8 +13,8 @@ from cloning.road.motion import MPH
 class ModelDriver:
     """Steers by a model in this process, with drive.py's arithmetic.
 
-    A recording's own frames are taken as they are. Disturbed ones, which may be moved, late or lost, are given to a
-    `Pilot`, as in drive.py, which needs all their rows.
+    A recording's own frames are taken as they are. Disturbed ones, which may be moved, noisy, late or lost, are given
+    to a `Pilot`, as in drive.py, which needs all their rows.
     """
 
     def __init__(self, model: str | Network):
