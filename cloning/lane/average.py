@@ -15,12 +15,13 @@ from cloning.road.camera import FIRST_BONNET_ROW, homographies
 from cloning.road.motion import AXLE_TO_CAMERA
 from cloning.road.warp import FIRST_ROW_WITHOUT_SKY, warp
 
-MEMORY = 15  # new frames over which the noise is averaged
+# Of so many new frames one tells the noise, and in so many the mean of what they tell forgets.
+TOLD, MEMORY = 3, 15
 # The noise from which frames are averaged, and that from which the mean before counts as much as the new frame. Clear
 # frames of real recordings have 0.12 to 0.26, never more than 0.33 (on grainy, steep roads at 25 mph up to 0.51); snow
 # and night have 0.45 to 0.5 at strength 3, 0.6 to 0.75 at 5.
 LEAST, MOST, SHARE = 0.48, 0.58, 0.5
-EVERY = 2  # of the rows and columns by which the noise is told
+EVERY = 2  # of so many rows and columns one tells the noise
 ROWS = slice(FIRST_ROW_WITHOUT_SKY, FIRST_BONNET_ROW)
 # From a grey frame's pixels to those by which the noise is told
 TO_FEW = np.array([[1 / EVERY, 0, 0], [0, 1 / EVERY, -ROWS.start / EVERY], [0, 0, 1]])
@@ -30,9 +31,9 @@ class Average:
     """The mean of one drive's noisy frames, which it is given one after the other."""
 
     def __init__(self) -> None:
-        self.frame = np.empty(0, np.uint8)  # the last one
-        self.mean, self.grey = self.frame, self.frame  # what takes its place, and itself in grey
-        self.turned = self.metres = 0.0  # radians to the right and m since then
+        self.frame = self.mean = np.empty(0, np.uint8)  # the last one, and what takes its place
+        self.frames = 0  # new ones
+        self.turned = self.metres = 0.0  # radians to the right and m since the last new one
         self.noise = 0.0  # by how much a frame differs from what is expected, of its contrast
 
     def __call__(self, frame: np.ndarray, step: Step | None) -> np.ndarray:
@@ -45,33 +46,39 @@ class Average:
             self.metres += step.metres
             if np.array_equal(frame, self.frame):
                 return self.mean
-        before, grey = self.mean, self.grey
-        self.frame, self.mean, self.grey = frame, frame, np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY))
-        if step and before.size:
+        last, before, self.frame, self.mean = self.frame, self.mean, frame, frame
+        self.frames += 1
+        tells = self.frames % TOLD == 0
+        if step and last.size and (tells or self.noise > LEAST):
             half = self.turned / 2
             right = self.metres * math.sin(half) + AXLE_TO_CAMERA * math.sin(self.turned)
             forward = self.metres * math.cos(half) + AXLE_TO_CAMERA * (math.cos(self.turned) - 1)
             pose = right, forward, self.turned
-            self.noise += (_noise(grey, self.grey, *pose) - self.noise) / MEMORY
-            if (share := float(np.interp(self.noise, (LEAST, MOST), (0, SHARE)))) > 0:
-                self.mean = _mean(frame, before, share, *pose)
+            if tells:
+                self.noise += (_noise(last, frame, *pose) - self.noise) * TOLD / MEMORY
+            if self.noise > LEAST:
+                share = np.interp(self.noise, (LEAST, MOST), (0, SHARE))
+                self.mean = _mean(frame, before, float(share), *pose)
         self.turned = self.metres = 0.0
         return self.mean
 
 
 def _noise(before: np.ndarray, now: np.ndarray, right: float, forward: float, yaw: float) -> float:
-    """Return by how much a grey frame's ground differs from what the one before lets expect, of its contrast."""
-    seen = now[ROWS][::EVERY, ::EVERY]
-    expected = cv2.warpPerspective(
-        before, TO_FEW @ homographies(right, forward, yaw)[0], seen.shape[::-1], borderMode=cv2.BORDER_REPLICATE
-    )
-    return float(np.median(cv2.absdiff(expected, np.ascontiguousarray(seen))) / (seen.std() + 1))
+    """Return by how much a frame's ground differs from what the one before lets expect, of its contrast; in grey.
+
+    right, forward, yaw: m, m and radians, of the camera since then.
+    """
+    seen = cv2.cvtColor(np.ascontiguousarray(now[ROWS][::EVERY, ::EVERY]), cv2.COLOR_RGB2GRAY)
+    to_few = TO_FEW @ homographies(right, forward, yaw)[0]
+    grey = cv2.cvtColor(before, cv2.COLOR_RGB2GRAY)
+    expected = cv2.warpPerspective(grey, to_few, seen.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    return float(np.median(cv2.absdiff(expected, seen)) / (seen.std() + 1))
 
 
 def _mean(frame: np.ndarray, before: np.ndarray, share: float, right: float, forward: float, yaw: float) -> np.ndarray:
-    """Return a frame averaged with the one before, of whose camera this is the pose, as `warp` takes it.
+    """Return a frame averaged with the mean before, which has this share where it shows the same.
 
-    share: of the one before, where that shows the same.
+    right, forward, yaw: as in `_noise`.
     """
     warped, seen = warp(before, right, forward, yaw, FIRST_BONNET_ROW)
     mean = frame.copy()
