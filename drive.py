@@ -116,7 +116,7 @@ class Session(page.Session):
         }
 
     def tell_of_camera(self) -> None:
-        """Log how late the frames are, and how they are moved, if that is found to be otherwise than before."""
+        """Log how late the frames are and how they are moved, if either is found to be otherwise than before."""
         if self.late != self.pilot.predictor.delay.frames:
             self.late = self.pilot.predictor.delay.frames
             what = f"frames come {self.late} frames late: steering for where the car is now"

@@ -1,6 +1,6 @@
 """Train the network of `cloning/lane/mount.py`, which tells how a drive's camera is turned and shifted.
 
-    python -m tools.train_mount          # twenty minutes on two cores; no recordings are needed
+    python -m tools.train_mount          # twelve minutes on two cores; no recordings are needed
 
 It is trained on short drives on rendered roads, whose camera is mounted at random: the rendered one is turned, or its
 frames are moved afterwards. Two of three are disturbed, too, so that the network learns what rain, fog or dirt hide,

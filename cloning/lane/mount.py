@@ -31,9 +31,9 @@ SCALES = 3  # of the picture, each half as large as the one before
 NOISE = 1.0  # added to the squared gradient, (grey levels a pixel)²: weaker edges tell no direction
 # Factors by which sine, cosine and strength of a direction, and a mounting, differ in the mirror image.
 MIRRORED_DIRECTION, MIRRORED_MOUNT = (-1.0, 1.0, 1.0), (-1.0, 1.0, -1.0)
-UNITS = np.array([10.0, 10.0, 8.0])  # pixels, pixels and degrees, in which the network computes
-LEAST = np.array([12.0, 9.0, 6.0])  # pixels, pixels and degrees: a smaller mounting does not count
-CERTAIN = 2.0  # standard deviations, likewise
+UNITS = np.array([10.0, 10.0, 8.0])  # of a mounting, pixels, pixels and degrees, in which the network computes
+LEAST = np.array([12.0, 9.0, 6.0])  # likewise: a smaller mounting does not count
+CERTAIN = 2.0  # standard deviations: nor does one that is smaller than these
 HELD = 0.5  # share of either that is enough for what counts already
 FIRST, EVERY = 12, 3  # frames before the first reading, and from one to the next
 FADING = 0.95  # share of a reading's weight that is left at the next
