@@ -200,7 +200,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = command_line("python -m tools.train_mount", __doc__)
     add = parser.add_argument
     add("--looks", type=number(int, 0), default=12, help="looks of each track, also with shadows (default %(default)s)")
-    add("--roads", type=number(int, 1), default=250, help="generated roads, and half as many mountain roads")
+    roads = "generated roads, and half as many mountain roads (default %(default)s)"
+    add("--roads", type=number(int, 1), default=250, help=roads)
     add("--drives", type=number(int, 1), default=16, help="drives in a scene (default %(default)s)")
     add("--epochs", type=number(int, 1), default=25, help="default %(default)s")
     add("--seed", type=number(int, 0), default=0, help="of all random choices (default %(default)s)")

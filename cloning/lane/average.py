@@ -5,14 +5,12 @@ speed. Warped to where the car is, it is averaged with the new one, and so are, 
 on the ground stays, flakes and noise go. Where frames are clear, they are left as they are.
 """
 
-import math
-
 import cv2
 import numpy as np
 
 from cloning.lane.predict import Step
-from cloning.road.camera import FIRST_BONNET_ROW, homographies
-from cloning.road.motion import AXLE_TO_CAMERA
+from cloning.road.camera import FIRST_BONNET_ROW, camera_position, homographies
+from cloning.road.motion import forward_vector
 from cloning.road.warp import FIRST_ROW_WITHOUT_SKY, warp
 
 # Of so many new frames one tells the noise, and in so many the mean of what they tell forgets.
@@ -25,6 +23,7 @@ EVERY = 2  # of so many rows and columns one tells the noise
 ROWS = slice(FIRST_ROW_WITHOUT_SKY, FIRST_BONNET_ROW)
 # From a grey frame's pixels to those by which the noise is told
 TO_FEW = np.array([[1 / EVERY, 0, 0], [0, 1 / EVERY, -ROWS.start / EVERY], [0, 0, 1]])
+CAMERA_BEFORE = camera_position(np.zeros(2), forward_vector(0.0))  # m right and forward, from the axle then
 
 
 class Average:
@@ -50,9 +49,8 @@ class Average:
         self.frames += 1
         tells = self.frames % TOLD == 0
         if step and last.size and (tells or self.noise > LEAST):
-            half = self.turned / 2
-            right = self.metres * math.sin(half) + AXLE_TO_CAMERA * math.sin(self.turned)
-            forward = self.metres * math.cos(half) + AXLE_TO_CAMERA * (math.cos(self.turned) - 1)
+            axle = self.metres * forward_vector(self.turned / 2)
+            right, forward = (camera_position(axle, forward_vector(self.turned)) - CAMERA_BEFORE).tolist()
             pose = right, forward, self.turned
             if tells:
                 self.noise += (_noise(last, frame, *pose) - self.noise) * TOLD / MEMORY

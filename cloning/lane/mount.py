@@ -28,6 +28,7 @@ PICTURE = FRAME[0] // 2, FRAME[1] // 2  # rows and columns of the mean picture
 MEMORY = 24  # frames in which it forgets
 CELLS = 10, 20  # rows and columns of the cells in which directions are told
 SCALES = 3  # of the picture, each half as large as the one before
+DROPOUT = 0.2  # in training
 NOISE = 1.0  # added to the squared gradient, (grey levels a pixel)²: weaker edges tell no direction
 # Factors by which sine, cosine and strength of a direction, and a mounting, differ in the mirror image.
 MIRRORED_DIRECTION, MIRRORED_MOUNT = (-1.0, 1.0, 1.0), (-1.0, 1.0, -1.0)
@@ -80,11 +81,11 @@ class MeanPicture:
 class MountNetwork(nn.Module):
     """Tells mountings from directions; the mirror image gives the mirrored mounting."""
 
-    def __init__(self, hidden: int = 96, dropout: float = 0.2):
+    def __init__(self, hidden: int = 96):
         super().__init__()
         inputs = SCALES * len(MIRRORED_DIRECTION) * CELLS[0] * CELLS[1]
         into, out = nn.Linear(inputs, hidden), nn.Linear(hidden, 2 * len(UNITS))
-        self.dense = nn.Sequential(nn.Dropout(dropout), into, nn.ReLU(), nn.Dropout(dropout), out)
+        self.dense = nn.Sequential(nn.Dropout(DROPOUT), into, nn.ReLU(), nn.Dropout(DROPOUT), out)
 
     def forward(self, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the mountings and their standard deviations, both float32 (n, 3), in UNITS.
