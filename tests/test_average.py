@@ -42,6 +42,16 @@ def test_clear_frames_are_left_as_they_are(driven):
     assert averaged.noise < 0.6 * average.LEAST
 
 
+@pytest.mark.parametrize("grey", [0, 90, 255])
+def test_one_frame_without_contrast_has_no_clear_ones_averaged(driven, grey):
+    """Such as a black one of a camera that fails for a moment."""
+    for at in range(20, 20 + average.TOLD):
+        averaged = Average()
+        for number, (frame, step) in enumerate(driven):
+            seen = np.full_like(frame, grey) if number == at else frame
+            assert averaged(seen, step) is seen
+
+
 @pytest.mark.parametrize("foul", ["noise:5", "night:5"])
 def test_noisy_frames_become_more_like_those_without_noise(driven, foul):
     averaged, disturber = Average(), Disturber(Disturbance.parse(foul), 1)

@@ -64,13 +64,14 @@ class Average:
 def _noise(before: np.ndarray, now: np.ndarray, right: float, forward: float, yaw: float) -> float:
     """Return by how much a frame's ground differs from what the one before lets expect, of its contrast; in grey.
 
+    At most 1, more than foul weather's: else one frame without contrast would have seconds of clear ones averaged.
     right, forward, yaw: m, m and radians, of the camera since then.
     """
     seen = cv2.cvtColor(np.ascontiguousarray(now[ROWS][::EVERY, ::EVERY]), cv2.COLOR_RGB2GRAY)
     to_few = TO_FEW @ homographies(right, forward, yaw)[0]
     grey = cv2.cvtColor(before, cv2.COLOR_RGB2GRAY)
     expected = cv2.warpPerspective(grey, to_few, seen.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
-    return float(np.median(cv2.absdiff(expected, seen)) / (seen.std() + 1))
+    return min(1.0, float(np.median(cv2.absdiff(expected, seen)) / (seen.std() + 1)))
 
 
 def _mean(frame: np.ndarray, before: np.ndarray, share: float, right: float, forward: float, yaw: float) -> np.ndarray:
