@@ -156,6 +156,18 @@ def test_a_pause_begins_anew(pause: float) -> None:
     assert (predictor.delay.frames, len(predictor.since), predictor.pose) == (0, 0, (0.0, 0.0))
 
 
+def test_telemetries_of_the_same_time_are_no_pause() -> None:
+    """The stand-in sends several between two physics steps, which show the same: the delay is found nevertheless."""
+    predictor, world, shown = Predictor(), World(), deque[tuple[np.ndarray, float]](maxlen=4)
+    for number in range(600):
+        shown.append((world.frame(), world.steering()))
+        for _ in range(2):
+            steering = corrected(predictor, shown[0][1], shown[0][0], number * PAUSE, SPEED)
+        world.move(float(steering))
+        if number > 300:
+            assert predictor.delay.frames == 6 and abs(world.offset) < 0.1
+
+
 def test_no_delay_is_seen_without_a_background() -> None:
     """Frames of one colour, or of noise, tell nothing."""
     rng = np.random.default_rng(0)

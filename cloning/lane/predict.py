@@ -136,7 +136,7 @@ class Predictor:
         time: of the next frame, s; speed: m/s.
         """
         pause = time - self.time
-        if not (self.frame.size and 0 < pause <= LONGEST_PAUSE):
+        if not (self.frame.size and 0 <= pause <= LONGEST_PAUSE):
             self._begin()
         else:
             before, metres = self.bend, min(max(speed, 0.0), FASTEST) * pause
