@@ -120,7 +120,7 @@ class Session(page.Session):
         if self.late != self.pilot.predictor.delay.frames:
             self.late = self.pilot.predictor.delay.frames
             what = f"frames come {self.late} frames late: steering for where the car is now"
-            log.warning(what if self.late else "frames are in time again", extra={"warned": self.warned})
+            log.warning(what if self.late else "frames are no longer known to come late", extra={"warned": self.warned})
         mount = self.pilot.mount
         if mount and self.moved != (found := np.sign(mount.found).tolist()):
             self.moved = found

@@ -223,12 +223,16 @@ def test_drive_py_tells_once_how_late_frames_are(
         drive_py.Session(drive_py.DriveServer(network)),
     )
     monkeypatch.setattr(drive_py, "steer", lambda network, frame: np.float32(shown[0][1]))
+
+    def steered(time: float) -> float:
+        packet = telemetry_packet(0, 0, SPEED / MPH, encode(shown[0][0], 90), Place("lake", 0.0, 0.0, 0.0, 0, time))
+        return float(session.answer(json.loads(packet[2:])[1])["steering_angle"])
+
     for number in range(200):
         shown.append((world.frame(), world.steering()))
-        place = Place("lake", 0.0, 0.0, 0.0, 0, number * PAUSE)
-        packet = telemetry_packet(0, 0, SPEED / MPH, encode(shown[0][0], 90), place)
-        world.move(float(session.answer(json.loads(packet[2:])[1])["steering_angle"]))
+        world.move(steered(number * PAUSE))
     assert abs(world.offset) < 0.3 and session.unusable == 0
-    assert [line for line in caplog.messages if "late" in line] == [
-        "frames come 4 frames late: steering for where the car is now"
-    ]
+    told = ["frames come 4 frames late: steering for where the car is now"]
+    assert caplog.messages == told
+    steered(260 * PAUSE)  # as after a person has driven: whether frames are still late is not known
+    assert caplog.messages == [*told, "frames are no longer known to come late"]
