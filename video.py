@@ -98,8 +98,11 @@ def make_film(folder: Path, fps: Fraction | None = None, draw: Overlay | None = 
     return len(unreadable)
 
 
-def load_overlay(model_file: Path) -> Overlay:
-    """Return the overlay that shows a model's steering and what it looks at. Raises ModelError."""
+def load_overlay(model_file: Path, as_mounted: bool = False) -> Overlay:
+    """Return the overlay that shows a model's steering and what it looks at; as_mounted: see `Pilot`.
+
+    Raises ModelError.
+    """
     import torch  # takes longer to import than a short film to make
 
     from cloning.lane.mount import Mount
@@ -107,10 +110,10 @@ def load_overlay(model_file: Path) -> Overlay:
     from cloning.network.network import load_model
 
     torch.set_num_threads(1)  # more threads are slower for single frames, and the encoder uses the other cores
-    network, mount = load_model(model_file), Mount()
+    network, mount = load_model(model_file), None if as_mounted else Mount()
 
     def picture(frame: np.ndarray) -> np.ndarray:
-        frame = mount(frame)  # as in drive.py
+        frame = mount(frame) if mount else frame  # as in drive.py
         try:
             return overlay(frame, *visual_backprop(network, frame))
         except ArithmeticError as error:
@@ -126,10 +129,13 @@ def main() -> int:
     fps_help = "frames per second, such as 60 or 30000/1001 (default: from the frames' times)"
     parser.add_argument("--fps", type=number(ratio, *FPS_RANGE), help=fps_help)
     parser.add_argument("--overlay", metavar="MODEL", type=Path, help="draw this model's steering and attention")
+    mounted = "with --overlay: take frames as they are, as drive.py does with this option"
+    parser.add_argument("--as-mounted", action="store_true", help=mounted)
     arguments = parser.parse_args()
     folder = arguments.folder if arguments.folder.name not in ("", "..") else arguments.folder.resolve()  # "." has none
     fps = Fraction(arguments.fps).limit_denominator(1001) if arguments.fps else None
-    left_out = make_film(folder, fps, load_overlay(arguments.overlay) if arguments.overlay else None)
+    draw = load_overlay(arguments.overlay, arguments.as_mounted) if arguments.overlay else None
+    left_out = make_film(folder, fps, draw)
     return program.INCOMPLETE if left_out else program.DONE
 
 

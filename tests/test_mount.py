@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import real_recordings
 import torch
+from commands import call_here
 from rendered import render_frame
 
 import drive as drive_py
+import video
 from cloning.base.errors import ModelError
 from cloning.base.frame import FRAME
 from cloning.lane import mount
@@ -26,7 +28,7 @@ from cloning.lane.mount import (
     MountNetwork,
 )
 from cloning.network import tensors
-from cloning.network.network import SHIPPED_MODEL, Network
+from cloning.network.network import SHIPPED_MODEL, Network, save_model
 from cloning.recordings.images import decode
 from cloning.recordings.log import read_recording
 from cloning.road.disturbances import Disturbance, moved
@@ -183,6 +185,28 @@ def test_drive_py_tells_of_it_once_and_leaves_it_on_demand(network: Network, cap
     ]
     assert drive_py.parse_arguments(["--as-mounted"]).as_mounted
     assert drive_py.DriveServer(network, as_mounted=True).session("sid").pilot.mount is None
+
+
+@pytest.mark.parametrize("options", [(), ("--as-mounted",)])
+def test_a_film_shows_what_drive_py_gave_to_the_network(options, network, tmp_path, monkeypatch):
+    """Also where that was told to take frames as they are."""
+    rng, seen = np.random.default_rng(5), list[np.ndarray]()
+    (tmp_path / "run1").mkdir()
+    for number, offset in enumerate(rng.uniform(-1, 1, mount.FIRST)):
+        name = f"2018_07_16_17_11_{number:02}_000.jpg"
+        (tmp_path / "run1" / name).write_bytes(drive_py.page.encode(render_frame(offset, 0.0, rng), 90))
+    save_model(tmp_path / "model.pt", network)
+    monkeypatch.setattr(mount, "load_network", lambda: Tells((0, -25, 14), 1.0))
+
+    def picture(frame: np.ndarray, *_: object) -> np.ndarray:
+        seen.append(frame)
+        return frame
+
+    monkeypatch.setattr(video, "overlay", picture)
+    call_here(video.main, "video.py", "run1", "--overlay", "model.pt", *options, cwd=tmp_path)
+    *_, last = sorted((tmp_path / "run1").iterdir())
+    assert len(seen) == mount.FIRST
+    assert np.array_equal(seen[-1], decode(last.read_bytes())) == bool(options)
 
 
 @pytest.mark.skipif(not real_recordings.FOLDERS, reason=real_recordings.MISSING)
