@@ -79,7 +79,7 @@ class Session(page.Session):
             self.separator = decimal_separator(message, self.separator)
             telemetry = parse_telemetry(message)
             place = telemetry.place
-            now = place.time if place else time.monotonic()
+            now = place.time if place else time.perf_counter()  # on Windows monotonic() may have ticks of 15.6 ms
             self.steering, risk = self.pilot(telemetry.image, now, telemetry.speed * MPH)
             if risk is not None:
                 self.slow_down(risk)
