@@ -187,6 +187,15 @@ def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys)
     assert re.fullmatch(r"training +\d+ %, \d+/100 images, 00:0\d since the start, 00:\d\d left, loss \d+", lines[0])
 
 
+def test_progress_beyond_the_total_is_complete(monkeypatch, capsys):
+    """As an epoch's is, which ends with a whole batch."""
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0.0)
+    with progress.progress_bar(20, "image") as bar:
+        bar.update(16)
+        bar.update(16)
+    assert "100 %, 32/32 images" in capsys.readouterr().err.splitlines()[-1]
+
+
 ENDING_MAIN = """
 import atexit, os, signal, sys, threading, time
 from cloning.base import program

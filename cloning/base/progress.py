@@ -16,6 +16,11 @@ class Bar(tqdm):
     monitor_interval = 0  # tqdm's thread would compare them with the clock
     _time = property(lambda _: time.monotonic, lambda _, clock: None)  # tqdm sets it to time.time
 
+    def update(self, n: float | None = 1) -> bool | None:
+        """Count n more; what goes beyond the total raises it, as tqdm would then show neither it nor the share."""
+        self.total = max(self.total or 0, self.n + (n or 0))
+        return super().update(n)
+
 
 class Lines(Bar):
     """A progress bar that is printed as a line every LINE_SECONDS."""
