@@ -217,7 +217,7 @@ def run_record(arguments: argparse.Namespace) -> int:
 
 
 def run_drive(arguments: argparse.Namespace) -> int:
-    """Let drive.py drive, and write the requested files even if the drive ends early."""
+    """Let drive.py drive, and write the requested files even if the drive ends early, unless it never began."""
     from simulator import report
     from simulator.cameras import Cameras
     from simulator.client import Client
@@ -230,16 +230,15 @@ def run_drive(arguments: argparse.Namespace) -> int:
     scene = Scene.of(run.track.source, arguments.look)
     cameras = Cameras(scene, ("center",), arguments.disturb)
     client = Client(run, cameras, arguments.host, arguments.port, arguments.wait, arguments.realtime)
-    outputs: list[Callable[[], object]] = []
+    film, outputs = None, list[Callable[[], object]]()
     if arguments.film:
         film = ChaseFilm(arguments.film, scene, cameras)
         client.watch = functools.partial(film.watch, run)
-        outputs.append(film.close)
     if arguments.report:
         outputs.append(lambda: write_json(arguments.report, report.lap_report(run, client)))
     if arguments.picture:
         outputs.append(lambda: report.write_picture(arguments.picture, run))
-    return report.drive_and_report(client, arguments.laps, *outputs)
+    return report.drive_and_report(client, arguments.laps, *outputs, film=film)
 
 
 def run_correct(arguments: argparse.Namespace) -> int:
@@ -255,7 +254,7 @@ def run_correct(arguments: argparse.Namespace) -> int:
         scene = Scene.of(run.track.source, arguments.look)
         server = (arguments.host, arguments.port, arguments.wait)
         client = CorrectedClient(run, scene, arguments.speed, recording, *server, arguments.disturb)
-        return drive_and_report(client, arguments.laps, lambda: print(client.summary()) if run.time else None)
+        return drive_and_report(client, arguments.laps, lambda: print(client.summary()))
 
 
 def run_replay(arguments: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 
 from cloning.base import program
 from cloning.base.figure import png
+from cloning.base.film import DriveFilm
 from cloning.base.outputs import plural, run_all, write_output
 from cloning.road.autonomy import LIMITS, autonomy, lap_in_words
 from cloning.road.motion import MPH
@@ -25,14 +26,17 @@ MAP_INCHES, MARGIN = 6.0, 15.0  # the longer side of the map, and m that it show
 ARROW_OFFSET, ARROW_LENGTH = 11.0, 35.0  # m from the centre line to the right, and m
 
 
-def drive_and_report(client: Client, laps: float, *outputs: Callable[[], object]) -> int:
-    """Let a server drive, print the lap report and make the outputs, also of an unfinished drive; return the status."""
+def drive_and_report(client: Client, laps: float, *outputs: Callable[[], object], film: DriveFilm | None = None) -> int:
+    """Let a server drive, print the lap report, make the film and the other outputs, and return the exit status.
 
-    def print_report() -> None:
+    All this also of a drive that is not finished; of one that never began there is nothing to show.
+    """
+
+    def report() -> None:
         if client.run.time:
-            print(report_text(lap_report(client.run, client)))
+            run_all(lambda: print(report_text(lap_report(client.run, client))), *outputs)
 
-    run_all(lambda: client.drive(laps), print_report, *outputs)
+    run_all(lambda: client.drive(laps), film.close if film else lambda: None, report)
     return program.INCOMPLETE if client.run.departures else program.DONE
 
 

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from scenes import load
-from steer_server import STEER, Server, ahead, drive
+from steer_server import STEER, Server, ahead, drive, unused_port
 
 from cloning.base.errors import OutputError
 from cloning.base.outputs import write_json
@@ -54,6 +54,16 @@ def test_a_drive_that_never_moved_and_one_lap_are_reported(tmp_path):
     assert report.report_text(report.lap_report(run)).startswith("lake ccw: 0 laps, 0 m")
     run.lap_times.append(80.0)
     assert report.report_text(report.lap_report(run)).startswith("lake ccw: 1 lap, 0 m")
+
+
+def test_a_drive_that_never_began_leaves_an_earlier_one_s_files(tmp_path, capsys):
+    names = [tmp_path / name for name in ("x.mp4", "report.json", "above.png")]
+    outputs = [str(word) for pair in zip(("--film", "--report", "--picture"), names, strict=True) for word in pair]
+    for name in names:
+        name.write_bytes(b"earlier")
+    assert main(["drive", "--wait", "0.1", "--port", str(unused_port()), *outputs]) == 2
+    assert "no server at" in capsys.readouterr().err
+    assert [name.read_bytes() for name in names] == [b"earlier"] * 3
 
 
 def test_a_round_trip_in_real_time_is_that_of_the_telemetry_that_is_answered():
