@@ -87,7 +87,8 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
         run: Callable, help: str, *shared: argparse.ArgumentParser, epilog: str | None = None
     ) -> argparse.ArgumentParser:
         """Add the command that the function run_NAME runs, and return its parser."""
-        added = commands.add_parser(run.__name__.removeprefix("run_"), help=help, parents=shared, epilog=epilog)
+        name, sentence = run.__name__.removeprefix("run_"), f"{help[0].upper()}{help[1:]}."
+        added = commands.add_parser(name, help=help, description=sentence, parents=shared, epilog=epilog)
         added.set_defaults(run=run)
         return added
 

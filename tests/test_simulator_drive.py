@@ -25,6 +25,12 @@ def test_a_report_that_cannot_be_written_is_reported_before_the_drive(tmp_path, 
     assert "road.csv: is read, and would be replaced; name another file" in capsys.readouterr().err
 
 
+def test_the_help_of_a_command_says_what_it_does(capsys):
+    with pytest.raises(SystemExit):
+        main(["drive", "--help"])
+    assert "\n\nLet drive.py drive, and print a lap report.\n\n" in capsys.readouterr().out
+
+
 def test_steering_goes_out_in_degrees_the_car_obeys_and_the_report_says_what_happened(tmp_path):
     with Server(lambda packet, n: [STEER % ("0.3" if n > 30 else "0", "1")]) as server:
         client = drive(server, laps=0.03)
