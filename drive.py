@@ -28,6 +28,7 @@ import torch
 from cloning.base.arguments import MAX_PORT, address, command_line, number
 from cloning.base.errors import UserError
 from cloning.base.frame import FRAME
+from cloning.base.outputs import plural
 from cloning.lane.foretell import ALARM, Foreteller, Limits, Observer, limits_file, load_limits
 from cloning.lane.pilot import Pilot
 from cloning.network.network import SHIPPED_MODEL, Network, load_model, steer
@@ -119,7 +120,7 @@ class Session(page.Session):
         """Log how late the frames are and how they are moved, if either is found to be otherwise than before."""
         if self.late != self.pilot.predictor.delay.frames:
             self.late = self.pilot.predictor.delay.frames
-            what = f"frames come {self.late} frames late: steering for where the car is now"
+            what = f"frames come late, by {plural(self.late, 'frame')}: steering for where the car is now"
             log.warning(what if self.late else "frames are no longer known to come late", extra={"warned": self.warned})
         mount = self.pilot.mount
         if mount and self.moved != (found := np.sign(mount.found).tolist()):

@@ -232,7 +232,7 @@ def test_drive_py_tells_once_how_late_frames_are(
         shown.append((world.frame(), world.steering()))
         world.move(steered(number * PAUSE))
     assert abs(world.offset) < 0.3 and session.unusable == 0
-    told = ["frames come 4 frames late: steering for where the car is now"]
+    told = ["frames come late, by 4 frames: steering for where the car is now"]
     assert caplog.messages == told
     steered(260 * PAUSE)  # as after a person has driven: whether frames are still late is not known
     assert caplog.messages == [*told, "frames are no longer known to come late"]
