@@ -1,6 +1,7 @@
 """How far a long job is: a bar on a terminal, and elsewhere, as in a log file, a line now and then."""
 
 import sys
+import threading
 import time
 from typing import Any
 
@@ -14,6 +15,9 @@ class Bar(tqdm):
     """A progress bar whose times do not change with the system's clock."""
 
     monitor_interval = 0  # tqdm's thread would compare them with the clock
+    # tqdm's own is for processes, too, and where they are not forked (macOS, Python 3.14) Python tells of a leak at the
+    # end of a process that ends at once.
+    _lock = threading.RLock()
     _time = property(lambda _: time.monotonic, lambda _, clock: None)  # tqdm sets it to time.time
 
     def update(self, n: float | None = 1) -> bool | None:

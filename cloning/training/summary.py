@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from cloning.base.errors import RecordingError
 from cloning.base.files import csv_bytes, write
 from cloning.base.outputs import plural
+from cloning.base.progress import Bar
 from cloning.network.compute import threads
 from cloning.network.layer_table import layer_table
 from cloning.network.network import Network
@@ -158,7 +158,7 @@ class Pace:
         if self.to_print and self.batches >= TIMED_BATCHES and seconds >= TIMED_SECONDS:
             self.to_print = False
             epochs = plural(self.epochs, "epoch")
-            tqdm.write(f"about {duration(seconds + left)} for {self.rest}{epochs} on this machine")
+            Bar.write(f"about {duration(seconds + left)} for {self.rest}{epochs} on this machine")
         return f"{loss}, {duration(left)} left in all"
 
 

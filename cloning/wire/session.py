@@ -3,9 +3,8 @@
 import sys
 import time
 
-from tqdm import tqdm
-
 from cloning.base.errors import SimulatorError
+from cloning.base.progress import Bar
 from cloning.wire.client import (
     CONNECT,
     CONNECT_TIMEOUT,
@@ -180,4 +179,4 @@ class ClientSession:
 
 def _print(message: str) -> None:
     """Print a message to stderr, above a progress bar if there is one."""
-    tqdm.write(f"simulator: {message}", file=sys.stderr)
+    Bar.write(f"simulator: {message}", file=sys.stderr)
