@@ -80,7 +80,8 @@ class Session(page.Session):
             self.separator = decimal_separator(message, self.separator)
             telemetry = parse_telemetry(message)
             place = telemetry.place
-            now = place.time if place else time.perf_counter()  # on Windows monotonic() may have ticks of 15.6 ms
+            # On Windows monotonic() may have ticks of 15.6 ms.
+            now = time.perf_counter() if telemetry.time is None else telemetry.time
             self.steering, risk = self.pilot(telemetry.image, now, telemetry.speed * MPH)
             if risk is not None:
                 self.slow_down(risk)
@@ -106,7 +107,7 @@ class Session(page.Session):
                     self.folder = self.server.saver.start_session()
                     self.folders.append(self.folder)
                 driven = float(self.steering), throttle, telemetry.speed
-                self.folder.save(telemetry.jpeg, driven, place.time if place else None)
+                self.folder.save(telemetry.jpeg, driven, telemetry.time)
             where = (place.offset, place.x, place.y, risk) if place else (telemetry.cte, None, None, risk)
             latency = (time.perf_counter() - arrived) * 1000
             figures = (time.monotonic(), float(self.steering), telemetry.speed, throttle, latency)

@@ -234,8 +234,8 @@ def workers_for(driver: str, processes: int, scheduler: str | None) -> AbstractC
 def drive(conditions: Conditions, road: str | PointRoad, watch: Watch | None = None) -> Drive:
     """Drive a road as `python -m simulator drive` and drive.py do; road: as `Track` takes it. Raises UserError.
 
-    A driver is sent the frame, steering, throttle and speed, and not where the car is. watch: called after each physics
-    step with the run, and the cameras if the driver needs them.
+    A driver is sent the frame, steering, throttle, speed and time, and not where the car is. watch: called after each
+    physics step with the run, and the cameras if the driver needs them.
     """
     with _ALONE:
         return _drive_with(conditions, road, watch)
@@ -268,7 +268,8 @@ def _drive_with(conditions: Conditions, road: str | PointRoad, watch: Watch | No
 
         def request(image: bytes, run: Run) -> Answer:
             session.receive_unasked()  # a server may answer twice
-            answer = session.request_answer(telemetry_packet(run.steering, run.throttle, run.speed_mph, image))
+            packet = telemetry_packet(run.steering, run.throttle, run.speed_mph, image, time=run.time)
+            answer = session.request_answer(packet)
             return answer if conditions.own_throttle else Answer(answer.steering)
 
         try:

@@ -130,7 +130,7 @@ def test_the_film_of_a_drive_that_went_otherwise_before_says_so():
     assert all(clip.film.startswith("data:video/mp4;base64,") for clip in (same, other))
 
 
-def test_a_server_is_told_no_place_and_its_speed_is_held_for_it():
+def test_a_server_is_told_the_time_and_no_place_and_its_speed_is_held_for_it():
     steered = [0.0]
     with Server(lambda packet, n: [STEER % (n / 1000, "0")] * 2) as server:
         conditions = TINY[1].conditions(f"127.0.0.1:{server.port}")
@@ -138,8 +138,10 @@ def test_a_server_is_told_no_place_and_its_speed_is_held_for_it():
     told = [message for message in server.messages if message.startswith("42")]
     assert done.ended == "arrived" and 2 < done.seconds < 8  # 15 m, at first at rest
     assert 1000 * steered[-1] > len(told) - 4, "the second answer to a frame is none to the next one"
-    fields = {"steering_angle", "throttle", "speed", "image"}
-    assert {key for packet in told for key in (parse_event(packet) or ("", {}))[1]} == fields
+    sent = [(parse_event(packet) or ("", {}))[1] for packet in told]
+    assert {key for fields in sent for key in fields} == {"steering_angle", "throttle", "speed", "image", "stand_in"}
+    times = [fields["stand_in"].pop("time") for fields in sent]
+    assert times[0] == 0 and times[-1] == pytest.approx(done.seconds, abs=0.1) and not sent[-1]["stand_in"]
 
 
 def onnx_file(path, shape, axes, kind, reduced="ReduceMean"):

@@ -161,6 +161,8 @@ def test_the_place_that_the_stand_in_tells_is_shown_and_any_other_ignored(sessio
     assert parse_place(vars(run.place)) and run.place.track.startswith("--road a road"), "no name of a known track"
     session.answer({**telemetry(jpeg), "stand_in": place})
     assert session.place == Place(**place) and session.history[-1][-4:] == (0.25, 1, -2.5, None)
+    session.answer({**telemetry(jpeg), "stand_in": {"time": 8.25}})  # as in a replay
+    assert session.place is None and session.pilot.predictor.time == 8.25
 
 
 @pytest.mark.parametrize(

@@ -392,7 +392,9 @@ def test_ctrl_c_ends_drives_in_processes_with_one_message(loaded, model_file, tm
 
 def test_stretches_are_joined_in_one_report_and_no_line_of_its_plot_goes_from_one_to_the_other(recording):
     recording.time[150:] += 60
-    done = replay.drive(recording, human(recording), 1.0, echo)
+    times: list[float] = []
+    done = replay.drive(recording, human(recording), 1.0, echo, lambda frame, _: times.append(frame.time))
+    assert times[0] == times[150] == 0 and times[149] == pytest.approx(149 * 0.067, abs=0.01), "of each stretch its own"
     assert len(human(recording)) == 2 and sum(done.seconds) == pytest.approx(298 * 0.067, abs=0.01)
     with patch.object(Axes, "plot", autospec=True, side_effect=Axes.plot) as drawn:
         plot(recording, [done])

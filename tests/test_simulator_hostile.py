@@ -18,7 +18,7 @@ from steer_server import STEER, Blank, Server, accept_websocket, frame, lake
 
 from cloning.base.errors import SimulatorError
 from cloning.replay.server_driver import ServerDriver
-from cloning.wire.client import Connection, ConnectionLost, parse_answer
+from cloning.wire.client import Connection, ConnectionLost, parse_answer, parse_event
 from simulator.client import RemoteDriver
 from simulator.run import Run
 
@@ -195,13 +195,25 @@ def test_answers_given_twice_drive_on(realtime):
 
 @pytest.mark.parametrize("name", ["greets and closes", "floods what is no answer", "nests deep"])
 def test_a_replay_over_the_wire_ends_as_well(name):
-    frame_of_a_replay: Any = SimpleNamespace(speed=0.0, jpeg=lambda: b"a frame")
+    frame_of_a_replay: Any = SimpleNamespace(speed=0.0, time=0.0, jpeg=lambda: b"a frame")
     with Hostile(CASES[name]) as server:
         driver = ServerDriver("127.0.0.1", server.port, WAIT)
         with pytest.raises(SimulatorError, match="no usable answer"):
             driver(frame_of_a_replay)
         driver.close()
         assert server.open
+
+
+def test_a_replay_tells_drive_py_its_time():
+    """Else frames that come late, or are noisy, would be corrected by the time that computing them takes."""
+    with Server(lambda packet, n: [AHEAD]) as server:
+        driver = ServerDriver("127.0.0.1", server.port, WAIT)
+        for told_time in (0.0, 0.067):
+            frame_of_a_replay: Any = SimpleNamespace(speed=9.0, time=told_time, jpeg=lambda: b"a frame")
+            driver(frame_of_a_replay)
+        driver.close()
+    told = [(parse_event(message) or ("", {}))[1] for message in server.messages if message.startswith("42")]
+    assert [each["stand_in"] for each in told] == [*[{"time": 0.0}] * 3, {"time": 0.067}]
 
 
 @hostile

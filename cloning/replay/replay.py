@@ -193,7 +193,10 @@ class ReplayFrame:
     ):
         self.views, self.at, self.pose, self.disturber = views, at, (car.right, car.yaw), disturber
         self.line, self.row = car.line, car.line.rows.start + at
-        self.speed, self.time = float(recording.speed[self.row]), float(recording.time[self.row])  # mph, s
+        self.speed = float(recording.speed[self.row])  # mph
+        self.time = float(
+            recording.time[self.row] - recording.time[car.line.rows.start]
+        )  # s since the line's first row
         self.human_steering = float(car.human_steering[at])  # -1..1
 
     @functools.cached_property

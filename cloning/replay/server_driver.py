@@ -10,7 +10,7 @@ class ServerDriver(Driven, ClientSession):
 
     def __call__(self, frame: ReplayFrame) -> float:
         """Return the steering, -1..1. Raises SimulatorError if the server is missing, or silent, for too long."""
-        packet = telemetry_packet(self.steering, self.throttle, frame.speed, frame.jpeg())
+        packet = telemetry_packet(self.steering, self.throttle, frame.speed, frame.jpeg(), time=frame.time)
         while True:
             try:
                 if not self.connected:

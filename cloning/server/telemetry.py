@@ -5,6 +5,7 @@ import math
 import re
 import unicodedata
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,7 @@ class Telemetry:
     speed: float  # mph
     cte: float | None  # m from the lane's centre, which some simulators tell, in their own sign; None if it is unusable
     place: Place | None  # which only the stand-in simulator tells
+    time: float | None  # s by the simulator's own clock, likewise, also without a place
 
 
 def parse_telemetry(message: object) -> Telemetry:
@@ -63,7 +65,8 @@ def parse_telemetry(message: object) -> Telemetry:
     except (TypeError, ValueError) as error:
         raise UnusableTelemetry("the image is not base64") from error
     try:
-        return Telemetry(jpeg, decode(jpeg), speed, cte, parse_place(message.get(STAND_IN)))
+        told = message.get(STAND_IN)
+        return Telemetry(jpeg, decode(jpeg), speed, cte, parse_place(told), parse_time(told))
     except ValueError as error:
         raise UnusableTelemetry(f"the image is unusable: {error}") from error
 
@@ -87,10 +90,18 @@ def parse_place(told: object) -> Place | None:
     if not isinstance(told, dict) or set(told) != {each.name for each in fields(Place)}:
         return None
     place = Place(**told)
-    numbers = (place.x, place.y, place.offset, place.departures, place.time)
-    # A comparison with nan is false.
-    usable = all(type(number) in (int, float) and abs(number) <= LARGEST for number in numbers)
+    usable = all(map(_usable, (place.x, place.y, place.offset, place.departures, place.time)))
     return place if usable and type(place.track) is str and len(place.track) <= MAX_NAME else None
+
+
+def parse_time(told: object) -> float | None:
+    """Return the time that the stand-in simulator tells, s; None if it tells none."""
+    time = told.get("time") if isinstance(told, dict) else None
+    return time if _usable(time) else None
+
+
+def _usable(number: Any) -> bool:
+    return type(number) in (int, float) and abs(number) <= LARGEST  # False for nan
 
 
 def parse_number(written: object) -> tuple[float, str]:

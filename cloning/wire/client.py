@@ -117,11 +117,14 @@ def event_packet(name: str, data: Any) -> str:
     return EVENT + json.dumps([name, data], separators=(",", ":"))
 
 
-def telemetry_packet(steering: float, throttle: float, speed: float, jpeg: bytes, place: Place | None = None) -> str:
+def telemetry_packet(
+    steering: float, throttle: float, speed: float, jpeg: bytes, place: Place | None = None, time: float | None = None
+) -> str:
     """Return the telemetry packet for a frame.
 
     steering, throttle: as last commanded, -1..1 (the packet has the steering in degrees); speed: mph; place: of the
-    stand-in's car, for the page of drive.py; other servers ignore a field that they do not know.
+    stand-in's car, for drive.py; time: without a place, s by its clock. Other servers ignore a field that they do not
+    know.
     """
     values: dict[str, object] = {
         "steering_angle": f"{FULL_LOCK * steering:.4f}",
@@ -129,8 +132,9 @@ def telemetry_packet(steering: float, throttle: float, speed: float, jpeg: bytes
         "speed": f"{speed:.4f}",
         "image": base64.b64encode(jpeg).decode(),
     }
-    if place:
-        values[STAND_IN] = {name: round(v, 3) if isinstance(v, float) else v for name, v in vars(place).items()}
+    if place or time is not None:
+        told = vars(place) if place else {"time": time}
+        values[STAND_IN] = {name: round(v, 3) if isinstance(v, float) else v for name, v in told.items()}
     return event_packet("telemetry", values)
 
 

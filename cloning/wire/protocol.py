@@ -6,7 +6,8 @@ PORT = 4567  # on which the simulator expects the server
 FRAGMENT = 1016  # bytes: the client splits longer messages
 PING_INTERVAL, PONG_TIMEOUT = 25, 60  # s: the client pings this often, and gives up without an answer in this time
 MAX_NAME = 40  # characters of a road's name
-STAND_IN = "stand_in"  # the field with a `Place` that the stand-in simulator adds to each telemetry
+# The field that the stand-in simulator adds to each telemetry: a `Place`, or in replays and benchmarks its time alone
+STAND_IN = "stand_in"
 
 
 @dataclass(frozen=True)
