@@ -38,11 +38,11 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
     """Write all rows of recordings into one new folder: `recording.take` chooses them. Return what did not fit, if any.
 
     The images are hard links, or copies where the file system has none. Numbers are those that were read, so the new
-    log needs no repairs. A `lane.csv` goes along if every recording has one. A recording of the same time as another,
-    as the stand-in makes them, is put so many days later that each stays a drive of its own. The log is written last: a
-    process killed at any time leaves a whole recording, or a folder that is none. Raises RecordingError if the folder
-    exists, if an image is missing, if one of several recordings has images without a time in their names, or if it
-    cannot be written; then nothing is left.
+    log needs no repairs. A `lane.csv` goes along if every recording has one, and it names one of the rows. A recording
+    of the same time as another, as the stand-in makes them, is put so many days later that each stays a drive of its
+    own. The log is written last: a process killed at any time leaves a whole recording, or a folder that is none.
+    Raises RecordingError if the folder exists, if an image is missing, if one of several recordings has images without
+    a time in their names, or if it cannot be written; then nothing is left.
     """
     recordings = sorted(recordings, key=lambda recording: float(recording.time[0]))
     renamed, notes, end = list[dict[str, str]](), list[str](), -inf
@@ -78,8 +78,10 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
                 centres = {recording.name(row) for row in range(len(recording))}
                 with open(recording.folder / LANE_FILE, encoding="utf-8", errors="surrogateescape", newline="") as file:
                     known += [[names[line[0]], *line[1:]] for line in csv.reader(file) if line and line[0] in centres]
-        if all(lanes):
+        if known:
             write(folder / LANE_FILE, csv_bytes([list(LANE_COLUMNS), *known]))
+        elif all(lanes):
+            notes.append(f"{LANE_FILE} is left out: it names none of these rows")
         write(folder / DRIVING_LOG, csv_bytes([list(COLUMNS), *rows]))
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
