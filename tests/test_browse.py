@@ -150,6 +150,9 @@ def test_a_part_of_a_recording_is_a_recording_with_the_same_images(linked, tmp_p
     notes = ["tags do not go along", "lane.csv is left out: it names none of these rows"]
     assert write_part([recording.take(slice(30, 60))], tmp_path / "unnamed") == notes
     assert not (tmp_path / "unnamed/lane.csv").exists()  # training refuses one that names no row
+    (linked / "lane.csv").unlink()
+    os.mkfifo(linked / "lane.csv")  # would be waited for without end
+    assert write_part([recording.take(slice(30, 60))], tmp_path / "pipe") == notes
     with pytest.raises(RecordingError, match="part: exists already"):
         write_part([chosen], tmp_path / "part")
     recording.path(10).unlink()
@@ -158,7 +161,7 @@ def test_a_part_of_a_recording_is_a_recording_with_the_same_images(linked, tmp_p
     recording.path(10).symlink_to(linked / "driving_log.csv")
     with pytest.raises(RecordingError, match=f"{recording.name(10)}: a link to another file .not a JPEG"):
         write_part([chosen], tmp_path / "other")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "part", "unnamed"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "part", "pipe", "unnamed"]
 
 
 def test_recordings_become_one_with_each_drive_as_it_was(linked, tmp_path):

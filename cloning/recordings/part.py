@@ -28,7 +28,7 @@ from cloning.recordings.format import (
     parse_time_stamp,
     time_stamp,
 )
-from cloning.recordings.images import jpeg_size, read_jpeg
+from cloning.recordings.images import jpeg_size, nonblocking, read_jpeg
 from cloning.recordings.log import Recording
 
 DAY = timedelta(days=1)
@@ -76,7 +76,8 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
             ]
             if all(lanes):
                 centres = {recording.name(row) for row in range(len(recording))}
-                with open(recording.folder / LANE_FILE, encoding="utf-8", errors="surrogateescape", newline="") as file:
+                lane, errors = recording.folder / LANE_FILE, "surrogateescape"
+                with open(lane, encoding="utf-8", errors=errors, newline="", opener=nonblocking) as file:
                     known += [[names[line[0]], *line[1:]] for line in csv.reader(file) if line and line[0] in centres]
         if known:
             write(folder / LANE_FILE, csv_bytes([list(LANE_COLUMNS), *known]))
