@@ -153,6 +153,11 @@ def test_a_part_of_a_recording_is_a_recording_with_the_same_images(linked, tmp_p
     (linked / "lane.csv").unlink()
     os.mkfifo(linked / "lane.csv")  # would be waited for without end
     assert write_part([recording.take(slice(30, 60))], tmp_path / "pipe") == notes
+    (linked / "lane.csv").unlink()
+    (linked / "lane.csv").write_text("\n".join([lane[0], f'"{lane[1]}', *lane[2:]]), encoding="utf-8")
+    with pytest.raises(RecordingError, match="unexpected end of data; mend it"):
+        write_part([chosen], tmp_path / "other")
+    (linked / "lane.csv").unlink()
     with pytest.raises(RecordingError, match="part: exists already"):
         write_part([chosen], tmp_path / "part")
     recording.path(10).unlink()

@@ -78,15 +78,17 @@ def write_part(recordings: Sequence[Recording], folder: Path) -> list[str]:
                 centres = {recording.name(row) for row in range(len(recording))}
                 lane, errors = recording.folder / LANE_FILE, "surrogateescape"
                 with open(lane, encoding="utf-8", errors=errors, newline="", opener=nonblocking) as file:
-                    known += [[names[line[0]], *line[1:]] for line in csv.reader(file) if line and line[0] in centres]
+                    lines = csv.reader(file, strict=True)
+                    known += [[names[line[0]], *line[1:]] for line in lines if line and line[0] in centres]
         if known:
             write(folder / LANE_FILE, csv_bytes([list(LANE_COLUMNS), *known]))
         elif all(lanes):
             notes.append(f"{LANE_FILE} is left out: it names none of these rows")
         write(folder / DRIVING_LOG, csv_bytes([list(COLUMNS), *rows]))
-    except OSError as error:
+    except (OSError, csv.Error) as error:
         shutil.rmtree(folder, ignore_errors=True)
-        raise RecordingError(f"{error.filename or folder}: {error.strerror}; mend it, and export again") from None
+        where, why = (error.filename or folder, error.strerror) if isinstance(error, OSError) else (lane, error)
+        raise RecordingError(f"{where}: {why}; mend it, and export again") from None
     return notes
 
 
