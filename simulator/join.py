@@ -119,6 +119,7 @@ class Joined(ClientSession):
 
     def _exchange(self) -> None:
         """Send and receive until the program wants no more, or the connection is lost. Raises ConnectionLost."""
+        self.dialect.replies.clear()  # what a program that has gone was to hear
         self._start_clock()
         self._listen(SETTLE)
         self._start_clock()

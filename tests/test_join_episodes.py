@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 import pytest
 import socketio
+from steer_server import Server
 from test_join import LAKE, join, number
 from werkzeug.serving import make_server
 
-from cloning.base.errors import TrackError
+from cloning.base.errors import SimulatorError, TrackError
 from cloning.recordings.images import decode
 from simulator.dialects import Episodes
+from simulator.join import Joined
 from simulator.scenery.segments import CAR, GROUND, ROAD, SKY
 
 pytestmark = pytest.mark.usefixtures("at_once")
@@ -187,6 +189,24 @@ def test_an_episode_can_be_ended_at_any_time_and_then_telemetry_goes_on():
     data = json.loads(dialect.telemetry()[2:])[1]
     assert (data["lap"], data["sector"], data["next_cte"]) == ("1", "0", data["cte"])
     assert abs(number(data, "angular_difference")) < 0.1
+
+
+def test_what_a_program_that_has_gone_was_to_hear_is_not_told_to_the_next(monkeypatch):
+    monkeypatch.undo()  # what `at_once` has changed
+    heard = []
+
+    def answer(packet, n):
+        heard.append(json.loads(packet[2:])[0])
+        if len(server.requests) == 1:
+            server.send(server.client, '42["start_episode",{"track_name":"lake"}]')
+            for _ in range(50):  # it has gone before the last one is obeyed
+                server.send(server.client, '42["end_episode"]')
+
+    dialect = Episodes(LAKE)
+    dialect.ready = True
+    with Server(answer, sessions=2) as server, pytest.raises(SimulatorError):
+        Joined(dialect, "127.0.0.1", server.port, wait=1.0, pace=0, rate=15).run()
+    assert heard == 2 * ["car_telemetry"]
 
 
 def test_unknown_names_are_refused_and_known_ones_all_start():
