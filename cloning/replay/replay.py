@@ -192,11 +192,10 @@ class ReplayFrame:
         self, recording: Recording, views: StretchViews, car: ReplayedCar, at: int, disturber: Disturber | None = None
     ):
         self.views, self.at, self.pose, self.disturber = views, at, (car.right, car.yaw), disturber
-        self.line, self.row = car.line, car.line.rows.start + at
+        self.line, first = car.line, car.line.rows.start
+        self.row = first + at
         self.speed = float(recording.speed[self.row])  # mph
-        self.time = float(
-            recording.time[self.row] - recording.time[car.line.rows.start]
-        )  # s since the line's first row
+        self.time = float(recording.time[self.row] - recording.time[first])  # s since the line's first row
         self.human_steering = float(car.human_steering[at])  # -1..1
 
     @functools.cached_property
