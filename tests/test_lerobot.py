@@ -13,6 +13,7 @@ import pytest
 from commands import call_here
 from rendered import render_frame, render_recording
 
+from cloning.base import program
 from cloning.lerobot import __main__ as lerobot
 from cloning.recordings.check import check_images
 from cloning.recordings.images import encode, read_frame
@@ -115,9 +116,11 @@ def test_a_data_set_has_what_lerobots_format_names(written):
     assert episodes["stats/action/max"][2] == pytest.approx(np.max(rows["action"][14:], axis=0))
 
 
-def test_a_recording_comes_back_with_the_same_rows(recordings, written, tmp_path):
-    assert converted(written, "--output", tmp_path / "back").startswith(f"{tmp_path}/back: 19 rows")
-    back, before = checked(tmp_path / "back"), [checked(folder).without_copies() for folder in recordings]
+def test_a_recording_comes_back_with_the_same_rows(recordings, written, tmp_path, monkeypatch):
+    monkeypatch.setattr(program, "installed", {"python -m cloning.browse": "bc browse"})
+    folder = tmp_path / "the way back"
+    assert converted(written, "--output", folder) == f"{folder}: 19 rows; look at them with `bc browse '{folder}'`\n"
+    back, before = checked(folder), [checked(folder).without_copies() for folder in recordings]
     for name in ("steering", "throttle", "brake", "speed", "time"):
         np.testing.assert_array_equal(getattr(back, name), np.concatenate([getattr(each, name) for each in before]))
     at = 0

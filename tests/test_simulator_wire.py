@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 from steer_server import LAPS, STEER, Blank, Server, ahead, drive, lake, unused_port
 
+from cloning.base import program
 from cloning.base.errors import SimulatorError
 from cloning.recordings.images import decode
 from cloning.wire.client import Answer, parse_answer
@@ -76,7 +77,7 @@ def test_answers_are_read():
     assert parse_answer('42["manual",{}]') == Answer()
 
 
-def test_a_missing_server_is_waited_for_then_reported(capsys):
+def test_a_missing_server_is_waited_for_then_reported(capsys, monkeypatch):
     assert main(["drive", "--wait", "0.5", "--port", str(unused_port())]) == 2
     told = capsys.readouterr().err
     start = r"start `python drive.py --port \d+` in another terminal; trying again"
@@ -86,6 +87,9 @@ def test_a_missing_server_is_waited_for_then_reported(capsys):
     assert main(["join", "--dialect", "roads", "--wait", "0.5", "--port", str(port)]) == 2
     missing = rf"no server at 127\.0\.0\.1:{port} \(.*\); start the program, or name its --port; "
     assert re.search(f"{missing}trying again for 0.5 s\n.*: {missing}waited 0.5 s$", capsys.readouterr().err)
+    monkeypatch.setattr(program, "installed", {"python drive.py": "bc drive"})
+    assert main(["drive", "--wait", "0.5", "--port", str(port)]) == 2
+    assert capsys.readouterr().err.count(f"start `bc drive --port {port}` in another terminal") == 2
 
 
 @pytest.mark.parametrize("realtime", [False, True])

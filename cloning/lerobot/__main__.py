@@ -19,7 +19,7 @@ from pathlib import Path
 
 from cloning.base.arguments import command_line, number
 from cloning.base.errors import OutputError, RecordingError, UserError, printable
-from cloning.base.outputs import plural
+from cloning.base.outputs import as_typed, plural
 from cloning.lerobot.drives import MANIFEST, read_driven, read_tub
 from cloning.lerobot.source import write_recording
 from cloning.recordings.check import check_images
@@ -87,7 +87,8 @@ def main() -> int:
     finally:  # also why there is no usable row
         for note, times in notes.items():
             print(f"{source}: {printable(note)} ({plural(times, 'time')})")
-    print(f"{output}: {plural(rows, 'row')}; look at them with `python -m cloning.browse {output}`")
+    browse = program.in_commands(as_typed("python", "-m", "cloning.browse", output))
+    print(f"{output}: {plural(rows, 'row')}; look at them with `{browse}`")
     return program.DONE
 
 

@@ -3,6 +3,7 @@
 import sys
 import time
 
+from cloning.base import program
 from cloning.base.errors import SimulatorError
 from cloning.base.progress import Bar
 from cloning.wire.client import (
@@ -179,4 +180,4 @@ class ClientSession:
 
 def _print(message: str) -> None:
     """Print a message to stderr, above a progress bar if there is one."""
-    Bar.write(f"simulator: {message}", file=sys.stderr)
+    Bar.write(program.in_commands(f"simulator: {message}"), file=sys.stderr)
