@@ -18,6 +18,8 @@ from cloning.recordings.columns import column_of
 from cloning.recordings.format import CAMERAS, NUMBERS
 
 INFO = "meta/info.json"
+# What reading a file raises that is another than LeRobot's, or damaged
+WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, pa.ArrowException)
 MOST_NUMBERS = 1000  # of a feature without names; a damaged file may tell of any number
 
 
@@ -32,7 +34,7 @@ def read_data_set(folder: Path, camera: str | None, steering: str | None) -> Ite
         yield from _rows(folder, info, _cameras(info, camera), _columns(info, steering))
     except av.FFmpegError as error:
         raise RecordingError(f"{error.filename or folder}: {error.strerror}; copy the film again") from error
-    except (ValueError, KeyError, TypeError, IndexError, pa.ArrowException) as error:  # ValueError: of JSON, too
+    except WRONG as error:
         problem = f"{type(error).__name__}: {error}"
         raise RecordingError(f"not a data set in LeRobot's format v3 or v2: {problem}; copy it again") from error
 
