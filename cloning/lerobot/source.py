@@ -99,7 +99,10 @@ def chosen_camera(names: list[str], camera: str | None) -> str:
 
 def decoded(image: bytes) -> np.ndarray | None:
     """Return an image file's pixels, uint8 (rows, columns, 3), RGB, or None if it is damaged."""
-    return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR_RGB) if image else None
+    try:
+        return cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR_RGB) if image else None
+    except cv2.error:  # of an image that is larger than OpenCV allows
+        return None
 
 
 def fit(image: np.ndarray, notes: Counter[str]) -> np.ndarray:
