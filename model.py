@@ -36,6 +36,7 @@ from torch import channels_last, manual_seed, nn
 from cloning.base.cores import threads
 from cloning.base.errors import RecordingError, UserError
 from cloning.base.files import write
+from cloning.base.outputs import as_typed
 from cloning.base.progress import progress_bar
 from cloning.network.compute import choose_device, choose_precision, keep_freed_memory, one_thread, repeatable
 from cloning.network.network import NETWORKS, load_model
@@ -417,7 +418,7 @@ def run(command: Command, ranks: Ranks) -> None:
         with training_run.stop:
             training_run.train()
         if ranks.first:
-            following = f"next: python drive.py {training_run.files.last}"
+            following = f"next: {as_typed('python', 'drive.py', training_run.files.last)}"
             if training_run.recipe.name != ROBUST.name:
                 following += "\n`python model.py --robust` trains a network that drives better"
             print(program.in_commands(f"{training_run.summary()}\n\n{following}"))

@@ -136,7 +136,7 @@ def steering(model_file, jpegs) -> list[np.float32]:
 @pytest.fixture(scope="session")
 def finished(sample_recording, tmp_path_factory) -> tuple[str, Path]:
     """A run of two epochs as in the report: what it printed, and its folder; not to be changed."""
-    return finished_run(sample_recording, tmp_path_factory.mktemp("run"), *SHORT)
+    return finished_run(sample_recording, tmp_path_factory.mktemp("my run"), *SHORT)
 
 
 @pytest.fixture

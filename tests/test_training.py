@@ -50,7 +50,7 @@ def test_what_a_run_prints(finished, sample_recording):
     assert all(re.match(r"[89]\d images \[={30}\] - \d+s - loss: ", line) for line in epochs)
     assert any("steer 0" in line and "model-best.pt" in line for line in lines)
     assert "nan" not in finished[0]
-    assert lines[-2] == f"next: python drive.py {finished[1] / 'model.pt'}"
+    assert lines[-2] == f"next: python drive.py '{finished[1] / 'model.pt'}'"
     assert lines[-1] == "`python model.py --robust` trains a network that drives better"
 
 
@@ -85,11 +85,11 @@ def test_an_error_above_that_of_constant_steering_is_explained():
     labels = np.array([0.0] * 9 + [0.5], np.float32)
 
     def text(guess):
-        return summary.error_table(labels, 0.05, {Path("runs", "net.pt"): guess}, REPORT)
+        return summary.error_table(labels, 0.05, {Path("my runs", "net.pt"): guess}, REPORT)
 
     larger = text(labels + np.float32(0.3))
     assert "net.pt has a larger error than steer 0, because on straights" in larger and "nan" not in larger
-    assert larger.endswith(f"replay RECORDING --model {Path('runs', 'net.pt')}")
+    assert larger.endswith(f"replay RECORDING --model '{Path('my runs', 'net.pt')}'")
     assert "larger error" not in text(labels) and "hardly follows" not in text(labels)
     long = summary.error_table(labels, 0.05, {Path("jungle-shadows.pt"): labels, Path("a.pt"): labels}, REPORT)
     title, *figures = [line for line in long.splitlines() if "  steer 0  " in line or line.startswith("steering of")]

@@ -12,7 +12,7 @@ import torch
 
 from cloning.base.errors import RecordingError
 from cloning.base.files import csv_bytes, write
-from cloning.base.outputs import plural
+from cloning.base.outputs import as_typed, plural
 from cloning.base.progress import Bar
 from cloning.network.compute import threads
 from cloning.network.layer_table import layer_table
@@ -199,7 +199,7 @@ def error_table(labels: np.ndarray, mean: float, models: Mapping[Path, np.ndarra
         lines.append(
             f"{last} has a larger error than steer 0, because on straights, most of the rows, 0 is nearly right.\n"
             f"It follows the {label_source} nevertheless. How well it drives, a replay tells:\n"
-            f"python -m simulator replay RECORDING --model {path}"
+            + as_typed("python", "-m", "simulator", "replay", "RECORDING", "--model", path)
         )
     return "\n".join(lines)
 
