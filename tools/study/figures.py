@@ -35,18 +35,15 @@ REPLAYS = {
     "replay_distance_2.5": ("replay: mean distance", 1),
 }
 MEASURES = LOSSES | REPLAYS
-DRIVING = {
-    "driving": "departures per km and, among equals, mean distance",
-    "departures_per_km": "departures per km",
-    "offset_mean": "mean distance from the lane's centre",
-}
 INTRODUCTION = """Made by `python -m tools.study`. How, and what follows from it, is in [the
 report](../../writeup_report.md#does-the-loss-tell-how-it-drives). Each network's errors are those against the human
 driver on the recording of its track that it did not see, its replays are of that recording, and its laps are driven in
 the stand-in simulator. *mse*: mean squared error; *whiteness*: root mean square of the steering's change per second;
-*drift*: how far from the driver's path the car is after 2 s. A network is named by its recipe, or by what differs from
-the report's: *centre camera*, no images of the side cameras; *shifts* and *rotations*, images seen from beside the
-lane's centre, or turned."""
+*drift*: how far from the driver's path the car is after 2 s. [study.csv](study.csv) has a row for each network,
+which is named by its recipe, or by what differs from the report's: *centre camera*, no images of the side cameras;
+*shifts* and *rotations*, images seen from beside the lane's centre, or turned."""
+SIGNED = """Spearman's, signed so that 1 is perfect foresight; in brackets, 95 % of a bootstrap's draws. Laps are the
+worse, the more departures per km they have, and among equals the further they are from the lane's centre."""
 EQUALS = 0.01  # departures per km that a metre of mean distance counts: less than one departure in a lap
 COLOURS = dict.fromkeys(LOSSES, "tab:orange") | dict.fromkeys(REPLAYS, "tab:blue")
 
@@ -59,10 +56,13 @@ def row(variant: Variant, found: dict[str, float]) -> Row:
 
 
 def column(rows: Sequence[Row], name: str) -> np.ndarray:
-    """Return a column of numbers, or what DRIVING calls driving: float64 (n,)."""
-    if name == "driving":
-        return column(rows, "departures_per_km") + EQUALS * column(rows, "offset_mean")
+    """Return a column of numbers: float64 (n,)."""
     return np.array([float(each[name]) for each in rows])
+
+
+def driving(rows: Sequence[Row]) -> np.ndarray:
+    """Return how badly networks drive in the laps, by departures and, among equals, by mean distance: float64 (n,)."""
+    return column(rows, "departures_per_km") + EQUALS * column(rows, "offset_mean")
 
 
 def correlated(measure: np.ndarray, driving: np.ndarray, sign: int) -> tuple[float, float, float]:
@@ -97,37 +97,28 @@ def groups(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return found
 
 
-def correlations(rows: Sequence[Row], driving: str) -> dict[str, tuple[float, float, float]]:
-    """Return, by measure, the correlation of some networks with driving and its interval; driving: key of DRIVING."""
-    true = column(rows, driving)
+def correlations(rows: Sequence[Row]) -> dict[str, tuple[float, float, float]]:
+    """Return, by measure, the correlation of some networks with driving, and its interval."""
+    true = driving(rows)
     return {name: correlated(column(rows, name), true, sign) for name, (_, sign) in MEASURES.items()}
 
 
 def report(rows: Sequence[Row]) -> str:
-    """Return study.md: the correlations on each track, the recovery, and all networks."""
+    """Return study.md: the correlations on each track, and the recovery."""
     lines = ["# Does the loss tell how a network drives?", "", INTRODUCTION]
     compared = {title: part for title, part in groups(rows).items() if len(part) > 2}
-    for name, words in DRIVING.items():
-        found = [correlations(part, name) for part in compared.values()]
-        lines += ["", f"## Rank correlation with laps in the stand-in simulator: {words}", ""]
-        lines.append(command.head("measure", *(f"{title}, {len(part)} networks" for title, part in compared.items())))
-        for measure, (title, _) in MEASURES.items():
-            cells = ["{:.2f} ({:.2f} to {:.2f})".format(*each[measure]) for each in found]
-            lines.append(command.row(title, *cells))
-        lines += ["", "Spearman's, signed so that 1 is perfect foresight; in brackets, 95 % of a bootstrap's draws."]
+    lines += ["", "## Rank correlation with laps in the stand-in simulator", ""]
+    lines.append(command.head("measure", *(f"{title}, {len(part)} networks" for title, part in compared.items())))
+    found = [correlations(part) for part in compared.values()]
+    for measure, (title, _) in MEASURES.items():
+        lines.append(command.row(title, *("{:.2f} ({:.2f} to {:.2f})".format(*each[measure]) for each in found)))
+    lines += ["", SIGNED]
     seconds, metres = RECOVERY_SECONDS, RECOVERY_SPEED * MPH
     lines += ["", f"## Back in the lane within {seconds:g} s, at {metres:.0f} m/s", ""]
     lines.append(command.head("trained with", "of its starts, by seed", "mean"))
     for method, shares in recovery(rows).items():
         by_seed = ", ".join(f"{100 * share:.0f} %" for share in shares)
         lines.append(command.row(method, by_seed, f"{100 * np.mean(shares):.0f} %"))
-    columns = {"mse": "{:.4f}", "autonomy_1": "{:.0%}", "offset_mean": "{:.2f} m", "departures_per_km": "{:.1f}"}
-    lines += ["", "## All networks", ""]
-    lines.append(command.head("network", "mse", "autonomy at 1 m", "mean distance", "departures per km"))
-    for each in rows:
-        network = f"{each['track']}, {each['method']}, seed {each['seed']}"
-        cells = [words.format(float(each[name])).replace("%", " %") for name, words in columns.items()]
-        lines.append(command.row(network, *cells))
     return "\n".join(lines) + "\n"
 
 
@@ -144,7 +135,7 @@ def correlation_picture(rows: Sequence[Row]) -> bytes:
     foretelling = dict.fromkeys(MEASURES, 0)
     every_axes = figure.subplots(1, len(compared), sharey=True)
     for axes, (title, part) in zip(every_axes, compared.items(), strict=True):
-        found = correlations(part, "driving") if len(part) > 2 else {}
+        found = correlations(part) if len(part) > 2 else {}
         for at, measure in enumerate(MEASURES):
             value, low, high = found.get(measure, (np.nan,) * 3)
             foretelling[measure] += low > 0
