@@ -311,12 +311,6 @@ def test_rendered_frames_are_like_themselves(drive, tmp_path, monkeypatch, capsy
     assert same < 5 and other > 2 * same  # not 0, because so short a drive is placed only to some metres
 
 
-@pytest.mark.parametrize("main, options", [(train_lane.main, []), (lane_accuracy.main, ["--laps", "0"])])
-def test_the_tools_name_what_is_missing(main, options, tmp_path):
-    with pytest.raises(RecordingError, match="nowhere"):
-        main([*options, str(tmp_path / "nowhere")])
-
-
 def test_an_output_in_no_folder_is_refused_before_the_training(tmp_path):
     with pytest.raises(OutputError, match="no such folder"):
         train_lane.main(["--output", str(tmp_path / "nowhere" / "lane.pt")])

@@ -270,13 +270,3 @@ def test_an_unusable_state_is_named(begun, change, words):
     told = refused_run("--output", begun / "model.pt", "--resume", "--epochs", 3)
     assert f"model.py: {path}: " in told and words in told and "new run without --resume" in told
     assert files(begun) == before
-
-
-def test_a_flipped_bit_in_the_optimizers_state_is_noticed(begun):
-    path = begun / "model-resume.pt"
-    data = bytearray(path.read_bytes())
-    average = torch.load(path, weights_only=True)["training"]["optimizer"]["state"][10]["exp_avg"]
-    data[data.find(average.numpy().tobytes()) + 1000] ^= 4
-    path.write_bytes(data)
-    told = refused_run("--output", begun / "model.pt", "--resume", "--epochs", 3)
-    assert f"{path}: " in told and "checksum" in told and "new run without --resume" in told

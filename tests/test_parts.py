@@ -218,15 +218,6 @@ def test_a_short_piece_that_was_followed_away_from_where_the_car_should_be_is_no
     assert placing.near(before, 1, (0, 0, 70), reach, True, False) is (found if certain else None)
 
 
-def test_the_same_is_sought_once(lake, monkeypatch):
-    placing, sought = Placing(lake[0], stretches(lake[0]), lake[1]), list[tuple]()
-    monkeypatch.setattr(placing, "best_of", lambda *place: sought.append(place))
-    part = Part(0, 0, 0, 300, Localisation(known_tracks()[0], np.zeros((300, 3)), 0.0, 0.1))
-    for reach, start in ((10.0, 300), (10.0, 300), (60.0, 300), (10.0, 310)):
-        placing.near(part, 0, (start, 300, 900), reach, True, False)
-    assert len(sought) == len(set(sought)) == 3 * 2  # where the car should be, and anywhere near
-
-
 @pytest.mark.parametrize(("blocks", "rows", "cuts"), [(80, 1, [29]), (60, 1, []), (80, 3, [])])
 def test_a_road_that_is_cut_is_told_from_one_that_changes(blocks, rows, cuts):
     """Shade comes over a part of the frames, or over all of them in successive rows."""
