@@ -25,6 +25,7 @@ from cloning.base.errors import RecordingError, UserError
 from cloning.network.network import Network
 from cloning.replay.replay import load_recording
 from model import REPORT, ROBUST, Generator, balance
+from simulator.expert import Expert
 from tools.study import __main__ as study
 from tools.study import figures
 from tools.study.measures import Simulator, offline
@@ -117,21 +118,13 @@ def test_errors_on_recorded_frames(sample_recording):
 def test_laps_and_recovery_in_the_simulator(monkeypatch, steering, departures):
     """Steered by the known position, the car stays and comes back; steered to one side, it leaves the road."""
     simulator = Simulator(Network(), "lake", "ccw", 15)
-    without_rendering = follow if steering is None else lambda run: steering
-    monkeypatch.setattr(simulator, "steering", without_rendering)
+    expert = Expert(simulator.track, wander=0)
+    monkeypatch.setattr(simulator, "steering", lambda run: expert.drive(run)[0] if steering is None else steering)
     run = simulator.lap(0.05)
     assert (len(run.departures) > 0) == departures
     assert (np.abs(run.trajectory.offset).max() < 1) == (not departures)
     assert run.distance >= 0.05 * simulator.track.length * (not departures)
     assert simulator.recovery(6) == (0 if departures else 1)
-
-
-def follow(run):
-    """Steer for a point 8 m ahead on the centre line."""
-    goal = run.track.at(run.s + 8)
-    position = run.car.node.get_pos()
-    bearing = np.arctan2(goal.y - position.y, goal.x - position.x) - run.car.heading
-    return float(np.clip(-3 * ((bearing + np.pi) % (2 * np.pi) - np.pi), -1, 1))
 
 
 def test_the_command_measures_and_goes_on(tmp_path, capsys, monkeypatch):
