@@ -1,15 +1,14 @@
 """Measure how accurately `cloning/lane` estimates the car's position in its lane.
 
-    python -m tools.lane_accuracy RECORDING …    # on rendered frames, and on these real recordings
+    python -m tools.lane_accuracy RECORDING …    # on rendered drives, and on these real recordings
 
-For rendered frames the true position is known. Single frames from random poses and whole drives are rendered, in looks
-that the network was not trained on; with --edges, also drives along each kind of edge. For real recordings only the
-position of the side cameras in the car is known.
+For rendered drives the true position is known. They are in looks that the network was not trained on; with --edges,
+there are also some along each kind of edge. For real recordings only the position of the side cameras in the car is
+known.
 """
 
 import itertools
 import tempfile
-import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,10 +24,8 @@ from cloning.lane.reader import (
     MOUNT_OFFSETS,
     LaneNetwork,
     detect_centres,
-    estimate_centres,
     fuse_detections,
     load_network,
-    read_strips,
 )
 from cloning.recordings.log import Recording, find_folders, read_recording
 from cloning.road.generated import COURSES, generate
@@ -36,7 +33,7 @@ from cloning.road.motion import MPH, stretches
 from cloning.road.track import ROADS, Track
 from simulator.car import STEP
 from simulator.record import record
-from tools.lane_frames import RenderedScene, render_all, shadowed
+from tools.lane_frames import shadowed
 
 UNSEEN_LOOKS = (998, 999, 1000)  # no network was trained on looks from 101 to 1000, nor on these roads
 UNSEEN_ROADS = tuple(f"road-{k}" for k in range(1, 9))
@@ -45,28 +42,11 @@ EDGES_LOOK = 700  # plus a road's number: its look
 NEAR = 0.3  # m: a reading no further from the truth is good
 
 
-def unseen_courses() -> dict[str, list[tuple[str, int]]]:
-    """Return courses by name, each with its tracks and looks."""
-    courses = {name: [(name, look) for look in UNSEEN_LOOKS] for name in ROADS}
-    courses["roads"] = [(road, 990 + k) for k, road in enumerate(UNSEEN_ROADS)]
-    shadows = {f"{name}, shadows": [(road, shadowed(look)) for road, look in some] for name, some in courses.items()}
-    return courses | shadows
-
-
-def measure_frames(network: LaneNetwork) -> None:
-    """Print the errors of single rendered frames from random poses, at each distance ahead."""
-    print(f"{'rendered frames, m ahead':34}" + "".join(f"{distance:>8g}" for distance in DISTANCES_AHEAD))
-    for name, courses in unseen_courses().items():
-        strips, true = render_all([RenderedScene(track, look, 150) for track, look in courses], seed=1)
-        estimated = estimate_centres(strips, network)
-        columns = zip(true.T, estimated.T, ~np.isnan(true.T), strict=True)
-        rows = {
-            "mean absolute error, m": np.nanmean(abs(estimated - true), 0),
-            "bias, m": np.nanmean(estimated - true, 0),
-            "slope": [np.polyfit(x[known], y[known], 1)[0] for x, y, known in columns],
-        }
-        for label, values in rows.items():
-            print(f"{f'{name}, {label}':34}" + "".join(f"{value:8.2f}" for value in values))
+def unseen_courses() -> list[tuple[str, int]]:
+    """Return tracks and looks, first without shadows, then with."""
+    plain = [(name, look) for name in ROADS for look in UNSEEN_LOOKS]
+    plain += [(road, 990 + k) for k, road in enumerate(UNSEEN_ROADS)]
+    return plain + [(name, shadowed(look)) for name, look in plain]
 
 
 @contextmanager
@@ -81,7 +61,7 @@ def rendered_drive(track: Track, laps: float, speed: float, look: int) -> Iterat
 
 def measure_drives(network: LaneNetwork, laps: float) -> None:
     """Print the errors on recordings of the stand-in simulator, which logs the true position."""
-    for name, look in (course for courses in unseen_courses().values() for course in courses):
+    for name, look in unseen_courses():
         with rendered_drive(Track(name), laps, 30 if name == "lake" else 15, look) as (recording, true):
             position = fuse_detections(recording, detect_centres(recording, network))
             located = estimate_lane_position(recording, stretches(recording), network)
@@ -125,15 +105,10 @@ def spread(values: np.ndarray) -> str:
 
 
 def measure_recording(folder: Path, network: LaneNetwork) -> None:
-    """Print the estimated positions of a real recording's side cameras, its lateral offsets, and the time needed."""
+    """Print the estimated positions of a real recording's side cameras, and its lateral offsets."""
     recording = read_recording(folder)
-    started = time.perf_counter()
-    strips = read_strips(recording)
-    decoded = time.perf_counter()
-    centres = estimate_centres(strips, network)
-    estimated = time.perf_counter()
+    centres = detect_centres(recording, network)
     position = fuse_detections(recording, centres)
-    finished = time.perf_counter()
     apart = centres[:, :1] - centres[:, 1:]
     print(f"{folder}, {len(recording)} rows")
     near = ", ".join(f"{distance:g}" for distance in DISTANCES_AHEAD[:3])
@@ -146,8 +121,6 @@ def measure_recording(folder: Path, network: LaneNetwork) -> None:
         f"  {'lateral offset':32}{spread(offset)}, mean {offset.mean():+.2f}; "
         f"heading error {np.degrees(position.heading_error).std():.1f} degrees; trusted {position.trusted.mean():.1%}"
     )
-    ms = np.diff([started, decoded, estimated, finished]) / len(recording) * 1e3
-    print(f"  {'ms a row':32}{ms.sum():.2f}: decode {ms[0]:.2f}, network {ms[1]:.2f}, fuse {ms[2]:.2f}")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -163,7 +136,6 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     network, folders = load_network(options.network), find_folders(options.recordings)
     if options.laps:
-        measure_frames(network)
         measure_drives(network, options.laps)
     if options.edges:
         measure_edges(network, options.edges)
