@@ -1,4 +1,4 @@
-"""The repository itself: wrong imports are found, documents name what exists, and requirements are what is used."""
+"""The repository: wrong imports are found, documents name what exists and works, requirements are what is used."""
 
 import ast
 import os
@@ -10,9 +10,14 @@ import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+import numpy as np
 import pytest
+from commands import ROOT
+from PIL import Image
 
-ROOT = Path(__file__).parent.parent
+from cloning.network.attention import visual_backprop
+from cloning.network.network import NETWORKS, load_model
+
 PACKAGES = ("cloning", "simulator", "tools")
 SCRIPTS = ("model.py", "drive.py", "video.py")
 DOCUMENTS = [*ROOT.glob("*.md"), ROOT / "data" / "README.md", *ROOT.glob("tools/**/*.md"), *ROOT.glob("cloning/*/*.md")]
@@ -125,3 +130,51 @@ def test_documents_name_what_exists(document):
 def test_lines_of_documents_are_at_most_120_characters(document):
     lines = document.read_text(encoding="utf-8").splitlines()
     assert [line for line in lines if len(line) > 120 and not line.startswith("|")] == []
+
+
+def test_what_runs_write_is_not_tracked(finished):
+    """What model.py leaves, and what drives, films and reports are called in the documents."""
+    if not (ROOT / ".git").exists() or not shutil.which("git"):
+        pytest.skip("needs git and a checkout")
+    names = [path.relative_to(finished[1]).as_posix() for path in finished[1].rglob("*") if path.is_file()]
+    names += ["model-previous.pt", "rejected_rows.csv", "report.html", "data/lake/driving_log.csv", "run1.mp4"]
+    names += ["run1/2018_07_16_17_11_43_382.jpg", "lap.json", "lap.png", "lap.mp4"]
+    ignored = subprocess.run(["git", "check-ignore", *names], cwd=ROOT, capture_output=True, text=True).stdout
+    assert set(ignored.splitlines()) == set(names)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What CONTRIBUTING.md shows works as it stands there
+
+SHORT = "replace(REPORT, epochs=1, samples_per_epoch=64, batch_size=8, "  # else the code is the document's
+
+
+def run_example(heading: str) -> None:
+    """Run the code below a heading, with a shorter training."""
+    section = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split(f"\n## {heading}\n")[1]
+    code = re.search(r"```python\n(.*?)```", section, re.DOTALL)
+    assert code and "replace(REPORT, " in code[1]
+    exec(compile(code[1].replace("replace(REPORT, ", SHORT), heading, "exec"), {"__name__": "example"})
+
+
+def test_an_augmentation_is_added(linked, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_example("How to add an augmentation")
+    assert (tmp_path / "runs/noisy/model.pt").exists()
+    picture = Image.open(tmp_path / "runs/noisy/diagnostic_images/training_generator_augmented-0.png")
+    fifth = np.asarray(picture)[-300:, : picture.width // 2].astype(int)  # in a third row, enlarged three times
+    assert np.abs(np.diff(fifth[::3], axis=0)).mean() > 5
+
+
+def test_a_network_is_added(linked, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cloning.network.network.NETWORKS", NETWORKS)
+    try:
+        run_example("How to add a network")
+        network = load_model(tmp_path / "runs/small/model.pt")
+    finally:
+        NETWORKS.pop("small", None)
+    assert type(network).__name__ == "SmallNetwork"
+    assert sum(weights.numel() for weights in network.parameters()) < 559_419 / 5
+    steering, mask = visual_backprop(network, np.full((160, 320, 3), 90, np.uint8))
+    assert abs(steering) <= 1 and mask.shape == (160, 320) and mask.max() > 0

@@ -1,4 +1,4 @@
-"""What `simulator drive` reports: figures, latencies, exit statuses, a full disk."""
+"""`simulator drive`: the network that ships stays on the road; what is reported: figures, latencies, a full disk."""
 
 import json
 import re
@@ -6,6 +6,8 @@ import time
 
 import numpy as np
 import pytest
+from commands import ROOT, python
+from drive_process import serving
 from scenes import load
 from steer_server import STEER, Server, ahead, drive, unused_port
 
@@ -15,6 +17,21 @@ from cloning.road.track import Track
 from simulator import report
 from simulator.__main__ import main
 from simulator.run import Run
+
+
+# The mean offsets were measured in lock-step on a CPU, where a drive is the same on every run.
+@pytest.mark.parametrize(("track", "mean_offset"), [("lake", 0.071), ("jungle", 0.173)])
+def test_the_shipped_network_stays_on_the_road(track, mean_offset, tmp_path):
+    laps, report = 150 / Track(track).length, tmp_path / "lap.json"
+    with serving("cloning/network/shipped.pt", "--speed", 15, cwd=ROOT) as server:
+        drive = ("-m", "simulator", "drive", "--track", track, "--port", server.port, "--report", report)
+        done = python(*drive, "--laps", f"{laps:.4f}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    lap = json.loads(report.read_text(encoding="utf-8"))
+    assert lap["departures"] == []
+    assert lap["distance_m"] == pytest.approx(150, abs=5)
+    assert lap["unusable_answers"] == lap["reconnections"] == 0
+    assert 0 < lap["offset_mean_m"] <= 1.3 * mean_offset
 
 
 def test_a_report_that_cannot_be_written_is_reported_before_the_drive(tmp_path, capsys):
