@@ -10,7 +10,7 @@ is made of), by replays of that recording, and by laps in the stand-in simulator
 started next to the lane, and turned: do they come back?
 
 The folder then holds study.csv, a row for each network, study.md with the rank correlations of all measures with
-driving, and pictures. An interrupted study continues when it is started again with the same options.
+driving, and a picture of these. An interrupted study continues when it is started again with the same options.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from cloning.recordings.format import DRIVING_LOG
 from cloning.road.track import Track
 from simulator.record import record
 from simulator.workers import begin
-from tools.study.figures import correlation_picture, recovery_picture, report, row
+from tools.study.figures import correlation_picture, report, row
 from tools.study.measures import measure
 from tools.study.networks import EPOCH_IMAGES, RENDERED, TRACKS, Variant, plan
 
@@ -102,8 +102,7 @@ def main(argv: list[str] | None = None) -> int:
         write_output(study.with_suffix(".csv"), csv_bytes([rows[0], *(network.values() for network in rows)]))
         write_output(study, report(rows).encode())
         write_output(study.with_name("study_correlation.png"), correlation_picture(rows))
-        write_output(study.with_name("study_recovery.png"), recovery_picture(rows))
-    print(f"{study}, study.csv and pictures")
+    print(f"{study}, study.csv and study_correlation.png")
     return program.DONE
 
 

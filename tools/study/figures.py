@@ -152,17 +152,3 @@ def correlation_picture(rows: Sequence[Row]) -> bytes:
     )
     figure.supxlabel("rank correlation with driving: 1 is perfect foresight")
     return png(figure, DPI)
-
-
-def recovery_picture(rows: Sequence[Row]) -> bytes:
-    """Return the share of starts from which the networks of each method come back: bars for means, dots for seeds."""
-    figure, found = Figure((7, 4), layout="constrained"), recovery(rows)
-    axes = figure.subplots()
-    for at, shares in enumerate(found.values()):
-        axes.bar(at, 100 * np.mean(shares), color="tab:blue", alpha=0.5)
-        axes.plot([at] * len(shares), 100 * np.array(shares), "o", color="black", markersize=4)
-    axes.set(xticks=range(len(found)), xticklabels=list(found), ylim=(0, 105), ylabel="% of starts")
-    ends = [f"{100 * np.mean(found[method]):.0f} % with {method}" for method in [*found][:1] + [*found][-1:]]
-    axes.set_title(f"Back in the lane within {RECOVERY_SECONDS:g} s: {', '.join(ends)}")
-    axes.grid(axis="y", alpha=0.3)
-    return png(figure, DPI)
