@@ -47,6 +47,12 @@ def test_a_camera_is_where_the_cars_pose_and_its_mounting_put_it():
     assert found == pytest.approx(np.add(axle, [turned.real, turned.imag]))
 
 
+def test_the_curvature_of_a_steering():
+    steering = np.linspace(-1, 1, 21)
+    assert motion.steering_for(motion.curvature(steering)) == pytest.approx(steering)
+    assert motion.curvature(1.0) == pytest.approx(np.tan(np.radians(25)) / 2.87)
+
+
 def test_a_constant_steering_drives_a_circle(sample_recording):
     recording = read_recording(sample_recording)
     recording.steering[:], recording.speed[:] = 0.5, 20
