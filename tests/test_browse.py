@@ -16,7 +16,7 @@ from drive_process import awaited
 
 from cloning.base.errors import RecordingError, UserError, message_of
 from cloning.browse import analyse, analyses, library, summary
-from cloning.browse.analyses import LANE, Analyses, Result, read_result, stamp, write_result
+from cloning.browse.analyses import LANE, Analyses, Analysis, Result, read_result, stamp, write_result
 from cloning.browse.filter import matching
 from cloning.browse.library import Library, UnknownError
 from cloning.lane.search import Localisation
@@ -231,11 +231,11 @@ def recording(linked):
         yield recording
 
 
-def ended(analyses: Analyses, folder: Path) -> dict:
-    """The state of an analysis of the lane once it is done or has failed."""
+def ended(analyses: Analyses, folder: Path, analysis=LANE) -> dict:
+    """The state of an analysis once it is done or has failed."""
 
     def is_over() -> dict | None:
-        state = analyses.state(folder, LANE)
+        state = analyses.state(folder, analysis)
         return None if state["state"] in ("waiting", "running") else state
 
     return awaited(is_over)
@@ -290,6 +290,17 @@ def test_an_analysis_tells_how_far_it_is_and_why_it_failed(recording, linked, mo
     assert queue.state(linked, LANE)["state"] == "waiting", "tried again once the recording has changed"
     queue.close()
     assert queue.process is None
+
+
+def test_no_name_is_an_option_or_progress(recording, linked, monkeypatch):
+    code = "import sys; sys.exit(sys.argv[1] + sys.argv[3])"
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", code))
+    monkeypatch.chdir(linked)
+    steering = Analysis("steering", "driving_log.csv")
+    for name in ("-x", "progress 1"):
+        Path(name).symlink_to(linked)
+        message = f"{linked / name}{linked / steering.model}"
+        assert ended(recording.analyses, Path(name), steering) == {"state": "failed", "message": message}
 
 
 def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried_again(recording, linked, monkeypatch):

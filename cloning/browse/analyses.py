@@ -218,8 +218,10 @@ class Analyses:
         with self.changed:
             if self.ended:
                 return ""
-            command = [*COMMAND, str(folder), analysis.kind]
-            command += [analysis.model] * bool(analysis.model) + [f"{analysis.limit:g}"] * bool(analysis.limit)
+            # Absolute, so that none is taken for an option, and what is said of it for progress.
+            command = [*COMMAND, os.path.abspath(folder), analysis.kind]
+            command += [os.path.abspath(analysis.model)] * bool(analysis.model)
+            command += [f"{analysis.limit:g}"] * bool(analysis.limit)
             pipe, both, env = subprocess.PIPE, subprocess.STDOUT, environment()
             self.process = subprocess.Popen(command, stdout=pipe, stderr=both, env=env, text=True, errors="replace")
         message = "was ended"
