@@ -14,6 +14,7 @@ import pytest
 from browse_process import opened
 from drive_process import awaited
 
+from cloning.base import program
 from cloning.base.errors import RecordingError, UserError, message_of
 from cloning.browse import analyse, analyses, library, summary
 from cloning.browse.analyses import LANE, Analyses, Analysis, Result, read_result, stamp, write_result
@@ -307,9 +308,10 @@ def test_an_analysis_whose_process_cannot_be_started_has_failed_and_can_be_tried
     monkeypatch.setattr(analyses, "COMMAND", ("/no/python",))
     message = "its process cannot be started: /no/python: No such file or directory"
     assert ended(recording.analyses, linked) == {"state": "failed", "message": message}
-    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", "import sys; sys.exit('started')"))
+    monkeypatch.setattr(analyses, "COMMAND", (sys.executable, "-c", "import sys; sys.exit('started: python model.py')"))
+    monkeypatch.setattr(program, "installed", {"python model.py": "bc train"})
     recording.retry("offset")
-    assert ended(recording.analyses, linked) == {"state": "failed", "message": "started"}
+    assert ended(recording.analyses, linked) == {"state": "failed", "message": "started: bc train"}
 
 
 def test_a_recording_without_an_image_has_no_lane(linked):

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from cloning.base import program
 from cloning.base.errors import RecordingError, UserError, message_of
 from cloning.base.files import written_whole
 from cloning.base.processes import PYTHON, environment
@@ -199,7 +200,7 @@ class Analyses:
                 message = f"its process cannot be started: {message_of(error)}"
             with self.changed:
                 if message and not self.ended:
-                    self.failed[job, before] = message
+                    self.failed[job, before] = program.in_commands(message)
                 self.process = self.running = None
 
     def _next(self) -> Job | None:
