@@ -257,6 +257,8 @@ def test_curves_are_zoomed_with_wheel_window_and_fingers(served, page):
     low, high = now(page, "plots.zoom")
     assert (low, high) == (pytest.approx(14.75, abs=1), pytest.approx(44.25, abs=1))
     page.shows("#zoomed", "The curves show 0:01.0 to 0:02.9")
+    clock = "import('/static/common.js').then(({clock}) => [0.04, 59.94, 59.96, 3599.96].map(clock).join())"
+    assert page.run(clock) == "0:00.0,0:59.9,1:00.0,60:00.0"
     page.wheel("#plots .u-over", -200)
     page.until(lambda: now(page, "plots.zoom[1]") < high - 3)
     first = now(page, "plots.zoom[0]")

@@ -28,7 +28,10 @@ export function notice(message = "") {
 export const sending = (method, value) =>
   ({method, headers: {"Content-Type": "application/json"}, body: JSON.stringify(value)});
 
-export const clock = seconds => `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")}`;
+export function clock(seconds) {
+  const tenths = Math.round(10 * seconds); // rounded first: 59.96 s are 1:00.0, not 0:60.0
+  return `${Math.floor(tenths / 600)}:${(tenths % 600 / 10).toFixed(1).padStart(4, "0")}`;
+}
 export const many = (count, word, several = `${word}s`) =>
   `${count.toLocaleString("en")} ${count == 1 ? word : several}`;
 
