@@ -208,3 +208,22 @@ def test_a_frame_that_is_late_is_shown_though_it_was_freed_meanwhile(linked, pag
         frame = read_recording(linked).path(1, 1).read_bytes()
         page.until(lambda: page.difference("left", frame) < 3, 20)
         assert page.complaints() == []
+
+
+def test_a_comparison_leads_to_what_is_chosen_there(linked, page):
+    """Not to what an earlier one with the same figures did, and without a model to no replays."""
+    placed(linked, np.zeros(60))
+    with browsing(linked) as server:
+        page.open(f"{server.base}#/compare?ids={server.hash('lake')[2:]}")
+        page.shows("#table", "lake")
+        page.run("location.hash = '#'")
+        page.wait("!document.querySelector('#list').hidden")
+        page.run("location.hash = '#/compare'")
+        page.wait("!document.querySelector('#comparison').hidden")
+        page.click("#comparing button:last-child")
+        page.wait("location.hash == '#/compare?limit=2.5'")
+        page.wait("document.querySelector('#table a').hash.endsWith('?limit=2.5')")
+        page.click("#table a")
+        at(page, 0)
+        page.wait("location.hash.endsWith('/0')")
+        assert page.run("document.querySelector('#replays').hidden")

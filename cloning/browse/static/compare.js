@@ -25,7 +25,7 @@ export async function showComparison(shown) {
   element("title").textContent = "/ compared";
   document.title = "Recordings compared";
   element("comparison").hidden = false;
-  renew(element("comparing"), now.limit, () => ["Replays at a limit of", ...LIMITS.map(limit => {
+  renew(element("comparing"), [now.limit, ids], () => ["Replays at a limit of", ...LIMITS.map(limit => {
     const button = make("button", `${limit} m`, {
       "aria-pressed": limit == now.limit, title: `A model is set back when it is ${limit} m from the lane's centre`});
     const state = new URLSearchParams({...ids && {ids}, limit});
@@ -55,7 +55,7 @@ async function refresh(now, method) {
   const count = state => states.filter(each => each == state).length, pending = count("running") + count("waiting");
   element("compare-all").hidden = !(count("none") + count("paused") + count("failed"));
   element("compared").textContent = pending ? `${many(pending, "analysis", "analyses")} to do` : "";
-  renew(element("table"), found, () => table(found, now.limit));
+  renew(element("table"), [now.limit, found], () => table(found, now.limit));
   if (pending) again();
 }
 

@@ -73,7 +73,7 @@ export async function showRecording(id, row, shown) {
   const now = page.open = {
     id, details, columns, count, marks: first > last ? {first: last, last: first} : {first, last}, ...changes(id),
     stamps: isStale ? {} : stamps, row: rowOf(row), playing: 0, orders: 0,
-    jumps: {...details.jumps}, limit: limits, attention, replays: [], update,
+    jumps: {...details.jumps}, limit: details.models.length ? limits : undefined, attention, replays: [], update,
     condition: shown.get("find") ?? "", of: shown.get("of") ?? "steering", paths: shown.get("paths") != "0",
     query: () => now.limit ? `?limit=${now.limit}` : "",
     column: name => column(id, details.version, name),
