@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -16,6 +17,7 @@ from drive_process import awaited
 
 from cloning.base import program
 from cloning.base.errors import RecordingError, UserError, message_of
+from cloning.base.outputs import short_names
 from cloning.browse import analyse, analyses, library, summary
 from cloning.browse.analyses import LANE, Analyses, Analysis, Result, read_result, stamp, write_result
 from cloning.browse.filter import matching
@@ -372,3 +374,19 @@ def test_threads_that_want_the_same_recording_read_it_once(recording, monkeypatc
     with ThreadPoolExecutor() as pool:
         one, two = pool.map(lambda _: recording.read(), range(2))
     assert one is two and read == [recording.folder]
+
+
+def test_of_recordings_that_are_added_at_the_same_time_none_is_lost(linked, tmp_path, monkeypatch):
+    with closing(Library([linked], [])) as shown:
+        other = threading.Thread(target=shown.add, args=[tmp_path])
+
+        def slowly(paths) -> list[str]:
+            if not other.ident:
+                other.start()
+                other.join(0.2)
+            return short_names(paths)
+
+        monkeypatch.setattr(library, "short_names", slowly)
+        shown.look()
+        other.join()
+        assert list(shown.recordings.values()) == [linked, tmp_path]

@@ -43,7 +43,7 @@ class Library:
         """given: recordings, or folders of recordings; models: whose steering is shown. Raises RecordingError."""
         self.recordings: dict[str, Path] = {}
         self.names: dict[str, str] = {}  # of the recordings, by the same identifiers
-        self.given = given
+        self.given, self._adding = given, threading.Lock()
         self.add(*find_folders(given))
         self.models = dict(zip(short_names(models), map(str, models), strict=True))
         self.analyses, self.attention = Analyses(), Attention()
@@ -59,9 +59,10 @@ class Library:
     def add(self, *folders: Path) -> list[str]:
         """Add recordings, and return their identifiers."""
         added = {hashlib.blake2b(os.fsencode(each.resolve()), digest_size=6).hexdigest(): each for each in folders}
-        recordings = self.recordings | added
-        self.names = dict(zip(recordings, short_names(recordings.values()), strict=True))
-        self.recordings = recordings
+        with self._adding:  # else of two threads one would lose what the other adds
+            recordings = self.recordings | added
+            self.names = dict(zip(recordings, short_names(recordings.values()), strict=True))
+            self.recordings = recordings
         return list(added)
 
     def close(self) -> None:
