@@ -186,12 +186,14 @@ def test_what_one_works_with_is_on_one_screen(served, page, sample_recording):
 
 def test_frames_are_found_cut_together_and_exported(linked, page):
     """By a condition and on the histogram; undoing outlives the page, whose address has all that it shows."""
-    placed(linked, np.where(np.arange(60) > 40, 1.5, 0.0))
+    placed(linked, np.where(np.arange(60) > 40, 1.5004, 0.0))
     recording = read_recording(linked)
     with browsing(linked) as server:
         page.open(f"{server.base}{server.hash('lake')}/0?find=offset > 1&speed=4&of=offset")
         page.shows("#matches", "19 frames in 1 stretch")
         page.wait("location.hash.includes('of=offset') && of.value == 'offset'")
+        page.drag("#histogram .u-over", 0.9, 1.05)
+        page.wait("condition.value.endsWith(' <= offset <= 1.51') && matches.innerText.startsWith('19 frames')")
         page.run("of.value = 'steering'; of.onchange()")
         page.wait("!location.hash.includes('of=')")
         page.press("g")

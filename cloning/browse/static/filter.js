@@ -71,13 +71,14 @@ export function showHistogram() {
     [there[0] ?? 0, there[0] ?? 0]);
   const [from, to] = low < high ? [low, high] : [low - 0.5, low + 0.5], wide = (to - from) / BINS;
   for (const value of there) counts[Math.min(BINS - 1, Math.floor((value - from) / wide))] += 1;
+  const fine = 10 ** Math.ceil(2 - Math.log10(to - from)); // a condition's numbers are multiples of 1 / fine
   plot?.destroy();
   plot = histogram(element("histogram"), name, counts, [from, to], {size: 16, gap: 1, space: 40}, {
     width: Math.min(WIDTH, innerWidth - 24), height: HEIGHT, padding: [2, 10, 0, 10],
     cursor: {y: false, points: {show: false}, drag: {x: true, y: false, setScale: false}},
     hooks: {setSelect: [plot => {
-      const {left, width} = plot.select, value = px => Number(plot.posToVal(px, "x").toPrecision(3));
-      if (width > 3) brush(name, value(left), value(left + width));
+      const {left, width} = plot.select, value = px => plot.posToVal(px, "x") * fine;
+      if (width > 3) brush(name, Math.floor(value(left)) / fine, Math.ceil(value(left + width)) / fine);
       plot.setSelect({left: 0, width: 0, top: 0, height: 0}, false);
     }]},
   });
