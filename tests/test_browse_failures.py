@@ -154,7 +154,7 @@ def test_a_recording_is_shown_though_a_model_is_trained_anew_meanwhile(linked, p
         page.run("late.go()")
         at(page, 7)
         page.shows("#findings", "one.pt: 0 % analysed")
-        page.shows("#matches", "still being analysed")
+        page.shows("#matches", "the analysis that tells this column is not done")
         written(linked, Analysis("steering", str(model)), {"steering": np.full(60, -0.3)})
         page.shows("#plots", "one.pt -0.300")
         page.shows("#matches", "60 frames in 1 stretch")

@@ -364,7 +364,7 @@ def _read_once(folder: Path, version: str) -> Recording:
 def _result(folder: Path, analysis: Analysis, now: str) -> Result:
     result = read_result(folder, analysis)
     if result is None:
-        raise UnknownError(f"{folder}: this column is still being analysed")
+        raise UnknownError(f"{folder}: the analysis that tells this column is not done")
     return result
 
 
