@@ -23,6 +23,7 @@ import numpy as np
 from cloning.base.arguments import command_line, number, ratio
 from cloning.base.errors import UserError
 from cloning.base.film import FilmWriter, frame_rate
+from cloning.base.outputs import as_typed
 from cloning.base.progress import progress_bar
 from cloning.recordings import saved_frames
 from cloning.recordings.format import SAMPLE_RATE
@@ -39,7 +40,8 @@ def find_frames(folder: Path) -> list[tuple[datetime, Path]]:
     if folder.is_file():
         raise UserError(f"{folder}: a file; name the folder in which drive.py has saved frames")
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; `python drive.py model.pt {folder}` saves frames in it")
+        command = as_typed("python", "drive.py", "model.pt", folder)
+        raise UserError(f"{folder}: no such folder; `{command}` saves frames in it")
     frames: list[tuple[datetime, Path]] = []
     others: list[str] = []
     for path in folder.iterdir():

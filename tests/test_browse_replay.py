@@ -183,13 +183,14 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
     best = load_checkpoint(finished[1] / "model-best.pt")["history"]
     least = {"epoch": len(best), "by": "val_loss", "value": best[-1]["val_loss"]}
     assert found["best"] == least, "too few rows to drift"
-    folder = shutil.copytree(finished[1], tmp_path / "copy")
+    folder = shutil.copytree(finished[1], tmp_path / "a copy")
     begun = (folder / "training_arguments.json").stat().st_mtime
     (folder / "report.html").write_text("", encoding="utf-8")
     for later, has_report in ((-1, False), (1, True)):  # the first one is of an earlier run
         os.utime(folder / "report.html", (begun + later, begun + later))
         assert runs.overview(RunFiles(str(folder / "model.pt")))["has_report"] is has_report
-    with pytest.raises(UserError, match="not a report"):  # it may be a link to another file
+    # It may be a link to another file.
+    with pytest.raises(UserError, match=r"not a report; `python -m cloning.report '\S+/a copy'`"):
         runs.Runs([folder]).report(0)
     files = written_run(tmp_path / "old", finished=4, images=0, losses=(0.5, float("nan"), 0.3))
     files.progress.unlink()

@@ -246,7 +246,7 @@ def test_what_measures_was_not_tuned_on():
 
 
 def test_limits_belong_to_one_network_and_a_damaged_file_is_refused(limits, network, tmp_path):
-    model, frame = tmp_path / "model.pt", render_frame(0.2, 0.3, np.random.default_rng(6))
+    model, frame = tmp_path / "my model.pt", render_frame(0.2, 0.3, np.random.default_rng(6))
     assert foretell.load_limits(model, network) is None, "no file"
     foretell.save_limits(model, network, limits)
     read = foretell.load_limits(model, network)
@@ -256,7 +256,7 @@ def test_limits_belong_to_one_network_and_a_damaged_file_is_refused(limits, netw
     assert foretell.limits_file(model).stat().st_size < 200_000
     assert foretell.load_limits(model, Network().eval()) is None, "another network has no figure"
     foretell.save_limits(model, network, limits._replace(weights=limits.weights[:-1]))
-    with pytest.raises(ModelError, match=r"model.limits.pt: .*python -m tools.foretell"):
+    with pytest.raises(ModelError, match=r"model.limits.pt: .*python -m tools.foretell '.*model.pt'"):
         foretell.load_limits(model, network)
 
 

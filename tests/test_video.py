@@ -180,13 +180,13 @@ def test_odd_sizes_lose_a_row_and_a_column(tmp_path):
 
 @pytest.mark.parametrize(
     "name, words",
-    [(None, "no such folder"), ("notes.txt", "name the folder in which"), (FIRST, "none of its 1 frames is readable")],
+    [(None, "model.pt 'my run'` saves"), ("notes.txt", "name the folder in which"), (FIRST, "none of its 1")],
 )
 def test_no_film_is_a_clear_error(run, tmp_path, name, words):
     if name:
-        (tmp_path / "run1").mkdir()
-        (tmp_path / "run1" / name).write_bytes(b"")
-    status, error = run("run1")
+        (tmp_path / "my run").mkdir()
+        (tmp_path / "my run" / name).write_bytes(b"")
+    status, error = run("my run")
     assert status == 2 and words in error
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
 

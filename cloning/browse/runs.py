@@ -66,11 +66,12 @@ class Runs:
     def report(self, index: int) -> bytes:
         """Return the report that `cloning.report` has written about a run, a page. Raises UnknownError, OSError."""
         path = self._files(index).report
+        writes = f"`{as_typed('python', '-m', 'cloning.report', path.parent)}` writes it"
         if not path.is_file():
-            raise UnknownError(f"{path}: not written yet; `python -m cloning.report {path.parent}` writes it")
+            raise UnknownError(f"{path}: not written yet; {writes}")
         page = path.read_bytes()
         if not page.lstrip().startswith(b"<!doctype html>"):  # a link to something else
-            raise UserError(f"{path}: not a report; `python -m cloning.report {path.parent}` writes it")
+            raise UserError(f"{path}: not a report; {writes}")
         return page
 
     def _place(self, index: int) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import torch
 from torch import nn
 
 from cloning.base.errors import ModelError
+from cloning.base.outputs import as_typed
 from cloning.lane.reader import ANY_ROAD_WEIGHTS, DISTANCES_AHEAD, extract_strip, fold_norms, load_network, normalize
 from cloning.lane.recovery import LOOKAHEAD
 from cloning.network import tensors
@@ -222,7 +223,8 @@ def load_limits(model: Path, network: Network) -> Limits | None:
 
     Raises ModelError for a file that is damaged.
     """
-    path, remedy = limits_file(model), f"measure the network again: `python -m tools.foretell {model}`"
+    path, command = limits_file(model), as_typed("python", "-m", "tools.foretell", model)
+    remedy = f"measure the network again: `{command}`"
     if not path.exists():
         return None
     saved = tensors.load(path, remedy)

@@ -21,6 +21,7 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from cloning.base.frame import FRAME, ROAD_ROWS
+from cloning.base.outputs import as_typed
 from cloning.lane.recovery import LanePosition
 from cloning.network import tensors
 from cloning.network.compute import choose_precision, in_precision, one_thread, threads
@@ -103,7 +104,7 @@ class LaneNetwork(nn.Module):
 def load_network(path: str | Path | None = None) -> LaneNetwork:
     """Return the network with the weights of a file, or with the shipped ones. Raises ModelError."""
     path, network = path or SHIPPED_WEIGHTS, LaneNetwork()
-    remedy = f"train the lane network with `python -m tools.train_lane --output {path}`"
+    remedy = f"train the lane network with `{as_typed('python', '-m', 'tools.train_lane', '--output', path)}`"
     tensors.load_weights(path, network, "the lane network", remedy)
     return network.eval()
 
