@@ -382,9 +382,9 @@ def test_the_pages_fit_every_screen_and_bar_nobody(served, page, width, dark):
         text = "map(each => `${each.tagName} ${each.id} ${each.textContent}`)"
         assert page.run(f"{CONTROLS}.filter(each => !each.title && !each.matches('a')).{text}") == []
         assert width > 600 or page.run(f"{CONTROLS}.filter(each => each.offsetHeight < 44).{text}") == []
-    models = "document.querySelectorAll('#attention button, #plots figcaption > span')"
-    page.run(f"{models}.forEach(each => each.textContent = 'a_long_name_'.repeat(9))")
-    assert page.fits(), "whatever models are called"
+    names = "document.querySelectorAll('#title, #attention button, #plots figcaption > span')"
+    page.run(f"{names}.forEach(each => each.textContent = 'a_long_name_'.repeat(9))")
+    assert page.fits() and page.run("(({scrollWidth: all, clientWidth: room}) => all <= room)(window['help-button'])")
 
 
 def test_the_focus_stays_on_a_button_of_what_is_shown_anew(served, page):
