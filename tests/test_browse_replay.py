@@ -202,9 +202,11 @@ def test_a_finished_run_and_one_of_an_earlier_version(finished, tmp_path):
     files = written_run(tmp_path / "diverged", finished=2, images=0, losses=(float("nan"), float("inf")))
     json.dumps(runs.Runs([files.last.parent]).found(), allow_nan=False)  # which no browser reads
     assert runs.overview(files)["best"] is None
-    options = json.loads(files.arguments.read_bytes()) | {"output": ""}
+    options = json.loads(files.arguments.read_bytes()) | {"output": "", "from_model": r'C:\runs\"old".pt'}
     files.arguments.write_text(json.dumps(options), encoding="utf-8")
-    assert runs.overview(files)["models"] == ["model.pt", "model-best.pt"]
+    found = runs.overview(files)
+    assert found["models"] == ["model.pt", "model-best.pt"]
+    assert found["options"]["from_model"] == options["from_model"]
 
 
 @pytest.mark.parametrize(

@@ -162,7 +162,7 @@ def _best(history: list[dict[str, float]], by: Any) -> dict[str, Any] | None:
 def _flat(options: dict[str, Any]) -> dict[str, str]:
     """Return the options of a run as texts, those of its recipe and of its libraries among them."""
     return {
-        str(name)[:60]: json.dumps(value, ensure_ascii=False)[:300].strip('"')
+        str(name)[:60]: (value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))[:300]
         for name, value in options.items()
         if not isinstance(value, dict) and name not in ("output", "resume")
     }
