@@ -227,3 +227,18 @@ def test_a_comparison_leads_to_what_is_chosen_there(linked, page):
         at(page, 0)
         page.wait("location.hash.endsWith('/0')")
         assert page.run("document.querySelector('#replays').hidden")
+
+
+def test_a_recording_is_cut_though_the_browser_stores_nothing(linked, page):
+    placed(linked, np.zeros(60))
+    denied = "Object.defineProperty(window, 'localStorage', {get() { throw new DOMException('', 'SecurityError'); }})"
+    script = page.send("Page.addScriptToEvaluateOnNewDocument", source=denied)
+    with browsing(linked) as server:
+        page.open(f"{server.base}{server.hash('lake')}/7?mark=5-9")
+        at(page, 7)
+        asks_why(page, "x")
+        page.press("Enter")
+        page.shows("#said", "Undo takes it back")
+        page.press("z")
+        page.shows("#cuts", "None")
+    page.send("Page.removeScriptToEvaluateOnNewDocument", **script)

@@ -5,6 +5,8 @@ import {seek, stop} from "./moving.js";
 import {page, remember, say} from "./state.js";
 
 const OPPOSITE = {POST: "DELETE", DELETE: "POST"}, GONE = 410; // the status of an answer
+let storage; // undefined where the browser refuses it, as with all cookies blocked: undoing ends with the page there
+try { storage = localStorage; } catch {}
 let turn = Promise.resolve(); // ends when all changes that were begun are made
 let asked; // the cuts that the dialog asks a reason for, without it: [first, row after the last] or names of images
 
@@ -130,18 +132,18 @@ async function act(now, kind, method, cuts, what, from = "") {
 }
 
 function keep({id, done, undone}) {
-  const write = () => localStorage.setItem(`cuts-${id}`, JSON.stringify({done, undone}));
+  const write = () => storage?.setItem(`cuts-${id}`, JSON.stringify({done, undone}));
   try {
     write();
   } catch { // it is full: what was changed in other recordings cannot be undone any more, only deleted
-    localStorage.clear();
+    storage.clear();
     write();
   }
 }
 
 // What was changed on this page earlier, to be undone: {done, undone}.
 export function changes(id) {
-  return JSON.parse(localStorage.getItem(`cuts-${id}`)) ?? {done: [], undone: []};
+  return JSON.parse(storage?.getItem(`cuts-${id}`) ?? null) ?? {done: [], undone: []};
 }
 
 // Another tab has changed the recording that is open here, too: both tabs show its cuts, and undo the same changes.
