@@ -60,7 +60,7 @@ def test_figures_are_those_of_the_rows_that_are_not_cut(sample_recording):
     assert found["histogram"] == wanted.tolist() and (found["frames"], found["cut_frames"]) == (60, 30)
     assert found["seconds"] == pytest.approx(59 * 0.067, abs=0.01)
     assert found["zeros"] == np.mean(recording.steering[30:] == 0)
-    assert found["speed"] == pytest.approx([30.19] * 3)
+    assert found["speed"] == pytest.approx([30.19] * 2)
     assert summary.figures(recording, np.ones(60, bool))["speed"] is None
 
 

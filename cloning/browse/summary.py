@@ -79,7 +79,7 @@ def figures(recording: Recording, is_cut: np.ndarray) -> dict[str, Any]:
         "picture": int(np.flatnonzero(kept)[kept.sum() // 2]) if kept.any() else 0,
         "histogram": counts.tolist(),
         "zeros": float((steering == 0).mean()) if len(steering) else None,
-        "speed": [float(function(speed)) for function in (np.min, np.mean, np.max)] if len(speed) else None,
+        "speed": [float(function(speed)) for function in (np.mean, np.max)] if len(speed) else None,
         "rows_read": recording.rows_read,
         "repairs": [[repair, rows, line] for repair, (rows, line) in recording.repairs.items()],
         "rejected": len(recording.rejected),

@@ -54,7 +54,7 @@ const FIGURES = { // of an overview, by which the list is searched and sorted
   minutes: each => (each.seconds ?? 0) / 60,
   frames: each => each.frames ?? 0,
   offset: each => each.offset?.[1] ?? 0,
-  speed: each => each.speed?.[1] ?? 0,
+  speed: each => each.speed?.[0] ?? 0,
   cut: each => each.cut_frames ?? 0,
   refused,
   repaired,
@@ -193,7 +193,7 @@ function draw(overview, card) {
   const src = `/recordings/${id}/rows/${overview.picture}/center.jpg?version=${overview.version}`;
   const picture = make("img", "", {src, alt: "", width: 320, height: 160, loading: "lazy"});
   picture.onerror = () => picture.replaceWith(make("div", "", {class: "none"}));
-  const histogram = make("div", "", {class: "histogram"}), [, mean, most] = overview.speed ?? [];
+  const histogram = make("div", "", {class: "histogram"}), [mean, most] = overview.speed ?? [];
   const lines = [
     `${(overview.seconds / 60).toFixed(1)} minutes, ${many(overview.frames, "frame")}; ${road(overview)}`,
     mean == undefined ? "all of it is cut"
