@@ -3,7 +3,7 @@ import {ask, element, make, many, notice, onClick, renew} from "./common.js";
 import {LIMITS, waits} from "./replays.js";
 
 const COLUMNS = { // of each model, and what they mean
-  "steering error": "Root mean square of the difference from the driver's steering, in all frames",
+  "steering error": "Root mean square of the difference from the driver's steering, in all frames that are not cut",
   autonomy: "Share of the time without an intervention, each of which counts as 6 s",
   "mean distance": "While the model drives, from the lane's centre, or from the driver's path where that is not known",
 };
