@@ -99,6 +99,7 @@ NUMBERS = {"steering": STEERING, "offset": OFFSET, "speed": np.arange(5, dtype=n
         ("abs(offset - steering) > 1", [1, 3]),
         ("not abs(offset) > 1", [2]),  # what is not known is not smaller either
         ("max(speed, 2) / 2 * (steering + 1) >= +2.2", [3, 4]),
+        ("steering == -9 / 10", [0]),
         ("speed > 1 / 0", []),
     ],
 )

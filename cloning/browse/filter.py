@@ -28,6 +28,10 @@ def matching(condition: str, column: Callable[[str], np.ndarray], names: list[st
     unknown: np.ndarray | bool = False
 
     def value(node: ast.AST) -> np.ndarray | float:
+        found = value_of(node)
+        return found.item() if isinstance(found, np.generic) else found  # 1/10, as 0.1, in a column's precision
+
+    def value_of(node: ast.AST) -> np.ndarray | float:
         nonlocal unknown
         match node:
             case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
