@@ -124,7 +124,7 @@ def test_a_replay_is_watched_with_the_keyboard_alone(served, page, sample_record
     page.shows("#said", "one.pt was 1.10 m to the left")
     page.press("N", shift=True)
     captions = "[...document.querySelectorAll('.replayed figcaption')].map(each => each.textContent).join()"
-    page.wait(f"{captions} == 'one.pt: 0.16 m right,two.pt: 0.16 m left'")
+    page.wait(f"{captions} == '0.16 m right: one.pt,0.16 m left: two.pt'")
     seen = served.ask(f"{here}/rows/39/replay-0-1.jpg")[1]
     page.until(lambda: page.difference("view-0", seen) < 3)
     centre = read_recording(sample_recording).path(39).read_bytes()

@@ -20,7 +20,8 @@ export function cameras() {
   if (!isReplayed) return [recorded("left", "Left"), centre, recorded("right", "Right")];
   const views = replays.map((replay, index) => replay && {
     canvas: `view-${index}`,
-    caption: row => `${details.models[index].name}: ${metres(replay.offset[row]).replace("to the ", "")}`,
+    // The name comes last, since the end is cut off where there is little room.
+    caption: row => `${metres(replay.offset[row]).replace("to the ", "")}: ${details.models[index].name}`,
     has: row => !Number.isNaN(replay.offset[row]),
     path: `replay-${index}-${replay.limit}`,
     looks: attention == index ? [index] : [],
