@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 import pytest
 import warm
-from browse_process import browsing, opened, placed, written_run
+from browse_process import browsing, opened, placed, replayed, steered, written_run
 from browser import needs_chromium
 from commands import HERE, trained
 from drive_process import awaited
 from test_excluded import center
 
 from cloning.base.errors import ModelError, UserError
-from cloning.browse import analyse, analyses, attend, runs
+from cloning.browse import analyse, analyses, attend, library, runs
 from cloning.browse.analyses import Analysis, UnknownError, stamp, write_result
 from cloning.browse.attention import Attention
 from cloning.network.attention import visual_backprop
@@ -100,6 +100,22 @@ def test_a_replay_begins_only_when_asked_for_and_can_be_stopped(linked, model_fi
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What a model looks at
+
+
+def test_a_replay_is_there_no_more_once_one_of_other_cuts_has_taken_its_place(linked, tmp_path):
+    (model := tmp_path / "model.pt").touch()
+    placed(linked, np.zeros(60))
+    steered(linked, model)
+    with opened(linked, model) as recording:
+        replayed(linked, model, 1.0, np.zeros(60), [])
+        assert recording.details("1")["replays"][0]["state"] == "ready"
+        cuts = recording.cut([Cut(center(linked, 50), center(linked, 59), "")])
+        assert recording.details("1")["replays"][0]["state"] == "none"
+        replayed(linked, model, 1.0, np.zeros(50), [])
+        assert recording.details("1")["replays"][0]["state"] == "ready"
+        recording.restore(cuts)
+        library._result.cache_clear()  # as if other recordings had been looked at
+        assert recording.details("1")["replays"][0]["state"] == "none"
 
 
 def test_the_attention_laid_over_a_frame_is_that_of_the_films(sample_recording, model_file):

@@ -119,7 +119,8 @@ class Analyses:
         self.waiting: dict[Job, int] = {}  # -> size of the log, bytes
         self.urgent: Path | None = None  # the folder whose analyses go before all others
         self.failed: dict[tuple[Job, str], str] = {}  # job, stamp -> message
-        self.ready: set[tuple[Job, str]] = set()  # job, stamp
+        # What is ready, and the `file_stamp` of its result: one of other cuts, for example, may take its place.
+        self.ready: set[tuple[tuple[Job, str], tuple[int, int] | None]] = set()
         self.running: Job | None = None
         self.paused = False  # whether none is begun, until `resume`
         self.progress = 0.0
@@ -143,8 +144,10 @@ class Analyses:
                 self.failed.pop(now, None)
             if now in self.failed:
                 return {"state": "failed", "message": self.failed[now]}
-            if (now in self.ready and result_file(*job).exists()) or read_result(*job):
-                self.ready.add(now)
+            file = result_file(*job)
+            seen = now, file_stamp(file) if file.exists() else None
+            if seen in self.ready or read_result(*job):
+                self.ready.add(seen)
                 return {"state": "ready", "stamp": now[1]}
             if self.running == job:
                 return {"state": "running", "progress": self.progress}
