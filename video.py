@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from cloning.base.arguments import command_line, number, ratio
-from cloning.base.errors import UserError
+from cloning.base.errors import UserError, printable
 from cloning.base.film import FilmWriter, frame_rate
 from cloning.base.outputs import as_typed
 from cloning.base.progress import progress_bar
@@ -66,7 +66,7 @@ def abbreviated(names: list[str]) -> str:
 
 def print_note(message: str) -> None:
     """Print a message about something that was left out or changed."""
-    print(f"{program.name}: {message}", file=sys.stderr)
+    print(f"{program.name}: {printable(message)}", file=sys.stderr)
 
 
 def make_film(folder: Path, fps: Fraction | None = None, draw: Overlay | None = None) -> int:
