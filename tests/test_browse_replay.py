@@ -320,6 +320,12 @@ def test_a_training_run_refreshes_itself(tmp_path, page):
         page.shows("#run-figures", "the least drift, 0.60 m, is that of epoch 3")
         assert page.run("document.querySelector('#run-bar').value") == 1
         assert page.run("document.querySelector('#run-read').open"), "after it has refreshed itself"
+        page.run("smooth.value = 0.7; smooth.oninput(); location.hash = '#'")
+        page.wait("!document.querySelector('#list').hidden")
+        page.run("location.hash = '#/run/0?with=1&smooth=0.5'")
+        page.wait("!document.querySelector('#run').hidden")
+        page.click("#run-others button")
+        page.wait("location.hash == '#/run/0?smooth=0.5'")
         page.run("location.hash = '#/run/1'")
         page.shows("#losses section", "Not known: no two seconds")
         assert page.complaints() == []

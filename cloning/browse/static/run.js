@@ -119,7 +119,7 @@ function update({all, runs}) {
     const isShown = now.others.includes(String(each.id));
     const button = make("button", each.name, {"aria-pressed": isShown, title: each.folder});
     const chosen = isShown ? now.others.filter(id => id != each.id) : [...now.others, each.id];
-    onClick(button, () => location.hash = addressOf(now, chosen));
+    onClick(button, () => location.hash = addressOf(open, chosen)); // it may be of an earlier visit
     return button;
   };
   renew(element("run-others"), [now.others, now.smooth, others.map(({id, folder}) => [id, folder])], () =>
