@@ -184,7 +184,7 @@ class Joined(ClientSession):
         driver.kept_silent(is_new)
 
     def _listen(self, pause: float) -> bool:
-        """Do what the server says until it is silent for `pause` seconds; return whether it answered a telemetry."""
+        """Do what the server says, its first event within `pause` seconds; return whether it answered a telemetry."""
         answered = False
         for _ in range(MAX_UNASKED):
             packet = self.connection.receive(pause)
@@ -195,7 +195,7 @@ class Joined(ClientSession):
                     self._catch_up()
                 answered = self.dialect.handle(*event) or answered
                 self._reply()
-            pause = self.dialect.more if answered else 0.0
+                pause = self.dialect.more if answered else 0.0
         return answered
 
     def _reply(self) -> None:

@@ -324,6 +324,20 @@ def test_a_telemetry_that_was_answered_late_has_a_second_answer_and_a_later_one_
     assert number(program.data[-1], "steering_angle") == pytest.approx(25 * 19 / 1000), "of the answer just before"
 
 
+def test_a_greeting_that_comes_after_connect_is_no_answer():
+    class Late(Program):
+        def send(self, client, text):
+            super().send(client, text)
+            if text == "40":
+                time.sleep(0.05)
+                super().send(client, "42" + json.dumps(steer(0.5, 0)))
+
+    with Late(lambda data, n: [steer(n / 1000, 1)] if n < 3 else None) as program:
+        program.greet = False
+        assert join("measures", program) == 0
+    assert [number(data, "steering_angle") / 25 for data in program.data] == pytest.approx([0.5, 0, 0.001, 0.002])
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Started by a program; many episodes
 
