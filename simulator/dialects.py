@@ -72,24 +72,20 @@ class Dialect(Driven):
 
     def __init__(self, stage: Stage):
         self.stage, self.still, self.ready, self.over, self.episodes = stage, False, True, False, 0
-        self.set_weather("sunny")
+        self.weather = "sunny"  # as `in_weather` names it, of the tracks that are built from now on
         self.views: list[Cameras] = []
         self.replies: list[str] = []  # packets to send besides telemetry
         self.open(stage.source, stage.direction)
 
     def open(self, source: str | PointRoad, direction: str | None = None) -> None:
         """Build a track, and set the car at its start. Raises TrackError."""
-        self.track = Track(source, direction)
+        self.track, self.disturbance = Track(source, direction), self.stage.disturbance or FALLING.get(self.weather)
         for i, built in enumerate(self.build(source)):
             if i < len(self.views):
                 self.views[i].move(Scene(built))
             else:
                 self.views.append(Cameras(Scene(built), ("center",)))
         self.restart()
-
-    def set_weather(self, weather: str) -> None:
-        """Choose the weather, as `in_weather` names it, of the tracks that are built from now on."""
-        self.weather, self.disturbance = weather, self.stage.disturbance or FALLING.get(weather)
 
     def build(self, source: str | PointRoad) -> list[scenery.Scenery]:
         """Return what the telemetry's images show. Raises TrackError for an unknown weather."""
@@ -213,7 +209,7 @@ class Roads(Dialect):
     def handle(self, event: str, data: Any) -> bool:
         """Steer, lay a road, or set the car back at its start. Raises TrackError for a text that is no road."""
         if event == "weather" and isinstance(data, dict):
-            self.set_weather(ROAD_WEATHERS.get(str(data.get("type")), "sunny"))
+            self.weather = ROAD_WEATHERS.get(str(data.get("type")), "sunny")
         self.same, self._last = event == "steer" and data == self._last, data
         if event == "steer":
             self.still = self.run.at_end
@@ -313,7 +309,7 @@ class Episodes(Dialect):
             raise TrackError(f"{daytime[:40]}: there is no such daytime; there are day and daynight")
         source: str | PointRoad = TRACKS.get(track, track)
         changed = (source, weather) != (self.track.source, self.weather)
-        self.set_weather(weather)
+        self.weather = weather
         self.day = daytime == "day"
         if changed:
             self.open(source, self.stage.direction)

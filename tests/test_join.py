@@ -152,6 +152,8 @@ def test_each_road_has_the_weather_sent_before_it():
     dialect, images = Roads(LAKE), []
     for weather in ("Sun", "Fog", "Rain", "MoonShine Skybox"):
         assert not dialect.handle("weather", {"type": weather, "rate": "30"}), "the road is the answer"
+        dialect.restart()  # on the road before, in its weather
+        assert bool(dialect.views[0].disturbance) == (weather == "MoonShine Skybox")
         assert dialect.handle("track", {"track_string": ROADS[0]})
         images.append(decode(base64.b64decode(json.loads(dialect.telemetry()[2:])[1]["image"])).astype(int))
     sun, fog, rain, moon = images
