@@ -120,6 +120,7 @@ class Joined(ClientSession):
     def _exchange(self) -> None:
         """Send and receive until the program wants no more, or the connection is lost. Raises ConnectionLost."""
         self.dialect.replies.clear()  # what a program that has gone was to hear
+        self.driver = AwaitedDriver(self.dialect.apart)  # and what was known of its driver
         self._start_clock()
         self._listen(SETTLE)
         self._start_clock()
